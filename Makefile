@@ -16,7 +16,7 @@ unexport PYTHONPATH PYTHONHOME PIP_USER
 unexport PYTHONDONTWRITEBYTECODE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup report test bench bench-all bench-check docs clean
+.PHONY: help setup report test bench bench-all bench-check docs learned clean
 .DEFAULT_GOAL := help
 
 help:
@@ -86,3 +86,10 @@ bench-check: $(READY_DEV) $(LLVM)
 clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build dist $(REPORT)
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# what the packaged Lake Wheeler site remembers, anew from the real logs in FIELD
+learned: $(READY_DEV)
+	for name in dataset12 lte afar nr_rank; do \
+	  $(BIN)/aerpaw-cmp calibrate tests/field/learned/$$name.yaml --into-site lake_wheeler --logs-root $(FIELD) \
+	    -o reports/learned/$$name.yaml || exit $$?; \
+	done

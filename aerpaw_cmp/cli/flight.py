@@ -21,6 +21,7 @@ from .shown import number, print_files, print_json, print_plan, say, table
         "aerpaw-cmp report flight.yaml --dry-run",
         "aerpaw-cmp report flight.yaml --figures all --style paper",
         "aerpaw-cmp report flight.yaml --export geopackage,kmz",
+        "aerpaw-cmp report flight.yaml --with calibrated.yaml",
         "aerpaw-cmp report flight.yaml --strict --json --quiet",
     ],
 )
@@ -39,6 +40,10 @@ def report(
     recommend: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("--recommend", help="Write the flight file with the settings of the model that the scene needs."),
+    ] = None,
+    learned: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--with", metavar="CALIBRATED", help="Antennas, ground and receiver of this calibrated.yaml."),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
@@ -70,6 +75,7 @@ def report(
         engine=engine,
         audit=audit,
         recommend=recommend,
+        learned=learned,
         force=force,
         export=export or (),
         figures=figures,
@@ -211,12 +217,22 @@ def _print_report_summary(outcome: Any) -> None:
     examples=[
         "aerpaw-cmp calibrate calibration.yaml -o learned.yaml",
         "aerpaw-cmp calibrate calibration.yaml --logs-root /data/flights --json",
+        "aerpaw-cmp calibrate calibration.yaml --into-site my_site.yaml",
+        "aerpaw-cmp calibrate calibration.yaml --score next_flight.yaml --score another.yaml",
     ],
 )
 def calibrate(
     calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
     out: Out = None,
     logs_root: LogsRoot = None,
+    into_site: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--into-site", metavar="SITE", help="Let this site remember it: drafts then use it by name."),
+    ] = None,
+    score: Annotated[
+        Optional[list[Path]],  # noqa: UP045
+        typer.Option(help="Also score this flight.yaml with all that was learned; may be repeated."),
+    ] = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,
     force: Force = False,
@@ -229,6 +245,8 @@ def calibrate(
         calibration_yaml,
         out=out,
         logs_root=logs_root,
+        into_site=into_site,
+        score=score or (),
         workers=workers,
         scheduler=scheduler,
         force=force,

@@ -23,6 +23,10 @@ def ingest(
     paths: Annotated[list[Path], typer.Argument(help="Log files and folders.")],
     out: Out = None,
     draft: Annotated[Optional[Path], typer.Option(help="Also write a first flight.yaml that names these logs.")] = None,  # noqa: UP045
+    site: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Site of the draft, whose memory of antennas it uses.  [default: lake_wheeler]"),
+    ] = None,
     reader: Annotated[Optional[str], typer.Option(help="Reader of all files, in place of sniffing.")] = None,  # noqa: UP045
     timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
     time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
@@ -46,7 +50,7 @@ def ingest(
     if columns:
         options |= run.mapping(columns)
         reader = reader or "generic_csv"
-    summary = run.run_ingest(paths, out=out, draft=draft, reader=reader, force=force, **options)
+    summary = run.run_ingest(paths, out=out, draft=draft, site=site, reader=reader, force=force, **options)
     if as_json:
         print_json(summary)
         return

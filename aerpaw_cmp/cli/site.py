@@ -119,6 +119,11 @@ def site_show(
     from ..jobs import run
 
     shown = run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export, force=force)
+    if not as_json and flight is None:
+        from ..site.learned import memory_lines
+
+        for line in memory_lines(site or "lake_wheeler"):
+            say(line)
     print_files(shown, as_json)
 
 

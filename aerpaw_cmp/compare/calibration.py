@@ -299,6 +299,13 @@ def flight_left_out(
     return tuple(s for s in out if s is not None)
 
 
+def score_with(learned: Learned, others: Sequence[Observed], train: Sequence[Observed]) -> tuple[Score, ...]:
+    """Scores of flights that were not learned from, at antennas that were."""
+    offsets = _offsets([o.samples for o in train], learned)
+    scored = [_scored_with(o, learned, offsets[o.samples.antenna], spread=True) for o in others]
+    return tuple(s for s in scored if s is not None)
+
+
 def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]:
     """Mean over flights of measured minus predicted, per antenna [dB]."""
     each: dict[str, list[float]] = {}

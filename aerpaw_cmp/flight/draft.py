@@ -17,6 +17,7 @@ from ..common.errors import UsageError, one_line
 from ..common.yamlfile import parse_yaml
 from ..logs.ingest import IngestedFile, read_log
 from ..logs.records import Stream, has_wall_clock
+from ..site.learned import Learned, read_learned
 from ..site.siteyaml import load_site
 from .cross_checks import questions
 from .data import is_ratio
@@ -25,7 +26,8 @@ from .grouping import flights
 from .heights import height_in_name, lacks_height
 from .lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
 from .node import CARRIER_HZ, POWER_DBM, Placer, listed_places
-from .settings import FlightFile, LogSettings, RssSettings
+from .remembered import Proposal, propose
+from .settings import FlightFile, LogSettings, RssSettings, with_learned
 from .time_origin import Origin, origin_of
 
 _TOWER = re.compile(r"(?<![a-z0-9])lw[-_ ]?([1-5])(?![0-9])", re.IGNORECASE)
@@ -53,6 +55,7 @@ def draft(
     timezone: str | None = None,
     time_origin: str | None = None,
     mapping: Mapping[str, Any] | None = None,
+    site: str = SITE,
 ) -> tuple[str, list[str]]:
     """The text of a flight.yaml that names the logs.
 
@@ -66,6 +69,8 @@ def draft(
         What zone-less clocks and relative times were read with.
     mapping : mapping, optional
         ``columns``, ``kind``, ``unit`` and ``ri_base`` that generic CSVs were read with.
+    site : str
+        Packaged site, or the path of a site.yaml against ``folder``; what it remembers of antennas is used.
 
     Returns
     -------
@@ -87,7 +92,7 @@ def draft(
         mapping=dict(mapping or {}),
         timezone=timezone,
         positioned=any(_has_positions(stream) for stream in every),
-        placer=_placer(files, flown),
+        placer=_placer(files, flown, _place_of(site, folder)),
         locks=any(may_lose_lock(stream) for stream in every),
     )
     for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest
@@ -98,7 +103,7 @@ def draft(
             "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in entries.out),
             expected="telemetry and levels or ranks of one flight",
         )
-    parts = [HEAD, f"flight: {_name(entries.flown, files)}\n", f"site: {SITE}  # or your own site.yaml?\n"]
+    parts = [HEAD, f"flight: {_name(entries.flown, files)}\n", f"site: {site}  # or your own site.yaml?\n"]
     if entries.towers:
         parts += [
             "towers:\n",
@@ -109,9 +114,10 @@ def draft(
     parts += ["logs:\n", *entries.lines.values()]
     parts += [NO_TRACK] if entries.without_track else []
     parts += [f"  # left out: {remark}\n" for remark in entries.out]
-    parts += [LINK] if "rss" in entries.kinds else []
+    known = _remembered(entries, site, folder)
+    parts += _learned_lines(known) if "rss" in entries.kinds else []
     parts += [RANK] if "rank" in entries.kinds else []
-    parts += _settings(entries)
+    parts += _settings(entries, known)
     text = "".join(parts)
     proof = _proof(text, folder, {file.path: file for file in files}, list(entries.lines))
     if proof.reason:
@@ -126,6 +132,7 @@ def draft(
 def _proof(text: str, folder: Path, files: Mapping[str, IngestedFile], paths: Sequence[str]) -> DryRun:
     """What a report of the draft would score; logs whose times the draft moves are read again."""
     settings = parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
+    settings = with_learned(settings, folder)
     read = []
     for log, path in zip(settings.logs, paths, strict=True):
         moved = log.time_origin is not None and any("clock" in s.attributes for s in files[path].result.streams)
@@ -159,6 +166,7 @@ def drafts(
     timezone: str | None = None,
     time_origin: str | None = None,
     mapping: Mapping[str, Any] | None = None,
+    site: str = SITE,
 ) -> list[Draft]:
     """A flight.yaml for each flight that the logs are of, in the order of time; see :func:`draft`.
 
@@ -177,6 +185,8 @@ def drafts(
         Of relative times.
     mapping : mapping, optional
         Keys of a log that ``--map`` gave.
+    site : str
+        As for :func:`draft`.
 
     Returns
     -------
@@ -185,7 +195,7 @@ def drafts(
     """
     every = [flight for flight in flights(files) if flight.measured]
     complete = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
-    options_of_clock = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping}
+    options_of_clock = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping, "site": site}
     groups = [flight.files for flight in complete] if len(complete) > 1 else [list(files)]
     made = []
     for group in groups:
@@ -213,19 +223,47 @@ QUICK_AUDIT = 24
 _QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers to publish"
 
 
-def _settings(entries: _Entries) -> list[str]:
+def _place_of(site: str, folder: Path) -> str | Path:
+    return folder / site if (folder / site).is_file() else site
+
+
+def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
+    """What the site remembers that fits; of a memory that cannot be read, nothing, and a remark says so."""
+    series = [(tower, channel, reader) for tower, channel, reader in entries.series]
+    try:
+        known = read_learned(_place_of(site, folder))
+    except UsageError as error:
+        entries.out.append(f"what site {site} remembers: {error.found}")
+        known = Learned()
+    return propose(known, str(Path(site).with_suffix("")), series)
+
+
+def _learned_lines(known: Proposal) -> list[str]:
+    """``antennas`` and ``link``."""
+    if not known.antennas:
+        return [LINK]
+    assert known.carrier_hz is not None
+    return [
+        f"antennas: {_plain(dict(known.antennas))}  # {known.antennas_about}\n",
+        LINK.replace(f"{CARRIER_HZ / 1e9:g}e9", f"{known.carrier_hz / 1e9:g}e9", 1),
+    ]
+
+
+def _settings(entries: _Entries, known: Proposal) -> list[str]:
     """Lines for ``rt``, ``rss`` and ``rank`` that real logs ask for."""
     if entries.flown is None:
-        return []
-    frame, lines = entries.flown[0].frame, []
+        receiver = {"receiver": known.receiver} if "rank" in entries.kinds and known.receiver else {}
+        return [f"rank: {_plain(receiver)}  # {known.receiver_about}\n"] if receiver else []
+    frame, lines = entries.flown[0].frame, list[str]()
+    alone = ", max_depth: 0" if known.antennas else ""  # the gains were learned beside line of sight alone
     if "rank" in entries.kinds:
         lines.append("# rt.attitude: logged needs link.rank.uav mounted as seen from the aircraft's nose.\n")
         lines.append(f"rt: {{audit_links: {QUICK_AUDIT}}}{_QUICK}\n")
     elif _has_attitude(frame):
-        lines.append(f"rt: {{attitude: logged, audit_links: {QUICK_AUDIT}}}{_QUICK}\n")
+        lines.append(f"rt: {{attitude: logged{alone}, audit_links: {QUICK_AUDIT}}}{_QUICK}\n")
     else:
         lines.append(
-            f"rt: {{attitude: level, audit_links: {QUICK_AUDIT}}}"
+            f"rt: {{attitude: level{alone}, audit_links: {QUICK_AUDIT}}}"
             "  # a quick audit; no attitude in the telemetry: the nose points along the track?\n"
         )
     low: dict[str, Any] = {}
@@ -240,6 +278,9 @@ def _settings(entries: _Entries) -> list[str]:
             if span := _span_of_offsets(entries.offsets_db):
                 chosen |= span
                 reasons.append("the levels lie outside the usual span of offsets")
+        elif known.receiver:
+            chosen |= {"receiver": known.receiver}
+            reasons.append(known.receiver_about)
         if chosen:
             lines.append(f"{kind}: {_plain(chosen)}  # {'; '.join(reasons)}\n")
     return lines
@@ -260,12 +301,12 @@ def _span_of_offsets(offsets_db: Sequence[float]) -> dict[str, Any]:
     return {"span_db": [10 * floor(low / 10.0), 10 * ceil(high / 10.0)]}
 
 
-def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None) -> Placer | None:
+def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, site: str | Path) -> Placer | None:
     """Proposals for nodes, where there is a track at the site."""
     if flown is None or lacks_height(flown[0]):
         return None
     listed = listed_places(Path(file.path).resolve().parent for file in files)
-    placer = Placer(load_site(SITE), flown[0], listed)
+    placer = Placer(load_site(site), flown[0], listed)
     return placer if placer.at_site else None
 
 
@@ -307,6 +348,8 @@ class _Entries:
     lines: dict[str, str] = field(default_factory=dict)
     """By the path as it was given."""
     kinds: set[str] = field(default_factory=set)
+    series: list[tuple[str, ...]] = field(default_factory=list)
+    """Tower, channel and reader of each level and rank."""
     out: list[str] = field(default_factory=list)
     without_track: bool = False
     """A record was entered that needs a track, and there is none."""
@@ -402,6 +445,7 @@ class _Entries:
         if self.placer is not None:
             self.offsets_db += [o for s in kept if (o := self._offset_db(s, entry, self.placer)) is not None]
         self.kinds |= {s.kind for s in kept}
+        self.series += [(*_key(s, entry), file.result.reader) for s in kept if s.kind in ("rss", "rank")]
         self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
 
     def _place(self, entry: dict[str, Any], asked: str, levels: Sequence[Stream], placer: Placer) -> str:

@@ -6,6 +6,7 @@ are errors that name the nearest valid key. Relative paths resolve against the f
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,6 +30,7 @@ from ..propagation.arrays import (
 )
 from ..propagation.search.interactions import Interaction
 from ..site.antennas import Isotropic
+from ..site.learned import BAND, Named, find_named
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -523,6 +525,8 @@ class FlightFile(Settings):
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = []
     """SHA-256 of the logs that settings of this file were learned from: nothing is scored on them."""
     logs: Annotated[list[LogSettings], Field(min_length=1)]
+    antennas: dict[str, str] = {}
+    """Learned antennas of a site by name, of the ``uav`` and of ``TOWER.CHANNEL``, in place of those of link."""
     link: LinksSettings = LinksSettings()
     rt: RtSettings = RtSettings()
     rss: RssSettings = RssSettings()
@@ -555,12 +559,139 @@ class FlightFile(Settings):
         return value
 
 
-def load_flight(path: str | Path) -> FlightFile:
+class LearnedSettings(Settings):
+    """calibrated.yaml: the part of a flight.yaml that a calibration knows."""
+
+    trained_on: list[str] = []
+    link: dict[str, Any] = {}
+    rt: dict[str, Any] = {}
+    rank: dict[str, Any] = {}
+
+
+def load_flight(path: str | Path, learned: Path | None = None) -> FlightFile:
     """Read and check a flight.yaml.
+
+    Parameters
+    ----------
+    path : str or Path
+    learned : Path, optional
+        calibrated.yaml whose settings take the place of those of the flight file; its files lie beside it.
+
+    Returns
+    -------
+    FlightFile
 
     Raises
     ------
     UsageError
         Unknown or duplicate keys, wrong types, wrong ranges: with the line and the nearest valid key.
     """
-    return load_yaml(Path(path), FlightFile)
+    settings = load_yaml(Path(path), FlightFile)
+    if learned is not None:
+        settings = _joined(settings, _placed(load_yaml(learned, LearnedSettings), learned), learned)
+    return with_learned(settings, Path(path).parent)
+
+
+def _placed(learned: LearnedSettings, path: Path) -> dict[str, Any]:
+    """The content of calibrated.yaml with the files that it names as absolute paths."""
+
+    def place(value: Any, key: str = "") -> Any:
+        if isinstance(value, dict):
+            return {name: place(item, name) for name, item in value.items()}
+        if key in ("file", "receiver") and isinstance(value, str):
+            return str((path.parent / value).absolute())
+        return value
+
+    return dict(place(learned.model_dump(exclude_unset=True)))
+
+
+def _joined(settings: FlightFile, learned: Mapping[str, Any], path: Path) -> FlightFile:
+    """The settings of a flight with what was learned in place of its own."""
+    stated: dict[str, Any] = settings.model_dump(mode="json", exclude_unset=True)
+    link = dict(stated.get("link", {}))
+    whole = settings.link.rss.model_dump(mode="json", exclude_unset=True)
+    channels = dict(link.get("channels", {}))
+    for name, one in learned.get("link", {}).get("channels", {}).items():
+        channels[name] = {**whole, **channels.get(name, {}), **one}
+    stated["link"] = {**link, **({"channels": channels} if channels else {})}
+    for key in ("rt", "rank"):
+        stated[key] = {**stated.get(key, {}), **learned.get(key, {})}
+    stated["trained_on"] = [*stated.get("trained_on", []), *learned.get("trained_on", [])]
+    try:
+        return FlightFile.model_validate(stated)
+    except ValueError as error:
+        raise UsageError(
+            f"its settings do not fit this flight: {str(error).splitlines()[-1]}",
+            expected="a calibrated.yaml of 'aerpaw-cmp calibrate'",
+            path=path,
+        ) from None
+
+
+def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
+    """The settings with the antennas and the receiver that they name from the memory of a site, as files.
+
+    What cannot be used (no such entry, a damaged memory, another band) is left out, and ``flight.notes`` say so: the
+    report goes on without it.
+
+    Parameters
+    ----------
+    settings : FlightFile
+    folder : Path
+        Of the flight file, where sites that are not packaged lie.
+    """
+    notes: list[str] = []
+    content: dict[str, Any] = {}
+    channels = dict(settings.link.channels)
+    for key, name in sorted(settings.antennas.items(), key=lambda item: item[0] == "uav"):
+        try:
+            named = find_named(name, folder)
+            channels |= _with_antenna(settings, channels, key, named)
+        except UsageError as error:
+            notes.append(f"antennas.{key}: {error.found}; isotropic in its place")
+    if channels != settings.link.channels:
+        content["link"] = settings.link.model_copy(update={"channels": channels})
+    receiver = settings.rank.receiver
+    if receiver is not None and "/" in receiver and not (folder / receiver).is_file():
+        try:
+            named = find_named(receiver, folder)
+            if named.entry.receivers:
+                file = str(named.folder / named.entry.receivers[0].file)
+                content["rank"] = settings.rank.model_copy(update={"receiver": file})
+        except UsageError:
+            pass  # a file of another place: reading it says what is wrong
+    if notes:
+        content["flight"] = settings.flight.model_copy(update={"notes": [*settings.flight.notes, *notes]})
+    return settings.model_copy(update=content) if content else settings
+
+
+def _with_antenna(
+    settings: FlightFile, channels: Mapping[str, LinkSettings], key: str, named: Named
+) -> dict[str, LinkSettings]:
+    """Links of the channels that a learned antenna belongs to.
+
+    Raises
+    ------
+    UsageError
+        No antenna of that name for this end, or one of another band.
+    """
+    end = "uav" if key == "uav" else "tower"
+    tower, _, channel = key.partition(".")
+    names = [channel] if end == "tower" else list(channels) or [s.channel for s in named.entry.series]
+    out = {}
+    for name in names:
+        link = channels.get(name, settings.link.rss)
+        series = named.antenna(tower, name, end)
+        if series is None:
+            raise UsageError(f"no learned antenna of {key}", expected="one that the entry has")
+        if abs(link.carrier_hz / series.carrier_hz - 1.0) > BAND:
+            raise UsageError(
+                f"learned at {series.carrier_hz / 1e9:g} GHz, used at {link.carrier_hz / 1e9:g} GHz",
+                expected="an antenna of the same band",
+            )
+        file = series.uav_file if end == "uav" else series.tower_file
+        antenna = AntennaSettings(model="sphere", file=str(named.folder / file))
+        if end == "uav":
+            out[name] = link.model_copy(update={"uav": ArraySettings(antenna=antenna)})
+        else:
+            out[name] = link.model_copy(update={"towers": {**link.towers, tower: ArraySettings(antenna=antenna)}})
+    return out

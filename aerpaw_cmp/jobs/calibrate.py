@@ -36,6 +36,7 @@ from ..flight.settings import AntennaSettings, Settings, load_flight, load_patte
 from ..flight.training import counted_once, flight_logs
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.field.baselines import free_space_dbm, two_ray_dbm
+from ..site.learned import Source
 from .calibrate_rank import RankFitSettings
 from .workers import Lost, Workers
 
@@ -72,6 +73,8 @@ class CalibrationFile(Settings):
     flights: Annotated[list[str], Field(min_length=1)]
     patterns: PatternsSettings = PatternsSettings()
     fit: FitSettings = FitSettings()
+    source: Source = Source()
+    """Title, DOI and licence of the flights' data, and their airframe: kept beside what a site remembers."""
     rank: RankFitSettings | None = None
     """Also learn how the receiver decides its rank."""
 
@@ -134,7 +137,12 @@ def load_calibration(path: Path) -> CalibrationFile:
 
 
 def calibrate(
-    path: Path, *, logs_root: Path | None = None, stages: Stages | None = None, workers: Workers | None = None
+    path: Path,
+    *,
+    logs_root: Path | None = None,
+    stages: Stages | None = None,
+    workers: Workers | None = None,
+    score: Sequence[Path] = (),
 ) -> Calibration:
     """Read the flights, learn, score.
 
@@ -147,6 +155,8 @@ def calibrate(
     stages : Stages, optional
     workers : Workers, optional
         Share the scores and the controls.
+    score : sequence of Path
+        Further flight files, scored with all that was learned.
 
     Returns
     -------
@@ -182,6 +192,10 @@ def calibrate(
         else:
             scores, controls = score_all(observed, recipe, stages)
     warnings += mount_warnings(learned)
+    if score:
+        with stages("score"):
+            others, said = _score_others(score, flights, logs_root, learned, observed)
+        scores, warnings = {**scores, "other_flights": others}, [*warnings, *said]
     return Calibration(
         settings=settings,
         flights=tuple(flights),
@@ -194,6 +208,29 @@ def calibrate(
         warnings=tuple(warnings),
         words=tuple(words_of(scores, controls, ground)),
     )
+
+
+def _score_others(
+    paths: Sequence[Path],
+    flights: Sequence[FlightData],
+    logs_root: Path | None,
+    learned: Learned,
+    observed: Sequence[Observed],
+) -> tuple[tuple[Score, ...], list[str]]:
+    """Scores of further flights with what was learned, and which of them were learned from."""
+    others = [load_data(load_flight(path), path.parent, logs_root) for path in paths]
+    kept, said = counted_once([*flights, *others])
+    fresh = [data for data in kept if not any(data is one for one in flights)]
+    if not fresh:
+        return (), said
+    seen = [one for data in fresh for one in observe([data])[0]]
+    known = {o.samples.antenna for o in observed}
+    said += [
+        f"{o.samples.flight}: nothing was learned about {o.samples.antenna}"
+        for o in seen
+        if o.samples.antenna not in known
+    ]
+    return calibration.score_with(learned, [o for o in seen if o.samples.antenna in known], observed), said
 
 
 # --- flights -------------------------------------------------------------------------------------------------------

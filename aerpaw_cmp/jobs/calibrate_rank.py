@@ -18,7 +18,6 @@ import numpy as np
 from pydantic import Field
 
 from ..common.errors import InputError, UsageError
-from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.provenance import KEY, union
 from ..common.units import FloatArray, IntArray
 from ..compare.forecast import ForecastScore, constant_forecast, score_forecast
@@ -41,6 +40,7 @@ from ..flight.settings import Settings
 from ..flight.training import logs_of
 from ..propagation.arrays import Link, Poses
 from ..propagation.drivers.geometries import Geometry, every_geometry, singular_values_of
+from ..site.learned import read_table
 
 FORMAT = "aerpaw-cmp receiver 1"
 """First key of a receiver file."""
@@ -195,7 +195,7 @@ def read_receiver(path: Path) -> dict[str, FittedReceiver]:
         If it is no such file.
     """
     try:
-        content = json.loads(read_bounded(path, LARGEST_TABLE, "a receiver file"))
+        content = json.loads(read_table(path, "a receiver file"))
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")
         return {tower: FittedReceiver.from_dict(tower, one) for tower, one in content["towers"].items()}

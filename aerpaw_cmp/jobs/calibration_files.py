@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -12,16 +12,20 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import UsageError
-from ..common.provenance import KEY
-from ..common.units import FloatArray
+from ..common.provenance import KEY, union
+from ..common.units import FloatArray, IntArray
 from ..common.versions import versions
-from ..compare.calibration import Learned
+from ..compare.calibration import Learned, mean_rmse
+from ..flight.data import FlightData, RankSeries, RssSeries
+from ..flight.training import flight_logs
 from ..report.calibration_data import AntennaMap, CalibrationData
 from ..report.calibration_html import write_calibration
 from ..report.export import write_file
 from ..report.names import safe_name
+from ..site.learned import Entry, Errors, LearnedReceiver, LearnedSeries
 from ..site.sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid, sphere_netcdf, unit_mean_gain
-from .calibrate import Calibration
+from .calibrate import Calibration, CalibrationFile
+from .calibrate_rank import RankCalibration
 
 MARK = "# aerpaw-cmp calibrate"
 """First words of calibrated.yaml, by which an own earlier output is known."""
@@ -232,3 +236,114 @@ def write_files(calibration: Calibration, folder: Path, name: str, stages_s: Map
     record = record_of(calibration, maps, text, stages_s)
     write_calibration(record, folder)
     return record, text
+
+
+def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str, bytes]]:
+    """What a site remembers of a calibration: the entry, and its tables by name."""
+    name, maps = calibration.settings.calibration, antenna_maps(calibration)
+    tables: dict[str, bytes] = {}
+    series = []
+    for antenna in calibration.learned.fit.antennas if calibration.learned.fit else ():
+        files = {}
+        for end in ("tower", "uav"):
+            one = maps[antenna, end]
+            files[end] = f"{safe_name(f'{name}.{antenna}.{end}')}.csv.gz"
+            notes = (
+                f"aerpaw-cmp calibrate: {name}, {antenna} {end}",
+                f"{KEY}: {' '.join(calibration.trained_on)}",
+                calibration.learned.spread(antenna).text(),
+            )
+            tables[files[end]] = sphere_csv(one.gain_dbi, one.sd_db, notes, decimals=2).encode()
+        own = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
+        first = next((data, s) for data in calibration.flights for s in data.rss if f"{s.tower}.{s.channel}" == antenna)
+        seen = np.concatenate([calibration.learned.predict(o.part(_spread_rows(len(o))))[1] for o in own])
+        series.append(
+            LearnedSeries(
+                tower=own[0].tower,
+                channel=own[0].channel,
+                reader=reader_of(*first),
+                carrier_hz=first[1].link.carrier_hz,
+                tower_file=files["tower"],
+                uav_file=files["uav"],
+                sd_db=round(float(np.nanmean(seen)), 2),
+            )
+        )
+    return (
+        Entry(
+            **_provenance(calibration.settings, calibration.flights, command),
+            errors=_errors(calibration),
+            series=series,
+            ground_roughness_m=None if calibration.ground is None else calibration.ground.used_m,
+        ),
+        tables,
+    )
+
+
+def receiver_entry(
+    settings: CalibrationFile, flights: Sequence[FlightData], ranked: RankCalibration, command: str
+) -> tuple[Entry, dict[str, bytes]]:
+    """What a site remembers of rank receivers.
+
+    Parameters
+    ----------
+    settings : CalibrationFile
+    flights : sequence of FlightData
+        That the receivers were fitted on.
+    ranked : RankCalibration
+    command : str
+        That makes the entry.
+
+    Returns
+    -------
+    entry : Entry
+    files : dict of str to bytes
+        By name.
+    """
+    file = f"{safe_name(settings.calibration)}.receiver.json.gz"
+    receivers = []
+    for tower in ranked.receivers:
+        scores = [score for _, at, score in ranked.scores["flight_left_out"] if at == tower]
+        first = next((data, s) for data in flights for s in data.rank if s.tower == tower)
+        means = {
+            key: round(float(np.mean([one.as_dict()[key] for one in scores])), 3)
+            for key in ("kappa", "log_score", "constant_log_score")
+            if scores
+        }
+        link = first[0].settings.link.rank
+        receivers.append(
+            LearnedReceiver(tower=tower, reader=reader_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
+        )
+    return Entry(**_provenance(settings, flights, command), receivers=receivers), {file: ranked.text().encode()}
+
+
+def reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:
+    """Reader of the log that holds a series."""
+    return data.files[int(series.log[0]) if len(series.log) else 0].result.reader
+
+
+def _spread_rows(count: int) -> IntArray:
+    return np.unique(np.linspace(0, count - 1, min(count, 200)).round().astype(np.int64))
+
+
+def _provenance(settings: CalibrationFile, flights: Sequence[FlightData], command: str) -> dict[str, Any]:
+    days = {str(s.time.min().astype("datetime64[D]")) for data in flights for s in data.rss}
+    days |= {str(s.time.min().astype("datetime64[D]")) for data in flights for s in data.rank}
+    return {
+        "command": command,
+        "made": datetime.now(timezone.utc).date().isoformat(),
+        "flights": [data.settings.flight.name for data in flights],
+        "flown": sorted(days),
+        "trained_on": list(union(*map(flight_logs, flights))),
+        "source": settings.source,
+    }
+
+
+def _errors(calibration: Calibration) -> Errors | None:
+    scores, sectors = (calibration.scores[f"{name}_left_out"] for name in ("flight", "sector"))
+    if not scores:
+        return None
+    values = {
+        name: round(mean_rmse(scores, name), 3) for name in ("rmse_db", "rmse_4s_db", "free_space_rmse_db", "inside_90")
+    }
+    sector = round(mean_rmse(sectors), 3) if sectors else None
+    return Errors(series=len(scores), sector_rmse_db=sector, **values)

@@ -346,6 +346,7 @@ def recommended_settings(settings: Mapping[str, Any], model: Model | None) -> di
         See :attr:`FlightLadder.recommended`.
     """
     result = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
+    result.pop("antennas", None)  # the names of learned antennas: link holds their files by now
     if model is None:
         return result
     changes = model.settings(int(result.get("rt", {}).get("max_depth", 2)))

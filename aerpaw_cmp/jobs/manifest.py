@@ -18,9 +18,12 @@ from ..common.outputs import file_digest
 from ..common.provenance import trained_on
 from ..flight.settings import FlightFile
 from ..report.data import InputFile
+from ..site.learned import read_table
 
 
-def other_inputs(settings: FlightFile, flight: Path, logs_root: Path | None = None) -> tuple[InputFile, ...]:
+def other_inputs(
+    settings: FlightFile, flight: Path, logs_root: Path | None = None, learned: Path | None = None
+) -> tuple[InputFile, ...]:
     """The flight file, the site file and every file that either names, but for the logs.
 
     Parameters
@@ -31,6 +34,8 @@ def other_inputs(settings: FlightFile, flight: Path, logs_root: Path | None = No
         The flight file.
     logs_root : Path, optional
         Where logs and antenna files resolve besides the folder of the flight file.
+    learned : Path, optional
+        calibrated.yaml of ``report --with``.
 
     Returns
     -------
@@ -41,6 +46,8 @@ def other_inputs(settings: FlightFile, flight: Path, logs_root: Path | None = No
     content = settings.model_dump(exclude={"logs"})
     roots = [flight.parent] if logs_root is None else [logs_root, flight.parent]
     entries = {os.path.realpath(flight): _entry(flight.name, flight, "flight file")}
+    if learned is not None:
+        entries[os.path.realpath(learned)] = _entry(learned.name, learned, "learned settings")
     for key, text, place in named_files(content, roots):
         if key != "site.file":
             entries.setdefault(os.path.realpath(place), _entry(text, place, key))
@@ -86,7 +93,7 @@ def _learned_on(place: Path, size: int, _mtime_ns: int) -> tuple[str, ...]:
     """SHA-256 of the logs that a file says it was learned from."""
     if size > LARGEST_TABLE:
         return ()
-    return trained_on(place.read_bytes().decode("utf-8", errors="replace"))
+    return trained_on(read_table(place, "an input").decode("utf-8", errors="replace"))
 
 
 def _entry(name: str, place: Path, role: str) -> InputFile:

@@ -14,6 +14,7 @@ from typing import Any
 from ..common.errors import AerpawCmpError, UsageError, noting_interrupts
 from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
+from ..common.provenance import KEY, union
 from ..common.stages import Progress, Stages, silent
 from ..flight.settings import RtSettings
 from ..propagation.options import Search
@@ -50,6 +51,7 @@ def run_ingest(
     *,
     out: Path | None = None,
     draft: Path | None = None,
+    site: str | None = None,
     reader: str | None = None,
     force: bool = False,
     **options: Any,
@@ -67,6 +69,8 @@ def run_ingest(
         The flight file (HDF5) to write.
     draft : Path, optional
         The flight.yaml to write.
+    site : str, optional
+        Of the draft: packaged, or a site.yaml; lake_wheeler without.
     reader : str, optional
         Of all files, in place of recognising them.
     force : bool
@@ -94,7 +98,7 @@ def run_ingest(
         if out is not None:
             target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=paths, force=force))
         if draft is not None:
-            from ..flight.draft import drafts
+            from ..flight.draft import SITE, drafts
 
             drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=paths, force=force))
         files = ingest(paths, options=ReadOptions(**options), reader=reader)
@@ -103,7 +107,10 @@ def run_ingest(
             options_of_clock = {key: options.get(key) for key in ("timezone", "time_origin")}
             named = ("columns", "kind", "unit", "ri_base")
             options_of_clock["mapping"] = {key: options[key] for key in named if options.get(key)}
-            made = drafts(files, drafted.target.parent, **options_of_clock)
+            home = drafted.target.parent
+            if site is not None and Path(site).is_file():
+                site = os.path.relpath(Path(site).resolve(), home.resolve())
+            made = drafts(files, home, site=site or SITE, **options_of_clock)
             account["draft"] = list(made[0].remarks)
             drafted.write(sealed(made[0].text))
             account["drafts"] = [str(draft)]
@@ -173,6 +180,7 @@ def run_report(
     engine: str | None = None,
     audit: str | None = None,
     recommend: Path | None = None,
+    learned: Path | str | None = None,
     force: bool = False,
     figures: str = "page",
     style: str = "screen",
@@ -194,6 +202,8 @@ def run_report(
         left to :func:`run_audit`.
     recommend : Path, optional
         Where to write it.
+    learned : Path, optional
+        calibrated.yaml whose antennas, ground and receiver take the place of those of the flight file.
     force : bool
         Replace what this tool did not write.
     figures : {"page", "none", "svg", "png", "pdf", "all"}
@@ -231,8 +241,9 @@ def run_report(
             raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
     if recommend is not None:
         _beside(recommend, flight, logs_root)
-    settings = _overridden(load_flight(flight), engine, audit)
-    inputs = input_files(settings, flight, logs_root)
+    learned = None if learned is None else Path(learned)
+    settings = _overridden(load_flight(flight, learned), engine, audit)
+    inputs = [*input_files(settings, flight, logs_root), *([] if learned is None else [learned])]
     folder = out or Path("reports") / settings.flight.name
     with ExitStack() as outputs:
         output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=force))
@@ -245,13 +256,14 @@ def run_report(
             data = load_data(settings, flight.parent, logs_root)
         replays = replay_flight(data, stages)
         flight_run = run_flight(data, stages, replays=replays, ladder=True)
-        record = report_record(flight_run, other_inputs(settings, flight, logs_root))
+        record = report_record(flight_run, other_inputs(settings, flight, logs_root, learned))
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
+        asked |= {} if learned is None else {"learned": os.path.relpath(learned, folder)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
         if same_inputs is not None:
             refuse_changed(same_inputs, record.inputs)
         if target is not None:
-            target.write(sealed(recommended_text(load_flight(flight), flight_run.ladder, flight.name)))
+            target.write(sealed(recommended_text(load_flight(flight, learned), flight_run.ladder, flight.name)))
         with output.filling() as place:
             record = write_report(record, place, drawn=figures, style=style, exports=formats, stages=stages).data
     metrics = metrics_of(record)
@@ -353,7 +365,7 @@ def run_audit(
         force=force,
         same_inputs=earlier.inputs,
         progress=progress,
-        **earlier.asked,
+        **{key: earlier.folder / value if key == "learned" else value for key, value in earlier.asked.items()},
     )
 
 
@@ -933,6 +945,8 @@ def run_calibrate(
     logs_root: Path | None = None,
     workers: int = 1,
     scheduler: str | None = None,
+    into_site: str | None = None,
+    score: Sequence[Path] = (),
     force: bool = False,
     progress: Progress = silent,
 ) -> CalibrateOutcome:
@@ -948,6 +962,10 @@ def run_calibrate(
         Where the paths of logs and antennas resolve.
     workers, scheduler
         Who computes the scores: workers of this machine, or of a Dask scheduler.
+    into_site : str, optional
+        Site (site.yaml or packaged) whose memory gets what was learned, as an entry of the calibration's name.
+    score : sequence of Path
+        Flight files that are scored with all that was learned; those of training logs are named and not scored.
     force : bool
         Replace also what this tool did not write; never an input.
     progress : Progress
@@ -964,8 +982,9 @@ def run_calibrate(
     """
     from ..flight.settings import load_flight
     from ..report.calibration_html import calibration_metrics
+    from ..site.learned import remember
     from .calibrate import calibrate, load_calibration
-    from .calibration_files import MARK, write_files
+    from .calibration_files import MARK, receiver_entry, site_entry, write_files
     from .campaign import absolute
     from .workers import open_workers
 
@@ -983,17 +1002,21 @@ def run_calibrate(
         OutputFile(target, own=is_sealed, inputs=inputs, force=force) as file,
         OutputFolder(folder, job="calibrate", inputs=inputs, force=force) as output,
     ):
-        ranked, has_rss = _calibrated_rank(settings, path, logs_root, stages)
+        ranked, flights = _calibrated_rank(settings, path, logs_root, stages)
+        has_rss = ranked is None or any(data.rss for data in flights)
+        command = f"aerpaw-cmp calibrate {path.name} --into-site {into_site}"
+        learned: list[tuple[str, Any, dict[str, bytes]]] = []
         if not has_rss and ranked is not None:
             text, metrics = MARK + "\n", {**_RANK_ALONE, "calibration": settings.calibration}
             with output.filling() as place:
                 metrics |= {"rank": ranked.metrics(), "warnings": list(ranked.warnings), "flights": settings.flights}
+                metrics[KEY] = list(union(*(one.trained_on for one in ranked.receivers.values())))
                 (place / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
                 (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
         else:
             path, logs_root = (path, logs_root) if scheduler is None else (absolute(path), absolute(logs_root))
             with open_workers(workers, scheduler, paths=[path], progress=progress) as crew:
-                calibration = calibrate(path, logs_root=logs_root, stages=stages, workers=crew)
+                calibration = calibrate(path, logs_root=logs_root, stages=stages, workers=crew, score=score)
             if ranked is not None:
                 calibration = replace(
                     calibration, rank=ranked.metrics(), warnings=(*calibration.warnings, *ranked.warnings)
@@ -1003,9 +1026,14 @@ def run_calibrate(
                 if ranked is not None:
                     (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
             metrics = calibration_metrics(record)
+            learned.append((settings.calibration, *site_entry(calibration, command)))
         if ranked is not None:
+            name = settings.calibration if not learned else f"{settings.calibration}_rank"
+            learned.append((name, *receiver_entry(settings, flights, ranked, command)))
             text += f"rank:\n  receiver: {folder.name}/receiver.json\n"
         file.write(sealed(text))
+    if into_site is not None:
+        metrics["into_site"] = [str(f) for entry in learned for f in remember(into_site, *entry)]
     return CalibrateOutcome(target, folder, metrics)
 
 
@@ -1013,10 +1041,10 @@ _RANK_ALONE: dict[str, Any] = {"scores": {}, "controls": {}, "words": [], "anten
 """What a calibration of flights without RSS has instead of antennas."""
 
 
-def _calibrated_rank(settings: Any, path: Path, logs_root: Path | None, stages: Stages) -> tuple[Any, bool]:
-    """The receiver, where calibration.yaml asks for one, and whether there is RSS to learn antennas from."""
+def _calibrated_rank(settings: Any, path: Path, logs_root: Path | None, stages: Stages) -> tuple[Any, list[Any]]:
+    """The receiver, where calibration.yaml asks for one, and the flights that it was fitted on."""
     if settings.rank is None:
-        return None, True
+        return None, []
     from .calibrate import read_flights
     from .calibrate_rank import fit_rank
 
@@ -1024,4 +1052,4 @@ def _calibrated_rank(settings: Any, path: Path, logs_root: Path | None, stages: 
         flights, copies = read_flights(settings, path.parent, logs_root)
         ranked = fit_rank(flights, settings.rank)
         ranked = replace(ranked, warnings=(*copies, *ranked.warnings))
-        return ranked, any(data.rss for data in flights)
+        return ranked, flights

@@ -11,10 +11,10 @@ import numpy as np
 
 from ..common.cf import CONVENTIONS, DB
 from ..common.errors import InputError
-from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.provenance import trained_on
 from ..common.units import FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern
+from .learned import read_table
 
 COLUMNS = ("azimuth_deg", "elevation_deg", "gain_dbi", "gain_sd_db")
 
@@ -129,13 +129,30 @@ def sphere_netcdf(
     return bytes(book.close())
 
 
-def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] = ()) -> str:
-    """Text of an antenna file: comment lines, a header, a line per direction."""
+def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] = (), decimals: int = 3) -> str:
+    """Text of an antenna file: comment lines, a header, a line per direction.
+
+    Parameters
+    ----------
+    gain_dbi, sd_db : (thetas, phis)
+        Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
+    notes : tuple of str
+        Comments, a line each.
+    decimals : int
+        Of the gains.
+
+    Returns
+    -------
+    str
+    """
     rows, columns = gain_dbi.shape
     theta, phi = np.linspace(0.0, 180.0, rows), np.arange(columns) * (360.0 / columns)
     lines = [f"# {note}" for note in notes] + [",".join(COLUMNS)]
     for i in range(rows):
-        lines += [f"{phi[j]:g},{90.0 - theta[i]:g},{gain_dbi[i, j]:.3f},{sd_db[i, j]:.3f}" for j in range(columns)]
+        lines += [
+            f"{phi[j]:g},{90.0 - theta[i]:g},{gain_dbi[i, j]:.{decimals}f},{sd_db[i, j]:.{decimals}f}"
+            for j in range(columns)
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -149,7 +166,7 @@ def read_sphere_csv(path: str | Path, *, name: str | None = None) -> SpherePatte
     """
     path = Path(path)
     try:
-        text = read_bounded(path, LARGEST_TABLE, "an antenna file").decode("utf-8-sig")
+        text = read_table(path, "an antenna file").decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"cannot be read ({error})", expected="a text file of gain over direction", path=path

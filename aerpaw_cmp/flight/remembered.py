@@ -1,0 +1,72 @@
+"""What a draft takes from the memory of its site: only what fits the tower, the channel, the reader and so the band."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from ..site.learned import Entry, Learned
+
+SeriesKey = tuple[str, str, str]
+"""Tower, channel (``rank`` of rank) and reader of a series of the draft."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """Learned antennas and receiver for a draft, by name, each with a sentence on what to expect."""
+
+    antennas: Mapping[str, str]
+    antennas_about: str
+    carrier_hz: float | None
+    receiver: str | None
+    receiver_about: str
+
+
+def propose(known: Learned, site: str, series: Sequence[SeriesKey]) -> Proposal:
+    """The entry that fits most series: tower antennas where the tower fits too, else the airframe alone.
+
+    Parameters
+    ----------
+    known : Learned
+        The memory of the site.
+    site : str
+        Its name in the names of the antennas.
+    series : sequence of (tower, channel, reader)
+
+    Returns
+    -------
+    Proposal
+        Empty where nothing fits.
+    """
+    antennas: dict[str, str] = {}
+    about, carrier = "", None
+    fits = {name: _fits(entry, series) for name, entry in known.entries.items()}
+    best = max(fits, key=lambda name: fits[name], default=None)
+    if best is not None and fits[best] > (0, 0):
+        entry = known.entries[best]
+        exact = [s for s in entry.series if (s.tower, s.channel, s.reader) in series]
+        alike = exact or [s for s in entry.series if (s.channel, s.reader) in {key[1:] for key in series}]
+        antennas = {f"{s.tower}.{s.channel}": f"{site}/{best}_{s.tower}.{s.channel}" for s in exact}
+        antennas["uav"] = f"{site}/{best}_uav"
+        about = entry.about() if exact else f"the airframe alone fits: {entry.about()}, there with its tower antenna"
+        carrier = alike[0].carrier_hz
+    ranked = {(tower, reader) for tower, channel, reader in series if channel == "rank"}
+    receivers = [
+        (name, entry)
+        for name, entry in known.entries.items()
+        if any((r.tower, r.reader) in ranked for r in entry.receivers)
+    ]
+    return Proposal(
+        antennas=antennas,
+        antennas_about=about,
+        carrier_hz=carrier,
+        receiver=f"{site}/{receivers[0][0]}" if receivers else None,
+        receiver_about=receivers[0][1].about() if receivers else "",
+    )
+
+
+def _fits(entry: Entry, series: Sequence[SeriesKey]) -> tuple[int, int]:
+    """Series of an entry that fit exactly, and those of another tower."""
+    exact = sum((s.tower, s.channel, s.reader) in series for s in entry.series)
+    alike = sum((s.channel, s.reader) in {key[1:] for key in series} for s in entry.series)
+    return exact, alike

@@ -1,0 +1,247 @@
+"""What flights taught about a site, beside its file: ``NAME.learned/learned.yaml`` and the tables that it names.
+
+Each entry is a calibration: learned antennas by tower, channel and reader, its airframe, or a rank receiver, with the
+band and the logs (SHA-256) that it was learned from, its errors on flights left out, the source of the flights and the
+command that made it.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from ..common.errors import InputError, UsageError
+from ..common.files import LARGEST_TABLE, read_bounded, write_whole
+from ..common.yamlfile import dump_yaml, load_yaml
+
+INDEX = "learned.yaml"
+FORMAT: Literal["aerpaw-cmp learned 1"] = "aerpaw-cmp learned 1"
+
+BAND = 0.02
+"""Share by which a carrier may differ from the one that an antenna was learned at."""
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Source(_Record):
+    """Whose flights these are, as calibration.yaml says."""
+
+    title: str = ""
+    doi: str = ""
+    licence: str = "not stated"
+    airframe: str = "not stated"
+
+
+class Errors(_Record):
+    """On flights left out, means over series: RMSE [dB] after one offset, and the share inside 90 % intervals."""
+
+    series: int
+    rmse_db: float
+    rmse_4s_db: float
+    free_space_rmse_db: float
+    inside_90: float
+    sector_rmse_db: float | None = None
+
+
+class LearnedSeries(_Record):
+    """Antennas of one tower and channel, and what the log of that channel looks like."""
+
+    tower: str
+    channel: str
+    reader: str
+    carrier_hz: float
+    tower_file: str
+    uav_file: str
+    sd_db: float
+    """Mean standard deviation of the level over directions that were flown."""
+
+
+class LearnedReceiver(_Record):
+    """A rank receiver of one tower: error on flights left out as kappa and log score beside the constant forecast."""
+
+    tower: str
+    reader: str
+    carrier_hz: float
+    file: str
+    kappa: float | None = None
+    log_score: float | None = None
+    constant_log_score: float | None = None
+
+
+class Entry(_Record):
+    """One calibration."""
+
+    command: str
+    made: str
+    flights: list[str]
+    flown: list[str]
+    trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]]
+    source: Source = Source()
+    errors: Errors | None = None
+    series: list[LearnedSeries] = []
+    receivers: list[LearnedReceiver] = []
+    ground_roughness_m: float | None = None
+
+    def about(self) -> str:
+        """One sentence: learned from what, and what error to expect."""
+        days = ", ".join(self.flown)
+        text = f"learned on {len(self.flights)} flights of {days}"
+        if self.errors is not None:
+            text += (
+                f"; expect an RMSE of {self.errors.rmse_db:.1f} dB on another flight, free space "
+                f"{self.errors.free_space_rmse_db:.1f} dB"
+            )
+        kappas = [one.kappa for one in self.receivers if one.kappa is not None]
+        return text + (f"; expect kappa {sum(kappas) / len(kappas):.2f} on another flight" if kappas else "")
+
+
+class Learned(_Record):
+    """All that a site remembers, by name."""
+
+    format: Literal["aerpaw-cmp learned 1"] = FORMAT
+    entries: dict[Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")], Entry] = {}
+
+
+def folder_of(site: str | Path) -> Path:
+    """Folder of what a site remembers: beside its file, or in the package."""
+    path = Path(site)
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return path.with_suffix(".learned")
+    name = str(site).lower().replace("-", "_").replace(" ", "_")
+    return Path(str(resources.files("aerpaw_cmp.site") / "data" / f"{name}.learned"))
+
+
+def read_learned(site: str | Path) -> Learned:
+    """What a site remembers; nothing for a site without a memory.
+
+    Raises
+    ------
+    UsageError
+        An index that is damaged, or of another version.
+    """
+    index = folder_of(site) / INDEX
+    return load_yaml(index, Learned) if index.is_file() else Learned()
+
+
+def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, bytes]) -> list[Path]:
+    """Write an entry and its tables (name: content, packed here) into the memory of a site; the index comes last.
+
+    Parameters
+    ----------
+    site : str or Path
+    name : str
+        Of the entry; one of this name is replaced.
+    entry : Entry
+    files : mapping of str to bytes
+        As the entry names them, with the ending ``.gz``.
+
+    Returns
+    -------
+    list of Path
+    """
+    folder, known = folder_of(site), read_learned(site)
+    folder.mkdir(exist_ok=True)
+    old = known.entries.get(name)
+    for file, content in files.items():
+        write_whole(folder / file, gzip.compress(content, 9, mtime=0))
+    entries = {**known.entries, name: entry}
+    text = dump_yaml(Learned(entries=dict(sorted(entries.items()))).model_dump(mode="json", exclude_none=True))
+    write_whole(folder / INDEX, text)
+    for file in sorted(files_of(old) - set(files)) if old is not None else ():
+        (folder / file).unlink(missing_ok=True)
+    return [folder / INDEX, *(folder / file for file in files)]
+
+
+def memory_lines(site: str | Path) -> list[str]:
+    """Lines that say what a site remembers."""
+    lines = []
+    for name, entry in read_learned(site).entries.items():
+        what = [f"{s.tower}.{s.channel} at {s.carrier_hz / 1e9:g} GHz (SD {s.sd_db:.1f} dB)" for s in entry.series]
+        what += [f"rank receiver at {r.tower}" for r in entry.receivers]
+        source = ", ".join(part for part in (entry.source.title, entry.source.doi, entry.source.licence) if part)
+        lines.append(f"{name}: {', '.join(what)}; {entry.about()}; airframe: {entry.source.airframe}")
+        lines.append(f"  source: {source}; {len(entry.trained_on)} logs, SHA-256 in {folder_of(site).name}/{INDEX}")
+        lines.append(f"  made {entry.made} by: {entry.command}")
+    return lines
+
+
+def files_of(entry: Entry) -> set[str]:
+    """Names of the tables of an entry."""
+    return {f for s in entry.series for f in (s.tower_file, s.uav_file)} | {r.file for r in entry.receivers}
+
+
+def read_table(path: Path, expected: str) -> bytes:
+    """Content of a table, packed or not.
+
+    Raises
+    ------
+    OSError
+    InputError
+        Too large, or a damaged packed file.
+    """
+    content = read_bounded(path, LARGEST_TABLE, expected)
+    if not content.startswith(b"\x1f\x8b"):
+        return content
+    try:
+        with gzip.open(path) as book:
+            unpacked = book.read(LARGEST_TABLE + 1)
+    except (OSError, EOFError) as error:
+        raise InputError(f"a damaged gzip file ({error})", expected=expected, cause="a cut copy", path=path) from None
+    if len(unpacked) > LARGEST_TABLE:
+        raise InputError(f"it unpacks to more than {LARGEST_TABLE} bytes", expected=expected, path=path)
+    return unpacked
+
+
+class Named(_Record):
+    """An entry by name, such as ``lake_wheeler/dataset12_uav``, and its part: ``uav``, ``TOWER.CHANNEL`` or all."""
+
+    entry: Entry
+    part: str
+    folder: Path
+
+    def antenna(self, tower: str, channel: str, end: str) -> LearnedSeries | None:
+        """The series whose antenna fits an end (``uav``, ``tower``) of a link; of an airframe, of any channel."""
+        if end == "tower":
+            return next((s for s in self.entry.series if f"{s.tower}.{s.channel}" == self.part), None)
+        exact = [s for s in self.entry.series if (s.tower, s.channel) == (tower, channel)]
+        return next(iter([*exact, *self.entry.series]), None)
+
+
+def find_named(name: str, folder: Path) -> Named:
+    """The entry of a name ``SITE/ENTRY``, ``SITE/ENTRY_uav`` or ``SITE/ENTRY_TOWER.CHANNEL``.
+
+    Parameters
+    ----------
+    name : str
+    folder : Path
+        Where sites that are not packaged lie: SITE.learned in it.
+
+    Raises
+    ------
+    UsageError
+        No such site, entry or part; a memory that cannot be read.
+    """
+    site, _, wanted = name.rpartition("/")
+    place = folder / f"{site}.yaml"
+    if not place.with_suffix(".learned").is_dir():
+        place = Path(site) if folder_of(site).is_dir() else place
+    known = read_learned(place)
+    for entry_name, entry in known.entries.items():
+        parts = {"": entry_name, "uav": f"{entry_name}_uav"}
+        parts |= {f"{s.tower}.{s.channel}": f"{entry_name}_{s.tower}.{s.channel}" for s in entry.series}
+        for part, full in parts.items():
+            if full == wanted:
+                return Named(entry=entry, part=part, folder=folder_of(place))
+    raise UsageError(
+        f"nothing learned is called {name!r}",
+        expected="SITE/ENTRY_uav, SITE/ENTRY_TOWER.CHANNEL or SITE/ENTRY, with one of the entries "
+        + (", ".join(known.entries) or "(there are none)"),
+        path=folder_of(place) / INDEX,
+    )

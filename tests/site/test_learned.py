@@ -1,0 +1,120 @@
+"""What a site remembers: written, found by name, refused where it does not fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.flight.remembered import propose
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.site.learned import Entry, LearnedReceiver, LearnedSeries, find_named, folder_of, read_learned, remember
+from aerpaw_cmp.site.sphere_pattern import SpherePattern, sphere_csv
+
+CARRIER_HZ = 3.3e9
+
+
+def entry(channel: str, reader: str = "flight_mat", tower: str = "LW1") -> Entry:
+    series = LearnedSeries(
+        tower=tower, channel=channel, reader=reader, carrier_hz=CARRIER_HZ, tower_file=f"{channel}.t.csv.gz",
+        uav_file=f"{channel}.u.csv.gz", sd_db=1.5,
+    )  # fmt: skip
+    return Entry(
+        command="aerpaw-cmp calibrate c.yaml --into-site s.yaml", made="2026-01-02", flights=["a", "b"],
+        flown=["2025-06-01"], trained_on=["a" * 64], series=[series],
+    )  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A site that remembers one channel, its tower antenna 3 dB above its UAV antenna."""
+    text = {
+        end: sphere_csv(np.full((7, 8), level), np.ones((7, 8))).encode() for end, level in (("t", 3.0), ("u", 0.0))
+    }
+    remember(tmp_path / "mine.yaml", "d12", entry("A"), {f"A.{end}.csv.gz": content for end, content in text.items()})
+    return tmp_path
+
+
+def flight(folder: Path, antennas: dict[str, str], carrier_hz: float = CARRIER_HZ) -> Path:
+    content = {
+        "flight": "f", "logs": [{"path": "x.txt"}], "antennas": antennas, "link": {"rss": {"carrier_hz": carrier_hz}}
+    }  # fmt: skip
+    path = folder / "flight.yaml"
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return path
+
+
+def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:
+    settings = load_flight(flight(folder, {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}))
+    link = settings.link.channels["A"].build(["LW1", "LW2"], Path("/nowhere"))
+    ends = [link.tower_arrays["LW1"].patterns[0], link.uav_array.patterns[0]]
+    assert all(isinstance(one, SpherePattern) for one in ends)
+    assert [float(one.gain_dbi(np.array(1.0), np.array(1.0))) for one in ends] == pytest.approx([3.0, 0.0], abs=1e-3)  # type: ignore[attr-defined]
+    assert not isinstance(link.tower_arrays["LW2"].patterns[0], SpherePattern)
+    assert settings.flight.notes == []
+
+
+@pytest.mark.parametrize(
+    ("name", "carrier_hz", "said"),
+    [
+        ("mine/d13_uav", CARRIER_HZ, "nothing learned is called 'mine/d13_uav'"),
+        ("other/d12_uav", CARRIER_HZ, "nothing learned is called 'other/d12_uav'"),
+        ("mine/d12_uav", 3.51e9, "learned at 3.3 GHz, used at 3.51 GHz"),
+    ],
+)
+def test_what_does_not_fit_is_left_out_and_said(folder: Path, name: str, carrier_hz: float, said: str) -> None:
+    settings = load_flight(flight(folder, {"uav": name}, carrier_hz))
+    (note,) = settings.flight.notes
+    assert said in note
+    assert settings.link.channels == {}
+
+
+@pytest.mark.parametrize(
+    "text", ["format: aerpaw-cmp learned 2\n", "entries: [1]\n", "\0", "entries: {d12: {made: x}}\n"]
+)
+def test_a_damaged_memory_is_one_message(folder: Path, text: str) -> None:
+    (folder_of(folder / "mine.yaml") / "learned.yaml").write_text(text)
+    with pytest.raises(UsageError):
+        read_learned(folder / "mine.yaml")
+    assert load_flight(flight(folder, {"uav": "mine/d12_uav"})).flight.notes
+
+
+def test_a_second_entry_joins_the_first_and_one_of_the_same_name_replaces_it(folder: Path) -> None:
+    site, table = folder / "mine.yaml", sphere_csv(np.zeros((7, 8)), np.ones((7, 8))).encode()
+    remember(site, "other", entry("B"), {"B.t.csv.gz": table, "B.u.csv.gz": table})
+    remember(site, "d12", entry("C"), {"C.t.csv.gz": table, "C.u.csv.gz": table})
+    assert set(read_learned(site).entries) == {"d12", "other"}
+    assert {p.name for p in folder_of(site).iterdir()} == {
+        "learned.yaml", "B.t.csv.gz", "B.u.csv.gz", "C.t.csv.gz", "C.u.csv.gz"
+    }  # fmt: skip
+    assert find_named("mine/d12_LW1.C", folder).part == "LW1.C"
+
+
+def test_a_draft_takes_only_what_fits(folder: Path) -> None:
+    known = read_learned(folder / "mine.yaml")
+    whole = propose(known, "mine", [("LW1", "A", "flight_mat")])
+    assert whole.antennas == {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}
+    assert whole.carrier_hz == CARRIER_HZ
+    elsewhere = propose(known, "mine", [("NODE", "A", "flight_mat")])
+    assert elsewhere.antennas == {"uav": "mine/d12_uav"}
+    assert elsewhere.antennas_about.startswith("the airframe alone fits")
+    for other in (("LW1", "A", "sounder_log"), ("LW1", "B", "flight_mat"), ("LW1", "rank", "flight_mat")):
+        assert propose(known, "mine", [other]).antennas == {}
+    receiver = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=3.4e9, file="r.json.gz", kappa=0.4)
+    ranked = known.model_copy(update={"entries": {"nr": entry("Z").model_copy(update={"receivers": [receiver]})}})
+    assert propose(ranked, "mine", [("LW1", "rank", "nemo_csv")]).receiver == "mine/nr"
+    assert propose(ranked, "mine", [("LW2", "rank", "nemo_csv")]).receiver is None
+
+
+def test_the_packaged_memory_is_small_and_says_where_it_comes_from() -> None:
+    known, place = read_learned("lake_wheeler"), folder_of("lake_wheeler")
+    assert {"dataset12", "lte", "afar", "nr_rank"} <= set(known.entries)
+    assert sum(p.stat().st_size for p in place.iterdir()) < 300_000
+    for one in known.entries.values():
+        assert len(one.trained_on) >= 2
+        assert one.command.startswith("aerpaw-cmp calibrate ")
+        assert one.source.title
+    assert known.entries["dataset12"].source.doi == "10.5061/dryad.2z34tmpvv"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -123,8 +124,36 @@ def most_telling(every: Sequence[Judged]) -> Judged:
     return min(lost or every, key=lambda one: one.other_db)
 
 
+def _forecast_of(panel: RankPanel) -> Mapping[str, Any] | None:
+    """Numbers of the fitted receiver's forecast of the rank, where it was scored."""
+    found = panel.extra.get("receiver")
+    return found if found and found["kappa"] is not None and found["log_score_gain"] is not None else None
+
+
+def _forecast_sentence(panel: RankPanel, found: Mapping[str, Any]) -> str:
+    side = "below" if found["log_score_gain"] > 0 else "above"
+    return (
+        f"Rank forecast at {panel.tower} by the receiver learned on other flights: kappa {found['kappa']:.2f} (0 is "
+        f"chance), log score {abs(100 * found['log_score_gain']):.0f} % {side} the constant forecast."
+        f" The forecast rank agrees in {100 * found['agreement']:.0f} % of samples; always "
+        f"guessing the commonest agrees in {100 * found['majority_agreement']:.0f} %."
+    )
+
+
+def _forecast_card(panel: RankPanel, found: Mapping[str, Any]) -> Headline:
+    low, high = found["kappa_ci95"]
+    return Headline(
+        label=f"Rank forecast at {panel.tower}",
+        value=f"kappa {found['kappa']:.2f}",
+        interval=NO_INTERVAL if low is None or high is None else f"95 %: {low:.2f} to {high:.2f}",
+        beside=f"log score {100 * found['log_score_gain']:+.0f} % against the constant (positive: lower loss)",
+    )
+
+
 def _rank_sentence(panels: Sequence[RankPanel]) -> str:
     for panel in panels:
+        if found := _forecast_of(panel):
+            return _forecast_sentence(panel, found)
         at = _best_k(panel)
         if at is not None:
             commonest = panel.extra.get("commonest") or {}
@@ -176,7 +205,10 @@ def headlines(data: ReportData) -> list[Headline]:
     if panels:
         lines += [_error(panels), *_difference(panels)]
     for panel in data.rank:
-        at = _best_k(panel)
+        found, at = _forecast_of(panel), _best_k(panel)
+        if found:
+            lines.append(_forecast_card(panel, found))
+            break
         if at is not None:
             lines.append(_rank(panel, at))
             break

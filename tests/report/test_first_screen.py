@@ -143,3 +143,23 @@ def test_nothing_to_score(report_data):
     panels = tuple(dataclasses.replace(panel, n=0, rmse_db=np.nan) for panel in report_data.rss)
     first, _ = verdict(dataclasses.replace(report_data, rss=panels, rank=()))
     assert first.startswith("Nothing could be compared")
+
+
+def test_a_rank_forecast_is_the_headline_where_there_is_one(report_data):
+    found = {
+        "kappa": 0.37,
+        "kappa_ci95": [0.17, 0.61],
+        "log_score_gain": 0.19,
+        "agreement": 0.71,
+        "majority_agreement": 0.66,
+    }
+    panel = dataclasses.replace(report_data.rank[0], extra={**report_data.rank[0].extra, "receiver": found})
+    data = dataclasses.replace(report_data, rss=(), rank=(panel,))
+    first = verdict(data)[0]
+    assert first.startswith(f"Rank forecast at {panel.tower} by the receiver learned on other flights: kappa 0.37")
+    assert "log score 19 % below the constant forecast" in first
+    assert "agrees in 71 % of samples; always guessing the commonest agrees in 66 %" in first
+    (card,) = [line for line in headlines(data) if line.label.startswith("Rank")]
+    assert (card.value, card.interval) == ("kappa 0.37", "95 %: 0.17 to 0.61")
+    unscored = dataclasses.replace(panel, extra={**panel.extra, "receiver": {**found, "kappa": None}})
+    assert "Rank forecast" not in verdict(dataclasses.replace(data, rank=(unscored,)))[0]

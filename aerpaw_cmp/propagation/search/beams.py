@@ -40,9 +40,6 @@ SLACK_M = 1e-5
 EDGE_M = 1e-6
 """How far outside its triangles a reflection point may lie [m]: the seams inside a face."""
 
-GRAZING = 0.05
-"""Cosine below which a convex face is not asked whether it hides another one wholly."""
-
 SOLID_MARGIN = 1e-6
 """Share of a triangle's height by which a segment must meet it to cut it beyond doubt."""
 

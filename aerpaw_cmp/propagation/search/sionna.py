@@ -57,7 +57,6 @@ LAST_CANDIDATES = 0
 """What the last batch had, for benchmarks."""
 
 LARGEST_BATCH = 100
-NO_SHAPE = 0xFFFFFFFF
 HALF_SPACE_THICKNESS_M = 10.0
 """Sionna knows slabs only; in this one no second echo returns. Its coefficients are not used for H."""
 WELD_M = 1e-3

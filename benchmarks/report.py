@@ -24,9 +24,11 @@ from pathlib import Path
 
 import yaml
 
-from aerpaw_cmp.jobs.peer_ratios import IMPORTS
-
 ROOT = Path(__file__).parents[1]
+IMPORTS = (
+    "from aerpaw_cmp.machine.llvm import let_sionna_load as let; let(); import sionna.rt, matplotlib.pyplot, pandas"
+)
+"""What every report with its audit has to load, as a program."""
 LIGHT = "import matplotlib.pyplot, pandas"
 
 

@@ -64,9 +64,6 @@ def bench(
     table([*header, "rank disagreement per K"], rows, f"Speed against error ({_conditions(result['conditions'])})")
     for name, ratio in result["ratios"].items():
         print(f"{name}: {ratio:.3g} times")
-    if result["report"]:
-        seconds = {name.removeprefix("seconds_"): value for name, value in result["report"].items()}
-        print("report: " + ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items()))
 
 
 def _conditions(made: Mapping[str, Any]) -> str:

@@ -436,7 +436,7 @@ def run_bench(
     Returns
     -------
     dict
-        ``conditions``, ``replay.rows``, ``ratios``, ``report`` and ``details``.
+        ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
     """
     from ..propagation.check.bench import random_scene, speed_against_error
 
@@ -448,7 +448,6 @@ def run_bench(
         "conditions": {"poses": poses, "towers": names, "buildings": len(site.buildings), "cpus": os.cpu_count()},
         "replay": {"rows": [row.as_dict() for row in rows]},
         "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None and "ratio" in value},
-        "report": measured.get("report"),
         "details": measured,
     }
 
@@ -471,8 +470,6 @@ def _against_peers(progress: Progress) -> dict[str, Any]:
     progress("ingest against pandas")
     for lines, value in peers.ingest_at_sizes().items():
         measured["ingest_vs_pandas" if lines == peers.LINES else f"ingest_vs_pandas_{lines // 1_000_000}m"] = value
-    progress("a report, cold and warm")
-    measured["report"] = peers.report_cold_and_warm()
     return measured
 
 

@@ -164,17 +164,25 @@ def _type(column: pd.Series[Any]) -> str:
     return {"M": "time", "f": "float", "i": "integer", "u": "integer", "b": "boolean"}.get(kind, "text")
 
 
+_AT_ONCE = 1 << 20
+"""Texts that become numbers at a time: lists of all rows of a large log would take more than its records."""
+
+
 def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> None:
     import numpy as np
 
     if kind == "text":
         # not by pandas: up to 2.3 its factorize ends a text at a NUL
-        missing = column.isna().to_numpy()
-        texts = [None if gone else str(text) for text, gone in zip(column.tolist(), missing.tolist(), strict=True)]
-        words = [text for text in dict.fromkeys(texts) if text is not None]
-        _write_json(group, f"{name}.words", words)
-        number = {None: -1} | {word: i for i, word in enumerate(words)}  # -1: no text at all
-        values = np.array([number[text] for text in texts], dtype=np.int32)
+        number: dict[str | None, int] = {None: -1}  # no text at all
+        values = np.empty(len(column), dtype=np.int32)
+        for first in range(0, len(column), _AT_ONCE):
+            part = column.iloc[first : first + _AT_ONCE]
+            missing = part.isna().tolist()
+            texts = [None if gone else str(text) for text, gone in zip(part.tolist(), missing, strict=True)]
+            for text in dict.fromkeys(texts):
+                number.setdefault(text, len(number) - 1)
+            values[first : first + len(texts)] = [number[text] for text in texts]
+        _write_json(group, f"{name}.words", list(number)[1:])
     elif kind == "time":
         values = column.to_numpy().astype("datetime64[ns]").astype(np.int64)
     else:

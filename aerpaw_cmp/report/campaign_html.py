@@ -348,7 +348,8 @@ def verdict(data: CampaignData) -> list[str]:
             said = [row.verdicts[name] for row in rows if row.verdicts.get(name, "none given") != "none given"]
             every.append(
                 Judged(ray_db=total, channels=len(rows), name=name, other_db=pooled_db(errors, [row.n for row in rows]),
-                       judged=len(said), better=said.count("better"), worse=said.count("worse"))
+                       judged=len(said), better=said.count("better"), worse=said.count("worse"),
+                       unit="flights x channels")
             )  # fmt: skip
     out = [first_sentence(most_telling(every) if every else Judged(ray_db=total, channels=len(rows)))]
     held = [row.held_out_rmse_db for row in rows if np.isfinite(row.held_out_rmse_db)]

@@ -85,20 +85,21 @@ class Judged:
     judged: int = 0
     better: int = 0
     worse: int = 0
+    unit: str = "channels"
 
 
 SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
     (lambda f: not f.name, "No baseline could be scored."),
     (lambda f: not f.judged, "Too few samples for an interval of the difference."),
     (lambda f: f.better > 0 and f.worse > 0,
-     "Ray tracing is significantly better on {better} and worse on {worse} of {channels} channels (95 %)."),
+     "Ray tracing is significantly better on {better} and worse on {worse} of {channels} {unit} (95 %)."),
     (lambda f: f.worse > 0 and f.channels == 1, "Ray tracing is significantly worse (95 %)."),
     (lambda f: f.better > 0 and f.channels == 1, "Ray tracing is significantly better (95 %)."),
-    (lambda f: f.worse > 0, "Ray tracing is significantly worse on {worse} of {channels} channels (95 %)."),
-    (lambda f: f.better > 0, "Ray tracing is significantly better on {better} of {channels} channels (95 %)."),
+    (lambda f: f.worse > 0, "Ray tracing is significantly worse on {worse} of {channels} {unit} (95 %)."),
+    (lambda f: f.better > 0, "Ray tracing is significantly better on {better} of {channels} {unit} (95 %)."),
     (lambda f: f.channels == 1, "The difference is not significant (95 %)."),
     (lambda f: f.channels == 2, "The difference is not significant on either channel (95 %)."),
-    (lambda f: f.channels > 2, "The difference is not significant on any of {channels} channels (95 %)."),
+    (lambda f: f.channels > 2, "The difference is not significant on any of {channels} {unit} (95 %)."),
 )  # fmt: skip
 """What may follow the two errors, and when: the first whose condition holds. No other sentence says better or worse."""
 
@@ -116,7 +117,7 @@ def first_sentence(facts: Judged) -> str:
     """
     beside = f"; {pretty(facts.name)}: {facts.other_db:.1f} dB" if facts.name else ""
     text = next(text for holds, text in SIGNIFICANCE if holds(facts))
-    said = text.format(better=facts.better, worse=facts.worse, channels=facts.channels)
+    said = text.format(better=facts.better, worse=facts.worse, channels=facts.channels, unit=facts.unit)
     return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{beside}. {said}"
 
 

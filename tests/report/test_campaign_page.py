@@ -181,7 +181,7 @@ def test_the_page_opens_with_a_verdict_against_the_baselines_and_explains_its_me
     said, means = campaign_html.verdict(shown)
     assert said == (
         "Ray tracing: RMSE 7.0 dB; free space: 6.0 dB. "
-        f"Ray tracing is significantly worse on {n} of {n} channels (95 %)."
+        f"Ray tracing is significantly worse on {n} of {n} flights x channels (95 %)."
     )
     assert "7.00 dB with each flight's own offset, 7.90 dB with the offset of the other flights" in means
     text = campaign_html.campaign_page(shown, [], [])

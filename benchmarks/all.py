@@ -84,6 +84,7 @@ SMALLEST: dict[str, list[str]] = {
     "fuzz_commands": ["--calls", "20"],
     "fuzz_inputs": ["--inputs", "20"],
     "ingest": ["--quick"],
+    "interval_weights": ["mean", "--sequences", "4"],
     "kernel": ["--poses", "200", "--pairs", "1"],
     "kriging": ["--quick", "--pairs", "60"],
     "kriging_field": ["--quick"],

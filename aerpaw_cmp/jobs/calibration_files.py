@@ -18,6 +18,7 @@ from ..common.versions import versions
 from ..compare.calibration import Learned, mean_rmse
 from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.training import flight_logs
+from ..logs.records import has_wall_clock
 from ..report.calibration_data import AntennaMap, CalibrationData
 from ..report.calibration_html import write_calibration
 from ..report.export import write_file
@@ -326,8 +327,10 @@ def _spread_rows(count: int) -> IntArray:
 
 
 def _provenance(settings: CalibrationFile, flights: Sequence[FlightData], command: str) -> dict[str, Any]:
-    days = {str(s.time.min().astype("datetime64[D]")) for data in flights for s in data.rss}
-    days |= {str(s.time.min().astype("datetime64[D]")) for data in flights for s in data.rank}
+    begins = [s.time.min() for data in flights for s in data.rss] + [
+        s.time.min() for data in flights for s in data.rank
+    ]
+    days = {str(begin.astype("datetime64[D]")) for begin in begins if has_wall_clock(begin)}
     return {
         "command": command,
         "made": datetime.now(timezone.utc).date().isoformat(),

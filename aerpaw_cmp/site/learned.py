@@ -91,8 +91,8 @@ class Entry(_Record):
 
     def about(self) -> str:
         """One sentence: learned from what, and what error to expect."""
-        days = ", ".join(self.flown)
-        text = f"learned on {len(self.flights)} flights of {days}"
+        days = f" of {', '.join(self.flown)}" if self.flown else ""  # none where the logs have relative times
+        text = f"learned on {len(self.flights)} flights{days}"
         if self.errors is not None:
             text += (
                 f"; expect an RMSE of {self.errors.rmse_db:.1f} dB on another flight, free space "

@@ -360,6 +360,10 @@ def gather(
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
     track = _track(site, *telemetry[0], warnings, maximum_gap_s=settings.rt.maximum_gap_s) if telemetry else None
+    if track is None and rss and any(series.position_m is not None for _, series in rank):
+        levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
+        warnings.append(f"no telemetry log: the levels of {levels} have no positions and are left out")
+        rss = []
     data = FlightData(
         settings=settings,
         folder=logs_root or folder,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
 import tempfile
 import time
@@ -26,7 +25,7 @@ def measure(seconds: float, folder: Path) -> dict[str, object]:
         start, before = time.monotonic(), cpu_s(process.pid)
         time.sleep(seconds)
         used, elapsed = cpu_s(process.pid) - before, time.monotonic() - start
-        process.send_signal(signal.SIGINT)
+        process.terminate()  # SIGINT is ignored where a shell started this in the background
         summary = json.loads(process.communicate(timeout=30)[0])
     return {
         "seconds": round(elapsed, 1),

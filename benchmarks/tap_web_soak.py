@@ -97,7 +97,7 @@ def pace(seconds: float, folder: Path, *, web: bool) -> dict[str, Any]:
         start, before = time.monotonic(), cpu_s(process.pid)
         time.sleep(seconds)
         share = (cpu_s(process.pid) - before) / (time.monotonic() - start)
-        process.send_signal(signal.SIGINT)
+        process.terminate()  # SIGINT is ignored where a shell started this in the background
         process.communicate(timeout=120)
     for browser in browsers:
         browser.terminate()
@@ -154,7 +154,7 @@ def fuzz(requests: int, folder: Path) -> dict[str, Any]:
             others += not (body in (b"", page) or body.startswith(b"retry: 1000") or len(body) < 100)
         grown = resident_kib(process.pid) - memory
         alive = process.poll() is None
-        process.send_signal(signal.SIGINT)
+        process.terminate()  # SIGINT is ignored where a shell started this in the background
         process.communicate(timeout=120)
         result = log_against_modem(log, modem)
     return {"requests": requests, "answers_by_status": dict(answers), "other_content": others, "alive": alive,

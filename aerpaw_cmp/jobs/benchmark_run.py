@@ -341,6 +341,8 @@ def _download(url: str, part: Path, size: int) -> None:
             while have < size and (piece := answer.read(min(1 << 20, size - have))):
                 have += len(piece)
                 stream.write(piece)
+            if have < size:
+                raise OSError(f"the answer ended after {have} of {size} bytes")
     except (urllib.error.URLError, TimeoutError, OSError) as error:
         raise OutputError(
             f"{url} could not be fetched: {error}",

@@ -9,6 +9,8 @@ import json
 import math
 import os
 import shutil
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.jobs import benchmark, benchmark_run, entrants
 
 TOWER = np.array([0.0, 0.0, 10.0])
@@ -281,3 +283,52 @@ def test_real_tasks_on_the_files_at_hand() -> None:
     p = entrants.RANK["constant"](real, ["nr_flight1"], "nr_flight3")[0]
     assert p.shape == (len(test[0].rank), 4)
     assert np.allclose(p.sum(axis=1), 1.0)
+
+
+class _Published(BaseHTTPRequestHandler):
+    """A server that knows ranges, and cuts the first answer short."""
+
+    content = b"published " * 5000
+    asked: list[str | None] = []  # noqa: RUF012
+
+    def do_GET(self) -> None:
+        begin = int((self.headers["Range"] or "bytes=0-").removeprefix("bytes=").removesuffix("-"))
+        self.asked.append(self.headers["Range"])
+        part = self.content[begin:]
+        self.send_response(206 if begin else 200)
+        self.send_header("Content-Length", str(len(part)))
+        self.end_headers()
+        self.wfile.write(part[: len(part) // 2] if len(self.asked) == 1 else part)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def test_a_cut_download_is_taken_up_and_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    digest = hashlib.sha256(_Published.content).hexdigest()
+    for name, value in (("good", digest), ("changed", "a" * 64)):
+        (tmp_path / f"{name}.yaml").write_text(
+            f"version: 1\nflights: {{}}\ntasks: {{}}\nfiles:\n  log: {{repository: a/b, path: log.csv, bytes: "
+            f"{len(_Published.content)}, sha256: {value}, licence: CC0-1.0}}\n"
+        )
+    server = ThreadingHTTPServer(("127.0.0.1", 0), _Published)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        address = f"http://127.0.0.1:{server.server_port}/log.csv"
+        monkeypatch.setattr(benchmark.FileEntry, "url", property(lambda _: address))
+        monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+        with pytest.raises(OutputError, match="could not be fetched"):
+            benchmark_run.fetch(tmp_path / "logs", manifest=tmp_path / "good.yaml")
+        part = tmp_path / "logs" / "log.csv.part"
+        assert 0 < part.stat().st_size < len(_Published.content)
+        (made,) = benchmark_run.fetch(tmp_path / "logs", manifest=tmp_path / "good.yaml")
+        assert made.read_bytes() == _Published.content
+        assert _Published.asked[0] is None
+        assert _Published.asked[1] == f"bytes={len(_Published.content) // 2}-"
+        assert benchmark_run.fetch(tmp_path / "logs", manifest=tmp_path / "good.yaml") == []
+        with pytest.raises(InputError, match="changed the file"):
+            benchmark_run.fetch(tmp_path / "other", manifest=tmp_path / "changed.yaml")
+        assert not list((tmp_path / "other").iterdir())
+    finally:
+        server.shutdown()
+        server.server_close()

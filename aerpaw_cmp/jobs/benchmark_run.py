@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import json
@@ -103,16 +104,16 @@ def run_benchmark(
     skipped = {task: lack for task in wanted if (lack := bench.skipped(task, training=True))}
     with OutputFolder(out, job="benchmark", inputs=list(bench.places.values()), force=force) as output:
         scores: Scores = {}
-        seconds: dict[tuple[str, str], float] = {}
+        cost: dict[tuple[str, str], dict[str, float]] = {}
         written: dict[str, list[Any]] = {name: [] for name in names}
         for task in wanted:
             if not bench.tests(task) or any(bench.missing(f) for f in bench.manifest.tasks[task].train):
                 continue
             for name in names:
                 progress(f"{task}: {name}")
-                started = time.process_time()
+                started = _started()
                 frame = _predicted(bench, task, name)
-                seconds[task, name] = time.process_time() - started
+                cost[task, name] = {"seconds": time.process_time() - started, "peak_mib": _peak_mib()}
                 if frame is not None:
                     written[name].append(frame)
         with output.filling() as folder:
@@ -123,7 +124,7 @@ def run_benchmark(
                     path = folder / "predictions" / f"{name}.csv"
                     path.write_text(_entry_text(name, frames), encoding="utf-8")
                     entries[name] = read_entry(path)
-            scores = _score_all(bench, entries, seconds)
+            scores = _score_all(bench, entries, cost)
             rows = [leaderboard_row(bench, e, _of(scores, n), __version__) for n, e in entries.items()]
             (folder / "leaderboard.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
             (folder / "scores.csv").write_text(_scores_csv(scores), encoding="utf-8")
@@ -147,14 +148,30 @@ def _entry_text(name: str, frames: Sequence[Any]) -> str:
     return f"# entrant: {name}\n# who: aerpaw-cmp {__version__}\n{text}"
 
 
-def _score_all(bench: Bench, entries: dict[str, Entry], seconds: dict[tuple[str, str], float]) -> Scores:
+def _started() -> float:
+    """Processor time now [s]; the peak of the memory counts from here where the system can do that (Linux)."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    return time.process_time()
+
+
+def _peak_mib() -> float:
+    """Largest resident memory of this process since :func:`_started` [MiB], the package itself included."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return float(status.split("VmHWM:")[1].split()[0]) / 1024.0
+    except (OSError, IndexError):
+        return float("nan")
+
+
+def _score_all(bench: Bench, entries: dict[str, Entry], cost: dict[tuple[str, str], dict[str, float]]) -> Scores:
     scores: Scores = {}
     for task in bench.manifest.tasks:
         mine = {n: e for n, e in entries.items() if (e.frame["task"] == task).any()}
         baselines = {n: mine[n] for n in BASELINES if n in mine}
         for name, entry in mine.items():
             row = score_task(bench, task, entry, baselines, accept_levels=True)
-            scores.setdefault(task, {})[name] = row | {"seconds": seconds.get((task, name), float("nan"))}
+            scores.setdefault(task, {})[name] = row | cost.get((task, name), {})
     return scores
 
 

@@ -31,6 +31,9 @@ Answer = tuple[FloatArray, FloatArray]
 
 Entrant = Callable[[Question, Bench], list[Answer]]
 
+TARGETS_AT_ONCE = 2048
+"""Bounds the matrices between samples and targets (some 25 MB)."""
+
 MOST_TRAINING = 1500
 """Samples of the residual field and of Kriging: their cost grows with the cube."""
 
@@ -202,9 +205,14 @@ def _field(place_m: FloatArray, value: FloatArray, targets_m: FloatArray) -> Ans
                 best = (likelihood, length, share, factor, white)
     assert best is not None
     _, length, share, factor, white = best
-    across = np.linalg.norm(targets_m[:, None] - place_m[None], axis=2)
-    half = np.linalg.solve(factor, power * share * np.exp(-across / length).T)
-    return np.asarray(half.T @ white), np.sqrt(np.maximum(power * share - (half**2).sum(axis=0), 0.0))
+    mean, sd = np.empty(len(targets_m)), np.empty(len(targets_m))
+    for start in range(0, len(targets_m), TARGETS_AT_ONCE):
+        part = slice(start, start + TARGETS_AT_ONCE)
+        across = np.linalg.norm(targets_m[part, None] - place_m[None], axis=2)
+        half = np.linalg.solve(factor, power * share * np.exp(-across / length).T)
+        mean[part] = half.T @ white
+        sd[part] = np.sqrt(np.maximum(power * share - (half**2).sum(axis=0), 0.0))
+    return mean, sd
 
 
 def _kriging(question: Question, _: Bench) -> list[Answer]:

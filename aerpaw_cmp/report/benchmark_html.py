@@ -17,6 +17,7 @@ LEVEL_COLUMNS = {
     "log_score": ("Log score", "nat"),
     "coverage_90": ("In 90 % interval", "share"),
     "seconds": ("CPU", "s"),
+    "peak_mib": ("Peak memory", "MiB"),
 }
 RANK_COLUMNS = {
     "log_score": ("Log score", "nat"),
@@ -25,6 +26,7 @@ RANK_COLUMNS = {
     "agreement": ("Agreement", "share"),
     "total_variation_expected": ("Total variation", ""),
     "seconds": ("CPU", "s"),
+    "peak_mib": ("Peak memory", "MiB"),
 }
 
 

@@ -8,6 +8,7 @@ import os
 import pickle
 import random
 import shutil
+import signal
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import cache
@@ -27,6 +28,10 @@ settings.load_profile("fixed" if os.environ.get("CI") else "further")
 # One worker per core: the threads of a linear algebra library would only wait for each other. Before numpy is loaded.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+# nohup, and shells for jobs in the background, leave signals ignored, which every child of a test would inherit.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # Nothing kept on this machine decides a test, and no test leaves anything in the user's cache. Workers of pytest-xdist
 # have a folder each; that this machine's LLVM works is found out once for all of them.

@@ -245,8 +245,8 @@ def outliers(level_db: ArrayLike) -> BoolArray:
 
     Examples
     --------
-    >>> outliers([-70.0, -72.0, -69.0, 99.0]).tolist()
-    [False, False, False, True]
+    >>> outliers([-70.0, -72.0, -69.0, -71.0, -68.0, 99.0]).tolist()
+    [False, False, False, False, False, True]
     """
     level = _levels(level_db)
     if not np.isfinite(level).any():

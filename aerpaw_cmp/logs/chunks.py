@@ -32,8 +32,8 @@ def whole_lines(chunks: Iterable[bytes]) -> Iterator[bytes]:
 
     Examples
     --------
-    >>> list(whole_lines([b"a\\nb", b"c", b"d\\n", b"e"]))
-    [b'a\\n', b'bcd\\n', b'e']
+    >>> list(whole_lines([b"a\nb", b"c", b"d\n", b"e"]))
+    [b'a\n', b'bcd\n', b'e']
     """
     kept: list[bytes] = []
     begun = False

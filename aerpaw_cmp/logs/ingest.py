@@ -357,11 +357,12 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
         )
     if reader is None and head:
         reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
-    if reader is not None and head.strip() and (file := _in_pieces(place, reader, options)) is not None:
+    pointer = head.startswith(b"version https://git-lfs")
+    if reader is not None and head.strip() and not pointer and (file := _in_pieces(place, reader, options)) is not None:
         return file
     data, digest = read_bytes(place)
     data = as_utf8(data)
-    if not data.strip() or data.startswith(b"version https://git-lfs"):
+    if not data.strip() or pointer:
         identify(data, path=str(path))  # raises the message for an empty file or a pointer
     return _read(place, data, digest, reader or identify(data, path=str(path)), options)
 

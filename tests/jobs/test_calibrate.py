@@ -197,7 +197,8 @@ def test_dataset12_each_way(tmp_path: Path) -> None:
     patterns = {"uav": grid | {"variable": "SA3300"}, "tower": grid | {"variable": "RMWB3300_normal"}}
     path = write(tmp_path / "c.yaml", {"calibration": "d12", "flights": flights, "patterns": patterns})
     found = load_calibration(path)
-    observed, _ = observe(read_flights(found, tmp_path, Path(ROOT)))
+    flown, _ = read_flights(found, tmp_path, Path(ROOT))
+    observed, _ = observe(flown)
     scores = calibration.flight_left_out(observed, recipe_of(found, observed, Path(ROOT)))
     assert mean_rmse(scores) < 3.75
     assert mean_rmse(scores, "rmse_4s_db") < 3.0

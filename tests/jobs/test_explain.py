@@ -17,13 +17,14 @@ from aerpaw_cmp.jobs import explain
 from aerpaw_cmp.jobs.explain import run_explain
 from aerpaw_cmp.propagation import replay as replay_module
 from aerpaw_cmp.propagation.field.sum import mean_pair_power
+from aerpaw_cmp.propagation.options import Search
 
 ANTENNA = {"layout": "single", "antenna": {"model": "dipole"}}
 SETTINGS = {
     "flight": {
         "name": "small", "synthetic": True,
         "plan": {
-            "start": "2025-06-01T10:00:00", "seed": 4, "speed_mps": 10.0, "rss_interval_s": 2.0, "fading_db": 0.0,
+            "start": "2025-06-01T10:00:00", "seed": 4, "speed_mps": 10.0, "rss_interval_s": 1.0, "fading_db": 0.0,
             "waypoints": [{"east_m": e, "north_m": n, "height_m": h} for e, n, h in ((-40, 10, 30), (-250, 60, 20))],
             "offsets_db": {"LW1": {"USRP1": 12.3}, "LW2": {"USRP1": 3.0}},
         },
@@ -193,10 +194,11 @@ def test_simulate_logs_the_level_with_other_interactions(flown, monkeypatch):
     path, _ = flown
     true, asked = simulate.replay, []
 
-    def replay(site, link, poses, *, engine, interactions=("reflection",), **options):
-        asked.append((engine, tuple(interactions)))
-        found = true(site, link, poses, max_depth=options["max_depth"])
-        return dataclasses.replace(found, rss_dbm=found.rss_dbm + 5.0 * (len(interactions) > 1))
+    def replay(site, link, poses, search, *options, **named):
+        asked.append((search.engine, tuple(search.interactions)))
+        found = true(site, link, poses, Search(max_depth=search.max_depth))
+        more = 5.0 * (len(search.interactions) > 1)
+        return dataclasses.replace(found, rss_dbm=found.rss_dbm + more, rss_power_dbm=found.rss_power_dbm + more)
 
     monkeypatch.setattr(simulate, "replay", replay)
     levels = {}

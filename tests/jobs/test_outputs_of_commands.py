@@ -166,6 +166,7 @@ def tiny_flight(folder: Path) -> Path:
     content["flight"]["plan"] |= {
         "waypoints": [{"east_m": -40, "north_m": 10, "height_m": 40}, {"east_m": 40, "north_m": 10, "height_m": 40}],
         "bad_lines": 0,
+        "rss_interval_s": 0.2,
         "clock_shift_s": {},
     }
     content["logs"] = [

@@ -110,7 +110,7 @@ FLIGHT = {
     "flight": {
         "name": "room", "synthetic": True,
         "plan": {
-            "start": "2025-06-01T10:00:00", "seed": 4, "speed_mps": 4.0, "rss_interval_s": 2.0, "fading_db": 0.0,
+            "start": "2025-06-01T10:00:00", "seed": 4, "speed_mps": 4.0, "rss_interval_s": 0.1, "fading_db": 0.0,
             "waypoints": [{"east_m": e, "north_m": 8.0, "height_m": h} for e, h in ((-18, 12), (6, 6))],
             "offsets_db": {"T": {"USRP1": 12.3}},
         },

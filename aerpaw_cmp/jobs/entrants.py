@@ -140,12 +140,12 @@ def _replay(level: str, engine: str = "image", **options: Any) -> Entrant:
 def _learned(question: Question, _: Bench) -> list[Answer]:
     fit = _fit(question.train)
     answers = anchored(question, fit.mean_of)
-    return [(level, fit.sd_of(one, spread)) for one, (level, spread) in zip(question.asked, answers, strict=True)]
+    return [(level, fit.sd_of(one)) for one, (level, _) in zip(question.asked, answers, strict=True)]
 
 
 @dataclasses.dataclass(frozen=True)
 class _Antennas:
-    """Learned antennas, and the scatter that they leave in training."""
+    """Learned antennas as an entrant asks for them."""
 
     learned: calibration.Learned
 
@@ -153,10 +153,16 @@ class _Antennas:
         """Gain (n,) [dB]."""
         return self.learned.mean(o.samples)
 
-    def sd_of(self, o: Observed, spread: FloatArray) -> FloatArray:
-        """Standard deviation (n,) of gain and training residual [dB]."""
-        _, sd = self.learned.predict(o.samples)
-        return np.asarray(np.hypot(sd, spread))
+    def sd_of(self, o: Observed, nuisance: FloatArray | None = None) -> FloatArray:
+        """Standard deviation (n,) of gain, the flight's own nuisance, noise and fading [dB].
+
+        ``nuisance`` (n,) stands in for the flight's own, where something is known of it.
+        """
+        _, gain = self.learned.predict(o.samples)
+        spread = self.learned.spread(o.samples.antenna)
+        if nuisance is None:
+            return spread.total_db(gain)
+        return np.asarray(np.hypot(dataclasses.replace(spread, own_sd_db=0.0).total_db(gain), nuisance))
 
 
 _FITS: dict[tuple[int, ...], _Antennas] = {}
@@ -177,15 +183,15 @@ def _learned_residual(question: Question, _: Bench) -> list[Answer]:
     answers = anchored(question, fit.mean_of)
     train = [dataclasses.replace(o.samples, residual_db=o.samples.residual_db - fit.mean_of(o)) for o in question.train]
     out = []
-    for one, (level, spread) in zip(question.asked, answers, strict=True):
+    for one, (level, _spread) in zip(question.asked, answers, strict=True):
         near = [s.binned(4.0) for s in train if s.antenna == one.samples.antenna]
         if not near or not len(one.samples):
-            out.append((level, fit.sd_of(one, spread)))
+            out.append((level, fit.sd_of(one)))
             continue
         value = np.concatenate([s.residual_db - s.residual_db.mean() for s in near])
         place = np.concatenate([s.position_m for s in near])
         mean, sd = _field(place, value, one.samples.position_m)
-        out.append((level + mean, np.hypot(sd, spread)))
+        out.append((level + mean, fit.sd_of(one, sd)))
     return out
 
 

@@ -406,7 +406,8 @@ def read_entry(path: Path) -> Entry:
     count = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     head = {k.strip(): v.strip() for k, _, v in (line[1:].partition(":") for line in lines[:count])}
     try:
-        frame = pd.read_csv(StringIO("\n".join(lines[count:])), dtype=dict.fromkeys(KEY, str), keep_default_na=False)
+        table = StringIO("\n".join(lines[count:]))
+        frame = pd.read_csv(table, dtype=dict.fromkeys(KEY, str), keep_default_na=False, low_memory=False)
     except (pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise InputError(f"no table: {error}", expected=f"columns {', '.join(KEY)}, level_db", path=path) from None
     if absent := [name for name in KEY if name not in frame]:
@@ -558,7 +559,14 @@ def _score_rank(bench: Bench, task: str, both: pd.DataFrame) -> dict[str, Any]:
     constant = constant_forecast(np.concatenate(known)) if known else np.full(4, 0.25)
     said = p.argmax(axis=1) + 1
     score = score_forecast(both["measured"].to_numpy(np.float64), p / p.sum(axis=1)[:, None], said, constant)
-    return dict(score.as_dict())
+    return {name: _known(value) for name, value in score.as_dict().items()}
+
+
+def _known(value: Any) -> Any:
+    """A value of a score's dictionary with NaN in place of None."""
+    if isinstance(value, (list, tuple)):
+        return tuple(map(_known, value))
+    return math.nan if value is None else value
 
 
 # --- the table of results ------------------------------------------------------------------------------------------

@@ -285,6 +285,24 @@ def test_real_tasks_on_the_files_at_hand() -> None:
     assert np.allclose(p.sum(axis=1), 1.0)
 
 
+RANK_TASK = """
+  ranks: {title: Ranks, kind: rank, train: [nr_flight1], test: [nr_flight3]}
+"""
+
+
+@pytest.mark.field
+@pytest.mark.skipif(not FIELD.is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set")
+def test_a_rank_task_reaches_the_page(tmp_path: Path) -> None:
+    packaged = (Path(benchmark.__file__).parent / "benchmark.yaml").read_text()
+    manifest = tmp_path / "manifest.yaml"
+    manifest.write_text(packaged[: packaged.index("tasks:")] + "tasks:" + RANK_TASK)
+    result = benchmark_run.run_benchmark(FIELD, tmp_path / "out", manifest=manifest, only=["constant"])
+    score = result.scores["ranks"]["constant"]
+    # a constant forecast that says one rank has no kappa to speak of, and its log score is that of the constant
+    assert score["log_score"] == pytest.approx(score["constant_log_score"], abs=1e-3)
+    assert "Ranks" in (tmp_path / "out" / "benchmark.html").read_text()
+
+
 class _Published(BaseHTTPRequestHandler):
     """A server that knows ranges, and cuts the first answer short."""
 

@@ -214,6 +214,20 @@ def _ended(error: BaseException) -> Lost:
 # --- Dask -----------------------------------------------------------------------------------------------------------
 
 
+_CUT = object()
+"""In place of a result: the task ended, and the way back was cut."""
+
+
+def _outcome(future: Any) -> tuple[BaseException | None, Any]:
+    """The error and the result of a task that is done; its ``status`` may say so later than ``done()`` does."""
+    try:
+        return None, future.result()
+    except (CancelledError, OSError, TimeoutError) as error:
+        return (error, None) if future.status == "error" else (None, _CUT)
+    except Exception as error:
+        return error, None
+
+
 class Cluster:
     """Workers of a Dask scheduler; a window of tasks is with it at a time, so that its memory does not grow.
 
@@ -276,10 +290,8 @@ class Cluster:
             came.clear()
             for future in [f for f in active if f.done()]:
                 number = active.pop(future)
-                try:
-                    error = future.exception() if future.status == "error" else None
-                    result: Any = future.result() if error is None else None
-                except (CancelledError, OSError, TimeoutError):  # finished, and the way back was cut
+                error, result = _outcome(future)
+                if error is None and result is _CUT:
                     waiting.appendleft(number)
                     continue
                 if error is None:

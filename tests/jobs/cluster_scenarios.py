@@ -96,6 +96,8 @@ def on_a_cluster(folder: Path) -> dict[str, Any]:
         out["other"] = message(lambda: check_workers(crew._client, []))
         workers.code_digest = real
         out["killed"] = collected(crew, dies, [(i, str(folder)) for i in range(8)])
+        # Dask cannot close a cluster while it starts a worker anew ("can only join a started process")
+        crew._client.wait_for_workers(2, timeout=60)
     return out
 
 

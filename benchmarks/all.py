@@ -69,7 +69,6 @@ SMALLEST: dict[str, list[str]] = {
     "aligned_paths": ["--links", "20"],
     "all": ["--only", "startup", "--no-history"],
     "calibrate_scale": ["--flights", "2", "--samples", "500"],
-    "clock_lag": ["--quick"],
     "clock_verdict": ["--flights", "1"],
     "compare": ["--quick"],
     "coverage_of_intervals": ["--flights", "20", "--replicates", "100"],
@@ -77,9 +76,6 @@ SMALLEST: dict[str, list[str]] = {
     "estimate": [],
     "exports": ["--samples", "20000"],
     "fabricated": [],
-    "field_held_out": [],
-    "field_models": ["--quick"],
-    "field_table": ["--quick", "--out", "{folder}"],
     "freeze": ["record", "{folder}/record.npz"],
     "fuzz_commands": ["--calls", "20"],
     "fuzz_inputs": ["--inputs", "20"],
@@ -96,11 +92,9 @@ SMALLEST: dict[str, list[str]] = {
     "pages": ["--only", "long", "--repeats", "1"],
     "performance": ["--docs", "{folder}/performance.md"],
     "planted_faults": ["--only", "foliage", "--every", "20"],
-    "rank_receiver": ["--step", "30", "--replicates", "100"],
     "repeats": ["--flights", "4", "--samples", "500"],
     "replay": ["--quick"],
     "report": ["--quick"],
-    "sample_report": ["--runs", "1"],
     "scaling": ["--axes", "poses"],
     "scenes": ["--scenes", "canyon", "--depths", "1", "--receivers", "10"],
     "season": ["--flights", "6", "--samples", "200", "--part", "speed"],
@@ -113,11 +107,10 @@ SMALLEST: dict[str, list[str]] = {
     "tap_sigkill": ["--quick"],
     "tap_soak": ["--quick"],
     "tap_web_soak": ["--quick"],
-    "whole_comparison": ["--quick"],
 }
 """How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards."""
 
-ON_FIELD_DATA = ("clock_verdict", "field_held_out", "field_models", "field_table", "kriging_field", "rank_receiver")
+ON_FIELD_DATA = ("clock_verdict", "kriging_field")
 
 AXES = ("poses", "towers", "faces", "samples", "report", "flights", "workers")
 

@@ -23,7 +23,7 @@ from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.field.foliage import CrownIndex, foliage_depth_m
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search.crowns import FACES_PER_CROWN, Crowns
-from aerpaw_cmp.site.footprints import import_site, write_site_yaml
+from aerpaw_cmp.site.footprints import import_site, site_yaml
 from aerpaw_cmp.site.meshes import site_meshes
 from aerpaw_cmp.site.site import Site, Trees
 from aerpaw_cmp.site.siteyaml import load_site, site_model
@@ -107,7 +107,7 @@ def main(arguments: list[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         source = village(Path(folder) / "village.json", buildings, trees)
         import_s, (model, actions) = timed(lambda: import_site([source]))
-        write_s, _ = timed(lambda: write_site_yaml(model, Path(folder) / "site.yaml"))
+        write_s, _ = timed(lambda: (Path(folder) / "site.yaml").write_text(site_yaml(model)))
         load_s, site = timed(lambda: load_site(Path(folder) / "site.yaml"))
         mesh_s, meshes = timed(lambda: site_meshes(site))
 

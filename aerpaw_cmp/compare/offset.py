@@ -355,33 +355,6 @@ Pooling = Literal["link", "tower", "channel", "flight", "all"]
 _GROUP: dict[str, tuple[int, ...]] = {"link": (0, 1, 2), "tower": (1,), "channel": (2,), "flight": (0,), "all": ()}
 
 
-def pooled_offsets(
-    pairs: Mapping[tuple[str, str, str], tuple[ArrayLike, ArrayLike]],
-    per: Pooling = "link",
-    *,
-    step_db: float = STEP_DB,
-    span_db: tuple[float, float] = SPAN_DB,
-) -> dict[tuple[str, str, str], OffsetFit]:
-    """One offset per tower, channel, flight, link or for everything.
-
-    Parameters
-    ----------
-    pairs : mapping of (flight, tower, channel) to (measured_db, simulated_db)
-        All sequences.
-    per : {"link", "tower", "channel", "flight", "all"}
-        Which sequences share an offset.
-    step_db, span_db : float, (float, float)
-        Grid of the search [dB].
-
-    Returns
-    -------
-    dict
-        Per (flight, tower, channel): the shared offset with the RMSE and the number of pairs of that sequence alone.
-    """
-    moments = {key: difference_moments(*levels) for key, levels in pairs.items()}
-    return pooled_moments(moments, per, step_db=step_db, span_db=span_db)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moments:
     """What an offset needs of a sequence: pairs, mean and variance of simulated minus measured [dB, dB^2]."""
@@ -413,11 +386,12 @@ def pooled_moments(
     step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> dict[tuple[str, str, str], OffsetFit]:
-    """:func:`pooled_offsets` of sequences whose levels are no longer at hand.
+    """One offset per tower, channel, flight, link or for everything.
 
     Parameters
     ----------
     moments : mapping of (flight, tower, channel) to Moments
+        Of all sequences.
     per : {"link", "tower", "channel", "flight", "all"}
         Which sequences share an offset.
     step_db, span_db : float, (float, float)
@@ -426,7 +400,7 @@ def pooled_moments(
     Returns
     -------
     dict
-        As :func:`pooled_offsets`.
+        Per (flight, tower, channel): the shared offset with the RMSE and the number of pairs of that sequence alone.
 
     Notes
     -----

@@ -146,7 +146,21 @@ class PassTable:
     def pairs(
         self, *, radius_m: float, heading_within_deg: float | None, first_flights: Iterable[str] | None = None
     ) -> Iterator[PassPair]:
-        """Every pair of two flights' passes on one link; parameters as in :func:`pass_pairs`."""
+        """Every pair of two flights' passes on one link, by first flight, second flight and link.
+
+        Parameters
+        ----------
+        radius_m : float
+            A sample of the first pass pairs with the nearest one of the second within this distance.
+        heading_within_deg : float, optional
+            Headings of a pair agree within this, where both passes have headings; None: any heading.
+        first_flights : iterable of str, optional
+            Only pairs whose first flight is one of these: shares of the work that can be done side by side.
+
+        Yields
+        ------
+        PassPair
+        """
         names = list(self._flights)
         chosen = set(names if first_flights is None else first_flights)
         rule = radius_m, heading_within_deg
@@ -169,39 +183,6 @@ class PassTable:
                             shared=shared,
                             rule=rule,
                         )
-
-
-def pass_pairs(
-    passes: Sequence[Pass],
-    *,
-    radius_m: float,
-    heading_within_deg: float | None,
-    cell_m: float,
-    first_flights: Iterable[str] | None = None,
-) -> Iterator[PassPair]:
-    """Every pair of two flights' passes on one link.
-
-    Parameters
-    ----------
-    passes : sequence of Pass
-    radius_m : float
-        A sample of the first pass pairs with the nearest one of the second within this distance.
-    heading_within_deg : float, optional
-        Headings of a pair agree within this, where both passes have headings; None: any heading.
-    cell_m : float
-        Edge of the cells of the plan.
-    first_flights : iterable of str, optional
-        Only pairs whose first flight is one of these: shares of the work that can be done side by side.
-
-    Yields
-    ------
-    PassPair
-        By first flight, second flight and link, each in the order given.
-    """
-    table = PassTable(passes, cell_m)
-    yield from table.pairs(
-        radius_m=radius_m, heading_within_deg=heading_within_deg, first_flights=first_flights
-    )  # fmt: skip
 
 
 def _prepare(one: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:

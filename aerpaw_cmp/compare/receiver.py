@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import InputError
-from ..common.units import BoolArray, FloatArray, IntArray
+from ..common.units import FloatArray, IntArray
 from .forecast import constant_forecast, log_losses, one_hot
-from .rank import MAX_RANK, cohen_kappa, k_grid
+from .rank import MAX_RANK, cohen_kappa
 from .statistics import REPLICATES, SEED, autocorrelation, bootstrap_means, interval, plain
 
 FLOOR_DB = -40.0
@@ -194,45 +194,13 @@ def decide(probability: FloatArray, weight: FloatArray) -> IntArray:
     return np.where(alive, best, 0).astype(np.int64)
 
 
-def fit_receiver(
-    features: FloatArray, rank: ArrayLike, groups: IntArray, *, penalties: Sequence[float] = PENALTIES
-) -> Receiver:
-    """Fit a receiver; penalty and decision are chosen on groups of the training samples left out.
-
-    Parameters
-    ----------
-    features : (n, features)
-        See :func:`stream_features`.
-    rank : array_like, (n,)
-        Reported rank; samples without (NaN, 0) or without features take no part.
-    groups : (n,) int
-        Each is left out once, e.g. :func:`sector_groups`.
-    penalties : sequence of float
-        To choose from.
-
-    Returns
-    -------
-    Receiver
-        Fitted to all training samples with the penalty of least log loss on those left out.
-
-    Raises
-    ------
-    InputError
-        Fewer than :data:`FEWEST` samples, or one rank only: nothing to learn from.
-    """
-    x, y, group = _training(features, rank, groups)
-    left_out = [out_of_group(x, y, group, penalty) for penalty in penalties]
-    best = int(np.argmin([log_losses(p, y).mean() for p in left_out]))
-    return _fitted(x, y, float(penalties[best]), decision_weights(left_out[best], y, group))
-
-
-def _fitted(x: FloatArray, rank: IntArray, penalty: float, decision_weight: FloatArray | None = None) -> Receiver:
+def _fitted(x: FloatArray, rank: IntArray, penalty: float) -> Receiver:
     mean, scale = _standard(x)
     return Receiver(
         coefficient=_fit_multinomial((x - mean) / scale, rank, np.ones(len(rank)), penalty),
         mean=mean,
         scale=scale,
-        decision_weight=np.ones(MAX_RANK) if decision_weight is None else decision_weight,
+        decision_weight=np.ones(MAX_RANK),
         penalty=penalty,
         constant=constant_forecast(rank),
         n=len(rank),
@@ -452,8 +420,12 @@ def fit_mixture(
     ----------
     features : (geometries, n, features)
         Those of :attr:`FeatureChoice.tied`, say.
-    rank, groups, penalties
-        As :func:`fit_receiver`.
+    rank : array_like, (n,)
+        Reported rank; samples without (NaN, 0) or without features take no part.
+    groups : (n,) int
+        Each is left out once, e.g. :func:`sector_groups`.
+    penalties : sequence of float
+        To choose from, by the log loss on groups left out.
 
     Returns
     -------
@@ -463,7 +435,7 @@ def fit_mixture(
     Raises
     ------
     InputError
-        As :func:`fit_receiver`.
+        Fewer than :data:`FEWEST` samples, or one rank only: nothing to learn from.
     """
     alive = np.asarray(np.isfinite(features).all(axis=(0, 2)))
     _, y, group = _training(np.where(alive[:, None], features[0], np.nan), rank, groups)
@@ -540,7 +512,7 @@ def choose_features(
     Raises
     ------
     InputError
-        As :func:`fit_receiver`.
+        As :func:`fit_mixture`.
     """
     alive = np.asarray(np.isfinite(features).all(axis=(0, 2)))
     _, y, group = _training(np.where(alive[:, None], features[0], np.nan), rank, groups)
@@ -566,7 +538,7 @@ def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray, penalt
     ----------
     features : (geometries, n, features)
     rank, groups : (n,)
-        As :func:`fit_receiver`.
+        As :func:`fit_mixture`.
     penalty : float
         The same for all.
 
@@ -600,96 +572,3 @@ def _not_worse(difference: FloatArray, replicates: int, seed: int) -> bool:
     drawn = bootstrap_means(difference[:, None], known.block_length, replicates=replicates, seed=seed)[:, 0]
     low, _ = interval(mean, drawn, known)
     return not low > 0.0
-
-
-# --- simpler rules --------------------------------------------------------------------------------------------------
-
-
-def rank_by_thresholds(ratio_db: ArrayLike, threshold_db: Sequence[float]) -> IntArray:
-    """Rank by one threshold per stream: stream i counts if streams 2 .. i exceed each their own threshold.
-
-    Parameters
-    ----------
-    ratio_db : array_like, (n, streams - 1)
-        ``20 log10 (sigma_i / sigma_1)`` [dB] of streams 2, 3, ...
-    threshold_db : sequence of float, (streams - 1,)
-
-    Examples
-    --------
-    >>> rank_by_thresholds([[-5.0, -12.0, -30.0], [-15.0, -16.0, -30.0]], (-10.0, -20.0, -20.0)).tolist()
-    [3, 1]
-    """
-    above: BoolArray = np.asarray(ratio_db, dtype=np.float64) > np.asarray(threshold_db, dtype=np.float64)
-    return np.asarray(1 + np.cumprod(above, axis=-1).sum(axis=-1), dtype=np.int64)
-
-
-def fit_thresholds(ratio_db: FloatArray, rank: ArrayLike, *, sweeps: int = 3) -> tuple[float, ...]:
-    """Thresholds [dB] with the largest kappa on the training samples, one after the other until none moves."""
-    ri = np.asarray(rank, dtype=np.float64)
-    good = (ri >= 1) & np.isfinite(ratio_db).all(axis=1)
-    y, ratio = ri[good], ratio_db[good]
-    grid = -20.0 * np.log10(k_grid(1.25, 100.0))
-    thresholds = [-20.0] * ratio.shape[1]
-    for _ in range(sweeps):
-        before = list(thresholds)
-        for stream in range(len(thresholds)):
-            trials = [[*thresholds[:stream], float(g), *thresholds[stream + 1 :]] for g in grid]
-            kappas = [cohen_kappa(y, rank_by_thresholds(ratio, trial)) for trial in trials]
-            if np.isfinite(kappas).any():
-                thresholds[stream] = float(grid[int(np.nanargmax(kappas))])
-        if thresholds == before:
-            break
-    return tuple(thresholds)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OrderedReceiver:
-    """A fitted ordered regression: ``P(rank > r) = 1 / (1 + exp(cut_r - slope . z))`` with z the standardised features.
-
-    McCullagh (1980), doi:10.1111/j.2517-6161.1980.tb01109.x.
-    """
-
-    slope: FloatArray
-    cut: FloatArray
-    mean: FloatArray
-    scale: FloatArray
-
-    def probabilities(self, features: FloatArray) -> FloatArray:
-        """Probability (n, ranks)."""
-        return _ordered(self.slope, self.cut, (features - self.mean) / self.scale)
-
-
-def fit_ordered(features: FloatArray, rank: ArrayLike, *, penalty: float = 10.0) -> OrderedReceiver:
-    """Ordered regression of the largest penalised likelihood.
-
-    Raises
-    ------
-    InputError
-        As :func:`fit_receiver`.
-    """
-    from scipy.optimize import minimize
-
-    x, y, _ = _training(features, rank, np.arange(len(features)))
-    mean, scale = _standard(x)
-    z = (x - mean) / scale
-    beyond = np.array([(np.sum(y > r) + 0.5) / (len(y) + 1.0) for r in range(1, MAX_RANK)])
-    cut = np.log((1.0 - beyond) / beyond)
-    start = np.concatenate([np.zeros(x.shape[1]), [cut[0]], np.log(np.maximum(np.diff(cut), 1e-3))])
-
-    def parts(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        width = x.shape[1]
-        # gaps as exponentials: cuts stay in order
-        return theta[:width], np.cumsum(np.concatenate([theta[width : width + 1], np.exp(theta[width + 1 :])]))
-
-    def objective(theta: FloatArray) -> float:
-        slope, cuts = parts(theta)
-        return float(log_losses(_ordered(slope, cuts, z), y).sum() + 0.5 * penalty * (slope @ slope))
-
-    slope, cuts = parts(minimize(objective, start, method="L-BFGS-B").x)
-    return OrderedReceiver(slope=slope, cut=cuts, mean=mean, scale=scale)
-
-
-def _ordered(slope: FloatArray, cut: FloatArray, z: FloatArray) -> FloatArray:
-    above = 1.0 / (1.0 + np.exp(np.clip(cut - (z @ slope)[:, None], -500.0, 500.0)))
-    edge = np.concatenate([np.ones((len(z), 1)), above, np.zeros((len(z), 1))], axis=1)
-    return np.asarray(np.maximum(edge[:, :-1] - edge[:, 1:], 0.0))

@@ -126,11 +126,6 @@ STANDS_STILL_M = 3.0
 """A ground node whose positions stay within this of their median stands still: that is the noise of its GNSS."""
 
 
-def with_ground_nodes(site: Site, settings: FlightFile, folder: Path) -> Site:
-    """The site with the flight's own nodes as towers; see :func:`ground_nodes`."""
-    return ground_nodes(site, settings, folder)[0]
-
-
 def ground_nodes(
     site: Site, settings: FlightFile, folder: Path, warnings: list[str] | None = None
 ) -> tuple[Site, dict[str, Track]]:

@@ -136,14 +136,6 @@ class MeasuredPattern:
             torus = [_torus(theta_part, -1), _torus(phi_part, -1)]
             self._layers = [_spline(layer) for whole in torus for layer in (whole.real, whole.imag)]
 
-    @property
-    def spline_layers(self) -> tuple[FloatArray, ...]:
-        """Spline coefficients over a full circle of theta times one of phi: the amplitude, or four parts.
-
-        Those are real and imaginary part of E_theta, then of E_phi.
-        """
-        return tuple(self._layers)
-
     def __repr__(self) -> str:
         return f"MeasuredPattern({self.name!r}, peak {self.peak_gain_dbi:.2f} dBi, efficiency {self.efficiency:.2f})"
 

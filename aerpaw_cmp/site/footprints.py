@@ -21,7 +21,6 @@ from shapely.geometry.base import BaseGeometry
 
 from ..common.errors import InputError, UsageError
 from ..common.geodesy import SiteFrame
-from ..common.outputs import OutputFile, is_sealed, sealed
 from ..common.units import FloatArray
 from ..common.yamlfile import dump_yaml
 from .mapfiles import read_map_file
@@ -657,9 +656,3 @@ def site_yaml(model: SiteModel, *, header: Sequence[str] = ()) -> str:
     content = model.model_dump(mode="json", exclude_defaults=True)
     text = "".join(f"# {_printable(line)}\n" for entry in header for line in str(entry).splitlines())
     return text + dump_yaml(content)
-
-
-def write_site_yaml(model: SiteModel, path: str | Path, *, header: Sequence[str] = ()) -> None:
-    """Write :func:`site_yaml` to a new file, or over one of this function that nobody changed."""
-    with OutputFile(Path(path), own=is_sealed) as output:
-        output.write(sealed(site_yaml(model, header=header)))

@@ -8,7 +8,6 @@ from aerpaw_cmp.compare.forecast import (
     constant_forecast,
     log_losses,
     one_hot,
-    repeat_ceiling,
     score_forecast,
 )
 
@@ -69,12 +68,3 @@ def test_intervals_of_the_expected_histogram_hold_it():
 def test_lengths_must_match():
     with pytest.raises(ValueError, match="not in pairs"):
         score_forecast([1, 2], np.ones((3, 4)) / 4, [1, 2, 3], np.full(4, 0.25))
-
-
-def test_repeat_ceiling_takes_the_nearest_report_within_reach():
-    one = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [500.0, 0.0, 0.0]])
-    two = one + np.array([1.0, 0.0, 0.0])
-    two[2, 0] = 520.0
-    found = repeat_ceiling(one, [1, 2, 3], two, [1, 2, 4])
-    assert (found.n, found.agreement, found.kappa) == (2, 1.0, 1.0)
-    assert repeat_ceiling(one, [np.nan] * 3, two, [1, 2, 3]).n == 0

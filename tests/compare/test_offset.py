@@ -14,18 +14,24 @@ from hypothesis import strategies as st
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.compare.offset import (
     censored_offset,
+    difference_moments,
     expected_offset_db,
     grid_offset,
     identifiable_range,
     offset_curve,
     offset_grid,
-    pooled_offsets,
+    pooled_moments,
     read_reference_powers,
     reference_power_dbm,
     trimmed_offset,
 )
 
 tenths = st.integers(-2000, 2000).map(lambda k: k / 100)
+
+
+def pooled_offsets(pairs, per="link"):
+    """One offset for all sequences of a group."""
+    return pooled_moments({key: difference_moments(*levels) for key, levels in pairs.items()}, per)
 
 
 def closed_form(difference: np.ndarray) -> float:

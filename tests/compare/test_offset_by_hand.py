@@ -21,13 +21,17 @@ from aerpaw_cmp.compare.offset import (
     offset_curve,
     offset_grid,
     pooled_moments,
-    pooled_offsets,
     read_reference_powers,
     reference_power_dbm,
     trimmed_offset,
 )
 
 NAN = float("nan")
+
+
+def pooled_offsets(pairs, per="link"):
+    """One offset for all sequences of a group."""
+    return pooled_moments({key: difference_moments(*levels) for key, levels in pairs.items()}, per)
 
 
 def tobit_by_hand(full, above, below):

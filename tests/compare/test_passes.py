@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.passes import Pass, pass_pairs
+from aerpaw_cmp.compare.passes import Pass, PassTable
 from aerpaw_cmp.compare.statistics import correlation
 
 RADIUS_M, WITHIN_DEG, CELL_M = 3.0, 20.0, 20.0
@@ -74,7 +74,7 @@ def test_the_pairs_are_those_of_brute_force() -> None:
     passes = season()
     found = {
         (p.first, p.second): p
-        for p in pass_pairs(passes, radius_m=RADIUS_M, heading_within_deg=WITHIN_DEG, cell_m=CELL_M)
+        for p in PassTable(passes, CELL_M).pairs(radius_m=RADIUS_M, heading_within_deg=WITHIN_DEG)
     }
     expected = [
         (i, j)
@@ -104,11 +104,11 @@ def test_the_pairs_are_those_of_brute_force() -> None:
 
 
 def test_shares_of_the_work_make_the_whole() -> None:
-    passes, rule = season(1), {"radius_m": RADIUS_M, "heading_within_deg": None, "cell_m": CELL_M}
-    whole = list(pass_pairs(passes, **rule))
+    table, rule = PassTable(season(1), CELL_M), {"radius_m": RADIUS_M, "heading_within_deg": None}
+    whole = list(table.pairs(**rule))
     parts = [
         p
         for share in (["f0", "f3"], ["f1"], ["f2", "f4", "f5", "f6"])
-        for p in pass_pairs(passes, first_flights=share, **rule)
+        for p in table.pairs(first_flights=share, **rule)
     ]
     assert sorted(map(repr, parts)) == sorted(map(repr, whole))

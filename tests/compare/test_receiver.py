@@ -5,18 +5,14 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.compare.forecast import log_losses
-from aerpaw_cmp.compare.rank import channel_rank, cohen_kappa
+from aerpaw_cmp.compare.rank import cohen_kappa
 from aerpaw_cmp.compare.receiver import (
     Receiver,
     choose_features,
     decide,
     decision_weights,
     fit_mixture,
-    fit_ordered,
-    fit_receiver,
-    fit_thresholds,
     out_of_group,
-    rank_by_thresholds,
     sector_groups,
     stream_features,
     time_means,
@@ -34,6 +30,11 @@ def planted(n=1200, seed=2):
     return x, rank, p, np.arange(n) * 8 // n
 
 
+def fit(x, rank, groups, **how):
+    """The receiver of one geometry."""
+    return fit_mixture(x[None], rank, groups, **how).members[0]
+
+
 def test_features_are_ratios_and_level_and_scale_only_moves_the_level():
     h = np.random.default_rng(0).normal(size=(5, 4, 4, 2)) @ [1, 1j]
     one, two = (stream_features(np.linalg.svd(m, compute_uv=False)) for m in (h, 10.0 * h))
@@ -43,7 +44,7 @@ def test_features_are_ratios_and_level_and_scale_only_moves_the_level():
 
 def test_probabilities_come_near_the_planted_ones():
     x, rank, truth, groups = planted(6000)
-    found = fit_receiver(x, rank, groups, penalties=(0.1,)).probabilities(x)
+    found = fit(x, rank, groups, penalties=(0.1,)).probabilities(x)
     assert np.abs(found - truth).mean() < 0.02
     assert found.sum(axis=1) == pytest.approx(1.0)
 
@@ -51,7 +52,7 @@ def test_probabilities_come_near_the_planted_ones():
 def test_regression_equals_the_one_of_scikit_learn():
     linear_model = pytest.importorskip("sklearn.linear_model")
     x, rank, _, groups = planted(600)
-    found = fit_receiver(x, rank, groups, penalties=(5.0,))
+    found = fit(x, rank, groups, penalties=(5.0,))
     z = (x - found.mean) / found.scale
     other = linear_model.LogisticRegression(C=1.0 / 5.0, tol=1e-10, max_iter=5000).fit(z, rank)
     np.testing.assert_allclose(found.coefficient[:, 1:], other.coef_, atol=2e-4)
@@ -77,7 +78,7 @@ def test_what_is_left_out_has_no_part_in_its_forecast():
 def test_noise_is_told_as_the_constant_forecast():
     x, rank, _, groups = planted()
     shuffled = np.random.default_rng(5).permutation(rank)
-    receiver = fit_receiver(x, shuffled, groups)
+    receiver = fit(x, shuffled, groups)
     p = receiver.probabilities(x)
     constant = -np.log(receiver.constant[shuffled - 1]).mean()
     assert log_losses(p, shuffled).mean() > 0.97 * constant
@@ -85,15 +86,15 @@ def test_noise_is_told_as_the_constant_forecast():
 
 def test_decision_for_kappa_says_the_rare_ranks_too():
     x, rank, _, groups = planted()
-    receiver = fit_receiver(x[::2], rank[::2], groups[::2])
-    p = receiver.probabilities(x[1::2])
+    receiver = fit_mixture(x[None, ::2], rank[::2], groups[::2])
+    p = receiver.probabilities(x[None, 1::2])
     assert cohen_kappa(rank[1::2], receiver.decide(p)) > cohen_kappa(rank[1::2], p.argmax(axis=1) + 1) - 0.01
     assert receiver.decide(np.full((1, 4), np.nan)).tolist() == [0]
 
 
 def test_a_receiver_survives_its_file():
     x, rank, _, groups = planted(300)
-    receiver = fit_receiver(x, rank, groups)
+    receiver = fit(x, rank, groups)
     again = Receiver.from_dict(receiver.as_dict())
     np.testing.assert_array_equal(again.probabilities(x), receiver.probabilities(x))
     with pytest.raises(ValueError, match="without penalty"):
@@ -103,7 +104,7 @@ def test_a_receiver_survives_its_file():
 @pytest.mark.parametrize("rank", [np.full(300, 2), np.r_[np.full(280, np.nan), np.tile([1, 2], 10)]])
 def test_nothing_to_learn_from_is_one_message(rank):
     with pytest.raises(InputError, match="to fit a receiver"):
-        fit_receiver(np.zeros((300, 4)), rank, np.arange(300) % 8)
+        fit(np.zeros((300, 4)), rank, np.arange(300) % 8)
 
 
 def test_the_planted_geometry_is_found_and_its_double_is_told_as_tied():
@@ -118,35 +119,10 @@ def test_the_planted_geometry_is_found_and_its_double_is_told_as_tied():
 def test_mixture_is_the_mean_of_its_members():
     x, rank, _, groups = planted(300)
     mixture = fit_mixture(np.stack([x, x]), rank, groups, penalties=(3.0,))
-    one = fit_receiver(x, rank, groups, penalties=(3.0,))
+    one = fit(x, rank, groups, penalties=(3.0,))
     np.testing.assert_allclose(mixture.probabilities(np.stack([x, x])), one.probabilities(x), atol=1e-9)
     with pytest.raises(ValueError, match="geometries"):
         mixture.probabilities(x[None])
-
-
-def test_equal_thresholds_are_the_rule_with_one_k():
-    h = np.random.default_rng(4).normal(size=(200, 4, 4, 2)) @ [1, 1j]
-    ratio = stream_features(np.linalg.svd(h, compute_uv=False))[:, :3]
-    np.testing.assert_array_equal(rank_by_thresholds(ratio, (-20.0,) * 3), channel_rank(h, 10.0))
-
-
-def test_planted_thresholds_are_found():
-    h = np.random.default_rng(4).normal(size=(600, 4, 4, 2)) @ [1, 1j]
-    ratio = stream_features(np.linalg.svd(h, compute_uv=False))[:, :3]
-    truth = rank_by_thresholds(ratio, (-4.0, -9.0, -20.0))
-    assert fit_thresholds(ratio, truth) == pytest.approx((-4.0, -9.0, -20.0), abs=20.0 / 24)  # a step of K
-
-
-def test_ordered_regression_finds_planted_cuts():
-    rng = np.random.default_rng(6)
-    x = rng.normal(size=(5000, 1))
-    rank = 1 + (x + rng.logistic(size=(5000, 1)) > np.array([-2.0, 0.5, 2.0])).sum(axis=1)
-    found = fit_ordered(x, rank, penalty=1e-3)
-    assert found.slope[0] / found.scale[0] == pytest.approx(1.0, abs=0.1)
-    np.testing.assert_allclose(
-        found.cut - found.slope[0] * -found.mean[0] / -found.scale[0], [-2.0, 0.5, 2.0], atol=0.2
-    )
-    assert found.probabilities(x).sum(axis=1) == pytest.approx(1.0)
 
 
 def test_sectors_are_contiguous_directions_of_equal_share():

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.flight.data import ground_nodes, with_ground_nodes
+from aerpaw_cmp.flight.data import ground_nodes
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -29,7 +29,7 @@ def rover(folder: Path, steps_deg: float) -> Path:
 
 def test_a_node_with_a_place_is_a_tower(tmp_path):
     site = load_site("lake_wheeler")
-    found = with_ground_nodes(site, flight(latitude_deg=35.728, longitude_deg=-78.697, antenna_height_m=1.0), tmp_path)
+    found, _ = ground_nodes(site, flight(latitude_deg=35.728, longitude_deg=-78.697, antenna_height_m=1.0), tmp_path)
     east, north = site.frame.to_local([35.728], [-78.697])
     assert found.towers["ROVER"].position_m == pytest.approx([east[0], north[0], 1.0])
     assert set(found.towers) == {*site.towers, "ROVER"}
@@ -39,7 +39,7 @@ def test_a_node_with_a_place_is_a_tower(tmp_path):
 def test_a_track_that_stays_is_a_place_and_one_that_moves_a_track(tmp_path):
     site = load_site("lake_wheeler")
     rover(tmp_path, 1e-7)  # 0.3 m in all
-    found = with_ground_nodes(site, flight(track="rover.csv"), tmp_path)
+    found, _ = ground_nodes(site, flight(track="rover.csv"), tmp_path)
     assert found.towers["ROVER"].latitude_deg == pytest.approx(35.728, abs=3e-6)
     rover(tmp_path, 1e-5)  # 32 m
     warnings: list[str] = []
@@ -51,7 +51,7 @@ def test_a_track_that_stays_is_a_place_and_one_that_moves_a_track(tmp_path):
     assert at.position_m[0, :2] == pytest.approx([east[0], north[0]], abs=1e-6)  # the flight's zone: EST
     assert at.valid.tolist() == [True, False]
     with pytest.raises(InputError, match="no such log"):
-        with_ground_nodes(site, flight(track="gone.csv"), tmp_path)
+        ground_nodes(site, flight(track="gone.csv"), tmp_path)
 
 
 def test_a_node_is_one_thing_and_has_its_own_name(tmp_path):
@@ -61,7 +61,7 @@ def test_a_node_is_one_thing_and_has_its_own_name(tmp_path):
     settings = flight(latitude_deg=35.728, longitude_deg=-78.697)
     taken = settings.model_copy(update={"towers": {"LW1": settings.towers["ROVER"]}})
     with pytest.raises(UsageError, match="of this name"):
-        with_ground_nodes(load_site("lake_wheeler"), taken, tmp_path)
+        ground_nodes(load_site("lake_wheeler"), taken, tmp_path)
 
 
 def test_heights_are_the_ground_s_or_the_log_s(tmp_path):
@@ -70,7 +70,7 @@ def test_heights_are_the_ground_s_or_the_log_s(tmp_path):
     text = (tmp_path / "rover.csv").read_text()
     text = text.replace(",0.0", ",25.0").replace("25.0", "0.0", 3)  # this reader's heights are above the first
     (tmp_path / "rover.csv").write_text(text)
-    low = with_ground_nodes(site, flight(track="rover.csv", antenna_height_m=2.0), tmp_path)
+    low, _ = ground_nodes(site, flight(track="rover.csv", antenna_height_m=2.0), tmp_path)
     assert low.towers["ROVER"].position_m[2] == pytest.approx(2.0)
     high, nodes = ground_nodes(site, flight(track={"path": "rover.csv"}, height="logged"), tmp_path)
     up = 25.0 + site.datum.takeoff_ground_m

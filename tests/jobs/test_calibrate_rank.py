@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.compare.receiver import rank_by_thresholds
 from aerpaw_cmp.jobs.calibrate_rank import (
     FittedReceiver,
     RankCalibration,
@@ -45,6 +44,11 @@ def flight(seed: int) -> RankSamples:
     )
 
 
+def by_medians(ratio):
+    """Planted rank: stream i counts where the ratios of streams 2 .. i all exceed their medians."""
+    return 1.0 + np.cumprod(ratio > np.median(ratio, axis=0), axis=-1).sum(axis=-1)
+
+
 @pytest.fixture(scope="module")
 def tried() -> Tried:
     flights = [flight(1), flight(2)]
@@ -52,7 +56,7 @@ def tried() -> Tried:
     planted = []
     for one in flights:
         ratio = features_of([truth], one)[0][:, :3]
-        rank = rank_by_thresholds(ratio, tuple(np.median(ratio, axis=0))).astype(float)
+        rank = by_medians(ratio)
         flip = np.random.default_rng(7).random(400) < 0.05
         planted.append(dataclasses.replace(one, rank=np.where(flip, 1.0 + (rank % 4), rank)))
     return Tried.of(planted, SETTINGS)
@@ -98,7 +102,7 @@ def test_planted_delay_and_mean_of_the_reports_are_found(shift_s: float, average
     truth = Tried.of([bare], settings).geometries[1]
     planted = Timing(shift_s=shift_s, average_s=average_s)
     ratio = features_of([truth], bare, planted)[0][:, :3]
-    rank = rank_by_thresholds(ratio, tuple(np.median(ratio, axis=0))).astype(float)
+    rank = by_medians(ratio)
     fitted = Tried.of([dataclasses.replace(bare, rank=rank)], settings).fit([0])
     assert (fitted.timing.shift_s, fitted.timing.average_s) == (shift_s, average_s)
     again = FittedReceiver.from_dict("T", fitted.as_dict())

@@ -174,7 +174,7 @@ def test_geotiff_equals_the_ascii_grid(tmp_path: Path) -> None:
 
 
 def test_imported_site_keeps_its_elevation_model(tmp_path: Path) -> None:
-    from aerpaw_cmp.site.footprints import import_site, write_site_yaml
+    from aerpaw_cmp.site.footprints import import_site, site_yaml
 
     (tmp_path / "base").mkdir()
     asc(tmp_path / "base" / "d.asc", plane(-500, -300, 10, (60, 100)), -500, -300, 10)
@@ -182,7 +182,7 @@ def test_imported_site_keeps_its_elevation_model(tmp_path: Path) -> None:
     tree = tmp_path / "tree.osm"
     tree.write_text('<osm><node id="1" lat="35.728" lon="-78.6962"><tag k="natural" v="tree"/></node></osm>')
     model, _ = import_site([tree], base=tmp_path / "base" / "site.yaml")
-    write_site_yaml(model, tmp_path / "new.yaml")
+    (tmp_path / "new.yaml").write_text(site_yaml(model), encoding="utf-8")
     site = load_site(tmp_path / "new.yaml")
     assert site.trees.ground_m[0] == pytest.approx(0.03 * site.trees.east_m[0] - 0.02 * site.trees.north_m[0], abs=1e-6)
 

@@ -13,7 +13,7 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site import footprints
-from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, write_site_yaml
+from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, site_yaml
 from aerpaw_cmp.site.siteyaml import build_site, load_site
 
 FRAME = SiteFrame(35.7275, -78.696)
@@ -148,7 +148,7 @@ def test_one_village_in_four_formats(tmp_path: Path, writer: object) -> None:
 
 def test_round_trip_through_site_yaml(tmp_path: Path) -> None:
     model, actions = import_site([village_geojson(tmp_path / "v.json")])
-    write_site_yaml(model, tmp_path / "site.yaml", header=["imported", *actions])
+    (tmp_path / "site.yaml").write_text(site_yaml(model, header=["imported", *actions]), encoding="utf-8")
     site, again = load_site(tmp_path / "site.yaml"), build_site(model)
     assert not site.illustrative
     assert not any("illustrative" in note for note in site.notes)
@@ -229,7 +229,7 @@ def test_rounding_for_the_file_breaks_no_outline(tmp_path: Path) -> None:
         ring = [(float(x), float(y)) for x, y in corner + box_ @ rotation.T]
         features.append(([ring], {"building": "yes", "height": f"{random.uniform(4, 12):.1f}"}))
     model, _ = import_site([geojson(tmp_path / "v.json", *features)])
-    write_site_yaml(model, tmp_path / "site.yaml")
+    (tmp_path / "site.yaml").write_text(site_yaml(model), encoding="utf-8")
     site = load_site(tmp_path / "site.yaml")
     assert len(site.buildings) > 200
     drawn = shapely.union_all([shapely.Polygon(rings[0]) for rings, _ in features]).area

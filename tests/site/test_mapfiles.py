@@ -14,7 +14,7 @@ import shapely
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site import mapfiles
-from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, write_site_yaml
+from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, site_yaml
 from aerpaw_cmp.site.mapfiles import MAX_TAGS, read_map_file
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -103,7 +103,7 @@ def test_clearings_stay_empty_of_trees(tmp_path: Path, style: str) -> None:
     osm.relation(members, type="multipolygon", **({} if style == "tags on the outer way" else wood))
     (tmp_path / "w.osm").write_text(osm.xml())
     model, _ = import_site([tmp_path / "w.osm"])
-    write_site_yaml(model, tmp_path / "site.yaml")
+    (tmp_path / "site.yaml").write_text(site_yaml(model), encoding="utf-8")
     site = load_site(tmp_path / "site.yaml")
     # the site's origin is LW1, a metre or so from FRAME's
     shift = np.array(site.frame.to_local(FRAME.latitude_deg, FRAME.longitude_deg))
@@ -129,7 +129,7 @@ def test_trees_have_their_tagged_sizes(tmp_path: Path) -> None:
         osm.node(*square(40.0 * place + 30, 50)[0], natural="tree", **tags)
     (tmp_path / "t.osm").write_text(osm.xml())
     model, actions = import_site([tmp_path / "t.osm"])
-    write_site_yaml(model, tmp_path / "site.yaml", header=actions)
+    (tmp_path / "site.yaml").write_text(site_yaml(model, header=actions), encoding="utf-8")
     trees = load_site(tmp_path / "site.yaml").trees
     np.testing.assert_allclose(trees.height_m, [12, 12.19, 20, 20, 20])
     np.testing.assert_allclose(trees.crown_diameter_m, [6, 10, 10, 10, 10])
@@ -394,7 +394,7 @@ def test_any_name_survives_site_yaml(tmp_path: Path, name: str) -> None:
     content = collection(feature(polygon(square(50, 0)), name=name, **BARN))
     (tmp_path / "v.json").write_text(json.dumps(content))
     model, actions = import_site([tmp_path / "v.json"])
-    write_site_yaml(model, tmp_path / "site.yaml", header=actions)
+    (tmp_path / "site.yaml").write_text(site_yaml(model, header=actions), encoding="utf-8")
     assert [b.name for b in load_site(tmp_path / "site.yaml").buildings] == [name]
 
 
@@ -403,7 +403,7 @@ def test_control_characters_do_not_spoil_the_file(tmp_path: Path) -> None:
     (tmp_path / "v.json").write_text(json.dumps(collection({**odd, "id": "x\u0000\u2028\ny"})))
     model, actions = import_site([tmp_path / "v.json"])
     assert any("is not a length" in action for action in actions)
-    write_site_yaml(model, tmp_path / "site.yaml", header=actions)
+    (tmp_path / "site.yaml").write_text(site_yaml(model, header=actions), encoding="utf-8")
     assert load_site(tmp_path / "site.yaml").buildings[0].name == "bell\u0007"
 
 

@@ -21,7 +21,7 @@ _CUT = re.compile(rb"Phi ?= ?-?\d{1,3}(?:\.\d{1,6})? ?\(deg\)")
 _GAIN = re.compile(rb"(?:\d{1,3}\s*\n)?Frequency\tE ?Total\. ?dB")
 _LEVELS = re.compile(rb"(?i)g-?net ?track|\b(?:rsrp|rxlev|rscp|level)\b\W{0,20}-?\d{2,3}\b")
 _CELL_SEARCH = re.compile(rb"Found CELL \d{1,5}\.\d MHz, EARFCN=\d")
-_PLAN = re.compile(rb'"fileType"\s*:\s*"Plan"')
+_PLAN = re.compile(rb'"fileType"\s*:\s*"Plan"|\A\s*QGC WPL \d+')
 _PLANNING = re.compile(rb"(?im)^(?:HORIZONTAL\s+\d{1,4}|REVNUM:,TIA)")
 _PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
 _POWER_REFS = re.compile(rb"(?:\xef\xbb\xbf)?Node,Category,Channel,[^\n]{0,80}Gain,Freq_")
@@ -153,7 +153,7 @@ _KINDS: tuple[tuple[str, str, Callable[[bytes], bool]], ...] = (
         "a KML with levels in a layout that is not read (G-NetTrack, ...): give the program's text log or CSV",
         lambda head: _kml(head) and _LEVELS.search(head) is not None,
     ),
-    ("kml_other", "a KML without measurements (a geofence, a map)", _plain_kml),
+    ("kml_other", "a KML without measurements (a geofence, a map, a route for 'aerpaw-cmp predict')", _plain_kml),
     ("gpx_other", "a GPX without points", _gpx),
     (
         "at_transcript",
@@ -178,7 +178,7 @@ _KINDS: tuple[tuple[str, str, Callable[[bytes], bool]], ...] = (
     ),
     (
         "flight_plan",
-        "a QGroundControl plan: where the aircraft was to fly",
+        "a planned route, not a flight: 'aerpaw-cmp predict' reads it",
         lambda head: _PLAN.search(head) is not None,
     ),
     ("flight_yaml", "a flight file of settings, not a log: give it to 'report'", _yaml),

@@ -1,0 +1,394 @@
+"""Routes: where an aircraft is to fly, from a plan, a map, a table of waypoints, or the log of an earlier flight.
+
+=====================  ============================================================================================
+file                   heights are brought to take-off by
+=====================  ============================================================================================
+QGroundControl `.plan`  the frame of each item: relative, or sea level less the planned home position's
+`QGC WPL 110` text      the frame of each line: relative, or sea level less that of line 0, the home
+KML                     ``relativeToGround``; ``absolute`` less the first point's, with a remark
+CSV                     nothing: above take-off (a column that says sea level is refused); feet become metres
+a log with positions    the log's reader
+=====================  ============================================================================================
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..common.errors import InputError
+from .ingest import as_utf8, read_bytes, read_file
+from .readers import HEAD_BYTES, ReadOptions, claims
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "yaw_deg", "time_s")
+"""Columns of a route: height above take-off, yaw clockwise from north, seconds since its first point (NaN: a plan)."""
+
+_SEA_LEVEL_FRAMES, _RELATIVE_FRAMES, _TERRAIN_FRAMES = (0, 5), (3, 6), (10, 11)
+_WAYPOINTS = (16, 17, 18, 19, 31, 82)
+_TAKEOFFS, _LANDINGS, _TURN, _RETURN = (22, 84), (21, 85), 115, 20
+_ARDUPILOT = 3
+_FOOT_M = 0.3048
+
+
+def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFrame:
+    """Points of a route, one row each, in the order of flight.
+
+    Parameters
+    ----------
+    path : str or Path
+        A QGroundControl plan, ``QGC WPL`` waypoints, a KML with a line or points, a CSV with named columns, or any
+        log with positions.
+    height_m : float, optional
+        Height above take-off of points that have none.
+
+    Returns
+    -------
+    pandas.DataFrame
+        :data:`COLUMNS`. Where the file says no yaw, it is the course to the next point. ``attrs["remarks"]`` is a list
+        of sentences that the user should read.
+
+    Raises
+    ------
+    InputError
+        If the file is no route, or points have no height and ``height_m`` does not say it.
+    """
+    data = as_utf8(read_bytes(path)[0])
+    try:
+        route = _route(data, path)
+        return _table(route, height_m)
+    except InputError as error:
+        if error.path is not None:
+            raise
+        raise InputError(error.found, expected=error.expected, cause=error.cause, path=path, line=error.line) from error
+
+
+@dataclass(slots=True)
+class _Route:
+    """Points as they are read: latitude, longitude, height, yaw, seconds; NaN for what is not said."""
+
+    points: list[tuple[float, float, float, float, float]] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+    def add(self, latitude: float, longitude: float, height: float = math.nan, yaw: float = math.nan) -> None:
+        self.points.append((latitude, longitude, height, yaw, math.nan))
+
+    def remark(self, text: str) -> None:
+        if text not in self.remarks:
+            self.remarks.append(text)
+
+
+def _route(data: bytes, path: str | Path) -> _Route:
+    head = data[:HEAD_BYTES]
+    if re.match(rb"\s*\{", head) and b'"fileType"' in data[: 1 << 20]:
+        return _plan(data)
+    if re.match(rb"\s*QGC WPL \d+", head):
+        return _waypoint_text(data.decode("utf-8", "replace"))
+    if any(reader.kinds for reader in claims(data)):
+        return _log(path)
+    if b"<kml" in head:
+        return _kml(data.decode("utf-8", "replace"))
+    if b"\0" in head:
+        raise InputError("binary content that is no route", expected=_EXPECTED)
+    return _sheet(data.decode("utf-8", "replace"))
+
+
+_EXPECTED = "a QGroundControl .plan, QGC WPL waypoints, a KML with a line, a CSV with lat, lon, alt, or a log"
+
+
+def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
+    import numpy as np
+    import pandas as pd
+
+    if not route.points:
+        raise InputError("the route has no point", expected=_EXPECTED)
+    table: pd.DataFrame = pd.DataFrame(np.array(route.points, dtype=np.float64), columns=list(COLUMNS))
+    bad = ~(table["latitude_deg"].between(-90, 90) & table["longitude_deg"].between(-180, 180))
+    if bad.any():
+        first = int(np.flatnonzero(bad)[0])
+        found = f"point {first + 1} lies at {table['latitude_deg'][first]:g}, {table['longitude_deg'][first]:g}"
+        raise InputError(found, expected="latitude and longitude in degrees", cause="exchanged columns, or radians")
+    silent = table["altitude_m"].isna()
+    if silent.any():
+        if height_m is None:
+            found = f"{int(silent.sum())} of {len(table)} points have no height"
+            raise InputError(found, expected="heights above take-off in the file, or one height for all points")
+        table["altitude_m"] = table["altitude_m"].fillna(height_m)
+    if table["yaw_deg"].isna().any():
+        route.remark("Points without a yaw face the next point.")
+        table["yaw_deg"] = table["yaw_deg"].fillna(_courses(table)).fillna(0.0)
+    table["yaw_deg"] = table["yaw_deg"] % 360.0
+    table.attrs["remarks"] = list(route.remarks)
+    return table
+
+
+def _courses(table: pd.DataFrame) -> pd.Series[float]:
+    """Course [deg] from each point to the next that lies elsewhere; the last keeps the one before."""
+    import numpy as np
+
+    north = table["latitude_deg"].diff().shift(-1)
+    east = table["longitude_deg"].diff().shift(-1) * np.cos(np.radians(table["latitude_deg"]))
+    course = np.degrees(np.arctan2(east, north))
+    courses: pd.Series[float] = course.where((north != 0) | (east != 0)).bfill().ffill()
+    return courses
+
+
+def _log(path: str | Path) -> _Route:
+    """Track of a log: the clock's zone is of no account."""
+    file = read_file(path, options=ReadOptions(timezone="UTC", time_origin="2000-01-01T00:00:00"))
+    tracks = [stream for stream in file.result.streams if "latitude_deg" in stream.frame.columns]
+    if not tracks:
+        raise InputError(f"a log of {file.result.reader!r} without positions", expected=_EXPECTED)
+    track = max(tracks, key=lambda stream: (stream.kind == "telemetry", len(stream.frame)))
+    frame = track.frame[track.frame["latitude_deg"].notna()]
+    route = _Route(remarks=[str(text) for text in file.result.warnings])
+    seconds = (frame["time"] - frame["time"].iloc[:1].min()).dt.total_seconds()
+    columns = [frame[name] if name in frame.columns else [math.nan] * len(frame) for name in COLUMNS[:4]]
+    route.points = list(zip(*columns, seconds, strict=True))
+    return route
+
+
+# --- QGroundControl and Mission Planner --------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Item:
+    """A mission item: MAVLink command and frame, its four parameters, latitude, longitude, altitude."""
+
+    command: int
+    frame: int
+    numbers: tuple[float, ...]
+
+
+def _plan(data: bytes) -> _Route:
+    try:
+        plan = json.loads(data)
+        mission = plan["mission"]
+        home = _numbers(mission.get("plannedHomePosition") or ())
+        items = list(_items(mission["items"]))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        found = f"a damaged QGroundControl plan ({type(error).__name__}: {error})"
+        raise InputError(found, expected="a mission with items") from error
+    route = _Route()
+    _fly(route, items, home, named_yaw=mission.get("firmwareType") != _ARDUPILOT)
+    return route
+
+
+def _items(listed: Sequence[Any]) -> Iterator[_Item]:
+    """Simple items in the order of flight, those of surveys included."""
+    for entry in listed:
+        if entry.get("type") == "ComplexItem":
+            inner = entry.get("TransectStyleComplexItem", entry).get("Items", ())
+            if not inner:
+                kind = entry.get("complexItemType", "complex item")
+                raise InputError(f"a {kind} without its items", expected="a plan saved by QGroundControl 3.4 or later")
+            yield from _items(inner)
+        else:
+            yield _Item(int(entry["command"]), int(entry.get("frame", 3)), _numbers(entry["params"], 7))
+
+
+def _numbers(values: Sequence[Any], count: int = 0) -> tuple[float, ...]:
+    """Numbers, NaN for null."""
+    numbers = tuple(math.nan if value is None else float(value) for value in values)
+    return numbers + (math.nan,) * (count - len(numbers))
+
+
+def _waypoint_text(text: str) -> _Route:
+    route, items = _Route(), []
+    home: tuple[float, ...] = ()
+    for number, line in enumerate(text.splitlines()[1:], start=2):
+        cells = line.split()
+        if not cells or line.startswith("#"):
+            continue
+        try:
+            index, command, frame = int(cells[0]), int(cells[3]), int(cells[2])
+            values = _numbers(cells[4:11], 7)
+        except (ValueError, IndexError) as error:
+            raise InputError(f"no waypoint: {line[:60]!r}", expected="12 fields", line=number) from error
+        if index == 0:
+            home = values[4:7]
+        else:
+            items.append(_Item(command, frame, values))
+    _fly(route, items, home, named_yaw=False)
+    return route
+
+
+def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, named_yaw: bool) -> None:
+    """Add the points of a mission.
+
+    Parameters
+    ----------
+    route : _Route
+    items : sequence of _Item
+    home : tuple of float
+        Latitude, longitude and altitude above sea level of the planned take-off; may be empty.
+    named_yaw : bool
+        Is the fourth parameter of a waypoint its yaw? ArduPilot ignores it.
+    """
+    here = home[:2] if len(home) > 1 else (math.nan, math.nan)
+    for item in items:
+        latitude, longitude, height = item.numbers[4:7]
+        if item.command == _TURN and route.points:
+            _turn(route, item)
+        elif item.command == _RETURN:
+            route.remark("The return to the take-off at the end is left out.")
+        elif item.command in (*_WAYPOINTS, *_TAKEOFFS, *_LANDINGS):
+            if not (latitude or longitude) or math.isnan(latitude):  # 0, 0 and null: where the aircraft is
+                latitude, longitude = here
+            if math.isnan(latitude):
+                continue
+            here = latitude, longitude
+            yaw = item.numbers[3] if named_yaw else math.nan
+            route.add(latitude, longitude, _height(route, item, height, home), yaw)
+
+
+def _turn(route: _Route, item: _Item) -> None:
+    """Yaw of the last point as CONDITION_YAW sets it."""
+    degrees, direction, relative = item.numbers[0], item.numbers[2], item.numbers[3]
+    if relative == 1:
+        route.remark("Turns relative to the course before them are left out.")
+    elif math.isfinite(degrees) and abs(direction) <= 1:
+        route.points[-1] = (*route.points[-1][:3], degrees, math.nan)
+
+
+def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) -> float:
+    if item.command in _LANDINGS:
+        return 0.0
+    if item.frame in _SEA_LEVEL_FRAMES:
+        if len(home) < 3 or math.isnan(home[2]):
+            cause = "set the planned home position"
+            raise InputError("heights above sea level without the take-off's", expected="heights", cause=cause)
+        return height - home[2]
+    if item.frame in _TERRAIN_FRAMES:
+        route.remark("Heights above the ground below each point are taken as heights above take-off.")
+    elif item.frame not in _RELATIVE_FRAMES:
+        raise InputError(f"a waypoint in MAVLink frame {item.frame}", expected="frames 0, 3, 5, 6, 10 or 11")
+    return height
+
+
+# --- KML ---------------------------------------------------------------------------------------------
+
+_SHAPE = re.compile(r"<(LineString|Point|gx:Track)\b[^>]*>(.*?)</\1>", re.DOTALL)
+_MODE = re.compile(r"<(?:gx:)?altitudeMode>\s*(\w+)\s*<")
+_COORDINATES = re.compile(r"<coordinates>(.*?)</coordinates>", re.DOTALL)
+_TRACK_POINT = re.compile(r"<gx:coord>(.*?)</gx:coord>", re.DOTALL)
+_TRACK_HEADING = re.compile(r"<gx:angles>\s*(-?[\d.]+)")
+
+
+def _kml(text: str) -> _Route:
+    """Lines and tracks of a map; where it has none, its points in their order."""
+    shapes = [match.groups() for match in _SHAPE.finditer(text)]
+    lines = [shape for shape in shapes if shape[0] != "Point"]
+    if not lines and len(shapes) < 2:
+        what = "a geofence, which has areas alone" if "<Polygon" in text else "a map without a line"
+        raise InputError(f"no route: {what}", expected="a KML with a line (LineString, gx:Track) or points")
+    route, sea_level = _Route(), False
+    if len(lines) > 1:
+        route.remark(f"{len(lines)} lines are flown one after the other.")
+    for kind, body in lines or shapes:
+        mode = _MODE.search(body)
+        sea_level |= mode is not None and mode[1] == "absolute"
+        clamped = mode is None or mode[1].startswith("clamp")
+        headings = [float(heading) for heading in _TRACK_HEADING.findall(body)]
+        for index, place in enumerate(_places(kind, body)):
+            yaw = headings[index] if index < len(headings) else math.nan
+            height = math.nan if len(place) < 3 or (clamped and place[2] == 0.0) else place[2]
+            route.add(place[1], place[0], height, yaw)
+    if sea_level:
+        zero = route.points[0][2]
+        route.points = [(*point[:2], point[2] - zero, *point[3:]) for point in route.points]
+        route.remark(f"Heights are above sea level: the first point's, {zero:.1f} m, is taken as the take-off's.")
+    return route
+
+
+def _places(kind: str, body: str) -> list[tuple[float, ...]]:
+    """Longitude, latitude and, where it is said, altitude of each point of a shape."""
+    if kind == "gx:Track":
+        texts = [match.split() for match in _TRACK_POINT.findall(body)]
+    else:
+        texts = [place.split(",") for match in _COORDINATES.findall(body) for place in match.split()]
+    try:
+        places = [tuple(float(cell) for cell in cells) for cells in texts]
+    except ValueError as error:
+        raise InputError(f"a coordinate that is no number ({error})", expected="longitude,latitude,altitude") from error
+    if any(len(place) < 2 for place in places):
+        raise InputError("a coordinate without latitude", expected="longitude,latitude,altitude")
+    return places
+
+
+# --- tables ------------------------------------------------------------------------------------------
+
+_NAMES = {
+    "latitude_deg": re.compile(r"(gps ?)?lat(itude)?( deg)?"),
+    "longitude_deg": re.compile(r"(gps ?)?(lon|lng|long|longitude)( deg)?"),
+    "altitude_m": re.compile(r"(rel(ative)? ?)?(alt|altitude|height)( above takeoff)?( m| ft| feet)?|(agl)( m| ft)?"),
+    "yaw_deg": re.compile(r"(yaw|heading|bearing|compass heading)( deg| rad)?"),
+}
+_SEA_LEVEL = re.compile(r"\b(amsl|msl|asl|sea ?level|elevation)\b")
+
+
+def _sheet(text: str) -> _Route:
+    """Waypoints of a table; without a header: latitude, longitude, height, yaw."""
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if not lines:
+        raise InputError("the file is empty", expected=_EXPECTED)
+    sign = max(",;\t", key=lines[0].count)
+    rows = list(csv.reader(io.StringIO("\n".join(lines)), delimiter=sign, skipinitialspace=True))
+    names = [re.sub(r"[^a-z0-9]+", " ", name.lower()).strip() for name in rows[0]]
+    found = {key: next((i for i, name in enumerate(names) if form.fullmatch(name)), -1) for key, form in _NAMES.items()}
+    first = 1
+    if found["latitude_deg"] < 0 or found["longitude_deg"] < 0:
+        if not all(_is_number(cell) for cell in rows[0]) or not 2 <= len(rows[0]) <= 4:
+            raise InputError(f"no route: {lines[0][:60]!r}", expected=_EXPECTED)
+        found = {key: index if index < len(rows[0]) else -1 for index, key in enumerate(_NAMES)}
+        first = 0
+    elif found["altitude_m"] < 0 and any(_SEA_LEVEL.search(name) for name in names):
+        raise InputError("heights above sea level", expected="a column 'altitude_m' of heights above take-off")
+    route = _Route()
+    for number, row in enumerate(rows[first:], start=first + 1):
+        _add_row(route, row, found, names, number)
+    return route
+
+
+def _add_row(route: _Route, row: Sequence[str], found: Mapping[str, int], names: Sequence[str], number: int) -> None:
+    """Add a row of a table.
+
+    Parameters
+    ----------
+    route : _Route
+    row : sequence of str
+        Its cells.
+    found : mapping
+        Column of each quantity, -1 where there is none.
+    names : sequence of str
+        Plain names of the columns; they say feet and radians.
+    number : int
+        Of the row, for messages.
+    """
+    cells = {key: row[index].strip() if 0 <= index < len(row) else "" for key, index in found.items()}
+    try:
+        values = {key: float(cell) if cell else math.nan for key, cell in cells.items()}
+    except ValueError as error:
+        raise InputError(f"row {number} holds what is no number ({error})", expected="latitude, longitude") from error
+    altitude, yaw = names[found["altitude_m"]], names[found["yaw_deg"]]
+    if altitude.endswith((" ft", " feet")):
+        values["altitude_m"] *= _FOOT_M
+    if yaw.endswith(" rad"):
+        values["yaw_deg"] = math.degrees(values["yaw_deg"])
+    route.add(*values.values())
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        return math.isfinite(float(cell))
+    except ValueError:
+        return False

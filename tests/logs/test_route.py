@@ -1,0 +1,155 @@
+"""Routes of plans, maps, tables and logs: the same points whatever the file."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs.route import COLUMNS, read_route
+from tests.parsers.samples import VEHICLE_10
+
+HOME = (35.7275, -78.6962, 90.0)
+POINTS = ((35.7275, -78.6962, 40.0), (35.7285, -78.6962, 40.0), (35.7285, -78.6950, 55.0))
+
+
+def item(command: int, *numbers: float | None, frame: int = 3) -> dict[str, object]:
+    return {"type": "SimpleItem", "command": command, "frame": frame, "params": list(numbers), "autoContinue": True}
+
+
+def plan(*items: object, firmware: int = 12) -> bytes:
+    mission = {"plannedHomePosition": HOME, "items": items, "firmwareType": firmware, "cruiseSpeed": 15}
+    return json.dumps(
+        {"fileType": "Plan", "version": 1, "mission": mission, "geoFence": {}, "rallyPoints": {}}
+    ).encode()
+
+
+def waypoint(place: tuple[float, float, float], *, yaw: float | None = None, frame: int = 3) -> dict[str, object]:
+    return item(16, 0, 0, 0, yaw, *place, frame=frame)
+
+
+def kml(shape: str) -> bytes:
+    return f'<?xml version="1.0"?>\n<kml><Document><Placemark>{shape}</Placemark></Document></kml>\n'.encode()
+
+
+LINE = " ".join(f"{lon},{lat},{height}" for lat, lon, height in POINTS)
+ABOVE = " ".join(f"{lon},{lat},{height + 90}" for lat, lon, height in POINTS)
+TRACK = "".join(f"<gx:coord>{lon} {lat} {height}</gx:coord>" for lat, lon, height in POINTS)
+WPL = "\n".join(
+    f"{i}\t0\t{0 if i < 3 else 3}\t16\t0\t0\t0\t77\t{lat}\t{lon}\t{height + (90 if i < 3 else 0)}\t1"
+    for i, (lat, lon, height) in enumerate(POINTS, start=1)
+)
+FILES = {
+    "relative.plan": plan(*map(waypoint, POINTS)),
+    "sea_level.plan": plan(*(waypoint((lat, lon, height + 90), frame=0) for lat, lon, height in POINTS)),
+    "survey.plan": plan(
+        waypoint(POINTS[0]),
+        {"type": "ComplexItem", "complexItemType": "survey",
+         "TransectStyleComplexItem": {"Items": [waypoint(POINTS[1]), waypoint(POINTS[2])]}},
+    ),
+    "here.plan": plan(item(22, 0, 0, 0, None, 0, 0, 40.0), waypoint(POINTS[1]), waypoint(POINTS[2])),
+    "mission.waypoints": f"QGC WPL 110\r\n0\t1\t0\t16\t0\t0\t0\t0\t35.7275\t-78.6962\t90\t1\r\n{WPL}\r\n".encode(),
+    "line.kml": kml("<LineString><altitudeMode>relativeToGround</altitudeMode><coordinates>\n" + LINE
+                    + "\n</coordinates></LineString>"),
+    "track.kml": kml(f"<gx:Track><altitudeMode>relativeToGround</altitudeMode>{TRACK}</gx:Track>"),
+    "header.csv": b"Longitude,Latitude,Altitude (m)\r\n" + "".join(f"{b},{a},{c}\r\n" for a, b, c in POINTS).encode(),
+    "feet.csv": b"lat;lng;alt [ft]\n" + "".join(f"{a};{b};{c / 0.3048}\n" for a, b, c in POINTS).encode(),
+    "bare.csv": "".join(f"{a}, {b}, {c}\n" for a, b, c in POINTS).encode(),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_points_of_a_route(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(FILES[name])
+    route = read_route(tmp_path / name)
+    assert tuple(route.columns) == COLUMNS
+    assert route[list(COLUMNS[:3])].to_numpy() == pytest.approx(np.array(POINTS), abs=1e-9)
+    assert route["yaw_deg"].to_numpy() == pytest.approx([0.0, 90.0, 90.0], abs=1e-6)  # north, then east
+    assert route["time_s"].isna().all()
+    assert "Points without a yaw face the next point." in route.attrs["remarks"]
+
+
+def test_heights_above_sea_level_of_a_map_count_from_its_first_point_and_say_so(tmp_path: Path) -> None:
+    file = tmp_path / "line.kml"
+    file.write_bytes(
+        kml(f"<LineString><altitudeMode>absolute</altitudeMode><coordinates>{ABOVE}</coordinates></LineString>")
+    )
+    route = read_route(file)
+    assert route["altitude_m"].tolist() == pytest.approx([0.0, 0.0, 15.0])
+    assert any("sea level" in text and "130.0 m" in text for text in route.attrs["remarks"])
+
+
+def test_yaw_of_a_plan(tmp_path: Path) -> None:
+    """A waypoint's own yaw counts on PX4 and not on ArduPilot, which turns by CONDITION_YAW."""
+    file = tmp_path / "a.plan"
+    file.write_bytes(plan(*(waypoint(place, yaw=45.0) for place in POINTS)))
+    assert read_route(file)["yaw_deg"].tolist() == [45.0] * 3
+    turned = item(115, 270, 30, 1, 0, None, None, None, frame=2)
+    file.write_bytes(
+        plan(waypoint(POINTS[0], yaw=45), waypoint(POINTS[1], yaw=45), turned, waypoint(POINTS[2]), firmware=3)
+    )
+    assert read_route(file)["yaw_deg"].tolist() == pytest.approx([0.0, 270.0, 90.0], abs=1e-6)
+
+
+def test_landings_returns_and_heights_above_ground(tmp_path: Path) -> None:
+    file = tmp_path / "a.plan"
+    above_ground = waypoint(POINTS[1], frame=10)
+    file.write_bytes(
+        plan(waypoint(POINTS[0]), above_ground, item(21, 0, 0, 0, None, 0, 0, 0), item(20, *[0] * 7, frame=2))
+    )
+    route = read_route(file)
+    assert route["altitude_m"].tolist() == [40.0, 40.0, 0.0]
+    assert route[["latitude_deg", "longitude_deg"]].iloc[2].tolist() == [*POINTS[1][:2]]
+    assert [word for word in ("return", "above the ground") if any(word in text for text in route.attrs["remarks"])] == [
+        "return", "above the ground"
+    ]  # fmt: skip
+
+
+def test_a_table_with_its_own_yaw(tmp_path: Path) -> None:
+    file = tmp_path / "a.csv"
+    file.write_text(f"lat,lon,height_m,yaw_rad\n35.7,-78.7,30,{math.pi / 2}\n35.71,-78.7,30,-0.1\n")
+    assert read_route(file)["yaw_deg"].tolist() == pytest.approx([90.0, 360 - math.degrees(0.1)])
+
+
+def test_the_track_of_a_log_is_a_route_with_times(tmp_path: Path) -> None:
+    file = tmp_path / "vehicleOut.txt"
+    file.write_bytes(VEHICLE_10)
+    route = read_route(file)
+    assert route["time_s"].tolist() == [0.0, 2.0]  # the second record has no fix
+    assert route["altitude_m"].tolist() == [0.5, 1.5]
+
+
+def test_points_without_height_ask_for_one(tmp_path: Path) -> None:
+    file = tmp_path / "a.kml"
+    file.write_bytes(kml("<LineString><coordinates>-78.7,35.7,0 -78.7,35.8,0</coordinates></LineString>"))
+    with pytest.raises(InputError, match="2 of 2 points have no height"):
+        read_route(file)
+    assert read_route(file, height_m=30.0)["altitude_m"].tolist() == [30.0, 30.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("fence.kml", kml("<Polygon><coordinates>-78.7,35.7,0</coordinates></Polygon>"), "geofence"),
+        ("a.plan", b'{"fileType": "Plan", "mission": 3}', "damaged QGroundControl plan"),
+        ("a.plan", b'{"fileType": "Plan", "mission": {"items": [', "damaged QGroundControl plan"),
+        ("a.plan", plan(), "no point"),
+        ("a.plan", plan({"type": "ComplexItem", "complexItemType": "CorridorScan"}), "CorridorScan without its items"),
+        ("a.waypoints", b"QGC WPL 110\n0 1 0\n", "line 2"),
+        ("a.csv", b"name,place\nx,y\n", "no route"),
+        ("a.csv", b"lon,lat\n35.7,-178.7\n", "point 1 lies at -178.7"),
+        ("a.csv", b"lat,lon,altitude_amsl\n35.7,-78.7,120\n", "above sea level"),
+        ("a.csv", b"lat,lon,alt\n35.7,-78.7,high\n", "row 2"),
+        ("a.bin", b"\x00\x01\x02", "binary"),
+    ],
+)
+def test_what_is_no_route_says_so(name: str, content: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_route(tmp_path / name)
+    assert message in str(caught.value)
+    assert caught.value.path == str(tmp_path / name)

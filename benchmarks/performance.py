@@ -115,7 +115,7 @@ def season(scaling: dict[str, Any]) -> list[str]:
     tasks = SEASON["flights"] * SEASON["settings"]
     hours = one * SEASON["towers"] * tasks / 3600.0
     first, later, *_ = (*measured(scaling, "workers"), None, None)
-    shared = f" Two workers took {later['wall_s'] / first['wall_s']:.2f} of one's wall time." if first and later else ""
+    shared = f" Two workers took {later['wall_s'] / first['wall_s']:.2f} of one's wall time." if later else ""
     return [
         f"- **A season**: {SEASON['flights']} flights x {SEASON['settings']} settings = {number(tasks)} tasks. A task "
         f"of one tower (two channels, 130 s, 260 samples each) costs {one:.2f} s of processor; with {SEASON['towers']} "

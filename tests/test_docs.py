@@ -138,7 +138,7 @@ def test_the_tutorial_shows_what_its_commands_print(
 
 needs_mkdocs = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("mkdocs", "material", "mkdocstrings_handlers")),
-    reason="mkdocs-material is not here: pip install 'aerpaw-cmp[docs]'",
+    reason="mkdocs-material is not here: pip install --group docs",
 )
 
 

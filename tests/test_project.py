@@ -25,12 +25,13 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT = PYPROJECT["project"]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 
 
 def test_every_dependency_has_its_reason() -> None:
-    extras = PROJECT["optional-dependencies"].values()
+    extras = [*PROJECT["optional-dependencies"].values(), *PYPROJECT["dependency-groups"].values()]
     needed = {re.split(r"[^\w.-]", line)[0].lower() for group in [PROJECT["dependencies"], *extras] for line in group}
     rows = [line for line in (ROOT / "docs/dependencies.md").read_text().splitlines() if line.startswith("| ")]
     named = {re.split(r"[^\w.-]", name)[0].lower() for row in rows for name in row.split("|")[1].strip().split(", ")}

@@ -12,7 +12,6 @@ from __future__ import annotations
 import difflib
 import math
 import re
-import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -434,6 +433,6 @@ def _models_at(model: type[pydantic.BaseModel], location: Location) -> list[type
 
 
 def _models_in(annotation: Any) -> list[type[pydantic.BaseModel]]:
-    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
+    if isinstance(annotation, type) and typing.get_origin(annotation) is None:  # on 3.10 list[int] is a type
         return [annotation] if issubclass(annotation, pydantic.BaseModel) else []
     return [model for part in typing.get_args(annotation) for model in _models_in(part)]

@@ -198,13 +198,12 @@ def correlated_noise(
 def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
     """The start in its zone; a wall time that never was, or was twice, or no clock can show, is refused."""
     try:
-        local: pd.Timestamp = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(
-            timezone, ambiguous="NaT", nonexistent="NaT"
-        )
+        local: Any = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(timezone, ambiguous="NaT", nonexistent="NaT")
         if not 1980 <= start.year <= 2200:
             why = "a clock that nothing flew by"
         elif not pd.isna(local):
-            return local
+            start_there: pd.Timestamp = local
+            return start_there
         else:
             why = "the clocks changed then: it never was, or it was twice"
     except (ValueError, OverflowError) as error:

@@ -304,7 +304,7 @@ class Comparison:
         """
         rows = []
         for one in self.result.rss:
-            low, high = one.score.rmse_ci95_db or (np.nan, np.nan)
+            low, high = one.score.rmse_ci95_db
             rows.append(
                 {
                     "tower": one.tower,

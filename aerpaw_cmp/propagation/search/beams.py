@@ -360,7 +360,14 @@ class _Search:
 
 def memory_mib(search: _Search) -> float:
     """Memory that a search holds [MiB]: geometry and trees; sequences are streamed."""
-    held = [search.corners, search.targets, *search.tree, *search.face_tree, *search.target_tree, *search.mirrors]
+    held: list[object] = [
+        search.corners,
+        search.targets,
+        *search.tree,
+        *search.face_tree,
+        *search.target_tree,
+        *search.mirrors,
+    ]
     return float(sum(a.nbytes for a in held if isinstance(a, np.ndarray)) / 2**20)
 
 

@@ -52,7 +52,7 @@ FULLEST_TABLE = 1 / 32
 MOST_SLOTS = 2**28
 """Slots of the table, over all towers of a call (two tables of 4 bytes each)."""
 
-RAISE_LIMITS = True
+RAISE_LIMITS: bool = True
 LAST_CANDIDATES = 0
 """What the last batch had, for benchmarks."""
 
@@ -303,7 +303,8 @@ class _Finder:
             scene.add(rt.Transmitter(name=f"tx{i}", position=[0.0, 0.0, 1.0]))
         for i in range(batch):
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
-        self.limit, self.slots, self.candidates = MAXIMUM_PATHS, _slots(built, batch * len(elements_m)), None
+        self.limit, self.slots = MAXIMUM_PATHS, _slots(built, batch * len(elements_m))
+        self.candidates: Any = None  # PathSolver fills it
         if not synthetic:  # each element of a tower is a source, with a table of its own
             self.slots //= 2 ** int(np.ceil(np.log2(len(sources.elements_m))))
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = self.slots

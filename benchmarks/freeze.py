@@ -26,9 +26,9 @@ from shapely.geometry import box
 import aerpaw_cmp
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.compare.rank import channel_rank
+from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation import compiled
 from aerpaw_cmp.propagation.arrays import Poses, single_element
-from aerpaw_cmp.propagation.check.bench import random_scene
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Building
 

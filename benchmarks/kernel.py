@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.compare.rank import channel_rank
+from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation import compiled
-from aerpaw_cmp.propagation.check.bench import random_scene
 from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.options import Run
 from aerpaw_cmp.propagation.replay import Replay, replay
@@ -162,7 +162,7 @@ def cold(sizes: tuple[int, ...] = (1000, 3000, 5000, 10_000)) -> list[dict[str, 
         row: dict[str, float] = {"poses": size, "pairs_of_links": size * TOWERS * 16}
         for mode in ("never", "always"):
             line = (
-                "import time\nfrom aerpaw_cmp.propagation.check.bench import random_scene\n"
+                "import time\nfrom aerpaw_cmp.jobs.bench import random_scene\n"
                 "from aerpaw_cmp.propagation.options import Run\nfrom aerpaw_cmp.propagation.replay import replay\n"
                 f"case = random_scene({size}, towers={TOWERS})\nreplay(*case, run=Run(threads=1))\n"
                 "print(time.process_time())"

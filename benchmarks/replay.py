@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.jobs.bench import path_search, random_scene, speed_against_error
 from aerpaw_cmp.propagation.arrays import Link, Poses
-from aerpaw_cmp.propagation.check.bench import path_search, random_scene, speed_against_error
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 

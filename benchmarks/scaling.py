@@ -69,7 +69,7 @@ def warm_timed(action: Callable[[], Any]) -> dict[str, float]:
 
 def replay_of(poses: int, towers: int = 1, buildings: int = 12) -> dict[str, float]:
     """Paths and fields of a random scene."""
-    from aerpaw_cmp.propagation.check.bench import random_scene
+    from aerpaw_cmp.jobs.bench import random_scene
     from aerpaw_cmp.propagation.replay import replay
 
     site, link, some = random_scene(poses, towers=towers, buildings=buildings)
@@ -83,8 +83,8 @@ def faces(count: int) -> dict[str, float]:
     from shapely import affinity
     from shapely.geometry import box
 
+    from aerpaw_cmp.jobs.bench import random_scene
     from aerpaw_cmp.propagation.arrays import Poses
-    from aerpaw_cmp.propagation.check.bench import random_scene
     from aerpaw_cmp.propagation.replay import replay
     from aerpaw_cmp.site.site import Building
 

@@ -34,11 +34,11 @@ def path_search_ratios(
     Returns
     -------
     dict
-        ``at`` maps samples to the numbers of :func:`~aerpaw_cmp.propagation.check.bench.path_search`; ``equal_error``
+        ``at`` maps samples to the numbers of :func:`~aerpaw_cmp.jobs.bench.path_search`; ``equal_error``
         is the entry of the fewest samples with which PathSolver finds as many of the paths as with the most: more
         samples than that buy it nothing, so a ratio to more of them flatters us.
     """
-    from ..propagation.check.bench import path_search
+    from .bench import path_search
 
     most = path_search(poses, samples[-1])
     at = {samples[-1]: most}

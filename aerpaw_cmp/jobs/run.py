@@ -438,7 +438,7 @@ def run_bench(
     dict
         ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
     """
-    from ..propagation.check.bench import random_scene, speed_against_error
+    from .bench import random_scene, speed_against_error
 
     site, link, some = random_scene(poses)
     names = list(link.tower_arrays)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from aerpaw_cmp.jobs import peer_ratios
-from aerpaw_cmp.propagation.check import bench
+from aerpaw_cmp.jobs import bench, peer_ratios
 
 
 def test_equal_error_is_the_fewest_samples_that_find_as_many_paths(monkeypatch):

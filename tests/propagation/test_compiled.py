@@ -21,10 +21,10 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
+from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation import compiled, engines
 from aerpaw_cmp.propagation import replay as replay_module
 from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
-from aerpaw_cmp.propagation.check.bench import random_scene
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.field import sum as field_sum
 from aerpaw_cmp.propagation.options import Run

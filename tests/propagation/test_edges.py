@@ -15,8 +15,8 @@ from shapely.geometry import LineString, box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
-from aerpaw_cmp.propagation.check.bench import random_scene
 from aerpaw_cmp.propagation.edges import Edges
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.options import Search

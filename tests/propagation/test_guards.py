@@ -7,14 +7,14 @@ import pytest
 
 from aerpaw_cmp.common.errors import CheckError
 from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.jobs import bench
+from aerpaw_cmp.jobs.bench import random_scene, speed_against_error
 from aerpaw_cmp.propagation.arrays import (
     rotation_from_aircraft,
     rotation_from_yaw_pitch_roll,
     tower_comparison_array,
     uav_comparison_array,
 )
-from aerpaw_cmp.propagation.check import bench
-from aerpaw_cmp.propagation.check.bench import random_scene, speed_against_error
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search import sionna

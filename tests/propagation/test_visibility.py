@@ -6,8 +6,8 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation.arrays import Array, linear_array, tower_comparison_array, uav_comparison_array
-from aerpaw_cmp.propagation.check.bench import random_scene
 from aerpaw_cmp.propagation.check.field_audit import per_pair
 from aerpaw_cmp.propagation.drivers.pairs import replay_pairs
 from aerpaw_cmp.propagation.options import Search

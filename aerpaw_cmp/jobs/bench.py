@@ -14,16 +14,16 @@ import numpy as np
 from shapely import affinity
 from shapely.geometry import Point, box
 
-from ...common.geodesy import SiteFrame
-from ...common.stages import Progress, silent
-from ...common.units import ComplexArray, FloatArray, wavelength_m
-from ...site.site import Building, Site, Tower
-from ..arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
-from ..field.sum import mean_pair_power, rss_dbm
-from ..options import Run, Search
-from ..replay import Replay, replay
-from ..scene import Scene
-from .audit import RANK_K, Difference, compare
+from ..common.geodesy import SiteFrame
+from ..common.stages import Progress, silent
+from ..common.units import ComplexArray, FloatArray, wavelength_m
+from ..propagation.arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
+from ..propagation.check.audit import RANK_K, Difference, compare
+from ..propagation.field.sum import mean_pair_power, rss_dbm
+from ..propagation.options import Run, Search
+from ..propagation.replay import Replay, replay
+from ..propagation.scene import Scene
+from ..site.site import Building, Site, Tower
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +211,7 @@ class _Runner:
         return replay(self.site, self.link, _take(self.poses, chosen), search, run=Run(cache_dir=""))
 
     def own_arrays(self, samples: int, explicit: bool, most: int) -> Row:
-        from ..search.sionna import own_channels
+        from ..propagation.search.sionna import own_channels
 
         name = "explicit" if explicit else "synthetic"
         self.progress(f"sionna, {samples} samples, its own {name} arrays")
@@ -248,7 +248,7 @@ class _Runner:
         )
 
     def _difference(self, h: ComplexArray, level: FloatArray, chosen: Any) -> Difference:
-        from ...compare.rank import channel_rank
+        from ..compare.rank import channel_rank
 
         expected = self.reference.rss_dbm[chosen]
         both = np.isfinite(level) & np.isfinite(expected)
@@ -357,7 +357,7 @@ def path_search(
         ``seconds_image``, ``seconds_sionna``, ``ratio``, ``paths_image``, ``paths_sionna``, ``missing_paths``,
         ``extra_paths`` and ``rss_max_error_db`` (image against Sionna), and the conditions.
     """
-    from ..search import mirror, sionna
+    from ..propagation.search import mirror, sionna
 
     site, link, some = random_scene(poses, buildings=buildings)
     scene = Scene.of(site, link, some)

@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 HISTORY = ROOT / "benchmarks" / "history.jsonl"
 PEERS = """
 import json
-from aerpaw_cmp.jobs import peer_ratios as p
+from aerpaw_cmp.jobs import bench as p
 search = p.path_search_ratios(samples=(1_000, 10_000, 100_000))
 found = {
     "path search, image engine / PathSolver at equal error": search["equal_error"]["ratio"],

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.jobs import run
+from aerpaw_cmp.jobs import bench
 from aerpaw_cmp.machine import llvm
 
 ROOT = Path(__file__).parents[1]
@@ -136,13 +136,13 @@ def test_a_file_in_the_way_of_the_folder(
 @pytest.mark.sionna
 def test_bench_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Of the two numbers of samples that ``--quick`` asks for, one is run: the rows are of the same kinds."""
-    real = run.run_bench
+    real = bench.run_bench
 
     def one_of_them(*, samples: tuple[int, ...], **asked: Any) -> dict[str, Any]:
         assert samples == (1_000, 10_000)
         return real(samples=samples[1:], **asked)
 
-    monkeypatch.setattr(run, "run_bench", one_of_them)
+    monkeypatch.setattr(bench, "run_bench", one_of_them)
     result = json.loads(out_of(capsys, "bench", "--quick", "--poses", "6", "--json"))
     wanted = {"engine", "samples", "arrays", "depth", "seconds", "links_per_s", "peak_mib", "missing_paths"}
     wanted |= {"extra_paths", "rss_max_error_db", "rss_rms_error_db", "rank_disagreement"}

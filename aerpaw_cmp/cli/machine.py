@@ -24,12 +24,12 @@ def bench(
     as_json: Json = False,
 ) -> None:
     """Speed against error on this machine."""
-    from ..jobs import run
+    from ..jobs import bench as job
 
     if quick:
-        result = run.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), ratios=False, progress=say)
+        result = job.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), ratios=False, progress=say)
     else:
-        result = run.run_bench(poses=poses, progress=say)
+        result = job.run_bench(poses=poses, progress=say)
     if as_json:
         print_json(result)
         return

@@ -1,14 +1,16 @@
-"""Speed against error of the engines on this machine, for ``aerpaw-cmp bench`` and the report."""
+"""Speed against error of the engines, and the tool beside its peers, for ``aerpaw-cmp bench``."""
 
 from __future__ import annotations
 
-import threading
+import contextlib
+import io
+import os
+import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from shapely import affinity
@@ -16,7 +18,8 @@ from shapely.geometry import Point, box
 
 from ..common.geodesy import SiteFrame
 from ..common.stages import Progress, silent
-from ..common.units import ComplexArray, FloatArray, wavelength_m
+from ..common.units import ComplexArray, FloatArray, IntArray, wavelength_m
+from ..compare.rank import channel_rank
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from ..propagation.check.audit import RANK_K, Difference, compare
 from ..propagation.field.sum import mean_pair_power, rss_dbm
@@ -24,6 +27,79 @@ from ..propagation.options import Run, Search
 from ..propagation.replay import Replay, replay
 from ..propagation.scene import Scene
 from ..site.site import Building, Site, Tower
+
+DEPTH = 2
+"""Reflections of the reference and of the Sionna rows."""
+
+BATCH = 50
+"""Poses per PathSolver call."""
+
+EXPLICIT_BATCH = 10
+"""The same with explicit arrays, which multiply sources and targets."""
+
+LINES = 20_523
+"""Lines of a real channel-sounder flight."""
+
+T = TypeVar("T")
+
+
+def run_bench(
+    *,
+    poses: int = 200,
+    samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000),
+    ratios: bool = True,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Speed against error of the replay, and how many times faster than its peers each part is, from one run.
+
+    Parameters
+    ----------
+    poses : int
+        Of the flight that is replayed.
+    samples : tuple of int
+        Rays per tower of the sionna engine.
+    ratios : bool
+        Compare with the peers, too.
+    progress : Progress
+
+    Returns
+    -------
+    dict
+        ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
+    """
+    site, link, some = random_scene(poses)
+    rows = speed_against_error(site, link, some, samples=samples, progress=progress)
+    measured = _against_peers(progress) if ratios else {}
+    about = {"poses": poses, "towers": list(link.tower_arrays), "buildings": len(site.buildings)}
+    return {
+        "conditions": {**about, "cpus": os.cpu_count()},
+        "replay": {"rows": [row.as_dict() for row in rows]},
+        "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None},
+        "details": measured,
+    }
+
+
+def _against_peers(progress: Progress) -> dict[str, Any]:
+    """Ratios to each peer; at equal error and with the same work on both sides first."""
+    progress("path search against PathSolver, at equal error and at 1e6 samples")
+    searches = path_search_ratios()
+    progress("Kriging against PyKrige")
+    shared = kriging_shared_weights()
+    measured: dict[str, Any] = {
+        "path_search_image_vs_sionna_equal_error": searches["equal_error"],
+        "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
+        "kriging_vs_pykrige_c_one_field": shared and {**shared, "ratio": shared["ratio_one_field"]},
+        "kriging_vs_pykrige_c_27_fields": shared,
+        "kriging_vs_pykrige": kriging_vs_pykrige(),
+    }
+    progress("ingest against pandas")
+    measured["ingest_vs_pandas"] = ingest_vs_pandas()
+    for millions in (1, 5):
+        measured[f"ingest_vs_pandas_{millions}m"] = ingest_vs_pandas(millions * 1_000_000, 1)
+    return measured
+
+
+# --- speed against error --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +120,11 @@ class Row:
     thinning : int
         Every n-th pose is replayed; RSS is interpolated, rank taken from the nearest.
     seconds : float
-        Warm: kernels were compiled and one batch run before.
+        Wall time, warm: kernels were compiled and one batch run before.
     links_per_s : float
         Pose-tower pairs answered per second.
     peak_mib : float
-        Largest resident memory of the whole process during the run.
+        Largest resident memory of the whole process during the run; 0 where the system does not say it.
     missing_paths, extra_paths : int or None
     rss_max_error_db, rss_rms_error_db : float
         Over links that both cover; NaN when there is none.
@@ -89,14 +165,10 @@ def speed_against_error(
     poses: Poses,
     *,
     samples: Sequence[int] = (1_000, 10_000, 100_000, 1_000_000),
-    arrays: Sequence[str] = ("synthetic", "explicit", "float64"),
-    explicit_poses: int = 50,
-    depth: int = 2,
     depths: Sequence[int] = (0, 1, 2, 3),
     thinning: Sequence[int] = (2, 5),
-    batch: int = 50,
-    ks: Sequence[float] = RANK_K,
-    progress: Progress | None = None,
+    explicit_poses: int = 50,
+    progress: Progress = silent,
 ) -> list[Row]:
     """Rows of speed against error.
 
@@ -106,18 +178,11 @@ def speed_against_error(
         What to replay. Rows of Sionna's own arrays need isotropic elements.
     samples : sequence of int
         Rays of the Sionna rows; empty for none.
-    arrays : sequence of {"synthetic", "explicit", "float64"}
-        Which Sionna rows.
+    depths, thinning : sequence of int
+        Rows of the image engine.
     explicit_poses : int
         Explicit arrays multiply the work by the element pairs: their rows take this many poses, evenly spread.
-    depth : int
-        Of the reference and the Sionna rows.
-    depths, thinning : sequence of int
-        Further rows of the image engine.
-    batch : int
-        Poses per PathSolver call.
-    ks : sequence of float
-    progress : callable, optional
+    progress : callable
         Told what runs.
 
     Returns
@@ -125,168 +190,124 @@ def speed_against_error(
     list of Row
         Image engine first: once Sionna is loaded the process stays larger.
     """
-    run = _Runner(
-        site=site, link=link, poses=poses, depth=depth, ks=tuple(ks), batch=batch, progress=progress or silent
-    )
-    rows = [run.image(d) for d in depths]
-    rows += [run.thinned(n) for n in thinning]
+    case = _Case(site, link, poses, replay(site, link, poses, Search(max_depth=DEPTH)))
+    every = np.arange(len(poses))
+    rows = []
+    for depth in depths:
+        progress(f"image engine, depth {depth}")
+        rows.append(case.replayed(Search(max_depth=depth)))
+    for step in thinning:
+        progress(f"image engine, one of {step} positions")
+        rows.append(case.thinned(step))
     for count in samples:
-        for kind in arrays:
-            if kind == "float64":
-                rows.append(run.sionna(count))
-            else:
-                rows.append(run.own_arrays(count, kind == "explicit", explicit_poses))
+        for kind in ("synthetic", "explicit"):
+            progress(f"sionna, {count} samples, its own {kind} arrays")
+            share = len(every) if kind == "synthetic" else min(explicit_poses, len(every))
+            chosen = np.unique(np.linspace(0, len(every) - 1, share).round().astype(np.int64))
+            rows.append(case.own_arrays(count, kind, chosen))
+        progress(f"sionna, {count} samples")
+        rows.append(case.replayed(Search("sionna", max_depth=DEPTH, samples=count, batch=BATCH)))
     return rows
 
 
-class _Runner:
-    """Runs rows against one reference."""
+@dataclass(frozen=True)
+class _Case:
+    """What every row replays, and the reference."""
 
-    def __init__(
-        self, site: Site, link: Link, poses: Poses, depth: int, ks: tuple[float, ...], batch: int, progress: Progress
-    ) -> None:
-        self.site, self.link, self.poses, self.depth = site, link, poses, depth
-        self.ks, self.batch, self.progress = ks, batch, progress
-        self.all = np.arange(len(poses))
-        self.reference = replay(site, link, poses, Search(max_depth=depth))
+    site: Site
+    link: Link
+    poses: Poses
+    reference: Replay
 
-    def image(self, depth: int) -> Row:
-        self.progress(f"image engine, depth {depth}")
-        with _Memory() as memory:
-            result = replay(self.site, self.link, self.poses, Search(max_depth=depth))
-        difference = compare(result, self.reference, self.all, self.ks)
-        return self._row(
-            engine="image",
-            samples=None,
-            arrays="float64",
-            depth=depth,
-            thinning=1,
-            seconds=result.seconds,
-            peak_mib=memory.peak_mib,
-            difference=difference,
-            poses=len(self.poses),
-        )
+    def replayed(self, search: Search) -> Row:
+        """The replay of all poses by an engine."""
+        sionna = search.engine == "sionna"
+        if sionna:
+            replay(self.site, self.link, _take(self.poses, slice(BATCH)), search, run=Run(cache_dir=""))
+        result, spent = _measured(lambda: replay(self.site, self.link, self.poses, search, run=Run(cache_dir="")))
+        difference = compare(result, self.reference, np.arange(len(self.poses)), RANK_K)
+        found = {"missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths}
+        about: dict[str, Any] = {
+            "engine": search.engine,
+            "samples": search.samples if sionna else None,
+            "depth": search.max_depth,
+        }
+        return self._row(difference, spent, **about, **found)
 
     def thinned(self, step: int) -> Row:
-        self.progress(f"image engine, one of {step} positions")
-        chosen = self.all[::step]
-        with _Memory() as memory:
-            result = replay(self.site, self.link, _take(self.poses, chosen), Search(max_depth=self.depth))
-        nearest = np.minimum((self.all + step // 2) // step, len(chosen) - 1)
-        level = np.stack([_between(self.all, chosen, column, nearest) for column in result.rss_dbm.T], axis=1)
-        left_out = np.flatnonzero(self.all % step)  # poses that were replayed have no error, and say nothing
-        difference = self._difference(result.h[nearest[left_out]], level[left_out], self.all[left_out])
-        return self._row(
-            engine="image",
-            samples=None,
-            arrays="float64",
-            depth=self.depth,
-            thinning=step,
-            seconds=result.seconds,
-            peak_mib=memory.peak_mib,
-            difference=difference,
-            poses=len(self.poses),
+        """The replay of every n-th pose; the others are interpolated."""
+        every = np.arange(len(self.poses))
+        chosen = every[::step]
+        result, spent = _measured(
+            lambda: replay(self.site, self.link, _take(self.poses, chosen), Search(max_depth=DEPTH))
         )
+        nearest = np.minimum((every + step // 2) // step, len(chosen) - 1)
+        level = np.stack([_between(every, chosen, column, nearest) for column in result.rss_dbm.T], axis=1)
+        left_out = np.flatnonzero(every % step)  # poses that were replayed have no error, and say nothing
+        difference = self._difference(result.h[nearest[left_out]], level[left_out], left_out)
+        return self._row(difference, spent, thinning=step)
 
-    def sionna(self, samples: int) -> Row:
-        self.progress(f"sionna, {samples} samples")
-        self._replay_sionna(samples, self.all[: self.batch])  # compiles the kernels
-        with _Memory() as memory:
-            result = self._replay_sionna(samples, self.all)
-        difference = compare(result, self.reference, self.all, self.ks)
-        return self._row(
-            engine="sionna",
-            samples=samples,
-            arrays="float64",
-            depth=self.depth,
-            thinning=1,
-            seconds=result.seconds,
-            peak_mib=memory.peak_mib,
-            difference=difference,
-            poses=len(self.poses),
-        )
-
-    def _replay_sionna(self, samples: int, chosen: Any) -> Replay:
-        search = Search("sionna", max_depth=self.depth, samples=samples, batch=self.batch)
-        return replay(self.site, self.link, _take(self.poses, chosen), search, run=Run(cache_dir=""))
-
-    def own_arrays(self, samples: int, explicit: bool, most: int) -> Row:
+    def own_arrays(self, samples: int, kind: str, chosen: IntArray) -> Row:
+        """Channels as Sionna evaluates them."""
         from ..propagation.search.sionna import own_channels
 
-        name = "explicit" if explicit else "synthetic"
-        self.progress(f"sionna, {samples} samples, its own {name} arrays")
-        chosen = self.all
-        if explicit and most < len(chosen):
-            chosen = np.unique(np.linspace(0, len(chosen) - 1, most).round().astype(np.int64))
-        # explicit arrays multiply sources and targets: smaller batches bound the memory
-        batch = min(self.batch, 10) if explicit else self.batch
+        explicit = kind == "explicit"
+        batch = EXPLICIT_BATCH if explicit else BATCH
         poses = _take(self.poses, chosen)
         scene = Scene.of(self.site, self.link, poses)
 
         def channels(some: Poses) -> ComplexArray:
             return own_channels(
                 scene.faces, scene.sources_m, some, self.link,
-                explicit=explicit, max_depth=self.depth, samples=samples, batch=batch, usable=scene.usable,
+                explicit=explicit, max_depth=DEPTH, samples=samples, batch=batch, usable=scene.usable,
             )  # fmt: skip
 
-        channels(_take(poses, np.arange(min(batch, len(poses)))))
-        with _Memory() as memory:
-            started = time.perf_counter()
-            h = channels(poses)
-            seconds = time.perf_counter() - started
+        channels(_take(poses, slice(batch)))
+        h, spent = _measured(lambda: channels(poses))
         difference = self._difference(h, rss_dbm(mean_pair_power(h), self.link.transmit_power_dbm), chosen)
-        return self._row(
-            engine="sionna",
-            samples=samples,
-            arrays=name,
-            depth=self.depth,
-            thinning=1,
-            seconds=seconds,
-            peak_mib=memory.peak_mib,
-            difference=difference,
-            poses=len(chosen),
-        )
+        return self._row(difference, spent, poses=len(chosen), engine="sionna", samples=samples, arrays=kind)
 
-    def _difference(self, h: ComplexArray, level: FloatArray, chosen: Any) -> Difference:
-        from ..compare.rank import channel_rank
-
+    def _difference(self, h: ComplexArray, level: FloatArray, chosen: IntArray) -> Difference:
+        """Levels and ranks of some poses against the reference; paths are not compared."""
         expected = self.reference.rss_dbm[chosen]
         both = np.isfinite(level) & np.isfinite(expected)
         error = np.abs(level[both] - expected[both])
+        parted = {k: channel_rank(h, k) != channel_rank(self.reference.h[chosen], k) for k in RANK_K}
         return Difference(
             missing_paths=-1,
             extra_paths=-1,
             reference_paths=0,
-            rss_max_error_db=float(error.max()) if error.size else float("nan"),
+            rss_max_error_db=float(error.max(initial=0.0)) if error.size else float("nan"),
             rss_rms_error_db=float(np.sqrt((error**2).mean())) if error.size else float("nan"),
             coverage_differs=int((np.isfinite(level) != np.isfinite(expected)).sum()),
-            rank_disagreement={
-                float(k): float(np.mean(channel_rank(h, k) != channel_rank(self.reference.h[chosen], k)))
-                for k in self.ks
-            },
+            rank_disagreement={float(k): float(np.mean(differs)) for k, differs in parted.items()},
         )
 
-    def _row(
-        self, engine: str, samples: int | None, arrays: str, depth: int, thinning: int, seconds: float, peak_mib: float,
-        difference: Difference, poses: int,
-    ) -> Row:  # fmt: skip
-        listed = difference.missing_paths >= 0
+    def _row(self, difference: Difference, spent: Mapping[str, Any], poses: int | None = None, **about: Any) -> Row:
+        plain: dict[str, Any] = {"engine": "image", "samples": None, "arrays": "float64", "depth": DEPTH, "thinning": 1}
+        names = ("rss_max_error_db", "rss_rms_error_db", "coverage_differs", "rank_disagreement")
+        links = (len(self.poses) if poses is None else poses) * len(self.link.tower_arrays)
         return Row(
-            engine=engine,
-            samples=samples,
-            arrays=arrays,
-            depth=depth,
-            thinning=thinning,
-            seconds=seconds,
-            links_per_s=poses * len(self.link.tower_arrays) / max(seconds, 1e-9),
-            peak_mib=peak_mib,
-            missing_paths=difference.missing_paths if listed else None,
-            extra_paths=difference.extra_paths if listed else None,
-            rss_max_error_db=difference.rss_max_error_db,
-            rss_rms_error_db=difference.rss_rms_error_db,
-            coverage_differs=difference.coverage_differs,
-            rank_disagreement=difference.rank_disagreement,
+            **{**plain, "missing_paths": None, "extra_paths": None, **about},
+            **{name: getattr(difference, name) for name in names},
+            **spent,
+            links_per_s=links / max(spent["seconds"], 1e-9),
         )
+
+
+def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:
+    """The result, its wall seconds and the peak of resident memory [MiB] meanwhile."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")  # proc(5): the high-water mark VmHWM begins anew
+    started = time.perf_counter()
+    result = action()
+    seconds = time.perf_counter() - started
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        lines = []
+    peak = next((int(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM")), 0.0)
+    return result, {"seconds": seconds, "peak_mib": peak}
 
 
 def _take(poses: Poses, chosen: Any) -> Poses:
@@ -302,50 +323,17 @@ def _between(at: Any, known: Any, values: FloatArray, nearest: Any) -> FloatArra
     return np.asarray(np.where(good[nearest], line, np.nan))
 
 
-class _Memory:
-    """Largest resident memory of this process while the block runs, sampled every 5 ms (0 where /proc is missing)."""
-
-    def __init__(self) -> None:
-        self.peak_mib = 0.0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
-
-    def __enter__(self) -> _Memory:
-        self._look()
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join()
-        self._look()
-
-    def _watch(self) -> None:
-        while not self._stop.wait(0.005):
-            self._look()
-
-    def _look(self) -> None:
-        try:
-            text = Path("/proc/self/status").read_text()
-        except OSError:
-            return
-        for line in text.splitlines():
-            if line.startswith("VmRSS:"):
-                self.peak_mib = max(self.peak_mib, int(line.split()[1]) / 1024.0)
+# --- beside the peers -----------------------------------------------------------------------------------------------
 
 
-def path_search(
-    poses: int = 1000, samples: int = 1_000_000, *, batch: int = 50, buildings: int = 12, repeats: int = 5
-) -> dict[str, Any]:
+def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5) -> dict[str, Any]:
     """Path search of the image engine against Sionna's PathSolver, both warm, in this one run.
 
     Parameters
     ----------
-    poses, buildings : int
-        Size of :func:`random_scene`.
-    samples, batch : int
+    poses : int
+        Of :func:`random_scene`.
+    samples : int
         Of PathSolver.
     repeats : int
         Runs of the image engine before, and as many after Sionna's; the median counts. The load of the machine may
@@ -359,28 +347,22 @@ def path_search(
     """
     from ..propagation.search import mirror, sionna
 
-    site, link, some = random_scene(poses, buildings=buildings)
+    site, link, some = random_scene(poses)
     scene = Scene.of(site, link, some)
+    rays, alone = Search("sionna", samples=samples, batch=BATCH), Run(cache_dir="")
 
     def search() -> float:
         started = time.perf_counter()
         mirror.find_paths(
-            scene.faces,
-            scene.sources_m,
-            some.position_m,
-            max_depth=2,
-            usable=scene.usable,
-            excluded=scene.excluded,
-        )
+            scene.faces, scene.sources_m, some.position_m,
+            max_depth=DEPTH, usable=scene.usable, excluded=scene.excluded,
+        )  # fmt: skip
         return time.perf_counter() - started
 
     search()
     times = [search() for _ in range(repeats)]
-    # compiles the kernels
-    replay(
-        site, link, _take(some, np.arange(batch)), Search("sionna", samples=samples, batch=batch), run=Run(cache_dir="")
-    )
-    theirs = replay(site, link, some, Search("sionna", samples=samples, batch=batch), run=Run(cache_dir=""))
+    replay(site, link, _take(some, slice(BATCH)), rays, run=alone)  # compiles the kernels
+    theirs = replay(site, link, some, rays, run=alone)
     times += [search() for _ in range(repeats)]
     difference = compare(replay(site, link, some), theirs, np.arange(poses))
     seconds = float(np.median(times))
@@ -395,10 +377,150 @@ def path_search(
         "rss_max_error_db": difference.rss_max_error_db,
         "poses": poses,
         "samples": samples,
-        "batch": batch,
+        "batch": BATCH,
         "faces": len(scene.faces),
-        "depth": 2,
+        "depth": DEPTH,
         "versions": sionna.engine_versions(),
+    }
+
+
+def median_seconds(action: Callable[[], Any], repeats: int = 5) -> float:
+    """Median processor time after a warm-up (none for a single run): other work on the machine does not count."""
+    if repeats > 1:
+        action()
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        action()
+        times.append(time.process_time() - start)
+    return statistics.median(times)
+
+
+def path_search_ratios(
+    poses: int = 1000, samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000)
+) -> dict[str, Any]:
+    """Path search of the image engine against PathSolver with ``samples`` (increasing), and at equal error.
+
+    Returns
+    -------
+    dict
+        ``at`` maps samples to the numbers of :func:`path_search`; ``equal_error``
+        is the entry of the fewest samples with which PathSolver finds as many of the paths as with the most: more
+        samples than that buy it nothing, so a ratio to more of them flatters us.
+    """
+    most = path_search(poses, samples[-1])
+    at = {samples[-1]: most}
+    for count in samples[:-1]:
+        at[count] = path_search(poses, count, repeats=3)
+        if at[count]["extra_paths"] <= most["extra_paths"]:
+            break
+    enough = min(n for n, measured in at.items() if measured["extra_paths"] <= most["extra_paths"])
+    return {"at": {f"{n:.0e}": measured for n, measured in sorted(at.items())}, "equal_error": at[enough]}
+
+
+def kriging_shared_weights(fields: int = 27, neighbours: int = 20) -> dict[str, Any] | None:
+    """Prediction at 2556 targets with one set of weights for all fields on our side and PyKrige's compiled back end.
+
+    Both have the same neighbours and the same exponential variogram. PyKrige has no several fields: one run is timed,
+    which for ``ratio`` counts as many times as there are fields; ``ratio_one_field`` gives us one field, too.
+    """
+    try:
+        from pykrige.ok import OrdinaryKriging as Peer
+    except ImportError:
+        return None
+    from ..maps.grid import Grid
+    from ..maps.kriging import OrdinaryKriging
+
+    generator = np.random.default_rng(2)
+    grid = Grid.over_area((-540.0, 540.0, -1065.0, 1065.0))
+    points = grid.points_m + generator.uniform(-5, 5, (len(grid), 2))
+    targets = points + generator.uniform(5, 10, points.shape)
+    values = generator.integers(1, 5, (len(grid), fields)).astype(np.float64)
+
+    def correlation(distance: Any) -> Any:
+        return 0.9 * np.exp(-3.0 * distance / 900.0)
+
+    def ours(count: int) -> float:
+        model = OrdinaryKriging(correlation, neighbours=neighbours, radius_m=np.inf).fit(points, values[:, :count])
+        return median_seconds(lambda: model.predict(targets), 3)
+
+    def peer() -> Any:
+        model = Peer(*points.T, values[:, 0], "exponential", {"psill": 0.9, "range": 900.0, "nugget": 0.1})
+        return model.execute("points", *targets.T, backend="C", n_closest_points=neighbours)
+
+    theirs, one, every = median_seconds(peer, 3), ours(1), ours(fields)
+    return {
+        "ratio": fields * theirs / every,
+        "ratio_one_field": theirs / one,
+        "seconds_pykrige_one_field": theirs,
+        "seconds_ours_one_field": one,
+        "seconds_ours_all_fields": every,
+        "fields": fields,
+    }
+
+
+def ingest_vs_pandas(lines: int = LINES, repeats: int = 5) -> dict[str, Any]:
+    """Reading a synthetic power log, against ``pandas.read_csv(engine="c")`` on the same bytes.
+
+    Ours gives UTC times, levels, flags and the account of every line; pandas columns of text and numbers.
+    """
+    import pandas as pd
+
+    from ..logs.readers import ReadOptions, by_name
+    from ..logs.writers import format_power_log
+
+    zone = "America/New_York"
+    generator = np.random.default_rng(1)
+    times = np.datetime64("2025-03-02T15:00:00", "ns") + np.arange(lines) * np.timedelta64(32_760_000, "ns")
+    data = format_power_log(times, generator.normal(-40, 12, lines), zone)
+    reader, options = by_name("sounder_log"), ReadOptions(timezone=zone)
+    ours = median_seconds(lambda: reader.read(data, options), repeats)
+    theirs = median_seconds(lambda: pd.read_csv(io.BytesIO(data), engine="c", header=None, sep=r"\s+"), repeats)
+    return {"ratio": theirs / ours, "seconds_ours": ours, "seconds_pandas": theirs, "lines": lines}
+
+
+def kriging_vs_pykrige(pairs: int = 150) -> dict[str, Any] | None:
+    """Leave-one-out of 2556 positions x 27 fields with 20 neighbours, against PyKrige with the same neighbours.
+
+    PyKrige runs ``pairs`` of the 69 012 systems and its time is scaled per system (the whole takes most of an hour).
+    """
+    try:
+        from pykrige.ok import OrdinaryKriging as Peer
+    except ImportError:
+        return None
+    from ..maps.grid import Grid
+    from ..maps.kriging import OrdinaryKriging
+    from ..maps.variogram import PAPER_BIEXPONENTIAL
+
+    generator = np.random.default_rng(1)
+    grid = Grid.over_area((-540.0, 540.0, -1065.0, 1065.0))
+    points = grid.points_m + generator.uniform(-1, 1, (len(grid), 2))  # untied: both sides choose alike
+    values = generator.integers(1, 5, (len(grid), 27)).astype(np.float64)
+    model = OrdinaryKriging(PAPER_BIEXPONENTIAL, neighbours=20, radius_m=150.0).fit(points, values)
+    ours = median_seconds(model.leave_one_out, 3)
+    estimate, _ = model.leave_one_out()
+    chosen = generator.choice(len(points), pairs, replace=False)
+    worst, start = 0.0, time.process_time()
+    for target in chosen:
+        field = int(target) % 27
+        distance = np.hypot(*(points - points[target]).T)
+        near = np.argsort(distance)[1:21]
+        peer = Peer(
+            *points[near].T,
+            values[near, field],
+            variogram_model="custom",
+            variogram_parameters=[0.0],
+            variogram_function=lambda _p, d: 1.0 - PAPER_BIEXPONENTIAL(d),
+        )
+        theirs_value = float(peer.execute("points", *points[target][:, None])[0][0])
+        worst = max(worst, abs(theirs_value - float(estimate[target, field])))
+    theirs = (time.process_time() - start) * values.size / pairs
+    return {
+        "ratio": theirs / ours,
+        "seconds_ours": ours,
+        "seconds_pykrige_scaled": theirs,
+        "pairs_run": pairs,
+        "largest_difference": worst,
     }
 
 

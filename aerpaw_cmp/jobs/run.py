@@ -414,65 +414,6 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
     return tuple(failed)
 
 
-def run_bench(
-    *,
-    poses: int = 200,
-    samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000),
-    ratios: bool = True,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Speed against error of the replay, and how many times faster than its peers each part is, from one run.
-
-    Parameters
-    ----------
-    poses : int
-        Of the flight that is replayed.
-    samples : tuple of int
-        Rays per tower of the sionna engine.
-    ratios : bool
-        Compare with the peers, too.
-    progress : Progress
-
-    Returns
-    -------
-    dict
-        ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
-    """
-    from .bench import random_scene, speed_against_error
-
-    site, link, some = random_scene(poses)
-    names = list(link.tower_arrays)
-    rows = speed_against_error(site, link, some, samples=samples, progress=progress)
-    measured = _against_peers(progress) if ratios else {}
-    return {
-        "conditions": {"poses": poses, "towers": names, "buildings": len(site.buildings), "cpus": os.cpu_count()},
-        "replay": {"rows": [row.as_dict() for row in rows]},
-        "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None and "ratio" in value},
-        "details": measured,
-    }
-
-
-def _against_peers(progress: Progress) -> dict[str, Any]:
-    """How many times faster than each peer; at equal error and with the same work on both sides first."""
-    from . import peer_ratios as peers
-
-    progress("path search against PathSolver, at equal error and at 1e6 samples")
-    searches = peers.path_search_ratios()
-    progress("Kriging against PyKrige")
-    shared = peers.kriging_shared_weights()
-    measured: dict[str, Any] = {
-        "path_search_image_vs_sionna_equal_error": searches["equal_error"],
-        "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
-        "kriging_vs_pykrige_c_one_field": shared and {**shared, "ratio": shared["ratio_one_field"]},
-        "kriging_vs_pykrige_c_27_fields": shared,
-        "kriging_vs_pykrige": peers.kriging_vs_pykrige(),
-    }
-    progress("ingest against pandas")
-    for lines, value in peers.ingest_at_sizes().items():
-        measured["ingest_vs_pandas" if lines == peers.LINES else f"ingest_vs_pandas_{lines // 1_000_000}m"] = value
-    return measured
-
-
 def run_site_import(
     files: list[Path], out: Path, *, base: str = "lake_wheeler", untagged: str | None = None, force: bool = False
 ) -> list[str]:

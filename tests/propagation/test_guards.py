@@ -149,9 +149,9 @@ def test_thinning_keeps_what_is_constant():
 def test_thinning_is_scored_on_the_poses_that_it_left_out(monkeypatch):
     site, link, poses = random_scene(20, buildings=0)
     scored = []
-    own = bench._Runner._difference
+    own = bench._Case._difference
     monkeypatch.setattr(
-        bench._Runner,
+        bench._Case,
         "_difference",
         lambda self, h, level, chosen: scored.append(chosen) or own(self, h, level, chosen),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from aerpaw_cmp.jobs import bench, peer_ratios
+from aerpaw_cmp.jobs import bench
 
 
 def test_equal_error_is_the_fewest_samples_that_find_as_many_paths(monkeypatch):
@@ -16,7 +16,7 @@ def test_equal_error_is_the_fewest_samples_that_find_as_many_paths(monkeypatch):
         return {"ratio": samples / 100.0, "extra_paths": missed[samples], "samples": samples}
 
     monkeypatch.setattr(bench, "path_search", search)
-    found = peer_ratios.path_search_ratios()
+    found = bench.path_search_ratios()
     assert found["equal_error"]["samples"] == 10_000
     assert found["equal_error"]["ratio"] < found["at"]["1e+06"]["ratio"]
     assert ran == [1_000_000, 1_000, 10_000]  # no more than is needed
@@ -26,17 +26,16 @@ def test_where_only_the_most_samples_find_all_that_is_equal_error(monkeypatch):
     monkeypatch.setattr(
         bench, "path_search", lambda _poses, samples, **_: {"ratio": 1.0, "extra_paths": 10 // len(str(samples))}
     )
-    assert peer_ratios.path_search_ratios(samples=(1_000, 10_000_000_000))["equal_error"]["extra_paths"] == 0
+    assert bench.path_search_ratios(samples=(1_000, 10_000_000_000))["equal_error"]["extra_paths"] == 0
 
 
 def test_both_sides_of_kriging_and_of_ingest_are_there():
     pytest.importorskip("pykrige")
-    kriging = peer_ratios.kriging_shared_weights(fields=3)
+    kriging = bench.kriging_shared_weights(fields=3)
     assert kriging["ratio"] == pytest.approx(
         3 * kriging["seconds_pykrige_one_field"] / kriging["seconds_ours_all_fields"]
     )
     assert kriging["ratio_one_field"] == pytest.approx(
         kriging["seconds_pykrige_one_field"] / kriging["seconds_ours_one_field"]
     )
-    sizes = peer_ratios.ingest_at_sizes((500, 2_000))
-    assert {lines: found["lines"] for lines, found in sizes.items()} == {500: 500, 2_000: 2_000}
+    assert bench.ingest_vs_pandas(500)["lines"] == 500

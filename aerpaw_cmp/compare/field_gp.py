@@ -1,0 +1,456 @@
+"""What a prediction leaves, as a Gaussian process over place, height, direction and time of flight.
+
+One covariance for every use (a map, a route, blocks left out, the rest of a flight)::
+
+    residual = mean + place(east, north, up, direction) + offset(flight) + drift(flight, time) + noise
+
+``mean`` is unknown. ``place`` is shared by all flights: ``sd^2 exp(-d / length) exp(-dz / height) exp(-chord^2 / 2
+turn^2)``. ``offset`` and ``drift`` (``sd^2 exp(-dt / drift_s)``) are each flight's own. The lengths are bounded by what
+the physics knows (:data:`BOUNDS`): unbounded, fading is fitted as place. Channels of a tower are kept apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..common.units import FloatArray, IntArray
+from .direction_gain import factor_of
+
+Part = Literal["mean", "place", "offset", "drift"]
+PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
+
+MEAN_SD_DB = 100.0
+"""Of the unknown mean: free in effect, and still a proper covariance."""
+
+EXACT_ROWS = 3000
+"""Rows of the exact solution: one matrix of 72 MB."""
+
+EXACT_WORK = 2.0e12
+"""Rows squared times targets: beyond it (some two minutes) only the nearest rows of a target are used."""
+
+NEAREST = 40
+"""Rows per target of the approximation."""
+
+FIT_ROWS = 700
+"""Rows of one channel from which scales are learned."""
+
+AT_ONCE = 1024
+"""Targets at a time; bounds the memory."""
+
+NEW_FLIGHT = -1
+"""Code of a flight that no row has."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldModel:
+    """Strengths [dB] and scales of the covariance.
+
+    Parameters
+    ----------
+    place_sd_db, length_m, height_m, turn : float
+        Field over places: horizontal and vertical scale [m], and chord of the direction; infinite: independent of it.
+    offset_sd_db : float
+        Between flights.
+    drift_sd_db, drift_s : float
+        Within a flight, over time [s].
+    noise_sd_db : float
+        Of a row.
+    """
+
+    place_sd_db: float = 2.0
+    length_m: float = 50.0
+    height_m: float = 30.0
+    turn: float = 0.7
+    offset_sd_db: float = 1.5
+    drift_sd_db: float = 1.5
+    drift_s: float = 60.0
+    noise_sd_db: float = 1.5
+
+    def scaled(self, factor: float) -> FieldModel:
+        """All strengths times a factor."""
+        names = ("place_sd_db", "offset_sd_db", "drift_sd_db", "noise_sd_db")
+        changed: dict[str, Any] = {name: factor * getattr(self, name) for name in names}
+        return dataclasses.replace(self, **changed)
+
+
+BOUNDS: dict[str, tuple[float, float]] = {
+    "place_sd_db": (0.05, 12.0),
+    "length_m": (10.0, 300.0),
+    "height_m": (5.0, 100.0),
+    "turn": (0.2, 5.0),
+    "drift_sd_db": (0.05, 12.0),
+    "drift_s": (10.0, 600.0),
+    "noise_sd_db": (0.2, 12.0),
+}
+"""What may be learned, and between which values."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rows:
+    """Where and when: samples of one channel, or targets.
+
+    Parameters
+    ----------
+    position_m : (n, 3)
+        East, north, up [m].
+    direction : (n, 3)
+        Unit vector towards the tower in the body frame.
+    time_s : (n,)
+        Since the start of the row's flight [s].
+    flight : (n,) int
+        Code of the flight; :data:`NEW_FLIGHT` of one that is not flown yet.
+    """
+
+    position_m: FloatArray
+    direction: FloatArray
+    time_s: FloatArray
+    flight: IntArray
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def part(self, keep: Any) -> Rows:
+        """Some of the rows; an index of two dimensions gives rows of rows."""
+        return Rows(**{f.name: getattr(self, f.name)[keep] for f in dataclasses.fields(self)})
+
+    @classmethod
+    def joined(cls, parts: Sequence[Rows]) -> Rows:
+        """All rows of several."""
+        return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(cls)})
+
+
+@dataclass(frozen=True, slots=True)
+class _Apart:
+    """How far rows are apart (..., n, m): horizontally, in height, in direction (squared), in time; same flight."""
+
+    across_m: FloatArray
+    height_m: FloatArray
+    chord2: FloatArray
+    seconds: FloatArray
+    same: FloatArray
+
+    @classmethod
+    def of(cls, one: Rows, other: Rows) -> _Apart:
+        """Of rows (..., n) from others (..., m)."""
+        a, b = (np.moveaxis(r.position_m, -1, 0) for r in (one, other))
+        up = np.abs(a[2][..., :, None] - b[2][..., None, :])
+        across = np.hypot(a[0][..., :, None] - b[0][..., None, :], a[1][..., :, None] - b[1][..., None, :])
+        inner = one.direction @ np.swapaxes(other.direction, -1, -2)
+        return cls(
+            across,
+            up,
+            np.maximum(2.0 - 2.0 * inner, 0.0),
+            np.abs(one.time_s[..., :, None] - other.time_s[..., None, :]),
+            (one.flight[..., :, None] == other.flight[..., None, :]).astype(np.float64),
+        )
+
+
+def _place(model: FieldModel, apart: _Apart) -> FloatArray:
+    exponent = apart.across_m / model.length_m + apart.height_m / model.height_m
+    if math.isfinite(model.turn):
+        exponent = exponent + apart.chord2 / (2.0 * model.turn**2)
+    return np.asarray(model.place_sd_db**2 * np.exp(-exponent))
+
+
+def _drift(model: FieldModel, apart: _Apart) -> FloatArray:
+    return np.asarray(model.drift_sd_db**2 * apart.same * np.exp(-apart.seconds / model.drift_s))
+
+
+def covariance(model: FieldModel, one: Rows, other: Rows, parts: Collection[Part] = PARTS) -> FloatArray:
+    """Covariance of some parts of the residual between rows (..., n, m), without noise [dB^2].
+
+    Parameters
+    ----------
+    model : FieldModel
+    one, other : Rows
+        (..., n) and (..., m).
+    parts : collection of str
+        Of :data:`PARTS`.
+
+    Returns
+    -------
+    (..., n, m)
+    """
+    return _covariance(model, _Apart.of(one, other), parts)
+
+
+def _covariance(model: FieldModel, apart: _Apart, parts: Collection[Part]) -> FloatArray:
+    out = np.full(apart.same.shape, MEAN_SD_DB**2 if "mean" in parts else 0.0)
+    if "place" in parts:
+        out += _place(model, apart)
+    if "offset" in parts:
+        out += model.offset_sd_db**2 * apart.same
+    if "drift" in parts:
+        out += _drift(model, apart)
+    return out
+
+
+def prior_sd_db(model: FieldModel, parts: Collection[Part]) -> float:
+    """Standard deviation of some parts where nothing is known [dB]."""
+    each = {
+        "mean": MEAN_SD_DB,
+        "place": model.place_sd_db,
+        "offset": model.offset_sd_db,
+        "drift": model.drift_sd_db,
+    }
+    return math.hypot(*(each[part] for part in parts))
+
+
+# --- prediction ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FieldFit:
+    """The process conditioned on rows; ``value_db`` (n,) may be absent, where only standard deviations are wanted."""
+
+    model: FieldModel
+    rows: Rows
+    value_db: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        if not len(self.rows):
+            raise InputError("no sample to condition on", expected="flights with levels at known poses")
+
+    def predict(
+        self, targets: Rows, parts: Collection[Part] = PARTS, *, exact: bool | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Mean and standard deviation (m,) of some parts at targets [dB]; NaN where a target has NaN.
+
+        Parameters
+        ----------
+        targets : Rows
+        parts : collection of str
+            Which parts of the residual: those of ``("place", "drift")`` are a flight about its own mean.
+        exact : bool, optional
+            By default where the matrices fit (:data:`EXACT_ROWS`, :data:`EXACT_WORK`); else the nearest rows alone.
+
+        Returns
+        -------
+        mean_db, sd_db : (m,)
+
+        Notes
+        -----
+        Beyond the exact solution the common mean and each flight's offset come from evenly thinned rows, and each
+        target from its :data:`NEAREST` rows in the scaled space (Vecchia's conditioning; Datta et al. 2016,
+        doi 10.1080/01621459.2015.1044091).
+        """
+        mean, sd = np.full((2, len(targets)), np.nan)
+        known = np.isfinite(np.column_stack([targets.position_m, targets.direction, targets.time_s])).all(axis=1)
+        if exact is None:
+            exact = len(self.rows) <= EXACT_ROWS and len(self.rows) ** 2 * float(known.sum()) <= EXACT_WORK
+        good, some = np.flatnonzero(known), targets.part(known)
+        moments = self._exact(some, parts) if exact else self._nearest(some, parts)
+        for start, (one, two) in zip(range(0, len(good), AT_ONCE), moments, strict=True):
+            mean[good[start : start + AT_ONCE]], sd[good[start : start + AT_ONCE]] = one, two
+        return mean, sd
+
+    def _exact(self, targets: Rows, parts: Collection[Part]) -> Iterator[tuple[FloatArray, FloatArray]]:
+        from scipy.linalg import solve_triangular
+
+        lower = factor_of(_noisy(self.model, covariance(self.model, self.rows, self.rows)))
+        value = np.zeros(len(self.rows)) if self.value_db is None else self.value_db
+        white = solve_triangular(lower, value, lower=True, check_finite=False)
+        prior = prior_sd_db(self.model, parts) ** 2
+        for start in range(0, len(targets), AT_ONCE):
+            across = covariance(self.model, targets.part(slice(start, start + AT_ONCE)), self.rows, parts)
+            half = solve_triangular(lower, across.T, lower=True, overwrite_b=True, check_finite=False)
+            yield half.T @ white, np.sqrt(np.maximum(prior - np.einsum("nm,nm->m", half, half), 0.0))
+
+    def _nearest(self, targets: Rows, parts: Collection[Part]) -> Iterator[tuple[FloatArray, FloatArray]]:
+        from scipy.spatial import cKDTree
+
+        levels, level_sd = self._levels(targets, parts)
+        own, _ = self._levels(self.rows, ("mean", "offset"))
+        value = np.zeros(len(self.rows)) if self.value_db is None else self.value_db - own
+        near: list[Part] = ["place", "drift"]
+        asked = [part for part in near if part in parts]
+        prior = prior_sd_db(self.model, asked) ** 2 if asked else 0.0
+        tree, count = cKDTree(self._scaled(self.rows)), min(NEAREST, len(self.rows))
+        for start in range(0, len(targets), AT_ONCE):
+            part = slice(start, start + AT_ONCE)
+            some = targets.part(part)
+            index = tree.query(self._scaled(some), k=np.arange(1, count + 1))[1]
+            rows = self.rows.part(index)
+            across = covariance(self.model, some.part((slice(None), None)), rows, asked)[:, 0, :, None]
+            matrix = _noisy(self.model, covariance(self.model, rows, rows, near))
+            weight = np.linalg.solve(matrix, across)[..., 0]
+            left = prior - np.einsum("tm,tm->t", weight, across[..., 0])
+            mean = levels[part] + np.einsum("tm,tm->t", weight, value[index])
+            yield mean, np.sqrt(np.maximum(left, 0.0) + level_sd[part] ** 2)
+
+    def _scaled(self, rows: Rows) -> FloatArray:
+        """Coordinates in which the place part falls off evenly."""
+        m = self.model
+        turn = rows.direction / m.turn if math.isfinite(m.turn) else 0.0 * rows.direction
+        return np.column_stack([rows.position_m / (m.length_m, m.length_m, m.height_m), turn])
+
+    def _levels(self, targets: Rows, parts: Collection[Part]) -> tuple[FloatArray, FloatArray]:
+        """Mean and offsets (m,) at targets from thinned rows, with their standard deviation."""
+        asked: list[Part] = [part for part in ("mean", "offset") if part in parts]  # type: ignore[misc]
+        out, sd = np.zeros((2, len(targets)))
+        if not asked:
+            return out, sd
+        thin = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), EXACT_ROWS // 2)).round().astype(int))
+        fit = FieldFit(self.model, self.rows.part(thin), None if self.value_db is None else self.value_db[thin])
+        _, first, member = np.unique(targets.flight, return_index=True, return_inverse=True)
+        mean_of, sd_of = fit.predict(targets.part(first), asked, exact=True)
+        return mean_of[member], sd_of[member]
+
+
+def _noisy(model: FieldModel, matrix: FloatArray) -> FloatArray:
+    """A covariance (..., n, n) with the noise on its diagonal, in place."""
+    count = matrix.shape[-1]
+    matrix[..., np.arange(count), np.arange(count)] += model.noise_sd_db**2
+    return matrix
+
+
+def left_out(
+    model: FieldModel, rows: Rows, value_db: FloatArray, block: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Each row predicted from the rows of other blocks: mean, standard deviation with noise, and mean error of blocks.
+
+    Parameters
+    ----------
+    model : FieldModel
+    rows : Rows
+        At most :data:`EXACT_ROWS`.
+    value_db : (n,)
+    block : (n,) int
+        Rows of one code are left out together.
+
+    Returns
+    -------
+    mean_db, sd_db : (n,)
+        Of ``value_db``, noise included.
+    own_sd_db : (n,)
+        Of a row about the mean of its block, where a block's own mean is taken off.
+
+    Notes
+    -----
+    One inverse P of the covariance serves all blocks: the block b given the rest has the covariance ``inv(P_bb)`` and
+    the error ``inv(P_bb) (P y)_b`` (Rasmussen and Williams, eq. 5.10-5.12, for blocks).
+    """
+    from scipy.linalg import cho_solve
+
+    lower = factor_of(_noisy(model, covariance(model, rows, rows)))
+    inverse = cho_solve((lower, True), np.eye(len(rows)), check_finite=False)
+    right = inverse @ value_db
+    mean, sd, own = np.empty((3, len(rows)))
+    for code in np.unique(block):
+        mine = np.flatnonzero(block == code)
+        spread = np.linalg.inv(inverse[np.ix_(mine, mine)])
+        mean[mine] = value_db[mine] - spread @ right[mine]
+        sd[mine] = np.sqrt(np.diag(spread))
+        about = spread - spread.mean(axis=0) - spread.mean(axis=1)[:, None] + spread.mean()
+        own[mine] = np.sqrt(np.maximum(np.diag(about), 0.0))
+    return mean, sd, own
+
+
+# --- scales --------------------------------------------------------------------------------------------------------
+
+
+def fit_field(
+    channels: Sequence[tuple[Rows, FloatArray]], start: FieldModel | None = None, learn: Collection[str] = tuple(BOUNDS)
+) -> FieldModel:
+    """Strengths and scales by the marginal likelihood of the residuals of one or more channels.
+
+    Parameters
+    ----------
+    channels : sequence of (Rows, (n,))
+        Rows and residuals [dB] of each channel; they share the model, not the field.
+    start : FieldModel, optional
+        Where the search starts, and what is not learned: the offset between flights is :func:`offset_sd_of` them.
+    learn : collection of str
+        Names of :data:`BOUNDS`.
+
+    Returns
+    -------
+    FieldModel
+
+    Raises
+    ------
+    InputError
+        No channel has three rows.
+    """
+    from scipy.optimize import minimize
+
+    used = [_evenly(rows, value) for rows, value in channels if len(rows) >= 3]
+    if not used:
+        raise InputError("fewer than three samples", expected="flights with levels at known poses")
+    start = start or FieldModel()
+    start = dataclasses.replace(start, offset_sd_db=offset_sd_of(used, start.offset_sd_db))
+    names = list(learn)
+    apart = [_Apart.of(rows, rows) for rows, _ in used]
+
+    def misfit(logs: FloatArray) -> tuple[float, FloatArray]:
+        model = _with(start, names, logs)
+        total, slope = 0.0, np.zeros(len(names))
+        for (_, value), each in zip(used, apart, strict=True):
+            one, two = _likelihood(model, each, value, names)
+            total, slope = total - one, slope - two
+        return total, slope
+
+    limits = [(math.log(BOUNDS[name][0]), math.log(BOUNDS[name][1])) for name in names]
+    first = np.clip([math.log(getattr(start, name)) for name in names], *np.array(limits).T)
+    best = minimize(misfit, first, jac=True, bounds=limits, method="L-BFGS-B", options={"maxiter": 40})
+    return _with(start, names, best.x)
+
+
+def _with(model: FieldModel, names: Sequence[str], logs: FloatArray) -> FieldModel:
+    values: dict[str, Any] = dict(zip(names, map(float, np.exp(logs)), strict=True))
+    return dataclasses.replace(model, **values)
+
+
+def _evenly(rows: Rows, value: FloatArray) -> tuple[Rows, FloatArray]:
+    """Whole stretches of at most :data:`FIT_ROWS` rows: thinning would hide short scales."""
+    if len(rows) <= FIT_ROWS:
+        return rows, value
+    stretch = FIT_ROWS // 7
+    starts = np.linspace(0, len(rows) - stretch, 7).astype(int)
+    keep = np.unique(np.concatenate([np.arange(s, s + stretch) for s in starts]))
+    return rows.part(keep), value[keep]
+
+
+def offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], otherwise_db: float) -> float:
+    """Standard deviation of the means of flights of one channel [dB], shrunk towards a prior guess.
+
+    Two flights say little: the guess counts as two more (the mean of an inverse-gamma posterior).
+    """
+    squares, count = 2.0 * otherwise_db**2, 2.0
+    for rows, value in channels:
+        means = np.array([value[rows.flight == code].mean() for code in np.unique(rows.flight)])
+        squares, count = squares + float(((means - means.mean()) ** 2).sum()), count + len(means) - 1
+    return math.sqrt(squares / count)
+
+
+def _likelihood(model: FieldModel, apart: _Apart, value: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray]:
+    """Log marginal likelihood but for a constant, and its slope along the logarithm of each named parameter."""
+    from scipy.linalg import cho_solve
+
+    lower = factor_of(_noisy(model, _covariance(model, apart, PARTS)))
+    inverse = cho_solve((lower, True), np.eye(len(value)), check_finite=False)
+    weight = inverse @ value
+    place, drift = _place(model, apart), _drift(model, apart)
+    outer = np.outer(weight, weight) - inverse
+    along = {
+        "place_sd_db": lambda: 2.0 * place,
+        "length_m": lambda: place * apart.across_m / model.length_m,
+        "height_m": lambda: place * apart.height_m / model.height_m,
+        "turn": lambda: place * apart.chord2 / model.turn**2,
+        "drift_sd_db": lambda: 2.0 * drift,
+        "drift_s": lambda: drift * apart.seconds / model.drift_s,
+    }
+    slope = [
+        model.noise_sd_db**2 * float(np.trace(outer))
+        if name == "noise_sd_db"
+        else 0.5 * float(np.einsum("ij,ij->", outer, along[name]()))
+        for name in names
+    ]
+    return -0.5 * float(value @ weight) - float(np.log(np.diag(lower)).sum()), np.array(slope)

@@ -513,10 +513,12 @@ def _cache_entry() -> bytes:
 
 
 def _flight_bytes(log: bytes) -> bytes:
-    from aerpaw_cmp.logs.flight_file import IngestedFile, flight_bytes
+    from aerpaw_cmp.logs.flight_file import IngestedFile, fill
     from aerpaw_cmp.logs.readers import identify
 
-    return flight_bytes([IngestedFile("a.txt", "0" * 64, identify(log).read(log, OPTIONS[0]))])
+    stream = io.BytesIO()
+    fill(stream, [IngestedFile("a.txt", "0" * 64, identify(log).read(log, OPTIONS[0]))])
+    return stream.getvalue()
 
 
 def _geotiff() -> bytes | None:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from aerpaw_cmp.logs.flight_file import write_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.writers import format_power_log, format_quectel_csv, format_vehicle_out
@@ -300,7 +301,14 @@ def _peak_mib() -> float:
 
 def contest(who: str, what: str, place: Path) -> dict[str, float]:
     """CPU and wall seconds, peak MiB above the imports, and MiB of the records of one contestant, in this process."""
-    run = {"ours": _ours, "pandas": _pandas, "pandas_1": _pandas_1, "pyarrow": _pyarrow, "polars": _polars}[who]
+    run = {
+        "ours": _ours,
+        "written": _written,
+        "pandas": _pandas,
+        "pandas_1": _pandas_1,
+        "pyarrow": _pyarrow,
+        "polars": _polars,
+    }[who]
     small = place.parent / f"small_{place.name}"
     with place.open("rb") as file:
         small.write_bytes(b"".join(file.readlines(100_000)))
@@ -317,6 +325,13 @@ def contest(who: str, what: str, place: Path) -> dict[str, float]:
 def _ours(what: str, place: Path) -> list[Any]:
     (file,) = ingest(place, options=SCALED[what][2], reader=what.partition(":")[0])
     return [frame[name].to_numpy() for frame in (s.frame for s in file.result.streams) for name in frame]
+
+
+def _written(what: str, place: Path) -> list[Any]:
+    """The same, and a flight file of it."""
+    files = ingest(place, options=SCALED[what][2], reader=what.partition(":")[0])
+    write_flight(place.with_suffix(".h5"), files)
+    return [frame[name].to_numpy() for frame in (s.frame for s in files[0].result.streams) for name in frame]
 
 
 def _utc(clock: pd.Series) -> np.ndarray:  # type: ignore[type-arg]
@@ -409,7 +424,17 @@ def _polars(what: str, place: Path) -> list[Any]:
     return [clock[names[at]].to_numpy(), *values]
 
 
-def scale(lines: int, formats: list[str], folder: str | None) -> None:
+CONTESTANTS = {
+    "ours": _ours,
+    "written": _written,
+    "pandas_1": _pandas_1,
+    "pandas": _pandas,
+    "pyarrow": _pyarrow,
+    "polars": _polars,
+}
+
+
+def scale(lines: int, formats: list[str], contestants: list[str], folder: str | None) -> None:
     """The table of peers."""
     import subprocess
     import sys
@@ -427,7 +452,7 @@ def scale(lines: int, formats: list[str], folder: str | None) -> None:
             write(place, lines)
             print(f"{what}: {lines} lines, {place.stat().st_size / 1e6:.0f} MB")
             found: dict[str, Any] = {}
-            for who in ("ours", "pandas_1", "pandas", "pyarrow", "polars"):
+            for who in contestants:
                 command = [sys.executable, __file__, "--contest", who, what, str(place)]
                 answer = subprocess.run(command, capture_output=True, text=True, check=False)
                 if answer.returncode:
@@ -451,6 +476,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--scale", type=int, nargs="?", const=SCALE_LINES, metavar="LINES", help=SCALE_HELP)
     parser.add_argument("--format", action="append", choices=sorted(SCALED), help="of --scale, repeatable; all")
+    parser.add_argument("--contestant", action="append", choices=list(CONTESTANTS), help="of --scale, repeatable; all")
     parser.add_argument("--folder", help="where --scale puts its files")
     parser.add_argument("--contest", nargs=3, metavar=("WHO", "WHAT", "FILE"), help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -458,7 +484,7 @@ def main() -> None:
         print(json.dumps(contest(given.contest[0], given.contest[1], Path(given.contest[2]))))
         return
     if given.scale:
-        scale(given.scale, given.format or list(SCALED), given.folder)
+        scale(given.scale, given.format or list(SCALED), given.contestant or list(CONTESTANTS), given.folder)
         return
     answer = measure(LINES // 10 if given.quick else LINES, 5 if given.quick else 31)
     folder = None if given.quick else measure_folder()

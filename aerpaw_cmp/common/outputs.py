@@ -190,13 +190,19 @@ class OutputFile:
                 path=self.named,
             )
 
-    def write(self, content: bytes) -> None:
-        """Write, sync, and take the name: a reader sees the old file or the new one, also after a power cut."""
+    def write(self, content: bytes | Callable[[BinaryIO], None]) -> None:
+        """Write, sync, and take the name: a reader sees the old file or the new one, also after a power cut.
+
+        ``content`` may be a function that fills a stream, which is open for reading, too.
+        """
         place = self._place
         assert place is not None, "used as a context"
         with explained_os_errors(self.named):
-            with os.fdopen(os.dup(place.descriptor), "wb") as stream:
-                stream.write(content)
+            with os.fdopen(os.dup(place.descriptor), "r+b") as stream:
+                if callable(content):
+                    content(stream)
+                else:
+                    stream.write(content)
                 stream.flush()
                 os.fchmod(stream.fileno(), plain_mode())
                 os.fsync(stream.fileno())

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +88,7 @@ def run_ingest(
     UsageError, InputError, OutputError
         With what was found, expected, and the likely cause.
     """
-    from ..logs.flight_file import flight_bytes, is_flight_file
+    from ..logs.flight_file import fill, is_flight_file
     from ..logs.ingest import ingest, summary
     from ..logs.readers import ReadOptions
 
@@ -121,7 +122,7 @@ def run_ingest(
                 account["drafts"].append(str(place))
                 account["draft"] += [f"{place.name}: {remark}" for remark in further.remarks]
         if target is not None:
-            target.write(flight_bytes(files))
+            target.write(partial(fill, files=files))
     return account
 
 

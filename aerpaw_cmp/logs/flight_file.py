@@ -22,8 +22,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -72,24 +73,75 @@ def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:
         If the disk does not take it.
     """
     with OutputFile(Path(path), own=is_flight_file) as output:
-        output.write(flight_bytes(files))
+        output.write(partial(fill, files=files))
 
 
-def flight_bytes(files: Sequence[IngestedFile]) -> bytes:
-    """The whole content of a flight file.
+def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
+    """Write the content of a flight file, block by block, to an empty stream that can be read, too.
 
-    Made in memory: HDF5 ends the process where a disk is full.
+    Raises
+    ------
+    OSError
+        If the stream takes no more.
     """
     import h5py
 
-    with h5py.File("flight", "w", driver="core", backing_store=False) as book:
-        book.attrs["format"], book.attrs["version"] = FORMAT, VERSION
-        shelf = book.create_group("files")
-        for i, file in enumerate(files):
-            _write_file(shelf.create_group(f"{i:05d}"), file)
-        book.flush()
-        content: bytes = book.id.get_file_image()
-    return content + _SEAL + hashlib.sha256(content).digest()
+    sink = _Sink(stream)
+    try:
+        with h5py.File(sink, "w") as book:
+            book.attrs["format"], book.attrs["version"] = FORMAT, VERSION
+            shelf = book.create_group("files")
+            for i, file in enumerate(files):
+                _write_file(shelf.create_group(f"{i:05d}"), file, sink)
+    finally:
+        sink.look()  # what HDF5 says after a failure is its consequence
+    size = stream.seek(0, os.SEEK_END)
+    digest = _digest(stream, size)
+    stream.seek(size)
+    stream.write(_SEAL + digest)
+
+
+class _Sink:
+    """A stream that never fails towards HDF5, which ends the process where a disk is full.
+
+    The first failure, an interrupt included, is kept for :meth:`look`; what comes after it is lost.
+    """
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._failure: BaseException | None = None
+
+    def look(self) -> None:
+        """Raise what HDF5 was spared."""
+        if self._failure is not None:
+            raise self._failure
+
+    def _spared(self, action: Callable[..., Any], *given: Any, instead: Any = 0) -> Any:
+        if self._failure is None:
+            try:
+                return action(*given)
+            except BaseException as failure:
+                self._failure = failure
+        return instead
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return int(self._spared(self._stream.seek, offset, whence))
+
+    def tell(self) -> int:
+        return int(self._spared(self._stream.tell))
+
+    def write(self, block: Any) -> int:
+        return int(self._spared(self._stream.write, block, instead=len(block)))
+
+    def read(self, size: int = -1) -> bytes:
+        block = self._spared(self._stream.read, size, instead=b"")
+        return bytes(block.ljust(max(size, 0), b"\0"))
+
+    def truncate(self, size: int | None = None) -> int:
+        return int(self._spared(self._stream.truncate, size))
+
+    def flush(self) -> None:
+        self._spared(self._stream.flush)
 
 
 def is_flight_file(path: Path) -> bool:
@@ -126,7 +178,7 @@ def _refuse_changed(content: bytes, path: str | Path) -> None:
         )
 
 
-def _write_file(group: Any, file: IngestedFile) -> None:
+def _write_file(group: Any, file: IngestedFile, sink: _Sink) -> None:
     result = file.result
     _write_json(
         group,
@@ -145,10 +197,10 @@ def _write_file(group: Any, file: IngestedFile) -> None:
     _write_json(group, "reasons", [[one.reason, one.count, one.first, one.last] for one in result.reasons])
     shelf = group.create_group("streams")
     for i, stream in enumerate(result.streams):
-        _write_stream(shelf.create_group(f"{i:05d}"), stream)
+        _write_stream(shelf.create_group(f"{i:05d}"), stream, sink)
 
 
-def _write_stream(group: Any, stream: Stream) -> None:
+def _write_stream(group: Any, stream: Stream, sink: _Sink) -> None:
     columns = [{"name": str(name), "type": _type(stream.frame[name])} for name in stream.frame.columns]
     _write_json(
         group,
@@ -157,6 +209,7 @@ def _write_stream(group: Any, stream: Stream) -> None:
     )
     for i, column in enumerate(columns):
         _write_column(group, f"C{i:05d}", stream.frame[column["name"]], column["type"])
+        sink.look()
 
 
 def _type(column: pd.Series[Any]) -> str:
@@ -164,32 +217,42 @@ def _type(column: pd.Series[Any]) -> str:
     return {"M": "time", "f": "float", "i": "integer", "u": "integer", "b": "boolean"}.get(kind, "text")
 
 
-_AT_ONCE = 1 << 20
-"""Texts that become numbers at a time: lists of all rows of a large log would take more than its records."""
+_AT_ONCE = 1 << 18
+"""Rows that are converted and written at a time: copies of all rows of a large log would take more than its records."""
+_CHUNK = 1 << 16
 
 
 def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> None:
     import numpy as np
 
-    if kind == "text":
-        # not by pandas: up to 2.3 its factorize ends a text at a NUL
-        number: dict[str | None, int] = {None: -1}  # no text at all
-        values = np.empty(len(column), dtype=np.int32)
-        for first in range(0, len(column), _AT_ONCE):
-            part = column.iloc[first : first + _AT_ONCE]
-            missing = part.isna().tolist()
-            texts = [None if gone else str(text) for text, gone in zip(part.tolist(), missing, strict=True)]
-            for text in dict.fromkeys(texts):
-                number.setdefault(text, len(number) - 1)
-            values[first : first + len(texts)] = [number[text] for text in texts]
-        _write_json(group, f"{name}.words", list(number)[1:])
-    elif kind == "time":
-        values = column.to_numpy().astype("datetime64[ns]").astype(np.int64)
-    else:
-        values = column.to_numpy().astype({"float": np.float64, "integer": np.int64, "boolean": np.bool_}[kind])
+    numbers = {"text": np.int32, "time": np.int64, "float": np.float64, "integer": np.int64, "boolean": np.bool_}
+    count = len(column)
     # the shuffle filter and light deflate: a tenth of the size for smooth columns, at little time
-    options = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if len(values) > 256 else {}
-    group.create_dataset(name, data=values, **options)
+    packing = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "chunks": (min(count, _CHUNK),)}
+    place = group.create_dataset(name, (count,), numbers[kind], **(packing if count > 256 else {}))
+    number: dict[str | None, int] = {None: -1}  # no text at all
+    for first in range(0, count, _AT_ONCE):
+        part = column.iloc[first : first + _AT_ONCE]
+        if kind == "text":
+            values = _codes(part, number)
+        elif kind == "time":
+            values = part.to_numpy().astype("datetime64[ns]").astype(np.int64)
+        else:
+            values = part.to_numpy().astype(numbers[kind])
+        place[first : first + len(values)] = values
+    if kind == "text":
+        _write_json(group, f"{name}.words", list(number)[1:])
+
+
+def _codes(part: pd.Series[Any], number: dict[str | None, int]) -> AnyArray:
+    """Numbers of texts; new texts get the next. Not by pandas: up to 2.3 its factorize ends a text at a NUL."""
+    import numpy as np
+
+    missing = part.isna().tolist()
+    texts = [None if gone else str(text) for text, gone in zip(part.tolist(), missing, strict=True)]
+    for text in dict.fromkeys(texts):
+        number.setdefault(text, len(number) - 1)
+    return np.array([number[text] for text in texts], dtype=np.int32)
 
 
 def _write_json(group: Any, name: str, content: Any) -> None:

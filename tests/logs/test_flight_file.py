@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import io
 import os
 import stat
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,7 +21,7 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.common import native
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
-from aerpaw_cmp.logs.flight_file import IngestedFile, read_flight, write_flight
+from aerpaw_cmp.logs.flight_file import IngestedFile, fill, read_flight, write_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, RejectedLine, Stream
 from tests.frames import assert_same_frame
@@ -157,6 +161,61 @@ def test_the_old_file_stands_until_the_new_one_takes_its_name(tmp_path: Path, mo
         write_flight(path, all_samples_of_one(tmp_path))
     assert seen == [(tmp_path, b"\x89HDF", True)]
     assert path.read_bytes() == before
+
+
+class _Full(io.BytesIO):
+    """A disk with so many bytes left."""
+
+    def __init__(self, left: int, failure: BaseException) -> None:
+        super().__init__()
+        self.left, self.failure = left, failure
+
+    def write(self, block: Any) -> int:
+        self.left -= len(block)
+        if self.left < 0:
+            raise self.failure
+        return super().write(block)
+
+
+@pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_disk_that_is_full_anywhere_ends_in_its_own_error(tmp_path: Path, failure: BaseException) -> None:
+    """HDF5 ends the process where a write of its own fails."""
+    files = all_samples_of_one(tmp_path)
+    large = pd.concat([files[0].result.streams[0].frame] * 40_000, ignore_index=True)
+    streams = (dataclasses.replace(files[0].result.streams[0], frame=large),)
+    files = [dataclasses.replace(files[0], result=dataclasses.replace(files[0].result, streams=streams))]
+    enough = io.BytesIO()
+    fill(enough, files)
+    assert read_back(enough.getvalue(), tmp_path).equals(large)
+    size = len(enough.getvalue())
+    for left in (0, 100, 3_000, *range(5_000, size, size // 12), size - 40, size - 1):
+        with pytest.raises(type(failure)) as caught:
+            fill(_Full(left, failure), files)
+        assert caught.value is failure
+
+
+def read_back(content: bytes, folder: Path) -> pd.DataFrame:
+    (folder / "back.h5").write_bytes(content)
+    (file,) = read_flight(folder / "back.h5")
+    return file.result.streams[0].frame
+
+
+def test_the_writer_takes_no_copy_of_the_records(tmp_path: Path) -> None:
+    """Peak of NumPy's and Python's memory while 32 MB of records are written: a few blocks of rows."""
+    rows = 1_000_000
+    frame = pd.DataFrame(
+        {"time": np.arange(rows).astype("datetime64[ns]"), "line": np.arange(rows), "flag": [""] * rows}
+    )
+    frame["rss_db"] = np.random.default_rng(3).normal(size=rows)
+    result = ReadResult(
+        reader="x", streams=(Stream("rss", "x", frame),), lines=rows, accepted=rows, blank=0, rejected=()
+    )
+    with (tmp_path / "f.h5").open("w+b") as stream:
+        tracemalloc.start()
+        fill(stream, [IngestedFile("x", "0" * 64, result)])
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < 16e6
 
 
 def all_samples_of_one(folder: Path) -> list[IngestedFile]:

@@ -8,31 +8,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timezone
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from ..common.errors import AerpawCmpError, InputError, UsageError
+from ..common.errors import AerpawCmpError, UsageError
 from ..common.stages import Progress, silent
 from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
-from ..compare.heldout import rmse
 from ..compare.rss import LEARNED_HERE
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, Settings, load_flight
 from ..report.campaign_data import CampaignData, Failure, HeldOutFold, RankHeldOutFold, RankRow, RssRow
-from .campaign_fit import Bench, Point, Spread, bench_of, fit_all
+from .campaign_fit import fit_all
 from .campaign_plan import compute, kept_outcomes
 from .campaign_rank_fit import K_KEY, fit_rank_all
 from .campaign_tasks import Task, counted_once, flight_data
 from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
 from .place import check_place, open_place
-from .workers import Lost, Workers, open_workers
+from .workers import open_workers
 
 Stage = Callable[[str], Any]
 
@@ -57,8 +55,6 @@ class HeldOutSettings(Settings):
     """Label of the setting that the fit starts from; by default the first."""
     samples: Annotated[int, Field(ge=50)] = 1000
     """Evenly spread samples per series that the search looks at; all of them are scored."""
-    refine: bool = False
-    """Search between the values, too."""
 
 
 class CampaignFile(Settings):
@@ -185,7 +181,7 @@ def run(
         held_out = _Folds()
         if campaign.held_out is not None:
             with stage("held-out"):
-                held_out = _folds(campaign.held_out, tasks, rows, rank, crew, progress)
+                held_out = _folds(campaign.held_out, tasks, rows, rank, progress)
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
     tracks = {o.track.flight: o.track for o in reversed(results) if o.track is not None}
     return CampaignData(
@@ -266,33 +262,22 @@ def _folds(
     tasks: Sequence[Task],
     rows: Sequence[RssRow],
     rank: Sequence[RankRow],
-    workers: Workers,
     progress: Progress,
 ) -> _Folds:
     """The held-out fit by its criterion; one that fails costs the other numbers of a campaign nothing."""
+    criterion = settings.criterion
+    label, of = _tasks_of_fit(settings, tasks, rows if criterion == "rmse" else rank)
+    about: dict[str, Any] = {"setting": label, "samples": settings.samples, "progress": progress}
     try:
-        if settings.criterion == "rmse":
-            return _Folds(rss=tuple(_held_out(settings, tasks, rows, workers, progress)))
-        return _Folds(rank=tuple(_held_out_rank(settings, tasks, rank, progress)))
+        flights = {flight: flight_data(task) for flight, task in of.items()}
+        if criterion != "rmse":
+            return _Folds(
+                rank=tuple(fit_rank_all(flights, settings.fit, settings.fit_on, criterion=criterion, **about))
+            )
+        grids = {key: [float(v) for v in values if not isinstance(v, list)] for key, values in settings.fit.items()}
+        return _Folds(rss=tuple(fit_all(flights, grids, settings.fit_on, **about)))
     except AerpawCmpError as error:
         return _Folds(failure=str(error))
-
-
-def _held_out(
-    settings: HeldOutSettings, tasks: Sequence[Task], rows: Sequence[RssRow], workers: Workers, progress: Progress
-) -> list[HeldOutFold]:
-    """Fit under one setting on the flights that gave RSS under it."""
-    label, of = _tasks_of_fit(settings, tasks, rows)
-    return fit_all(
-        {flight: flight_data(task) for flight, task in of.items()},
-        {key: [float(v) for v in values if not isinstance(v, list)] for key, values in settings.fit.items()},
-        settings.fit_on,
-        setting=label,
-        samples=settings.samples,
-        refine=settings.refine,
-        progress=progress,
-        spread=spread_over(workers, of, settings),
-    )
 
 
 def _tasks_of_fit(
@@ -303,23 +288,6 @@ def _tasks_of_fit(
     learned = {row.flight for row in rows if isinstance(row, RssRow) and LEARNED_HERE in row.fitted}
     gave = {row.flight for row in rows if row.setting == label} - learned
     return label, {task.flight: task for task in tasks if task.setting == label and task.flight in gave}
-
-
-def _held_out_rank(
-    settings: HeldOutSettings, tasks: Sequence[Task], rows: Sequence[RankRow], progress: Progress
-) -> list[RankHeldOutFold]:
-    """Fit rank parameters under one setting on the flights that gave rank under it."""
-    assert settings.criterion != "rmse"
-    label, of = _tasks_of_fit(settings, tasks, rows)
-    return fit_rank_all(
-        {flight: flight_data(task) for flight, task in of.items()},
-        settings.fit,
-        settings.fit_on,
-        criterion=settings.criterion,
-        setting=label,
-        samples=settings.samples,
-        progress=progress,
-    )
 
 
 def _flight_files(
@@ -372,64 +340,3 @@ def _check_names(
                 raise UsageError(
                     f"held_out.fit for {path}: {error.found}", expected=error.expected, cause=error.cause
                 ) from None
-
-
-def spread_over(workers: Workers, tasks: Mapping[str, Task], settings: HeldOutSettings) -> Spread | None:
-    """Errors of many points and flights, computed by workers; None where there is only this process."""
-    if workers.count <= 1:
-        return None
-
-    def errors(points: Mapping[str, Sequence[Point]]) -> dict[str, list[float]]:
-        pieces = max(1, -(-2 * workers.count // max(len(points), 1)))
-        orders = [
-            PointsOrder(task=tasks[flight], points=tuple(dict(p) for p in some), samples=settings.samples)
-            for flight, wanted in points.items()
-            for some in _parts(wanted, pieces)
-        ]
-        errors_of: dict[int, list[float]] = {}
-
-        def done(number: int, result: list[float] | Lost) -> None:
-            if isinstance(result, Lost):
-                raise InputError(f"held-out fit of {orders[number].task.flight}: {result.message}")
-            errors_of[number] = result
-
-        workers.run(point_errors, orders, done)
-        out: dict[str, list[float]] = {}
-        for number, order in enumerate(orders):
-            out.setdefault(order.task.flight, []).extend(errors_of[number])
-        return out
-
-    return errors
-
-
-def _parts(items: Sequence[Point], count: int) -> list[Sequence[Point]]:
-    size = -(-len(items) // count)
-    return [items[i : i + size] for i in range(0, len(items), size)]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PointsOrder:
-    """Points of the held-out search on one flight, for a worker."""
-
-    task: Task
-    points: tuple[dict[str, float], ...]
-    samples: int
-
-
-def point_errors(order: PointsOrder) -> list[float]:
-    """RMSE [dB] of a flight at some points of the search."""
-    bench = _bench(_Wanted(order.task.path, str(dict(order.task.overrides)), order.samples, order.task))
-    return [rmse(bench.residual_db(point)) for point in order.points]
-
-
-@dataclass(frozen=True, slots=True)
-class _Wanted:
-    path: Path
-    overrides: str
-    samples: int
-    task: Task = field(compare=False)
-
-
-@lru_cache(maxsize=2)
-def _bench(wanted: _Wanted) -> Bench:
-    return bench_of(flight_data(wanted.task)).thinned(wanted.samples)

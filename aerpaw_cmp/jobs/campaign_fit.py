@@ -1,9 +1,14 @@
-"""Parameters beyond the offset, fitted on some flights of a campaign and scored on all of them."""
+"""Parameters beyond the offset, fitted on some flights of a campaign and scored on all of them.
+
+Every key has values to try. All combinations are tried, or, of many, one key after the other; the flights that are
+scored without a say are named. ``aerpaw-cmp calibrate`` learns patterns and searches between values; this does not.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from math import prod
@@ -14,7 +19,6 @@ import numpy as np
 from ..common.errors import InputError, UsageError
 from ..common.stages import Progress, silent
 from ..common.units import FloatArray
-from ..compare.heldout import fit_held_out, goes_round, rmse
 from ..compare.offset import grid_offset
 from ..compare.result import APPLIED
 from ..flight.data import FlightData, choose_site
@@ -24,10 +28,8 @@ from ..flight.settings import FlightFile, RssSettings
 from ..report.campaign_data import HeldOutFold, HeldOutRow
 from .levels import levels_of
 
-Point = Mapping[str, float]
-
-Spread = Callable[[Mapping[str, Sequence[Point]]], dict[str, list[float]]]
-"""RMSE [dB] of points by flight, in their order."""
+Point = Mapping[str, Any]
+"""Dotted flight key -> value."""
 
 LARGEST_PRODUCT = 500
 """Combinations that are all tried; of more, one parameter after the other is searched."""
@@ -37,6 +39,112 @@ NO_EFFECT_DB = 0.01
 
 SWEEPS = 6
 """Rounds over all parameters, at most; it ends earlier when a round changes nothing."""
+
+
+# --- the search -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """Points that were tried with their losses, least first, and how they were chosen."""
+
+    tried: tuple[tuple[dict[str, Any], float], ...]
+    method: str
+
+    @property
+    def point(self) -> dict[str, Any]:
+        """The best one."""
+        return self.tried[0][0]
+
+
+def search(loss: Callable[[Point], float], grids: Mapping[str, Sequence[Any]]) -> Search:
+    """Least loss over all combinations of values; of more than :data:`LARGEST_PRODUCT`, key by key from three starts.
+
+    A loss that is not finite is never the least one.
+    """
+    known: dict[str, tuple[dict[str, Any], float]] = {}
+
+    def tried(point: dict[str, Any]) -> float:
+        name = json.dumps(point, sort_keys=True)
+        if name not in known:
+            known[name] = dict(point), float(np.nan_to_num(loss(point), nan=np.inf))
+        return known[name][1]
+
+    if prod(len(values) for values in grids.values()) <= LARGEST_PRODUCT:
+        for combination in product(*grids.values()):
+            tried(dict(zip(grids, combination, strict=True)))
+        method = "every combination"
+    else:
+        for share in (0.25, 0.5, 0.75):
+            point = {name: values[int(share * (len(values) - 1))] for name, values in grids.items()}
+            for _ in range(SWEEPS):
+                before = dict(point)
+                for name, values in grids.items():
+                    point[name] = min(values, key=lambda value: tried({**point, name: value}))
+                if point == before:
+                    break
+        method = "one parameter after the other, three starts"
+    return Search(tuple(sorted(known.values(), key=lambda row: row[1])), method)
+
+
+def fitted_folds(
+    kind: str,
+    names: Sequence[str],
+    fit_on: Sequence[str] | None,
+    loss: Callable[[Sequence[str], Point], float],
+    grids: Mapping[str, Sequence[Any]],
+    progress: Progress,
+) -> Iterator[tuple[list[str], list[str], Search]]:
+    """The fit on the named flights, or, without names, on all but one, each left out in turn.
+
+    Parameters
+    ----------
+    kind : {"RSS", "rank"}
+        What is fitted.
+    names : sequence of str
+        Flights that gave it.
+    fit_on : sequence of str, optional
+        Those to fit on; names that gave nothing are passed over.
+    loss : callable
+        Of training flights at a point.
+    grids : mapping of str to sequence
+        Values to try.
+    progress : Progress
+
+    Yields
+    ------
+    train, test, search
+        Names of the flights of the fit, names of the others, and what was found.
+
+    Raises
+    ------
+    UsageError
+        No flight to fit on, or too few to leave one out.
+    InputError
+        No sample could be compared under any of the values.
+    """
+    if fit_on is None:
+        if len(names) < 2:
+            raise UsageError(f"{len(names)} flights with {kind}", expected="two or more, to leave one out at a time")
+        trainings = [[name for name in names if name != left] for left in names]
+    else:
+        trainings = [[name for name in fit_on if name in names]]
+        if not trainings[0]:
+            known = ", ".join(names) or "none has"
+            raise UsageError(f"no flight of held_out.fit_on gave {kind}", expected=f"a flight that has {kind}: {known}")
+    for train in trainings:
+        progress(f"held-out {kind}: fit on " + ", ".join(train))
+        found = search(lambda point, train=train: loss(train, point), grids)  # type: ignore[misc]
+        if not np.isfinite(found.tried[0][1]):
+            raise InputError(
+                f"nothing can be fitted on {', '.join(train)}",
+                expected=f"samples of {kind} that are measured and simulated under some of the values",
+                cause="no coverage, no positions, a minimum height above the flight, or values far off",
+            )
+        yield train, [name for name in names if name not in train], found
+
+
+# --- RSS ------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(slots=True)
@@ -51,8 +159,6 @@ class Bench:
     clocks: list[Clock | None]
     measured_db: list[FloatArray]
     kept: dict[tuple[int, str], FloatArray] = field(default_factory=dict)
-    known: dict[tuple[tuple[str, float], ...], float] = field(default_factory=dict)
-    """RMSE [dB] of points that workers computed."""
 
     def simulated(self, point: Point) -> list[FloatArray]:
         """Simulated level (n,) [dB] of every series with these parameters."""
@@ -80,10 +186,7 @@ class Bench:
         return dataclasses.replace(self.data, settings=settings, site=site, rss=tuple(series))
 
     def residual_db(self, point: Point) -> FloatArray:
-        """Residuals of all series, each with its own best offset; of a known point, their RMSE alone."""
-        known = self.known.get(_named(point))
-        if known is not None:
-            return np.array([known])
+        """Residuals of all series, each with its own best offset."""
         pairs = zip(self.measured_db, self.simulated(point), strict=True)
         return np.concatenate([own_residual_db(m, s, self.data.settings.rss) for m, s in pairs])
 
@@ -104,14 +207,6 @@ class Bench:
         return Bench(dataclasses.replace(self.data, rss=tuple(series)), clocks, measured)
 
 
-def _named(point: Point) -> tuple[tuple[str, float], ...]:
-    return tuple(sorted((name, float(value)) for name, value in point.items()))
-
-
-def _combinations(grids: Mapping[str, Sequence[float]]) -> int:
-    return prod(len(values) for values in grids.values())
-
-
 def own_residual_db(measured_db: FloatArray, simulated_db: FloatArray, rules: RssSettings) -> FloatArray:
     """Measured minus simulated after the best offset of these very samples (n,)."""
     fit = grid_offset(measured_db, simulated_db, step_db=rules.step_db, span_db=rules.span_db)
@@ -128,25 +223,6 @@ def bench_of(data: FlightData) -> Bench:
     return Bench(data, clocks, measured)
 
 
-def training_sets(names: Sequence[str], fit_on: Sequence[str] | None, kind: str) -> list[list[str]]:
-    """Flights of each fit: those that are named and gave ``kind`` (RSS, rank), or all but one, each in turn.
-
-    Raises
-    ------
-    UsageError
-        No flight to fit on, or too few to leave one out.
-    """
-    if fit_on is None:
-        if len(names) < 2:
-            raise UsageError(f"{len(names)} flights with {kind}", expected="two or more, to leave one out at a time")
-        return [[name for name in names if name != left] for left in names]
-    chosen = [name for name in fit_on if name in names]
-    if not chosen:
-        known = ", ".join(names) or "none has"
-        raise UsageError(f"no flight of held_out.fit_on gave {kind}", expected=f"a flight that has {kind}: {known}")
-    return [chosen]
-
-
 def fit_all(
     flights: Mapping[str, FlightData],
     grids: Mapping[str, Sequence[float]],
@@ -154,30 +230,23 @@ def fit_all(
     *,
     setting: str = "",
     samples: int = 1000,
-    refine: bool = False,
     progress: Progress = silent,
-    spread: Spread | None = None,
 ) -> list[HeldOutFold]:
-    """Fit on the named flights, or leave each flight out once.
+    """Least mean over flights of the mean square residual.
 
     Parameters
     ----------
     flights : mapping of str to FlightData
         Flights with RSS, by name.
     grids : mapping of str to sequence of float
-        Values to try, by dotted flight key.
+        Values to try, increasing, by dotted flight key.
     fit_on : sequence of str, optional
         Names; those that are not in ``flights`` (they failed) are passed over.
     setting : str
         Label, for the record.
     samples : int
         Evenly spread samples per series that the search looks at; all are scored.
-    refine : bool
-        Search between the values, too.
-    spread : callable, optional
-        Computes the errors of all combinations of values, flight by flight, on workers: the same numbers, sooner.
     progress : Progress
-        Gets what is fitted.
 
     Returns
     -------
@@ -186,116 +255,55 @@ def fit_all(
 
     Raises
     ------
-    UsageError
-        No flight to fit on, or too few to leave one out.
-    InputError
-        A flight of the fit has no sample that could be compared.
+    UsageError, InputError
+        As :func:`fitted_folds`.
     """
-    names, trainings = list(flights), training_sets(list(flights), fit_on, "RSS")
-    full = {}
-    for name, data in flights.items():
-        progress(f"held-out: prepare {name}")
-        full[name] = bench_of(data)
+    full = {name: bench_of(data) for name, data in flights.items()}
     few = {name: bench.thinned(samples) for name, bench in full.items()}
-    if spread is not None and _combinations(grids) <= LARGEST_PRODUCT:
-        progress(f"held-out: {_combinations(grids)} combinations of values on the workers")
-        points = [dict(zip(grids, map(float, values), strict=True)) for values in product(*grids.values())]
-        for name, errors in spread(
-            dict.fromkeys(dict.fromkeys(n for train in trainings for n in train), points)
-        ).items():
-            few[name].known.update(zip(map(_named, points), errors, strict=True))
+
+    def loss(train: Sequence[str], point: Point) -> float:
+        return float(np.mean([rmse(few[name].residual_db(point)) ** 2 for name in train]))
+
     folds = []
-    for train in trainings:
-        progress("held-out: fit on " + ", ".join(train))
-        test = [name for name in names if name not in train]
-        try:
-            optimum = search(few, grids, train, refine=refine)
-        except ValueError as error:
-            raise InputError(
-                f"nothing can be fitted on {', '.join(train)}: {error}",
-                expected="samples that are measured and simulated under some of the values",
-                cause="no coverage, or values far off",
-            ) from None
-        curves = _curves(few, grids, optimum.parameters)
-        flat = [n for n, by in curves.items() if all(np.ptp(by[f][1]) < NO_EFFECT_DB for f in train)]
+    for train, test, found in fitted_folds("RSS", list(flights), fit_on, loss, grids, progress):
+        curves = _curves(few, grids, found.point)
+        ends = {name: (values[0], values[-1]) for name, values in grids.items() if len(values) > 1}
         folds.append(
             HeldOutFold(
                 setting=setting,
                 fitted_on=tuple(train),
                 applied_to=tuple(test),
-                parameters=optimum.parameters,
-                at_bounds=optimum.at_bounds,
-                evaluations=optimum.evaluations,
-                method=optimum.method,
-                rows=tuple(_scores(full, optimum.parameters, train, test)),
-                without_effect=tuple(flat),
+                parameters=found.point,
+                at_bounds=tuple(n for n, v in ends.items() if found.point[n] in v and not _round(n, grids[n])),
+                evaluations=len(found.tried) * len(train),
+                method=found.method,
+                rows=tuple(_scores(full, found.point, train, test)),
+                without_effect=tuple(
+                    n for n, by in curves.items() if all(np.ptp(by[name][1]) < NO_EFFECT_DB for name in train)
+                ),
                 curves=curves,
             )
         )
     return folds
 
 
-@dataclass(frozen=True, slots=True)
-class Search:
-    """What a search found, how, and in how many evaluations of a flight."""
-
-    parameters: dict[str, float]
-    at_bounds: tuple[str, ...]
-    evaluations: int
-    method: str
+def rmse(residual_db: FloatArray) -> float:
+    """Root mean square without NaN; NaN if nothing is left."""
+    values = residual_db[np.isfinite(residual_db)]
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 
-def search(
-    benches: Mapping[str, Bench], grids: Mapping[str, Sequence[float]], train: Sequence[str], *, refine: bool
-) -> Search:
-    """Least mean square residual over the training flights, mean over flights.
+def _round(name: str, values: Sequence[float]) -> bool:
+    return name.endswith("yaw_deg") and goes_round(values)
 
-    All combinations of values are tried up to :data:`LARGEST_PRODUCT`; beyond, one parameter after the other from
-    three starts (the quartiles of every list), until a round changes nothing.
 
-    Parameters
-    ----------
-    benches : mapping of str to Bench
-        Flights by name.
-    grids : mapping of str to sequence of float
-        Values to try, increasing, by dotted flight key.
-    train : sequence of str
-        Names of the flights to fit on.
-    refine : bool
-        Search between the values, too (where all combinations are tried).
-
-    Returns
-    -------
-    Search
-        The best values, those at the end of their list, and how many points were looked at.
-    """
-
-    def objective(point: Mapping[str, float], flight: str) -> FloatArray:
-        return benches[flight].residual_db(point)
-
-    circular = [name for name, values in grids.items() if name.endswith("yaw_deg") and goes_round(values)]
-    if _combinations(grids) <= LARGEST_PRODUCT:
-        fit = fit_held_out(objective, grids, train, refine=refine, circular=circular)
-        return Search(dict(fit.parameters), fit.at_bounds, fit.evaluations, "every combination")
-    calls, best = 0, (np.inf, {name: float(v[0]) for name, v in grids.items()})
-    for share in (0.25, 0.5, 0.75):
-        point = {name: float(v[int(share * (len(v) - 1))]) for name, v in grids.items()}
-        for _ in range(SWEEPS):
-            before = dict(point)
-            for name, values in grids.items():
-                others = {key: [value] for key, value in point.items() if key != name}
-                fit = fit_held_out(objective, {name: values, **others}, train, refine=False)
-                point = {key: fit.parameters[key] for key in point}
-                calls += fit.evaluations
-            if point == before:
-                break
-        score = float(np.mean([rmse(objective(point, flight)) ** 2 for flight in train]))
-        if score < best[0]:
-            best = (score, point)
-    edge = tuple(
-        n for n, v in grids.items() if len(v) > 1 and n not in circular and best[1][n] in (float(v[0]), float(v[-1]))
-    )
-    return Search(best[1], edge, calls, "one parameter after the other, three starts")
+def goes_round(values: Sequence[float] | FloatArray) -> bool:
+    """Whether increasing angles [deg] cover the circle: the gap from the last to the first is no wider than another."""
+    angles = np.asarray(values, dtype=np.float64)
+    if len(angles) < 3:
+        return False
+    gap = 360.0 - (angles[-1] - angles[0])
+    return bool(0.0 <= gap <= np.diff(angles).max() * (1.0 + 1e-9))
 
 
 def _scores(benches: Mapping[str, Bench], point: Point, train: list[str], test: list[str]) -> list[HeldOutRow]:

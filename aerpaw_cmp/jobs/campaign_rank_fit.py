@@ -6,12 +6,10 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 from typing import Any, Literal
 
 import numpy as np
 
-from ..common.errors import InputError
 from ..common.stages import Progress, silent
 from ..common.units import FloatArray, IntArray
 from ..compare import rank as ranks
@@ -21,16 +19,12 @@ from ..flight.data import FlightData, choose_site
 from ..flight.overrides import overridden
 from ..flight.replay import replay_rank
 from ..report.campaign_data import RankHeldOutFold, RankHeldOutRow
-from .campaign_fit import LARGEST_PRODUCT, training_sets
+from .campaign_fit import Point, Search, fitted_folds
 
 Criterion = Literal["kappa", "log_score", "total_variation"]
-Point = Mapping[str, Any]
 
 K_KEY = "rank.k"
 """The one key of the fit that is no key of a replay: a single singular-value ratio."""
-
-SWEEPS = 4
-"""Rounds over all parameters, at most."""
 
 FINALISTS = 40
 """Combinations that are compared with the best one by one: what cannot be told from it is listed."""
@@ -162,87 +156,29 @@ def fit_rank_all(
 
     Raises
     ------
-    UsageError
-        No flight to fit on, or too few to leave one out.
-    InputError
-        No report could be compared under any of the values.
+    UsageError, InputError
+        As :func:`~aerpaw_cmp.jobs.campaign_fit.fitted_folds`.
     """
-    trainings = training_sets(list(flights), fit_on, "rank")
     full = {name: RankBench(data) for name, data in flights.items()}
     few = {name: bench.thinned(samples) for name, bench in full.items()}
-    folds = []
-    for train in trainings:
-        progress("held-out rank: fit on " + ", ".join(train))
-        optimum = search([few[name] for name in train], grids, criterion)
-        if not np.isfinite(optimum.loss):
-            raise InputError(
-                f"nothing can be fitted on {', '.join(train)}",
-                expected="reports with a rank where the replay has a channel",
-                cause="no coverage, no positions, or rank.minimum_height_m above the flight",
-            )
-        folds.append(_fold(full, few, train, optimum, criterion, setting))
-    return folds
 
+    def lost(train: Sequence[str], point: Point) -> float:
+        return loss([few[name] for name in train], point, criterion)
 
-@dataclass(frozen=True, slots=True)
-class Search:
-    """What a search found: the point, its loss, every point that was tried with its loss, and how."""
-
-    point: dict[str, Any]
-    loss: float
-    tried: tuple[tuple[dict[str, Any], float], ...]
-    method: str
-
-
-def search(benches: Sequence[RankBench], grids: Mapping[str, Sequence[Any]], criterion: Criterion) -> Search:
-    """Least loss over all combinations, or, of more than :data:`LARGEST_PRODUCT`, key by key from three starts."""
-    known: dict[str, tuple[dict[str, Any], float]] = {}
-
-    def tried(point: dict[str, Any]) -> float:
-        name = json.dumps(point, sort_keys=True)
-        if name not in known:
-            known[name] = (dict(point), loss(benches, point, criterion))
-        return known[name][1]
-
-    if np.prod([len(values) for values in grids.values()], dtype=np.float64) <= LARGEST_PRODUCT:
-        for combination in product(*grids.values()):
-            tried(dict(zip(grids, combination, strict=True)))
-        method = "every combination"
-    else:
-        for share in (0.25, 0.5, 0.75):
-            point = {name: values[int(share * (len(values) - 1))] for name, values in grids.items()}
-            for _ in range(SWEEPS):
-                before = dict(point)
-                for name, values in grids.items():
-                    point[name] = min(values, key=lambda v: np.nan_to_num(tried({**point, name: v}), nan=np.inf))
-                if point == before:
-                    break
-        method = "one parameter after the other, three starts"
-    in_order = sorted(known.values(), key=lambda row: np.nan_to_num(row[1], nan=np.inf))
-    return Search(in_order[0][0], in_order[0][1], tuple(in_order), method)
-
-
-def _fold(
-    full: Mapping[str, RankBench],
-    few: Mapping[str, RankBench],
-    train: Sequence[str],
-    optimum: Search,
-    criterion: Criterion,
-    setting: str,
-) -> RankHeldOutFold:
-    test = [name for name in full if name not in train]
-    ties = _ties([few[name] for name in train], optimum)
-    return RankHeldOutFold(
-        setting=setting,
-        criterion=criterion,
-        fitted_on=tuple(train),
-        applied_to=tuple(test),
-        parameters=optimum.point,
-        evaluations=len(optimum.tried),
-        method=optimum.method,
-        ties=tuple(ties),
-        rows=tuple(_rows(full, train, test, optimum.point)),
-    )
+    return [
+        RankHeldOutFold(
+            setting=setting,
+            criterion=criterion,
+            fitted_on=tuple(train),
+            applied_to=tuple(test),
+            parameters=found.point,
+            evaluations=len(found.tried),
+            method=found.method,
+            ties=tuple(_ties([few[name] for name in train], found)),
+            rows=tuple(_rows(full, train, test, found.point)),
+        )
+        for train, test, found in fitted_folds("rank", list(flights), fit_on, lost, grids, progress)
+    ]
 
 
 def _ties(benches: Sequence[RankBench], optimum: Search) -> list[dict[str, Any]]:

@@ -7,23 +7,23 @@ import json
 import os
 import shutil
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.common.stages import silent
 from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import campaign_fit
-from aerpaw_cmp.jobs.campaign import PointsOrder, _held_out, campaign_tasks, load_campaign, point_errors, run
+from aerpaw_cmp.jobs.campaign import load_campaign, run
+from aerpaw_cmp.jobs.campaign_fit import goes_round, search
 from aerpaw_cmp.jobs.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
-from aerpaw_cmp.jobs.workers import Here
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -625,29 +625,27 @@ def test_a_failed_task_leaves_its_traceback_in_a_file(folder: Path) -> None:
     assert "Traceback (most recent call last)" in text
 
 
-def test_workers_search_the_held_out_fit_to_the_same_digit(folder: Path) -> None:
-    """Two processes compute the errors of all combinations; parameters, scores and curves are those of one."""
-    path = write_campaign(folder, "spread", held_out={"fit": {YAW: [0, 60, 110, 160]}, "samples": 60})
-    campaign = load_campaign(path)
-    tasks, _, _ = campaign_tasks(campaign, folder)
-    assert campaign.held_out is not None
-
-    class Two(Here):
-        count = 2
-
-    asked: list[int] = []
-
-    def counted(order: PointsOrder) -> list[float]:
-        asked.append(len(order.points))
-        return point_errors(order)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("aerpaw_cmp.jobs.campaign.point_errors", counted)
-        alone, shared = (_held_out(campaign.held_out, tasks, rows(folder), crew, silent) for crew in (Here(), Two()))
-    assert sum(asked) == 8
-    assert repr(alone) == repr(shared)
+def test_what_goes_round() -> None:
+    assert goes_round(np.arange(0, 360, 10))
+    assert goes_round([-180.0, -60.0, 60.0])
+    assert goes_round(np.arange(0, 361, 10))
+    assert not goes_round(np.arange(0, 180, 10))
+    assert not goes_round([0.0, 10.0, 20.0, 350.0, 700.0])
+    assert not goes_round([0.0, 180.0])
 
 
-def rows(folder: Path) -> list[RssRow]:
-    """Just enough for the search to know which flights have RSS."""
-    return [replace(row(name, "USRP1", [1.0, 2.0], [0.0, 0.0]), setting="as written") for name in OFFSETS_DB]
+def test_an_azimuth_that_goes_round_has_no_bound(folder: Path) -> None:
+    """The best of values over the circle is the first of them; of values over a half it would be at a bound."""
+    for values, bound in (([110, 200, 290, 380], ()), ([110, 200], (YAW,))):
+        path = write_campaign(folder, "round", held_out={"fit": {YAW: values}, "fit_on": ["first"], "samples": 60})
+        (fold,) = run(load_campaign(path), folder).held_out
+        assert fold.parameters == {YAW: 110.0}
+        assert fold.at_bounds == bound
+
+
+@given(st.lists(st.floats(0, 1, width=32), min_size=1, max_size=5, unique=True), st.integers(1, 3))
+def test_the_search_gives_the_least_of_every_combination(values: list[float], keys: int) -> None:
+    grids = {str(key): sorted(values) for key in range(keys)}
+    found = search(lambda point: sum((x - 0.4) ** 2 for x in point.values()), grids)
+    assert set(found.point.values()) == {min(sorted(values), key=lambda x: (x - 0.4) ** 2)}
+    assert len(found.tried) == len(values) ** keys

@@ -15,7 +15,8 @@ from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.campaign import load_campaign
-from aerpaw_cmp.jobs.campaign_rank_fit import RankBench, fit_rank_all, loss, search, shares_by_rank
+from aerpaw_cmp.jobs.campaign_fit import search
+from aerpaw_cmp.jobs.campaign_rank_fit import RankBench, fit_rank_all, loss, shares_by_rank
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -87,7 +88,8 @@ def test_values_may_be_lists_and_long_products_are_searched_key_by_key(flights: 
     (fold,) = fit_rank_all(flights, {"link.rank.uav.slant_deg": slants, **GRIDS}, ["one"], criterion="kappa")
     assert fold.parameters == {"link.rank.uav.slant_deg": slants[1], **PLANTED}
     many = {"rank.k": [20.0, *np.linspace(30, 300, 600).tolist()], "link.rank.uav.yaw_deg": [90.0]}
-    found = search([RankBench(flights["one"]).thinned(40)], many, "kappa")
+    few = [RankBench(flights["one"]).thinned(40)]
+    found = search(lambda point: loss(few, point, "kappa"), many)
     assert found.method.startswith("one parameter")
     assert found.point["rank.k"] == 20.0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,18 @@ def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for cell in cells(path):
         source = "".join(line for line in cell["source"] if not line.startswith("%"))  # type: ignore[attr-defined]
         exec(compile(source, str(path), "exec"), scope)
+
+
+def test_the_code_of_the_python_page_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "sample_logs").symlink_to(FOLDER.parents[1] / "sample_logs")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    parts = re.findall(r"^```python\n(.*?)^```", (FOLDER.parent / "api.md").read_text(), re.MULTILINE | re.DOTALL)
+    assert len(parts) == 3
+    scope: dict[str, object] = {"__name__": "page"}
+    for part in parts:
+        exec(compile(part, "docs/api.md", "exec"), scope)
+    assert (tmp_path / "level.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

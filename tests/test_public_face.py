@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import aerpaw_cmp as ac
@@ -28,6 +31,13 @@ def test_every_public_name_exists_has_a_docstring_and_stands_in_the_page() -> No
     assert set(ac.__all__) - {"__version__"} == set(ac._HOME)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = ac.nothing
+
+
+def test_the_stub_names_every_public_name_from_its_home() -> None:
+    """Type checkers read ``__init__.pyi`` alone: without it every public name would be ``Any``."""
+    stub = (ROOT / "aerpaw_cmp" / "__init__.pyi").read_text()
+    lines = re.findall(r"^from aerpaw_cmp\.([\w.]+) import (\w+) as \2$", stub, re.MULTILINE)
+    assert {name: home for home, name in lines} == ac._HOME
 
 
 def test_using_one_name_loads_only_its_room() -> None:
@@ -56,6 +66,40 @@ def test_read_gives_frames_by_stream_with_their_account() -> None:
     assert lines == sum(file.result.lines for file in logs.files)
     assert "<table>" in logs._repr_html_()
     assert f"{len(frames[0])} records" in repr(logs)
+
+
+def test_read_takes_patterns_open_files_lists_and_zones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(SAMPLE.parent))
+    log = next((SAMPLE / "UAV").glob("*vehicleOut*"))
+    expected = ac.read(log, timezone="America/New_York")["vehicle"]
+    assert str(expected.time.dt.tz) == "UTC"
+    with log.open("rb") as file:
+        opened = ac.read(file, timezone="America/New_York")
+    assert opened["vehicle"].attrs["file"] == log.name
+    assert opened.files[0].sha256 == ac.read(log, timezone="America/New_York").files[0].sha256
+    for source in (f"{SAMPLE}/UAV/*vehicleOut*", f"~/{SAMPLE.name}/UAV/*vehicleOut*", [log], iter([str(log)])):
+        pd.testing.assert_frame_equal(ac.read(source, timezone=ZoneInfo("America/New_York"))["vehicle"], expected)
+    with pytest.raises(Exception, match="no file matches the pattern"):
+        ac.read(f"{SAMPLE}/*.nothing")
+
+
+def test_logs_are_selected_written_and_opened_again_as_a_flight(tmp_path: Path) -> None:
+    logs = ac.read([SAMPLE / "UAV", SAMPLE / "LW1"], timezone="America/New_York")
+    assert {frame.attrs["kind"] for frame in logs.select(kind="rss").values()} == {"rss"}
+    assert set(logs.select(kind="rss", node="nowhere")) == set()
+    logs.write(tmp_path / "flight.h5")
+    again = ac.read(tmp_path / "flight.h5")
+    assert set(again) == set(logs)
+    for name, frame in logs.items():
+        pd.testing.assert_frame_equal(again[name], frame)
+    flight = ac.open_flight(tmp_path / "flight.h5")
+    records = {frame.attrs["kind"]: len(frame) for frame in logs.values()}
+    assert len(flight.rank) == records["rank"]
+    assert str(flight.rss.time.dt.tz) == "UTC"
+    assert flight.plot().get_xlabel() == "East [m]"
+    assert "LW1" in flight.site._repr_html_()
+    with pytest.raises(Exception, match="as it stands"):
+        flight.report(tmp_path / "report")
 
 
 def test_streams_of_one_name_keep_apart() -> None:
@@ -88,10 +132,17 @@ def test_a_replayed_flight_has_levels_matrices_and_paths_that_agree(flight: ac.F
     known = np.isfinite(level[one.valid])
     assert level[one.valid][known] == pytest.approx(power[known], abs=1e-9)
     assert replayed.paths[key].depth.max() == 0
-    data = replayed.to_xarray()[key]
-    assert data.sizes["pose"] == one.valid.sum()
+    data = replayed.to_xarray()["/".join(key)]
+    assert data.sizes["time"] == one.valid.sum()
     assert {"time", "east_m"} <= set(data.coords)
-    table = replayed.compare().to_frame()
+    compared = replayed.compare()
+    levels = compared.to_xarray()["/".join(key)]
+    residual = levels.residual_db
+    assert float(abs(levels.calibrated_db - levels.simulated_dbm - residual).max()) < 1e-9
+    score = next(fit for fit in compared.result.rss if (fit.tower, fit.channel) == key).score
+    assert float(np.sqrt(np.nanmean(residual**2))) == pytest.approx(score.rmse_db)
+    assert len(compared.plot().lines) == 2 * len(compared.result.rss)
+    table = compared.to_frame()
     assert len(table) == len(flight.data.rss)
     assert {"rmse_db", "free_space_rmse_db", "two_ray_rmse_db"} <= set(table.columns)
     with pytest.raises(Exception, match="did you mean 'max_depth'"):

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import pydantic
 import yaml
@@ -56,7 +56,7 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 class StrictModel(pydantic.BaseModel):
     """A settings model that refuses unknown keys and cannot be changed after loading."""
 
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+    model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(extra="forbid", frozen=True)
 
 
 def nearest(name: object, choices: Iterable[str]) -> str | None:

@@ -383,7 +383,8 @@ class _Entries:
 
     def enter(self, file: IngestedFile) -> None:
         """One log: a line of ``logs:``, or the reason why not."""
-        path = os.path.relpath(Path(file.path).resolve(), self.folder)
+        place = Path(file.holder, file.path.lstrip("/")) if file.holder else Path(file.path)
+        path = os.path.relpath(place.resolve(), self.folder)
         shown = one_line(path)
         if (first := self.contents.setdefault(file.sha256, shown)) != shown:
             self.out.append(f"{shown}: the same bytes as {first}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -12,13 +11,19 @@ import numpy as np
 import pandas as pd
 
 from ..common.errors import UsageError
+from ..common.htmltable import html_table
 from ..common.units import ComplexArray, FloatArray
+from ..common.yamlfile import parse_yaml
 from ..compare.result import FlightResult
 from ..flight.data import FlightData, gather, load_data, rank_positions
+from ..flight.draft import draft
 from ..flight.overrides import overridden
 from ..flight.replay import FlightReplay, Replayed, replay_flight
-from ..flight.settings import FlightFile, load_flight
+from ..flight.settings import FlightFile, load_flight, with_learned
+from ..logs.flight_file import is_flight_file
+from ..logs.ingest import ingest
 from ..propagation.paths import PathSet
+from ..propagation.replay import require_xarray
 from ..site.site import Site
 from .compare_flight import compare_flight
 
@@ -35,12 +40,12 @@ def open_flight(
     logs_root: str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> Flight:
-    """Read a flight.yaml and its logs.
+    """Read a flight.yaml and its logs, or a flight.h5 with the settings that a draft of it would have.
 
     Parameters
     ----------
     path : path
-        The flight file.
+        A flight.yaml, or a flight file (HDF5) that ``ingest -o`` or ``Logs.write`` wrote.
     logs_root : path, optional
         Folder against which the paths of its logs resolve; default its own folder.
     overrides : mapping, optional
@@ -60,11 +65,19 @@ def open_flight(
     >>> flight = open_flight("sample_logs/flight.yaml")  # doctest: +SKIP
     >>> flight.compare().to_frame()  # doctest: +SKIP
     """
-    file = Path(path)
-    settings = overridden(load_flight(file), overrides or {})
-    root = None if logs_root is None else Path(logs_root)
-    data = load_data(settings, file.parent, root)
-    return Flight(file, data, root, changed=tuple(overrides or ()))
+    file = Path(path).expanduser()
+    root = None if logs_root is None else Path(logs_root).expanduser()
+    drafted = file.is_file() and is_flight_file(file)
+    settings = _drafted(file) if drafted else load_flight(file)
+    data = load_data(overridden(settings, overrides or {}), file.parent, root)
+    changed = ("the draft of its flight file",) if drafted else ()
+    return Flight(file, data, root, changed=(*changed, *(overrides or ())))
+
+
+def _drafted(file: Path) -> FlightFile:
+    """Settings that ``ingest --draft`` would write for a flight file."""
+    text, _ = draft(ingest(file), file.parent)
+    return with_learned(parse_yaml(text, FlightFile), file.parent)
 
 
 class Flight:
@@ -113,7 +126,7 @@ class Flight:
         times = self._telemetry_times()
         poses = self.data.track.pose_at(times)
         frame = pd.DataFrame(poses.position_m, columns=["east_m", "north_m", "up_m"])
-        frame.insert(0, "time", times)
+        frame.insert(0, "time", _utc(times))
         frame["heading_deg"] = poses.heading_deg
         frame["attitude_known"] = poses.attitude_known
         kept: pd.DataFrame = frame[poses.valid].reset_index(drop=True)
@@ -129,7 +142,7 @@ class Flight:
                 position = self.data.track.pose_at(series.time).position_m
             level = {"measured_db": series.measured_db, **_place(position)}
             what = {"tower": series.tower, "channel": series.channel, "unit": series.unit}
-            frames.append(pd.DataFrame({"time": series.time, **what, **level}))
+            frames.append(pd.DataFrame({"time": _utc(series.time), **what, **level}))
         return _together(frames, ["time", "tower", "channel", "unit", "measured_db", "east_m", "north_m", "up_m"])
 
     @cached_property
@@ -139,7 +152,7 @@ class Flight:
         for series in self.data.rank:
             position, _ = rank_positions(series, self.data.track)
             columns = {"tower": series.tower, "rank": series.rank, "sinr_db": series.sinr_db, **_place(position)}
-            frames.append(pd.DataFrame({"time": series.time, **columns}))
+            frames.append(pd.DataFrame({"time": _utc(series.time), **columns}))
         return _together(frames, ["time", "tower", "rank", "sinr_db", "east_m", "north_m", "up_m"])
 
     def replay(self, engine: str | None = None, **overrides: Any) -> ReplayedFlight:
@@ -200,6 +213,26 @@ class Flight:
         run_report(self.path, out=out, logs_root=self.logs_root, force=force, **options)
         return out / "report.html"
 
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the trajectory with the towers, seen from above.
+
+        Parameters
+        ----------
+        axes : matplotlib.axes.Axes, optional
+            Default: those of a new figure.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+        """
+        axes = axes if axes is not None else _new_axes()
+        axes.plot(self.track.east_m, self.track.north_m, label=self.settings.flight.name)
+        for name, tower in self.site.towers.items():
+            axes.plot(*tower.position_m[:2], "^", label=name)
+        axes.set(xlabel="East [m]", ylabel="North [m]", aspect="equal")
+        axes.legend()
+        return axes
+
     def _telemetry_times(self) -> Any:
         frames = [s.frame for f in self.data.files for s in f.result.streams if s.kind == "telemetry"]
         times = pd.concat([frame["time"] for frame in frames]).dropna().to_numpy("datetime64[ns]")
@@ -217,7 +250,7 @@ class Flight:
         """A table of the series for notebooks."""
         rows = [(s.tower, s.channel, f"RSS [{s.unit}]", len(s.time)) for s in self.data.rss]
         rows += [(s.tower, "", "rank", len(s.time)) for s in self.data.rank]
-        return _table(("tower", "channel", "quantity", "samples"), rows, self.settings.flight.name)
+        return html_table(("tower", "channel", "quantity", "samples"), rows, self.settings.flight.name)
 
     def _span(self) -> str:
         return "no track" if self.data.track is None else f"{len(self.track)} poses"
@@ -258,8 +291,13 @@ class ReplayedFlight:
         """Paths of each series; ``pose`` counts the poses that are known."""
         return {key: one.replay.paths for key, one in self.series.items()}
 
-    def to_xarray(self) -> dict[Series, Any]:
-        """An ``xarray.Dataset`` per series, with ``time`` and position as coordinates of its poses.
+    def to_xarray(self) -> Any:
+        """Levels and channel matrices on an index of time.
+
+        Returns
+        -------
+        xarray.DataTree
+            A node ``<tower>/<channel>`` per series; ``time`` is UTC, and holds the poses that are known.
 
         Raises
         ------
@@ -268,12 +306,12 @@ class ReplayedFlight:
         """
         times = {(s.tower, s.channel): s.time for s in self.data.rss}
         times |= {(s.tower, "rank"): s.time for s in self.data.rank}
-        out = {}
+        nodes = {}
         for key, one in self.series.items():
-            place = _place(one.poses.position_m)
-            where = {name: ("pose", values) for name, values in place.items()}
-            out[key] = one.replay.to_xarray().assign_coords(time=("pose", times[key][one.valid]), **where)
-        return out
+            data = one.replay.to_xarray().rename(pose="time")
+            place = {name: ("time", values) for name, values in _place(one.poses.position_m).items()}
+            nodes[_node(key)] = data.assign_coords(time=times[key][one.valid], **place)
+        return _tree(nodes)
 
     def compare(self) -> Comparison:
         """Offsets, errors, baselines and ranks of every series."""
@@ -334,6 +372,59 @@ class Comparison:
         table: pd.DataFrame = pd.DataFrame(rows)
         return table
 
+    def to_xarray(self) -> Any:
+        """Measured and simulated levels and ranks on an index of time.
+
+        Returns
+        -------
+        xarray.DataTree
+            A node ``<tower>/<channel>`` per RSS series with ``measured_db``, ``calibrated_db`` (measured plus the
+            fitted offset), ``simulated_dbm`` and ``residual_db`` (calibrated minus simulated, NaN where nothing is
+            compared), and ``<tower>/rank`` per rank series with ``measured`` and ``simulated`` by ``k``. Times are UTC.
+
+        Raises
+        ------
+        UsageError
+            If xarray is not installed.
+        """
+        xarray = require_xarray()
+        nodes = {}
+        for one in self.result.rss:
+            level = {"measured_db": one.measured_db, "calibrated_db": one.measured_db + one.score.offset_db}
+            level |= {"simulated_dbm": one.simulated_dbm, "residual_db": one.score.residual_db}
+            columns = {**level, **_place(one.position_m)}
+            nodes[_node((one.tower, one.channel))] = xarray.Dataset(
+                {name: ("time", values) for name, values in columns.items()}, {"time": one.time}, {"unit": one.unit}
+            ).set_coords(["east_m", "north_m", "up_m"])
+        for one_rank in self.result.rank:
+            ranks = np.array(list(one_rank.rank.values()))
+            nodes[_node((one_rank.tower, "rank"))] = xarray.Dataset(
+                {"measured": ("time", one_rank.measured), "simulated": (("k", "time"), ranks)},
+                {"time": one_rank.time, "k": list(one_rank.rank)},
+            )
+        return _tree(nodes)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw calibrated and simulated levels along time.
+
+        Parameters
+        ----------
+        axes : matplotlib.axes.Axes, optional
+            Default: those of a new figure.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+        """
+        axes = axes if axes is not None else _new_axes()
+        for one in self.result.rss:
+            name, measured_dbm = f"{one.tower} {one.channel}", one.measured_db + one.score.offset_db
+            (line,) = axes.plot(one.time, measured_dbm, ".", markersize=2, label=f"{name} measured")
+            axes.plot(one.time, one.simulated_dbm, color=line.get_color(), label=f"{name} simulated")
+        axes.set(xlabel="Time [UTC]", ylabel="Level [dBm]")
+        axes.legend()
+        return axes
+
     def __repr__(self) -> str:
         """The tables as text."""
         tables = [table for table in (self.to_frame(), self.rank_to_frame()) if len(table)]
@@ -345,6 +436,26 @@ class Comparison:
         return "".join(table.round(2).to_html(index=False, border=0) for table in tables)
 
 
+def _node(series: Series) -> str:
+    """The place of a series in a tree, whose names hold no slash."""
+    return "/".join(name.replace("/", "_") for name in series)
+
+
+def _tree(nodes: Mapping[str, Any]) -> Any:
+    return require_xarray().DataTree.from_dict(nodes)
+
+
+def _new_axes() -> Any:
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(layout="constrained")[1]
+
+
+def _utc(time: Any) -> pd.DatetimeIndex:
+    instants: pd.DatetimeIndex = pd.DatetimeIndex(time).tz_localize("UTC")
+    return instants
+
+
 def _place(position_m: FloatArray) -> dict[str, FloatArray]:
     return {"east_m": position_m[:, 0], "north_m": position_m[:, 1], "up_m": position_m[:, 2]}
 
@@ -352,13 +463,6 @@ def _place(position_m: FloatArray) -> dict[str, FloatArray]:
 def _together(frames: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
     table: pd.DataFrame = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
     return table
-
-
-def _table(titles: Sequence[str], rows: Sequence[Sequence[object]], caption: str) -> str:
-    head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
-    name = html.escape(caption)
-    return f"<table><caption>{name}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 __all__ = ["Comparison", "Flight", "ReplayedFlight", "open_flight"]

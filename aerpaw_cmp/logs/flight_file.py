@@ -55,11 +55,14 @@ class IngestedFile:
     sha256 : str
         Of the content after unpacking: a log is known by it, whatever its name or archive.
     result : ReadResult
+    holder : str
+        The flight file that the log was read from; empty where it was read itself.
     """
 
     path: str
     sha256: str
     result: ReadResult
+    holder: str = ""
 
 
 def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:

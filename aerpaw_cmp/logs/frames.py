@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-import html
-from collections.abc import Sequence
+import glob
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, TypeAlias, cast
+from zoneinfo import ZoneInfo
 
 import pandas as pd
 
+from ..common.errors import InputError
+from ..common.htmltable import html_table
+from .flight_file import IngestedFile, write_flight
 from .ingest import Ingested, account_notes, ingest, summary
 from .readers import ReadOptions
+
+Source: TypeAlias = str | os.PathLike[str] | BinaryIO
+"""A file, a folder, a pattern such as ``"logs/*.txt"``, or an open binary file; ``~`` is the home folder."""
 
 
 class Logs(dict[str, pd.DataFrame]):
@@ -39,13 +49,9 @@ class Logs(dict[str, pd.DataFrame]):
             key = stream.name if names.count(stream.name) == 1 else f"{file_name}:{stream.name}"
             if key in frames:  # two files of one name in two folders
                 key = f"{file.path}:{stream.name}"
-            frame = stream.frame.copy(deep=False)
-            frame.attrs = {
-                **stream.attributes,
-                "kind": stream.kind,
-                "reader": file.result.reader,
-                "file": file.path,
-            }
+            frame = in_utc(stream.frame)
+            frame.attrs.update(stream.attributes)
+            frame.attrs |= {"kind": stream.kind, "reader": file.result.reader, "file": file.path}
             frames[key] = frame
         super().__init__(frames)
 
@@ -59,20 +65,41 @@ class Logs(dict[str, pd.DataFrame]):
         """Rejected lines, warnings and files left out, one sentence each."""
         return account_notes(self.account)
 
+    def select(self, **wanted: Any) -> dict[str, pd.DataFrame]:
+        """Frames whose attributes have the given values.
+
+        Parameters
+        ----------
+        wanted
+            Attributes of a stream, such as ``kind="rss"``, ``node="LW1"``, ``channel``, ``unit``, ``reader``, ``file``.
+
+        Examples
+        --------
+        >>> logs.select(kind="rss", node="LW1")  # doctest: +SKIP
+        """
+        return {k: v for k, v in self.items() if all(v.attrs.get(name) == value for name, value in wanted.items())}
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write every stream with its account into a flight file (HDF5), which :func:`read` reads back.
+
+        Parameters
+        ----------
+        path : path
+            Such as ``flight.h5``; a file that stands there is replaced.
+        """
+        write_flight(Path(path).expanduser(), self.files)
+
     def __repr__(self) -> str:
         """One line per stream."""
         return "\n".join([f"Logs of {_count(len(self.files), 'file')}", *("  " + _line(k, v) for k, v in self.items())])
 
     def _repr_html_(self) -> str:
         """A table of streams for notebooks."""
-        rows = "".join(
-            f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(frame.attrs['kind']))}</td>"
-            f"<td>{html.escape(str(frame.attrs['reader']))}</td><td>{len(frame)}</td>"
-            f"<td>{html.escape(Path(str(frame.attrs['file'])).name)}</td></tr>"
+        rows = [
+            (name, frame.attrs["kind"], frame.attrs["reader"], len(frame), Path(str(frame.attrs["file"])).name)
             for name, frame in self.items()
-        )
-        head = "".join(f"<th>{title}</th>" for title in ("stream", "kind", "reader", "records", "file"))
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        ]
+        return html_table(("stream", "kind", "reader", "records", "file"), rows)
 
 
 def _count(number: int, noun: str) -> str:
@@ -83,9 +110,16 @@ def _line(name: str, frame: pd.DataFrame) -> str:
     return f"{name}: {frame.attrs['kind']}, {_count(len(frame), 'record')} ({frame.attrs['reader']})"
 
 
+def in_utc(frame: pd.DataFrame) -> pd.DataFrame:
+    """The frame with ``time`` as instants of UTC: records hold UTC without a zone."""
+    out: pd.DataFrame = frame.copy(deep=False)
+    out["time"] = pd.to_datetime(out["time"]).dt.tz_localize("UTC")
+    return out
+
+
 def read(
-    path: str | Path | Sequence[str | Path],
-    timezone: str | None = None,
+    path: Source | Iterable[Source],
+    timezone: str | ZoneInfo | None = None,
     *,
     reader: str | None = None,
     time_origin: str | None = None,
@@ -95,9 +129,10 @@ def read(
 
     Parameters
     ----------
-    path : path or sequence of paths
-        Files and folders; a folder is searched to the bottom.
-    timezone : str, optional
+    path : path, pattern, open file, or several of these
+        Files and folders (searched to the bottom); ``~`` and ``"logs/*.txt"`` are understood; a file may be open in
+        binary mode.
+    timezone : str or ZoneInfo, optional
         IANA zone of clocks that show local time, such as ``"America/New_York"``.
     reader : str, optional
         Name of the reader (``aerpaw-cmp formats`` lists them) instead of finding it by content.
@@ -109,12 +144,12 @@ def read(
     Returns
     -------
     Logs
-        A dict ``{stream: DataFrame}``; columns as in :mod:`aerpaw_cmp.logs.records`, ``time`` in UTC.
+        A dict ``{stream: DataFrame}``; columns as in :mod:`aerpaw_cmp.logs.records`, ``time`` in UTC with its zone.
 
     Raises
     ------
     InputError
-        A file is missing, damaged or of no known format.
+        A file is missing, damaged or of no known format; a pattern that no file matches.
     UsageError
         An option is missing, such as ``timezone``.
 
@@ -123,5 +158,38 @@ def read(
     >>> logs = read("sample_logs/UAV", timezone="America/New_York")  # doctest: +SKIP
     >>> logs["vehicle"].altitude_m.max()  # doctest: +SKIP
     """
-    chosen = ReadOptions(timezone=timezone, time_origin=time_origin, **options)
-    return Logs(ingest(path, options=chosen, reader=reader))
+    zone = timezone.key if isinstance(timezone, ZoneInfo) else timezone
+    chosen = ReadOptions(timezone=zone, time_origin=time_origin, **options)
+    files = Ingested()
+    single = isinstance(path, (str, os.PathLike)) or hasattr(path, "read")
+    for source in cast("Iterable[Source]", [path] if single else path):
+        if isinstance(source, (str, os.PathLike)):
+            here = ingest(list(_matching(source)), options=chosen, reader=reader)
+        else:
+            here = _opened(source, chosen, reader)
+        files += here
+        files.skipped += here.skipped
+    return Logs(files)
+
+
+def _matching(source: str | os.PathLike[str]) -> Iterator[Path]:
+    """The path itself, or what its pattern matches."""
+    place = Path(source).expanduser()
+    if place.exists() or not glob.has_magic(str(place)):
+        yield place
+        return
+    matching = sorted(glob.glob(str(place), recursive=True))  # noqa: PTH207 - absolute patterns, which Path refuses
+    if not matching:
+        raise InputError("no file matches the pattern", expected="at least one log", path=str(source))
+    yield from map(Path, matching)
+
+
+def _opened(file: BinaryIO, options: ReadOptions, reader: str | None) -> Ingested:
+    """An open file as a log of its name; archives and HDF5 need a place on the disk."""
+    name = Path(str(getattr(file, "name", "") or "log")).name
+    with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-") as folder:
+        place = Path(folder) / name
+        place.write_bytes(file.read())
+        read_there = ingest(place, options=options, reader=reader)
+    renamed: list[IngestedFile] = [replace(one, path=one.path.replace(str(place), name, 1)) for one in read_there]
+    return Ingested(renamed, read_there.skipped)

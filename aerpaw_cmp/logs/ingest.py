@@ -133,7 +133,7 @@ def ingest(
         elif _is_archive(place):
             inside, left = _archive(place, options, chosen)
         elif _head(place).startswith(_HDF5):
-            files += [_of_kind(one, chosen, place) for one in read_flight(place)]
+            files += [replace(_of_kind(one, chosen, place), holder=str(place)) for one in read_flight(place)]
             continue
         else:
             files.append(read_file(place, options=options, reader=chosen))
@@ -180,11 +180,13 @@ def exists(path: Path) -> bool:
 
 
 def sniffers_of(path: Path) -> list[str]:
-    """Names of the readers whose sniffers accept a log; none for a folder of pieces."""
+    """Names of the readers whose sniffers accept a log; none for a folder of pieces or a log in a flight file."""
     if path.is_dir():
         return []
     if (part := None if _present(path) else archives.inside(path)) is None:
         return [reader.name for reader in claims(_beginning(path)) if reader.kinds]
+    if _head(part[0]).startswith(_HDF5):
+        return []  # a flight file knows the reader of each log
     content = archives.members(read_bytes(part[0])[0], part[0])
     data = as_utf8(content[part[1]].read(DEEP_BYTES)) if part[1] in content else b""
     return [reader.name for reader in claims(data) if reader.kinds]

@@ -124,12 +124,7 @@ class Replay:
         UsageError
             If xarray is not installed.
         """
-        try:
-            import xarray
-        except ImportError:
-            raise UsageError(
-                "xarray is not installed", expected="pip install 'aerpaw-cmp[geo]'", cause="to_xarray() needs it"
-            ) from None
+        xarray = require_xarray()
         level = {"units": "dBm", "long_name": "received power, coherent sum of the paths"}
         power = {"units": "dBm", "long_name": "received power, sum of the paths' powers"}
         ports = ("pose", "tower", "n_rx", "n_tx")
@@ -144,6 +139,17 @@ class Replay:
             coords={"tower": list(self.towers)},
             attrs={"engine": self.engine, "seconds": self.seconds},
         )
+
+
+def require_xarray() -> Any:
+    """The module ``xarray``, or a :class:`UsageError` that says how to install it."""
+    try:
+        import xarray
+    except ImportError:
+        raise UsageError(
+            "xarray is not installed", expected="pip install 'aerpaw-cmp[geo]'", cause="to_xarray() needs it"
+        ) from None
+    return xarray
 
 
 def replay(

@@ -13,6 +13,7 @@ import numpy as np
 from shapely.geometry import Polygon
 
 from ..common.geodesy import SiteFrame
+from ..common.htmltable import html_table
 from ..common.units import FloatArray
 from .dem import Dem
 from .heights import VerticalDatum
@@ -171,3 +172,9 @@ class Site:
     dem: Dem | None = None
     scene: TriangleScene | None = None
     merge_m: float = 1e-3
+
+    def _repr_html_(self) -> str:
+        """Towers and their places, for notebooks."""
+        rows = [(name, *(f"{metres:.1f}" for metres in tower.position_m)) for name, tower in self.towers.items()]
+        caption = f"{self.name}: {len(self.buildings)} buildings, {len(self.trees)} trees"
+        return html_table(("tower", "east [m]", "north [m]", "up [m]"), rows, caption)

@@ -22,20 +22,21 @@ import numpy as np
 
 def flight(samples: int):
     """An export of one link."""
-    from aerpaw_cmp.report.exports.samples import Export, SampleSet, Series, column
+    from aerpaw_cmp.report.exports.points import Export, points_table
     from aerpaw_cmp.site.siteyaml import load_site
 
     rng = np.random.default_rng(1)
     s = np.linspace(0, 1, samples)
     names = ("measured_db", "calibrated_db", "simulated_dbm", "residual_db", "free_space_dbm", "two_ray_dbm")
-    values = {name: np.round(rng.normal(-80, 8, samples), 4) for name in names}
-    series = Series(
-        flight="long", tower="LW1", channel="USRP1", unit="dBm",
-        time=np.datetime64("2024-07-15T17:02:11", "ns") + np.round(s * samples * 1e8).astype("timedelta64[ns]"),
-        east_m=500 * np.cos(50 * s), north_m=900 * np.sin(41 * s), up_m=40 + 30 * s, values=values,
-    )  # fmt: skip
-    rss = SampleSet(kind="rss", columns=tuple(column(name, "dBm") for name in names), series=(series,))
-    return Export(name="long", title="A long flight", site=load_site("lake_wheeler"), sets=(rss,), lines=(), clock=True)
+    link = {
+        "time": np.datetime64("2024-07-15T17:02:11", "ns") + np.round(s * samples * 1e8).astype("timedelta64[ns]"),
+        **{"flight": "long", "tower": "LW1", "channel": "USRP1", "unit": "dBm"},
+        **{"east_m": 500 * np.cos(50 * s), "north_m": 900 * np.sin(41 * s), "up_m": 40 + 30 * s},
+        **{name: rng.normal(-80, 8, samples) for name in names},
+    }
+    site = load_site("lake_wheeler")
+    rss = points_table("rss", [link], site.frame)
+    return Export(name="long", title="A long flight", site=site, sets=rss, lines=(), clock=True)
 
 
 def one(name: str, samples: int) -> None:

@@ -1,11 +1,14 @@
-"""What NetCDF files after the CF conventions share: units that UDUNITS reads, text, the coordinate reference system."""
+"""What NetCDF files after the CF conventions share: units, reference systems, the file."""
 
 from __future__ import annotations
 
+import importlib
+import math
+from collections.abc import Mapping
 from typing import Any
 
+from .errors import UsageError
 from .geodesy import SiteFrame
-from .units import AnyArray
 
 CONVENTIONS = "CF-1.11"
 
@@ -38,33 +41,72 @@ def site_crs(frame: SiteFrame) -> Any:
     )
 
 
-def write_text(book: Any, name: str, dimensions: tuple[str, ...], values: AnyArray, meaning: str) -> Any:
-    """A variable of text as characters, which every reader of CF takes.
+def file_attributes(title: str, source: str, generated: str, version: str, comment: str) -> dict[str, str]:
+    """Attributes of a file: what it holds and who wrote it when.
 
     Parameters
     ----------
-    book : netCDF4.Dataset
-    name : str
-    dimensions : tuple of str
-        Those of ``values``; one more is made for the characters.
-    values : ndarray of str
-    meaning : str
-        ``long_name``.
+    title, source, comment : str
+    generated : str
+        ISO 8601.
+    version : str
+        Of aerpaw-cmp.
 
     Returns
     -------
-    netCDF4.Variable
-        Of ``S1``, its last dimension ``<name>_length``.
+    dict of str to str
     """
-    import numpy as np
+    return {
+        "Conventions": CONVENTIONS,
+        "title": title,
+        "source": f"aerpaw-cmp {version}: {source}",
+        "history": f"{generated} written by aerpaw-cmp {version}",
+        "institution": "not stated",
+        "references": "https://arxiv.org/abs/2502.10324",
+        "comment": comment,
+    }
 
-    encoded = [str(value).encode("utf-8") for value in values.ravel()]
-    width = max([1, *map(len, encoded)])
-    length = f"{name}_length"
-    book.createDimension(length, width)
-    variable = book.createVariable(name, "S1", (*dimensions, length))
-    variable.setncatts({"long_name": meaning, "_Encoding": "utf-8"})
-    variable.set_auto_chartostring(False)
-    table = np.frombuffer(b"".join(text.ljust(width, b"\0") for text in encoded), dtype="S1")
-    variable[:] = table.reshape(*values.shape, width)
-    return variable
+
+def dataset(variables: Mapping[str, Any], attributes: Mapping[str, Any]) -> Any:
+    """An ``xarray.Dataset`` of variables: (dimensions, values, attributes) by name.
+
+    Raises
+    ------
+    UsageError
+        If xarray is not installed.
+    """
+    return _library("xarray").Dataset(dict(variables), attrs=dict(attributes))
+
+
+def netcdf_bytes(data: Any) -> Any:
+    """A NetCDF-4 file of an ``xarray.Dataset``, made in memory: HDF5 ends the process where a disk is full.
+
+    Arrays are deflated; text becomes characters in UTF-8, which every reader of CF takes. A variable with NaN has it as
+    ``_FillValue``; another has none, unless its ``encoding`` says so.
+
+    Raises
+    ------
+    UsageError
+        If netCDF4 is not installed.
+    """
+    book = _library("netCDF4").Dataset("data", "w", memory=1 << 20)
+    data = data.copy()
+    for name, variable in data.variables.items():
+        if variable.dtype.kind in "OU":
+            variable.encoding |= {"dtype": "S1", "char_dim_name": f"{name}_length"}
+            continue
+        missing = variable.dtype.kind == "f" and bool(variable.isnull().any())
+        deflated = {"zlib": True, "complevel": 4, "shuffle": variable.dtype.itemsize > 1} if variable.ndim else {}
+        variable.encoding = {"_FillValue": math.nan if missing else None, **deflated, **variable.encoding}
+    data.dump_to_store(_library("xarray.backends").NetCDF4DataStore(book))
+    return book.close()
+
+
+def _library(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as missing:
+        raise UsageError(
+            f"NetCDF needs {missing.name}, which is not installed",
+            expected="pip install 'aerpaw-cmp[geo]', or another format",
+        ) from None

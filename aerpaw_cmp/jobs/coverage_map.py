@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.cf import file_attributes
 from ..common.errors import InputError, UsageError
 from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import AnyArray, ComplexArray, FloatArray, wavelength_m
@@ -772,19 +773,28 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
     names = {layer.name for layer in joint}
     every = [layer for layer in every if layer.name in names or not layer.name.startswith(RATIOS)]
     shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
-    towers = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
-    borders = outcome.shown.borders
+    named = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
+    every_layer = export.MapLayers(
+        grid=grid, frame=site.frame, layers=every, towers_m=named, borders=outcome.shown.borders
+    )
+    all_joint, levels_and_ranks = replace(every_layer, layers=joint), replace(every_layer, layers=shown)
     written = [
-        export.write_csv(folder / "layers.csv", grid, site.frame, every),
-        export.write_geojson(folder / "layers.geojson", grid, site.frame, shown, towers, borders),
-        export.write_json(folder / "maps.json", grid, site.frame, joint, summary),
-        export.write_kmz(folder / "maps.kmz", grid, site.frame, shown, towers, borders, title=site.name),
+        export.write_csv(folder / "layers.csv", every_layer),
+        export.write_geojson(folder / "layers.geojson", levels_and_ranks),
+        export.write_json(folder / "maps.json", all_joint, summary),
+        export.write_kmz(folder / "maps.kmz", levels_and_ranks, title=site.name),
     ]
-    made = {name: str(summary.get(name, "")) for name in ("generated", "version")}
+    about = file_attributes(
+        title=site.name,
+        source="ray tracing",
+        generated=str(summary.get("generated", "")),
+        version=str(summary.get("version", "")),
+        comment="A missing level has no path or lies below the threshold. A rank of 0 is a code: no path.",
+    )
     maps = dict(outcome.ordered())
     writers: tuple[Callable[[], Path], ...] = (
-        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, title=site.name, **made),
-        lambda: export.write_geotiff(folder / "maps.tif", grid, site.frame, joint),
+        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, about),
+        lambda: export.write_geotiff(folder / "maps.tif", all_joint),
     )
     for write in writers:
         try:

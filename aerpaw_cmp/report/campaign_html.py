@@ -25,7 +25,7 @@ from .campaign_pairs import by_link, pair_frame, telling, telling_ranks
 from .canvas import Picture
 from .explorer import as_json
 from .export import write_file
-from .exports.samples import of_campaign
+from .exports.points import of_campaign
 from .exports.write import write_exports
 from .first_screen import most_telling, pooled_db
 from .html import by_section, environment, policy, script

@@ -15,7 +15,8 @@ from ..logs.records import has_wall_clock
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
-_DECIMALS = 4  # 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable
+DECIMALS = 4
+"""0.1 mm and 1e-4 dB: finer than any log, and the files stay readable."""
 
 
 def metrics(data: ReportData) -> dict[str, Any]:
@@ -162,22 +163,22 @@ def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
 
 def rss_frame(panels: Iterable[RssPanel]) -> Any:
     """All RSS samples as one table with the columns of :data:`RSS_COLUMNS` and one per baseline."""
-    return _whole(_rss_tables(list(panels)), RSS_COLUMNS)
+    return _whole(rss_tables(list(panels)), RSS_COLUMNS)
 
 
 def rss_csv(panels: Iterable[RssPanel]) -> Iterator[str]:
     """The text of :func:`rss_frame` in pieces of bounded size."""
-    return _text(_rss_tables(list(panels)), RSS_COLUMNS)
+    return _text(rss_tables(list(panels)), RSS_COLUMNS)
 
 
 def rank_frame(panels: Iterable[RankPanel]) -> Any:
     """All rank samples as one table with the columns of :data:`RANK_COLUMNS` and one per K."""
-    return _whole(_rank_tables(list(panels)), RANK_COLUMNS)
+    return _whole(rank_tables(list(panels)), RANK_COLUMNS)
 
 
 def rank_csv(panels: Iterable[RankPanel]) -> Iterator[str]:
     """The text of :func:`rank_frame` in pieces of bounded size."""
-    return _text(_rank_tables(list(panels)), RANK_COLUMNS)
+    return _text(rank_tables(list(panels)), RANK_COLUMNS)
 
 
 _Table = tuple[Any, dict[str, Any]]
@@ -187,7 +188,8 @@ _ROWS = 50_000
 """Rows that are text at once."""
 
 
-def _rss_tables(panels: list[RssPanel]) -> Iterator[_Table]:
+def rss_tables(panels: list[RssPanel]) -> Iterator[_Table]:
+    """Times and further columns of rss.csv by panel, not yet rounded."""
     names = list(dict.fromkeys(b.name for panel in panels for b in panel.baselines))
     further = list(dict.fromkeys(name for panel in panels for name in panel.per_sample))
     for panel in panels:
@@ -212,7 +214,8 @@ def _rss_tables(panels: list[RssPanel]) -> Iterator[_Table]:
         yield panel.time, columns
 
 
-def _rank_tables(panels: list[RankPanel]) -> Iterator[_Table]:
+def rank_tables(panels: list[RankPanel]) -> Iterator[_Table]:
+    """Times and further columns of rank.csv by panel, not yet rounded."""
     import pandas as pd
 
     def integers(values: Any) -> Any:
@@ -267,7 +270,7 @@ def _rows(table: _Table, part: slice) -> Any:
     time, columns = table
     parts = {name: value if isinstance(value, str) else value[part] for name, value in columns.items()}
     frame = pd.DataFrame({**_times(time, part), **parts}, index=range(len(time[part])))
-    return frame.round(_DECIMALS)
+    return frame.round(DECIMALS)
 
 
 def _times(time: Any, part: slice) -> dict[str, Any]:

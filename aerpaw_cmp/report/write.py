@@ -75,7 +75,7 @@ def write_report(
         pictures, paths = write_figures(specs, folder / "figures", formats, style, stages.progress)
     written += paths
     if exports:
-        from .exports.samples import of_report
+        from .exports.points import of_report
         from .exports.write import write_exports
 
         with stages("exports"):

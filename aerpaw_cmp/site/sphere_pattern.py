@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..common.cf import CONVENTIONS, DB
-from ..common.errors import InputError
+from ..common.cf import CONVENTIONS, DB, dataset, netcdf_bytes
+from ..common.errors import InputError, UsageError
 from ..common.provenance import trained_on
 from ..common.units import FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern
@@ -99,34 +99,28 @@ def sphere_netcdf(
         ``gain`` and its ancillary ``gain_sd`` over ``elevation`` (90 to -90 deg) and ``azimuth`` (0 to below 360 deg,
         counter-clockwise from x), in dB as UDUNITS has it, and the scalar ``frequency``.
     """
-    try:
-        import netCDF4
-    except ImportError:
-        return None
     rows, columns = gain_dbi.shape
-    book = netCDF4.Dataset("antenna", "w", memory=1 << 18)  # HDF5 ends the process where a disk is full
-    book.setncatts({"Conventions": CONVENTIONS, **attributes})
-    axes = {
-        "elevation": (90.0 - np.linspace(0.0, 180.0, rows), "angle above the x-y plane of the antenna's frame"),
-        "azimuth": (np.arange(columns) * (360.0 / columns), "angle in the x-y plane, counter-clockwise from x"),
-    }
-    for name, (values, meaning) in axes.items():
-        book.createDimension(name, len(values))
-        axis = book.createVariable(name, "f8", (name,), fill_value=False)
-        axis.setncatts({"long_name": meaning, "units": "degree"})
-        axis[:] = values
-    carrier = book.createVariable("frequency", "f8", ())
-    carrier.setncatts({"long_name": "frequency of the gain", "standard_name": "radiation_frequency", "units": "Hz"})
-    carrier[...] = frequency_hz
-    for name, values, meaning in (
-        ("gain", gain_dbi, "gain of the antenna as mounted, its mean power over the sphere 0 dBi"),
-        ("gain_sd", sd_db, "standard deviation of the gain"),
-    ):
-        variable = book.createVariable(name, "f4", ("elevation", "azimuth"), zlib=True)
-        variable.setncatts({"long_name": meaning, "units": DB, "coordinates": "frequency"})
-        variable[:] = values
-    book["gain"].ancillary_variables = "gain_sd"
-    return bytes(book.close())
+    over = ("elevation", "azimuth")
+    carrier = {"long_name": "frequency of the gain", "standard_name": "radiation_frequency", "units": "Hz"}
+    gain = {"long_name": "gain of the antenna as mounted, its mean power over the sphere 0 dBi",
+            "ancillary_variables": "gain_sd"}  # fmt: skip
+    shared = {"units": DB, "coordinates": "frequency"}
+    try:
+        sphere = dataset(
+            {
+                "elevation": ("elevation", 90.0 - np.linspace(0.0, 180.0, rows),
+                              {"long_name": "angle above the x-y plane of the antenna's frame", "units": "degree"}),
+                "azimuth": ("azimuth", np.arange(columns) * (360.0 / columns),
+                            {"long_name": "angle in the x-y plane, counter-clockwise from x", "units": "degree"}),
+                "frequency": ((), frequency_hz, carrier),
+                "gain": (over, gain_dbi.astype(np.float32), gain | shared),
+                "gain_sd": (over, sd_db.astype(np.float32), {"long_name": "standard deviation of the gain"} | shared),
+            },
+            {"Conventions": CONVENTIONS, **attributes},
+        )  # fmt: skip
+        return bytes(netcdf_bytes(sphere))
+    except UsageError:
+        return None
 
 
 def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] = (), decimals: int = 3) -> str:

@@ -29,9 +29,16 @@ TOWERS = {"LW1": [-50.0, 0.0, 10.0], "LW<2>": [50.0, 10.0, 10.0]}
 BORDERS = voronoi_borders(list(TOWERS.values()), (-90.0, 90.0, -60.0, 60.0))
 
 
+def over(grid, layers, **more):
+    return export.MapLayers(grid=grid, frame=FRAME, layers=layers, **more)
+
+
+BARE, MAPS = over(GRID, LAYERS), over(GRID, LAYERS, towers_m=TOWERS, borders=BORDERS)
+
+
 def test_csv_keeps_order_and_gaps(tmp_path):
     levels = "rss_h030m_joint"  # as text first: pandas 2 reads to the last digit but one
-    table = pd.read_csv(export.write_csv(tmp_path / "m.csv", GRID, FRAME, LAYERS), dtype={levels: str})
+    table = pd.read_csv(export.write_csv(tmp_path / "m.csv", BARE), dtype={levels: str})
     assert table["index"].tolist() == list(range(1, len(GRID) + 1))
     np.testing.assert_array_equal(table[["east_m", "north_m"]], GRID.points_m)
     np.testing.assert_array_equal(table[levels].astype(float), RSS)
@@ -42,7 +49,7 @@ def test_csv_keeps_order_and_gaps(tmp_path):
 
 def test_json_is_strict(tmp_path):
     path = export.write_json(
-        tmp_path / "m.json", GRID, FRAME, LAYERS, {"mae": np.array([1.0, np.nan]), "n": np.int64(3), "r": float("inf")}
+        tmp_path / "m.json", BARE, {"mae": np.array([1.0, np.nan]), "n": np.int64(3), "r": float("inf")}
     )
 
     def refuse(name):
@@ -57,7 +64,7 @@ def test_json_is_strict(tmp_path):
 
 
 def test_geojson_cells_are_where_the_positions_are(tmp_path):
-    path = export.write_geojson(tmp_path / "m.geojson", GRID, FRAME, LAYERS, TOWERS, BORDERS)
+    path = export.write_geojson(tmp_path / "m.geojson", MAPS)
     features = json.loads(path.read_text())["features"]
     cells = [f for f in features if f["properties"]["kind"] == "cell"]
     assert len(cells) == len(GRID)
@@ -78,7 +85,7 @@ def test_geojson_cells_are_where_the_positions_are(tmp_path):
 def test_kmz_has_a_map_and_a_legend_per_layer(tmp_path):
     from matplotlib.image import imread
 
-    path = export.write_kmz(tmp_path / "m.kmz", GRID, FRAME, LAYERS, TOWERS, BORDERS)
+    path = export.write_kmz(tmp_path / "m.kmz", MAPS)
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
         tree = ElementTree.fromstring(archive.read("doc.kml"))
@@ -103,15 +110,15 @@ def test_kmz_has_a_map_and_a_legend_per_layer(tmp_path):
 
 def test_kml_box_fits_the_site_at_full_size():
     grid = Grid.over_area((-540.0, 540.0, -1065.0, 1065.0))
-    north, south, east, west = export._bounding_box(grid, FRAME)
+    north, south, east, west = export._bounding_box(over(grid, []))
     corner_east, corner_north = FRAME.to_local([north, north, south, south], [west, east, west, east])
     assert np.abs(np.abs(corner_east) - 540.0).max() < 0.3
     assert np.abs(np.abs(corner_north) - 1065.0).max() < 0.3
 
 
 def test_same_map_same_bytes(tmp_path):
-    first = export.write_kmz(tmp_path / "a.kmz", GRID, FRAME, LAYERS).read_bytes()
-    assert first == export.write_kmz(tmp_path / "b.kmz", GRID, FRAME, LAYERS).read_bytes()
+    first = export.write_kmz(tmp_path / "a.kmz", BARE).read_bytes()
+    assert first == export.write_kmz(tmp_path / "b.kmz", BARE).read_bytes()
 
 
 def test_out_of_coverage_is_its_own_colour():
@@ -126,13 +133,13 @@ def test_constant_and_empty_layers_can_be_drawn(tmp_path):
     flat = Layer("flat", np.full(len(GRID), 3.0), "dB", "flat")
     empty = Layer("empty", np.full(len(GRID), np.nan), "dB", "empty")
     endless = Layer("endless", np.full(len(GRID), np.inf), "dB", "endless")
-    assert export.write_kmz(tmp_path / "m.kmz", GRID, FRAME, [flat, empty, endless]).stat().st_size > 0
+    assert export.write_kmz(tmp_path / "m.kmz", over(GRID, [flat, empty, endless])).stat().st_size > 0
 
 
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # rasterio's own, of affine
 def test_geotiff_is_north_up_named_and_has_units(tmp_path):
     rasterio = pytest.importorskip("rasterio")
-    path = export.write_geotiff(tmp_path / "m.tif", GRID, FRAME, LAYERS)
+    path = export.write_geotiff(tmp_path / "m.tif", BARE)
     with rasterio.open(path) as file:
         assert file.count == 2
         assert file.descriptions == tuple(layer.name for layer in LAYERS)
@@ -160,7 +167,7 @@ def test_geotiff_has_the_layout_of_a_cloud_optimised_one(tmp_path):
     cogeo = pytest.importorskip("rio_cogeo.cogeo")
     grid = Grid.over_area((0.0, 1100.0, 0.0, 1200.0), 1.0)
     layer = Layer("level", np.linspace(-120.0, -40.0, len(grid)), "dBm", "Level")
-    path = export.write_geotiff(tmp_path / "m.tif", grid, FRAME, [layer])
+    path = export.write_geotiff(tmp_path / "m.tif", over(grid, [layer]))
     valid, errors, warnings = cogeo.cog_validate(path, strict=True)
     assert (valid, errors, warnings) == (True, [], [])
     with rasterio.open(path) as file:
@@ -178,13 +185,13 @@ def test_geotiff_has_the_layout_of_a_cloud_optimised_one(tmp_path):
 def test_missing_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(UsageError, match=r"aerpaw-cmp\[geo\]"):
-        export.write_geotiff(tmp_path / "m", GRID, FRAME, LAYERS)
+        export.write_geotiff(tmp_path / "m", BARE)
 
 
-def test_wrong_layers_are_a_bug(tmp_path):
+def test_wrong_layers_are_a_bug():
     with pytest.raises(ValueError, match="same name"):
-        export.write_csv(tmp_path / "m.csv", GRID, FRAME, [LAYERS[0], LAYERS[0]])
+        over(GRID, [LAYERS[0], LAYERS[0]])
     with pytest.raises(ValueError, match="shape"):
-        export.write_csv(tmp_path / "m.csv", GRID, FRAME, [Layer("a", np.zeros(3), "1", "a")])
+        over(GRID, [Layer("a", np.zeros(3), "1", "a")])
     with pytest.raises(ValueError, match="layer name"):
         Layer("a b", np.zeros(3), "1", "a")

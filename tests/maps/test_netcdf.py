@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 
+from aerpaw_cmp.common.cf import file_attributes
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.maps import netcdf
@@ -48,9 +49,14 @@ def path(tmp_path):
 
 
 def write(path):
-    return netcdf.write_netcdf(
-        path, MAPS, FRAME, title="A <site>", generated="2026-01-02T03:04:05+00:00", version="0.2.0"
+    about = file_attributes(
+        title="A <site>",
+        source="ray tracing",
+        generated="2026-01-02T03:04:05+00:00",
+        version="0.2.0",
+        comment="A gap has no path.",
     )
+    return netcdf.write_netcdf(path, MAPS, FRAME, about)
 
 
 def check(path):
@@ -119,9 +125,8 @@ def in_watts(monkeypatch):
 
 
 def other_mode(monkeypatch):
-    monkeypatch.setattr(
-        netcdf, "enumerate", lambda values, *_: list(zip(range(9), list(values)[::-1], strict=False)), raising=False
-    )
+    real = netcdf.np.stack
+    monkeypatch.setattr(netcdf.np, "stack", lambda planes, *a, **k: real(planes[::-1], *a, **k))
 
 
 @pytest.mark.parametrize("fault", [turned, swapped, in_watts, other_mode])

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import itertools
 import json
 import sqlite3
 import sys
 import typing
 import zipfile
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -18,7 +20,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.flight.settings import ReportSettings
 from aerpaw_cmp.report.export import rank_frame, rss_frame
-from aerpaw_cmp.report.exports import formats, geojson, geopackage, gpx, kmz, matlab, netcdf, parquet, samples, write
+from aerpaw_cmp.report.exports import formats, kmz, points, tables, vectors, write
 
 ODD = 'LW<4> & "ö"'
 DBM = "0.1 lg(re 1 mW)"
@@ -137,7 +139,7 @@ def check_geojson(folder, frames):
 def check_geopackage(folder, frames):
     pyogrio = pytest.importorskip("pyogrio")
     path = folder / "samples.gpkg"
-    assert [name for name, _ in pyogrio.list_layers(path)] == ["towers", "track", "rss", "rank"]
+    assert [name for name, _ in pyogrio.list_layers(path)] == ["towers", "track", "rss", "rank", "layer_styles"]
     with sqlite3.connect(path) as book:
         assert book.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         titles = book.execute("SELECT table_name, column_name, title FROM gpkg_data_columns").fetchall()
@@ -150,6 +152,29 @@ def check_geopackage(folder, frames):
         assert 35.72 < box[1] < box[3] < 35.74
     _, _, lines, _ = pyogrio.raw.read(path, layer="track")
     assert len(lines) == 1
+    check_styles(path)
+
+
+def check_styles(path):
+    """The layers of samples have styles of QGIS: one by default, each of a column that the layer has."""
+    with sqlite3.connect(path) as book:
+        styles = book.execute("SELECT f_table_name, f_geometry_column, styleQML, useAsDefault FROM layer_styles")
+        styles = styles.fetchall()
+        columns = {name: {c[1] for c in book.execute(f"PRAGMA table_info({name})")} for name in ("rss", "rank")}
+    book.close()
+    assert [sum(one[3] for one in styles if one[0] == kind) for kind in columns] == [1, 1]
+    for kind, geometry, text, _ in styles:
+        tree = ElementTree.fromstring(text)
+        renderer = tree.find("renderer-v2")
+        assert geometry in columns[kind]
+        assert renderer.get("attr") in columns[kind]
+        rules = renderer.findall("*/range") + renderer.findall("*/category")
+        symbols = [one.get("name") for one in renderer.findall("symbols/symbol")]
+        assert [one.get("symbol") for one in rules] == symbols
+        assert len(symbols) > 3
+        bounds = [(float(one.get("lower")), float(one.get("upper"))) for one in rules if one.tag == "range"]
+        assert all(low < high for low, high in bounds)
+        assert all(before[1] == after[0] for before, after in itertools.pairwise(bounds)), "no value falls between"
 
 
 def check_netcdf(folder, frames):
@@ -301,55 +326,43 @@ def checked(name, folder, frames, data):
 
 @pytest.mark.parametrize("name", write.FORMATS)
 def test_an_independent_reader_finds_what_the_csvs_hold(name, data, frames, tmp_path):
-    written = write.write_exports(samples.of_report(data), tmp_path, [name])
+    written = write.write_exports(points.of_report(data), tmp_path, [name])
     assert written
     assert all(path.is_file() and path.parent.name == "exports" for path in written)
     checked(name, tmp_path, frames, data)
 
 
-MODULES = (geojson, geopackage, gpx, kmz, matlab, netcdf, parquet)
+def changed(export, change):
+    """An export with another table of each kind."""
+    sets = tuple(dataclasses.replace(one, table=change(one.table)) for one in export.sets)
+    return dataclasses.replace(export, sets=sets)
 
 
 def swap_places(monkeypatch, data):
-    def swapped(frame, east_m, north_m):
-        return samples.latitude_longitude(frame, east_m, north_m)[::-1]
-
-    for module in MODULES:
-        monkeypatch.setattr(module, "latitude_longitude", swapped)
-    return samples.of_report(data)
+    real = points.latitude_longitude
+    for module in (points, vectors, kmz):
+        monkeypatch.setattr(module, "latitude_longitude", lambda *places: real(*places)[::-1])
+    return points.of_report(data)
 
 
 def shift_time(monkeypatch, data):
     del monkeypatch
-    export = samples.of_report(data)
     one_hour = np.timedelta64(3600, "s")
-    later = [
-        dataclasses.replace(s, series=tuple(dataclasses.replace(x, time=x.time + one_hour) for x in s.series))
-        for s in export.sets
-    ]
+    export = changed(points.of_report(data), lambda table: table.assign(time=table["time"] + one_hour))
     lines = tuple(dataclasses.replace(line, time=line.time + one_hour) for line in export.lines)
-    return dataclasses.replace(export, sets=tuple(later), lines=lines)
+    return dataclasses.replace(export, lines=lines)
 
 
 def wrong_unit(monkeypatch, data):
-    monkeypatch.setattr(samples, "DBM", "W")
-    monkeypatch.setattr(samples, "_UNITS", ((r"_dbm$", "W", "W"), *samples._UNITS[1:]))
-    return samples.of_report(data)
+    monkeypatch.setattr(points, "DBM", "W")
+    monkeypatch.setattr(points, "_UNITS", ((r"_dbm$", "W", "W"), *points._UNITS[1:]))
+    return points.of_report(data)
 
 
 def zeros_for_missing(monkeypatch, data):
     del monkeypatch
-    export = samples.of_report(data)
-    filled = [
-        dataclasses.replace(
-            s,
-            series=tuple(
-                dataclasses.replace(x, values={n: np.nan_to_num(v) for n, v in x.values.items()}) for x in s.series
-            ),
-        )
-        for s in export.sets
-    ]
-    return dataclasses.replace(export, sets=tuple(filled))
+    values = [*COLUMNS["rss"][:-1], *COLUMNS["rank"][:-1]]
+    return changed(points.of_report(data), lambda table: table.fillna(dict.fromkeys(values, 0.0)))
 
 
 WITHOUT_UNITS = ("gpx", "kmz")
@@ -370,13 +383,13 @@ def test_a_planted_fault_is_seen(name, fault, data, frames, tmp_path, monkeypatc
 
 
 def test_netcdf_passes_the_checker_of_the_conventions_it_claims(data, tmp_path, cf_faults):
-    write.write_exports(samples.of_report(data), tmp_path, ["netcdf"])
+    write.write_exports(points.of_report(data), tmp_path, ["netcdf"])
     assert cf_faults(tmp_path / "exports" / "rss.nc") == []
     assert cf_faults(tmp_path / "exports" / "rank.nc") == []
 
 
 def test_the_checker_of_the_conventions_sees_a_unit_that_is_none(data, tmp_path, cf_faults):
-    export = samples.of_report(data)
+    export = points.of_report(data)
     rss, rank = export.sets
     wrong = [dataclasses.replace(c, unit="decibels of something") for c in rss.columns]
     wrong = dataclasses.replace(export, sets=(dataclasses.replace(rss, columns=tuple(wrong)), rank))
@@ -397,7 +410,7 @@ def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatc
     relative = dataclasses.replace(
         data, rss=tuple(map(moved, data.rss)), rank=tuple(map(moved, data.rank)), track=moved(data.track)
     )
-    export = samples.of_report(relative)
+    export = points.of_report(relative)
     assert not export.clock
     write.write_exports(export, tmp_path, ["gpx", "kmz"])
     place = tmp_path / "exports"
@@ -412,12 +425,12 @@ def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypat
     monkeypatch.setattr(kmz, "_legend", lambda _: b"")
     alone = dataclasses.replace(data, rss=())
     (tmp_path / "a").mkdir()
-    names = {p.name for p in write.write_exports(samples.of_report(alone), tmp_path / "a", write.FORMATS)}
+    names = {p.name for p in write.write_exports(points.of_report(alone), tmp_path / "a", write.FORMATS)}
     assert "rank.nc" in names
     assert "rss.nc" not in names
     nothing = dataclasses.replace(data, rss=(), rank=(), track=None)
     (tmp_path / "b").mkdir()
-    assert write.write_exports(samples.of_report(nothing), tmp_path / "b", write.FORMATS)
+    assert write.write_exports(points.of_report(nothing), tmp_path / "b", write.FORMATS)
     silent = dataclasses.replace(
         data.rss[0],
         **{
@@ -427,14 +440,14 @@ def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypat
     )
     (tmp_path / "c").mkdir()
     assert write.write_exports(
-        samples.of_report(dataclasses.replace(data, rss=(silent,), rank=())), tmp_path / "c", write.FORMATS
+        points.of_report(dataclasses.replace(data, rss=(silent,), rank=())), tmp_path / "c", write.FORMATS
     )
 
 
 def test_same_flight_same_kmz(data, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        write.write_exports(samples.of_report(data), tmp_path / name, ["kmz", "gpx", "geojson"])
+        write.write_exports(points.of_report(data), tmp_path / name, ["kmz", "gpx", "geojson"])
     for path in sorted((tmp_path / "a" / "exports").iterdir()):
         assert path.read_bytes() == (tmp_path / "b" / "exports" / path.name).read_bytes()
 
@@ -446,7 +459,7 @@ def test_a_long_flight_is_thinned_with_its_extremes(data, tmp_path, monkeypatch)
     panel = data.rss[0]
     level = np.array(panel.measured_db)
     level[61] += 60.0  # one sample among many
-    export = samples.of_report(
+    export = points.of_report(
         dataclasses.replace(data, rss=(dataclasses.replace(panel, measured_db=level), data.rss[1]))
     )
     kmz.write_kmz(export, folder)
@@ -476,7 +489,7 @@ def test_a_missing_library_is_named_with_its_extra(name, module, data, tmp_path,
         formats.chosen_formats([name])
     told = []
     write.write_exports(
-        samples.of_report(data), tmp_path, formats.chosen_formats(["gpx", "all"]), lambda text, *_: told.append(text)
+        points.of_report(data), tmp_path, formats.chosen_formats(["gpx", "all"]), lambda text, *_: told.append(text)
     )
     assert any(module in text and "aerpaw-cmp[geo]" in text for text in told)
     assert not list((tmp_path / "exports").glob("*.nc" if name == "netcdf" else "*.parquet"))
@@ -487,7 +500,7 @@ def test_a_limit_of_the_disk_is_an_oserror_in_every_format(name, data, tmp_path,
     """A library that writes by itself must not end the process or keep silent."""
     resource = pytest.importorskip("resource")
     monkeypatch.setattr(kmz, "_legend", lambda _: b"")
-    export = samples.of_report(data)
+    export = points.of_report(data)
     write.write_exports(export, tmp_path, [name])  # what it loads is loaded now
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # it would be cut, and kept
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -503,13 +516,13 @@ def test_a_full_disk_is_an_oserror_for_sqlite_too(data, tmp_path, monkeypatch):
     def full(*_):
         raise sqlite3.OperationalError("database or disk is full")
 
-    monkeypatch.setattr(geopackage, "_fill", full)
+    monkeypatch.setattr(vectors, "_fill", full)
     with pytest.raises(OSError, match="full") as caught:
-        geopackage.write_geopackage(samples.of_report(data), tmp_path)
+        vectors.write_geopackage(points.of_report(data), tmp_path)
     assert caught.value.errno == errno.ENOSPC
 
 
 def test_a_flight_too_long_for_matlab_is_told(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(matlab, "LARGEST", 1000)
+    monkeypatch.setattr(tables, "LARGEST_MAT", 1000)
     with pytest.raises(UsageError, match="MATLAB 5"):
-        matlab.write_mat(samples.of_report(data), tmp_path)
+        tables.write_mat(points.of_report(data), tmp_path)

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 
 from ...common.errors import UsageError
 
-_NEEDS = {"geojson": "", "geopackage": "", "kmz": "", "gpx": "", "mat": "", "netcdf": "netCDF4", "parquet": "pyarrow"}
-"""By format: the module that it needs besides the default installation."""
+FORMATS = ("geojson", "geopackage", "kmz", "gpx", "mat", "netcdf", "parquet")
+_NEEDS = {"netcdf": ("netCDF4", "xarray"), "parquet": ("pyarrow",)}
+"""By format: the modules that it needs besides the default installation."""
 
-FORMATS = tuple(_NEEDS)
 ALL = "all"
 FOLDER = "exports"
 
@@ -44,9 +44,11 @@ def chosen_formats(*lists: str | Iterable[str]) -> tuple[str, ...]:
 
 def missing_module(name: str) -> str:
     """The module that a format needs and that is not there."""
-    module = _NEEDS[name]
+    return next((module for module in _NEEDS.get(name, ()) if not _installed(module)), "")
+
+
+def _installed(module: str) -> bool:
     try:
-        installed = not module or importlib.util.find_spec(module) is not None
+        return importlib.util.find_spec(module) is not None
     except ValueError:  # a module that is set to None, as an import of it would fail
-        installed = False
-    return "" if installed else module
+        return False

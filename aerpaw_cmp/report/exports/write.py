@@ -7,14 +7,10 @@ from pathlib import Path
 
 from ...common.stages import Progress, silent
 from .formats import FOLDER, FORMATS, missing_module
-from .geojson import write_geojson
-from .geopackage import write_geopackage
-from .gpx import write_gpx
 from .kmz import write_kmz
-from .matlab import write_mat
-from .netcdf import write_netcdf
-from .parquet import write_parquet
-from .samples import Export
+from .points import Export
+from .tables import write_mat, write_netcdf, write_parquet
+from .vectors import write_geojson, write_geopackage, write_gpx
 
 __all__ = ["FORMATS", "write_exports"]
 

@@ -1,0 +1,140 @@
+"""Pieces of KMZ files: text, coordinates, marks, lines, legends and the archive."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from ..common.errors import one_line
+from ..common.units import FloatArray
+
+CLASS_COLOURS = ("#9e9e9e", "#440154", "#31688e", "#35b779", "#fde725", "#e66101", "#b2182b")
+"""Z grey, then ranks 1 to 4 from dark to light (viridis), then spare ones."""
+_DATE = (1980, 1, 1, 0, 0, 0)
+"""Fixed, so that the same content gives the same bytes."""
+
+
+def xml_text(text: str) -> str:
+    """Text for an XML element or attribute: characters that XML cannot hold as escapes."""
+    return escape(one_line(text), {'"': "&quot;"})
+
+
+def coordinates(longitude: FloatArray, latitude: FloatArray, up_m: FloatArray | float = 0.0) -> list[str]:
+    """Places (n,) as KML writes them; a height below or unknown is 0."""
+    up = np.broadcast_to(np.maximum(np.nan_to_num(up_m), 0.0), np.shape(longitude))
+    return [f"{a:.7f},{b:.7f},{h:.1f}" for a, b, h in zip(longitude, latitude, up, strict=True)]
+
+
+def mark(name: str, at: str, *, in_the_air: bool = False) -> str:
+    """A named point; in the air it stands on a pole at its height above the ground."""
+    height = "<extrude>1</extrude><altitudeMode>relativeToGround</altitudeMode>" if in_the_air else ""
+    point = f"<Point>{height}<coordinates>{at}</coordinates></Point>"
+    return f"<Placemark><name>{xml_text(name)}</name>{point}</Placemark>"
+
+
+def folder(name: str, legend: str, content: str, *, visible: bool) -> str:
+    """A folder that can be switched, with a legend in a corner of the screen.
+
+    Parameters
+    ----------
+    name : str
+    legend : str
+        Name of the picture in the archive.
+    content : str
+        KML elements.
+    visible : bool
+        Switched on when the file is opened.
+
+    Returns
+    -------
+    str
+        KML.
+    """
+    shown = int(visible)
+    return (
+        f"<Folder><name>{xml_text(name)}</name><visibility>{shown}</visibility>"
+        f"<ScreenOverlay><name>legend</name><visibility>{shown}</visibility><Icon><href>{legend}</href></Icon>"
+        '<overlayXY x="0" y="1" xunits="fraction" yunits="fraction"/>'
+        '<screenXY x="0.01" y="0.97" xunits="fraction" yunits="fraction"/>'
+        f'<size x="0" y="0" xunits="pixels" yunits="pixels"/></ScreenOverlay>{content}</Folder>'
+    )
+
+
+def write_archive(path: Path, title: str, description: str, body: str, pictures: Mapping[str, bytes]) -> Path:
+    """A KMZ file: the document and its pictures by name.
+
+    Parameters
+    ----------
+    path : Path
+    title, description : str
+        Of the document.
+    body : str
+        KML elements.
+    pictures : mapping of str to bytes
+
+    Returns
+    -------
+    Path
+        The file.
+    """
+    said = f"<description>{xml_text(description)}</description>" if description else ""
+    document = (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2" '
+        'xmlns:gx="http://www.google.com/kml/ext/2.2"><Document>'
+        f"<name>{xml_text(title)}</name><open>1</open>{said}{body}</Document></kml>\n"
+    )
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in {"doc.kml": document.encode(), **pictures}.items():
+            entry = zipfile.ZipInfo(name, _DATE)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, content)
+    return path
+
+
+def list_legend(title: str, colours: Mapping[str, str], width: float = 2.6) -> bytes:
+    """A list of colours by label as PNG, ``width`` inches wide."""
+    from matplotlib.patches import Patch
+
+    figure = _figure(title, width, 0.38 + 0.155 * len(colours))
+    patches = [Patch(color=c, label=n) for n, c in colours.items()]
+    figure.legend(handles=patches, loc="lower left", fontsize=8, frameon=False, borderaxespad=0.3, labelspacing=0.3)
+    return _png(figure)
+
+
+def bar_legend(title: str, label: str, limits: tuple[float, float]) -> bytes:
+    """A colour bar as PNG."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    figure = _figure(title, 4.2, 0.9)
+    axes = figure.add_axes((0.08, 0.42, 0.84, 0.22))
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(*limits), "viridis"), cax=axes, orientation="horizontal", extend="both"
+    )
+    bar.set_label(label, fontsize=8, labelpad=1)
+    bar.ax.tick_params(labelsize=8, pad=1)
+    return _png(figure)
+
+
+def _figure(title: str, width: float, height: float) -> Any:
+    """An empty legend, drawn without touching pyplot's state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=110)
+    FigureCanvasAgg(figure)
+    figure.patch.set_alpha(0.9)
+    figure.suptitle(title, fontsize=9, y=0.98, va="top")
+    return figure
+
+
+def _png(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": "aerpaw-cmp"})
+    return buffer.getvalue()

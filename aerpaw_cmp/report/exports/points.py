@@ -1,0 +1,376 @@
+"""Tables of points: samples of links with the unit and the meaning of every column, towers, flown lines.
+
+The values are those of ``rss.csv`` and ``rank.csv``, rounded as there, with latitude and longitude beside them. A
+missing number is NaN; a rank of 0 is a code, "no path".
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ...common.cf import DB, DBM
+from ...common.geodesy import SiteFrame
+from ...common.units import AnyArray, FloatArray
+from ...logs.records import has_wall_clock
+from ...site.site import Site
+from ..campaign_data import CampaignData, FlownRank, RssRow
+from ..data import ReportData
+from ..export import DECIMALS, rank_tables, rss_tables
+from ..names import iso_time, k_key
+
+DEGREE_DECIMALS = 8
+"""1 mm."""
+
+RANK_FLAGS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
+"""Meanings of 0 to 4 in a simulated rank."""
+YES_NO = ("no", "yes")
+
+_UNITS = (
+    (r"_dbm$", DBM, "dBm"),
+    (r"_db$", DB, "dB"),
+    (r"_deg$", "degree", "deg"),
+    (r"_m$", "m", "m"),
+    (r"_s$", "s", "s"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """One quantity of the samples.
+
+    Parameters
+    ----------
+    name : str
+        As in the CSV.
+    unit : str
+        As UDUNITS reads it.
+    shown_unit : str
+        As people write it: dBm.
+    meaning : str
+    flags : tuple of str
+        Meanings of 0, 1, ...; empty for a number.
+    """
+
+    name: str
+    unit: str = "1"
+    shown_unit: str = ""
+    meaning: str
+    flags: tuple[str, ...] = ()
+
+
+LABELS = {
+    "flight": "name of the flight",
+    "tower": "name of the tower",
+    "channel": "name of the channel",
+    "unit": "unit of measured_db",
+}
+UP = Column(name="up_m", unit="m", shown_unit="m", meaning="height above the ground at the site origin")
+PLACES = {
+    "latitude_deg": ("degrees_north", "WGS84 latitude"),
+    "longitude_deg": ("degrees_east", "WGS84 longitude"),
+    "east_m": ("m", "east of the site origin"),
+    "north_m": ("m", "north of the site origin"),
+    "up_m": ("m", UP.meaning),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Points:
+    """Samples of one kind.
+
+    Parameters
+    ----------
+    kind : str
+        Name of files and layers: ``"rss"``, ``"rank"``.
+    table : pandas.DataFrame
+        ``time`` (UTC), :data:`LABELS`, :data:`PLACES`, then ``columns``; links one below the other, each in time order.
+    columns : tuple of Column
+    """
+
+    kind: str
+    table: Any
+    columns: tuple[Column, ...]
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def links(self) -> Iterator[tuple[str, str, str, Any]]:
+        """Flight, tower, channel and table of each link, in their order."""
+        for key, rows in self.table.groupby(["flight", "tower", "channel"], sort=False, observed=True):
+            yield *map(str, key), rows
+
+    def rows(self) -> Iterator[tuple[Any, ...]]:
+        """Samples as Python's own values, None where missing: time, labels, up, columns; codes are whole numbers."""
+        for start in range(0, len(self), 20_000):  # bounds what a writer holds at once
+            part = self.table.iloc[start : start + 20_000]
+            lists = [[text or None for text in iso_time(part["time"].to_numpy()).tolist()]]
+            lists += [part[name].astype(str).tolist() for name in LABELS]
+            lists += [_plain(part[c.name].to_numpy(), whole=bool(c.flags)) for c in (UP, *self.columns)]
+            yield from zip(*lists, strict=True)
+
+
+def _plain(values: FloatArray, *, whole: bool) -> list[Any]:
+    known = np.isfinite(values)
+    boxed = np.where(known, values, 0.0).astype(np.int64 if whole else np.float64).astype(object)
+    boxed[~known] = None
+    listed: list[Any] = boxed.tolist()
+    return listed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Line:
+    """A flown line (n,): instants and positions in the site frame [m]."""
+
+    flight: str
+    time: AnyArray
+    east_m: FloatArray
+    north_m: FloatArray
+    up_m: FloatArray
+
+    @property
+    def known(self) -> AnyArray:
+        """Where the position is known (n,)."""
+        return np.isfinite(self.east_m) & np.isfinite(self.north_m)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Export:
+    """Everything that is exported.
+
+    Parameters
+    ----------
+    name, title : str
+    site : Site
+        Frame, towers, height of the origin.
+    sets : tuple of Points
+    lines : tuple of Line
+    clock : bool
+        Instants are UTC; else they count from 1970-01-01, because the logs have relative times and no origin.
+    synthetic : bool
+    attributes : mapping
+        What made it: generated, version.
+    """
+
+    name: str
+    title: str
+    site: Site
+    sets: tuple[Points, ...]
+    lines: tuple[Line, ...]
+    clock: bool
+    synthetic: bool = False
+    attributes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What whoever opens a file must know."""
+        said = [
+            "Heights (up_m) are metres above the ground at the site origin.",
+            "A missing number is out of coverage or unknown; a simulated rank of 0 means that there is no path.",
+        ]
+        if not self.clock:
+            said.append("The logs have relative times and no origin: instants count from 1970-01-01, the date is none.")
+        if self.synthetic:
+            said.append("The logs are synthetic: made by simulation, they measure nothing.")
+        return tuple(said)
+
+    def towers(self) -> Iterator[tuple[str, float, float, float]]:
+        """Name, latitude, longitude [deg] and height above the ground at the origin [m]."""
+        for tower in self.site.towers.values():
+            latitude, longitude = latitude_longitude(self.site.frame, tower.east_m, tower.north_m)
+            yield tower.name, float(latitude), float(longitude), float(tower.position_m[2])
+
+
+# --- columns --------------------------------------------------------------------------------------------------------
+
+_RSS_MEANINGS = {
+    "measured_db": "level as logged",
+    "calibrated_db": "level as logged plus the fitted offset of the link",
+    "simulated_dbm": "level by ray tracing",
+    "residual_db": "calibrated minus simulated level",
+    "measured_out_of_coverage": "whether the log has no signal here",
+    "simulated_out_of_coverage": "whether the ray tracing has no path here",
+}
+
+
+def column(name: str, unit: str | None = None) -> Column:
+    """The column of a name: its unit from the name's end, its meaning from what is known of it."""
+    meaning = _RSS_MEANINGS.get(name, name.replace("_", " "))
+    if name.endswith("out_of_coverage"):
+        return Column(name=name, meaning=meaning, flags=YES_NO)
+    if name == "measured_rank":
+        return Column(name=name, meaning="rank reported by the modem, missing where it reported none", flags=RANK_FLAGS)
+    if re.match(r"(simulated_)?rank_", name):
+        k = name.rsplit("_k", 1)[-1]
+        what = name.removeprefix("simulated_").removeprefix("rank_").rsplit("k" + k, 1)[0].strip("_").replace("_", " ")
+        return Column(
+            name=name, meaning=f"rank by ray tracing, K = {k}" + (f", {what}" if what else ""), flags=RANK_FLAGS
+        )
+    if name == "calibrated_db":
+        return Column(name=name, unit=DBM, shown_unit="dBm", meaning=meaning)
+    if name == "measured_db":
+        known = (DBM, "dBm") if unit == "dBm" else (DB, unit or "dB")
+        return Column(name=name, unit=known[0], shown_unit=known[1], meaning=meaning)
+    for end, udunits, shown in _UNITS:
+        if re.search(end, name):
+            return Column(name=name, unit=udunits, shown_unit=shown, meaning=meaning)
+    return Column(name=name, meaning=meaning)
+
+
+def points_table(kind: str, links: Iterable[Mapping[str, Any]], frame: SiteFrame) -> tuple[Points, ...]:
+    """The points of links one below the other; none without links.
+
+    Parameters
+    ----------
+    kind : str
+        Name of files and layers.
+    links : iterable of mapping
+        Columns of each link, arrays (n,) or one value for all rows: ``time``, :data:`LABELS` (``channel`` and ``unit``
+        may be missing), ``east_m``, ``north_m``, ``up_m``, then values with their unit at the end of the name.
+    frame : SiteFrame
+
+    Returns
+    -------
+    tuple of Points
+        One, or none.
+    """
+    import pandas as pd
+
+    parts = [
+        pd.DataFrame({"channel": "", "unit": "1", **link}, index=range(len(np.asarray(link["time"])))) for link in links
+    ]
+    if not parts:
+        return ()
+    table = pd.concat(parts, ignore_index=True)
+    table["time"] = table["time"].to_numpy("datetime64[ns]")
+    units = table["unit"].unique()
+    names = [name for name in table.columns if name not in {"time", *LABELS, *PLACES}]
+    for name in ("east_m", "north_m", "up_m", *names):
+        values = np.round(table[name].to_numpy(np.float64, na_value=np.nan), DECIMALS)
+        table[name] = np.where(np.isfinite(values), values, np.nan)
+    table["latitude_deg"], table["longitude_deg"] = latitude_longitude(
+        frame, table["east_m"].to_numpy(), table["north_m"].to_numpy()
+    )
+    table = table.astype(dict.fromkeys(LABELS, "category"))[["time", *LABELS, *PLACES, *names]]
+    shared = str(units[0]) if len(units) == 1 else "dB, reference by link"
+    return (Points(kind=kind, table=table, columns=tuple(column(name, shared) for name in names)),)
+
+
+def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[FloatArray, FloatArray]:
+    """WGS84 latitude and longitude [deg] of positions (n,), NaN where a position is unknown."""
+    known = np.isfinite(east_m) & np.isfinite(north_m)
+    latitude, longitude = frame.to_geographic(np.where(known, east_m, 0.0), np.where(known, north_m, 0.0))
+    return (
+        np.where(known, np.round(latitude, DEGREE_DECIMALS), np.nan),
+        np.where(known, np.round(longitude, DEGREE_DECIMALS), np.nan),
+    )
+
+
+def well_known_binary(rows: Any) -> Any:
+    """Places as well-known binary, None where unknown; an unknown height is 0."""
+    import shapely
+
+    places = rows[["longitude_deg", "latitude_deg"]].to_numpy()
+    at = shapely.points(np.column_stack([places, np.nan_to_num(rows["up_m"].to_numpy())]))
+    return shapely.to_wkb(np.where(np.isfinite(places).all(axis=1), at, None), byte_order=1, flavor="iso")
+
+
+# --- from a report --------------------------------------------------------------------------------------------------
+
+
+def of_report(data: ReportData) -> Export:
+    """The samples of a flight."""
+    tables = {"rss": rss_tables(list(data.rss)), "rank": rank_tables(list(data.rank))}
+    sets = [
+        points
+        for kind, links in tables.items()
+        for points in points_table(
+            kind, ({"time": time, "flight": data.flight, **columns} for time, columns in links), data.site.frame
+        )
+    ]
+    track = data.track
+    places = {} if track is None else {name: getattr(track, name) for name in ("time", "east_m", "north_m", "up_m")}
+    lines = [Line(flight=data.flight, **places)] if places else []
+    return Export(
+        name=data.flight,
+        title=data.title,
+        site=data.site,
+        sets=tuple(sets),
+        lines=tuple(lines),
+        clock=_clock([*(points.table["time"].to_numpy() for points in sets), *(line.time for line in lines)]),
+        synthetic=data.synthetic,
+        attributes=_made(data.generated, data.versions),
+    )
+
+
+def _made(generated: str, versions: Mapping[str, str]) -> dict[str, str]:
+    return {"generated": generated, "version": versions.get("aerpaw-cmp", "")}
+
+
+def _clock(times: Iterable[AnyArray]) -> bool:
+    """Whether the first known instant is a time of day."""
+    known = [time[~np.isnat(time)] for time in times]
+    first = [time.min() for time in known if len(time)]
+    return bool(first) and has_wall_clock(min(first))
+
+
+# --- from a campaign ------------------------------------------------------------------------------------------------
+
+
+def of_campaign(data: CampaignData) -> Export | None:
+    """The samples of all flights under the reference setting; None where no flight could be read."""
+    if data.site is None:
+        return None
+    rss = [_rss_link(row) for row in data.reference_rows]
+    rank = [_rank_link(one) for one in data.flown_ranks]
+    lines = []
+    for track in data.tracks:
+        start = next((x["time"][0] for x in (*rss, *rank) if x["flight"] == track.flight and len(x["time"])), None)
+        if start is not None:
+            east, north, up = track.position_m.T
+            time = start + _nanoseconds(track.time_s)
+            lines.append(Line(flight=track.flight, time=time, east_m=east, north_m=north, up_m=up))
+    return Export(
+        name=data.name,
+        title=data.title,
+        site=data.site,
+        sets=(*points_table("rss", rss, data.site.frame), *points_table("rank", rank, data.site.frame)),
+        lines=tuple(lines),
+        clock=_clock(one["time"] for one in (*rss, *rank)),
+        synthetic=bool(data.synthetic),
+        attributes=_made(data.generated, data.versions),
+    )
+
+
+def _nanoseconds(seconds: FloatArray) -> AnyArray:
+    return np.round(seconds * 1e9).astype("timedelta64[ns]")
+
+
+def _flown(one: RssRow | FlownRank) -> dict[str, Any]:
+    time = np.datetime64(one.start_ns, "ns") + _nanoseconds(one.time_s)
+    places = dict(zip(("east_m", "north_m", "up_m"), one.position_m.T, strict=True))
+    return {"time": time, "flight": one.flight, "tower": one.tower, **places}
+
+
+def _rss_link(row: RssRow) -> dict[str, Any]:
+    placed = np.isfinite(row.position_m).all(axis=1)
+    return {
+        **_flown(row),
+        "channel": row.channel,
+        "unit": row.unit,
+        "measured_db": row.measured_db,
+        "calibrated_db": row.measured_db + row.offset_db,
+        "simulated_dbm": row.simulated_dbm,
+        "residual_db": row.residual_db,
+        "measured_out_of_coverage": placed & ~np.isfinite(row.measured_db),
+        "simulated_out_of_coverage": placed & ~np.isfinite(row.simulated_dbm),
+    }
+
+
+def _rank_link(one: FlownRank) -> dict[str, Any]:
+    ranks = {f"simulated_rank_k{k_key(k)}": rank for k, rank in one.simulated.items()}
+    return {**_flown(one), "measured_rank": one.rank, **ranks}

@@ -1,0 +1,230 @@
+"""Samples as tables of numbers: MATLAB 5, NetCDF after CF-1.11, Parquet with GeoParquet 1.1."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.cf import WGS84, dataset, file_attributes, netcdf_bytes
+from ...common.errors import UsageError
+from .points import LABELS, PLACES, Column, Export, Points, well_known_binary
+
+LARGEST_MAT = 2**31 - 2**20
+"""Bytes of one variable of a MATLAB 5 file, a little below its limit."""
+
+NO_CODE = -1
+"""Stands for a missing code in NetCDF; attribute ``_FillValue``."""
+
+ROWS = 100_000
+"""Rows of one group of a Parquet file: what is held at once."""
+
+
+# --- MATLAB ---------------------------------------------------------------------------------------------------------
+
+
+def write_mat(export: Export, folder: Path) -> list[Path]:
+    """``samples.mat``: ``about``, ``towers``, ``units``, and each kind as a struct array with one element per link.
+
+    Raises
+    ------
+    UsageError
+        If a variable would be larger than the format takes.
+    """
+    from scipy.io import savemat
+
+    towers = export.site.towers.values()
+    content: dict[str, Any] = {
+        "about": {
+            "name": export.name,
+            "title": export.title,
+            "remarks": " ".join(export.remarks),
+            "time": "time_posix_s counts seconds since 1970-01-01 UTC: datetime(x, 'ConvertFrom', 'posixtime')",
+            "has_clock": export.clock,
+            "synthetic": export.synthetic,
+            **export.attributes,
+        },
+        "towers": {
+            "name": np.array([t.name for t in towers], dtype=object)[:, None],
+            "latitude_deg": np.array([t.latitude_deg for t in towers]),
+            "longitude_deg": np.array([t.longitude_deg for t in towers]),
+            "position_m": np.array([t.position_m for t in towers]).reshape(-1, 3),
+        },
+    }
+    for points in export.sets:
+        largest = len(points) * (len(points.columns) + 7) * 8
+        if largest > LARGEST_MAT:
+            raise UsageError(
+                f"{points.kind} has {len(points)} samples, {largest / 2**30:.1f} GiB: too many for a MATLAB 5 file",
+                expected="another format, such as parquet or netcdf (which MATLAB reads, too)",
+            )
+        content[points.kind] = _structs(points)
+        content[f"{points.kind}_units"] = {_field(c.name): c.shown_unit or "1" for c in points.columns}
+    buffer = io.BytesIO()
+    savemat(buffer, content, long_field_names=True, do_compression=True, oned_as="column")
+    path = folder / "samples.mat"
+    path.write_bytes(buffer.getbuffer())
+    return [path]
+
+
+def _field(name: str) -> str:
+    """A name that MATLAB takes.
+
+    Examples
+    --------
+    >>> _field("simulated_rank_k12.5")
+    'simulated_rank_k12_5'
+    """
+    return re.sub(r"\W", "_", name)[:63]
+
+
+def _structs(points: Points) -> Any:
+    """A struct array (1, links)."""
+    structs = []
+    for flight, tower, channel, rows in points.links():
+        time = rows["time"].to_numpy()
+        struct: dict[str, Any] = {
+            "flight": flight,
+            "tower": tower,
+            "channel": channel,
+            "unit": str(rows["unit"].iloc[0]),
+        }
+        struct["time_posix_s"] = np.where(np.isnat(time), np.nan, time.astype(np.int64) / 1e9)[:, None]
+        names = (*PLACES, *(c.name for c in points.columns))
+        structs.append(struct | {_field(name): rows[name].to_numpy()[:, None] for name in names})
+    array = np.empty((1, len(structs)), dtype=[(name, object) for name in structs[0]])
+    array[0] = [tuple(struct.values()) for struct in structs]
+    return array
+
+
+# --- NetCDF ---------------------------------------------------------------------------------------------------------
+
+_TITLES = {"rss": "Received level, measured and replayed", "rank": "Channel rank, reported and replayed"}
+
+
+def write_netcdf(export: Export, folder: Path) -> list[Path]:
+    """``<kind>.nc``: trajectories as a contiguous ragged array, one per link."""
+    paths = []
+    for points in export.sets:
+        path = folder / f"{points.kind}.nc"
+        path.write_bytes(netcdf_bytes(points_dataset(export, points)))
+        paths.append(path)
+    return paths
+
+
+def points_dataset(export: Export, points: Points) -> Any:
+    """The samples of one kind as an ``xarray.Dataset`` with dimensions trajectory (links) and obs."""
+    links = list(points.links())
+    texts = {
+        "link": ("flight, tower and channel", [f"{f} {f'{t} {c}'.strip()}" for f, t, c, _ in links]),
+        "flight": (LABELS["flight"], [flight for flight, *_ in links]),
+        "tower": (LABELS["tower"], [tower for _, tower, *_ in links]),
+        "channel": (LABELS["channel"], [channel for *_, channel, _ in links]),
+        "unit_of_measured": ("unit of the level as logged", [str(rows["unit"].iloc[0]) for *_, rows in links]),
+    }
+    variables: dict[str, Any] = {
+        name: ("trajectory", np.array(values, dtype=object), {"long_name": meaning})
+        for name, (meaning, values) in texts.items()
+    }
+    variables["link"][2]["cf_role"] = "trajectory_id"
+    size = {"long_name": "number of samples of this link", "sample_dimension": "obs"}
+    variables["row_size"] = ("trajectory", np.array([len(rows) for *_, rows in links], dtype=np.int32), size)
+    variables["time"] = ("obs", *_seconds(export, points.table["time"].to_numpy()))
+    axes = {"latitude_deg": "Y", "longitude_deg": "X", "up_m": "Z"}
+    for name, (unit, meaning) in PLACES.items():
+        short = name.rpartition("_")[0]
+        said = {"long_name": meaning, "units": unit}
+        if name in axes:
+            said |= {"standard_name": "height" if short == "up" else short, "axis": axes[name]}
+        if short == "up":
+            said["positive"] = "up"
+        variables[short] = ("obs", points.table[name].to_numpy(), said)
+    variables["crs"] = ((), np.int32(0), WGS84)
+    for one in points.columns:
+        variables[one.name.replace(".", "p")] = ("obs", *_values(one, points.table[one.name].to_numpy()))
+    about = file_attributes(
+        title=f"{_TITLES.get(points.kind, points.kind)}: {export.title}",
+        source="field logs, replayed by ray tracing",
+        generated=export.attributes.get("generated", ""),
+        version=export.attributes.get("version", ""),
+        comment=" ".join(export.remarks),
+    )
+    return dataset(variables, {**about, "featureType": "trajectory"})
+
+
+def _seconds(export: Export, times: Any) -> tuple[Any, dict[str, str]]:
+    """Seconds after the first whole second, and their attributes."""
+    known = times[~np.isnat(times)]
+    start = known.min().astype("datetime64[s]") if len(known) and export.clock else np.datetime64("1970-01-01", "s")
+    said = {
+        "standard_name": "time",
+        "long_name": "instant of the sample",
+        "units": f"seconds since {str(start).replace('T', ' ')} UTC",
+        "calendar": "standard",
+        "units_metadata": "leap_seconds: none",
+        "axis": "T",
+    }
+    if not export.clock:
+        said["comment"] = "the logs have relative times and no origin: the date is none"
+    return np.where(np.isnat(times), np.nan, (times - start) / np.timedelta64(1, "s")), said
+
+
+def _values(column: Column, values: Any) -> tuple[Any, ...]:
+    """Values, attributes and encoding of a quantity or of codes."""
+    shared = {"long_name": column.meaning, "coordinates": "time latitude longitude up", "grid_mapping": "crs"}
+    if column.flags:
+        codes = np.where(np.isfinite(values), values, NO_CODE).astype(np.int8)
+        said = {"flag_values": np.arange(len(column.flags), dtype=np.int8), "flag_meanings": " ".join(column.flags)}
+        return codes, shared | said, {"_FillValue": np.int8(NO_CODE)}
+    other = {} if column.shown_unit in ("", column.unit) else {"comment": f"unit: {column.shown_unit}"}
+    return values, {**shared, "units": column.unit, **other}, {"_FillValue": np.nan}
+
+
+# --- Parquet --------------------------------------------------------------------------------------------------------
+
+
+def write_parquet(export: Export, folder: Path) -> list[Path]:
+    """``<kind>.parquet``: units in the metadata of the columns, places as GeoParquet."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    paths = []
+    for points in export.sets:
+        schema = _schema(export, points)
+        path = folder / f"{points.kind}.parquet"
+        # a stream of Python's own: the disk's errors come as OSError
+        with path.open("wb") as stream, parquet.ParquetWriter(stream, schema, compression="zstd") as writer:
+            for start in range(0, len(points), ROWS):
+                part = points.table.iloc[start : start + ROWS]
+                part = part.assign(time=part["time"].dt.tz_localize("UTC"), geometry=well_known_binary(part))
+                writer.write_table(pa.Table.from_pandas(part, schema=schema, preserve_index=False))
+        paths.append(path)
+    return paths
+
+
+def _schema(export: Export, points: Points) -> Any:
+    import pyarrow as pa
+
+    text = pa.dictionary(pa.int32(), pa.string())
+    when = "instant, UTC" if export.clock else "instant after 1970-01-01: the logs have no origin of time"
+    fields = [("time", pa.timestamp("ns", tz="UTC"), {"unit": "", "description": when})]
+    fields += [(name, text, {"unit": "", "description": meaning}) for name, meaning in LABELS.items()]
+    fields += [(n, pa.float64(), {"unit": unit, "description": meaning}) for n, (unit, meaning) in PLACES.items()]
+    for c in points.columns:
+        codes = {"codes": json.dumps(dict(enumerate(c.flags)))} if c.flags else {}
+        kind = pa.int8() if c.flags else pa.float64()
+        fields.append((c.name, kind, {"unit": c.shown_unit, "description": c.meaning, **codes}))
+    said = {"unit": "", "description": "longitude, latitude [deg], up_m [m] as WKB"}
+    fields.append(("geometry", pa.binary(), said))
+    about = {"title": export.title, "name": export.name, "remarks": " ".join(export.remarks), **export.attributes}
+    # longitude and latitude default to WGS84 where GeoParquet names no CRS
+    shape = {"encoding": "WKB", "geometry_types": ["Point Z"]}
+    geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": shape}}
+    return pa.schema(
+        [pa.field(name, kind, metadata=metadata) for name, kind, metadata in fields],
+        metadata={**about, "geo": json.dumps(geo)},
+    )

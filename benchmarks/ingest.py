@@ -1,18 +1,16 @@
-"""Time of reading a sounder power log, as a ratio to pandas' C parser on the same bytes.
+"""Time and peak memory of reading a large log, beside pandas, pyarrow and polars on the same file.
 
-``python benchmarks/ingest.py [--quick] [--json]``. The log has 20 523 lines: those of the real flight where
-AERPAW_CMP_FIELD_DATA names the field data, else a synthetic one in the same layout. Ours gives UTC times, levels and
-flags with every line accounted for; pandas gives columns of text and numbers.
+    python benchmarks/ingest.py [--scale LINES] [--format READER ...] [--folder DIR]
+
+Every contestant is a process of its own. Ours gives UTC times, values and flags with every line accounted for; the
+peers give columns with their times converted.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import os
-import platform
-import statistics
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,109 +21,11 @@ import pandas as pd
 
 from aerpaw_cmp.logs.flight_file import write_flight
 from aerpaw_cmp.logs.ingest import ingest
-from aerpaw_cmp.logs.readers import ReadOptions, by_name
-from aerpaw_cmp.logs.writers import format_power_log, format_quectel_csv, format_vehicle_out
+from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.writers import format_quectel_csv, format_vehicle_out
 
-LINES = 20_523
 ZONE = "America/New_York"
-REAL = "sounder/2023-12-13_12_33_02_power_log.txt"
-
-
-def sounder_bytes(lines: int) -> tuple[bytes, str]:
-    """A power log of that many lines, and where it comes from."""
-    real = Path(os.environ.get("AERPAW_CMP_FIELD_DATA", "")) / REAL
-    if real.is_file():
-        return b"".join(real.read_bytes().splitlines(keepends=True)[:lines]), "field/" + REAL
-    rng = np.random.default_rng(20_523)
-    times = np.datetime64("2025-03-02T15:00:00", "ns") + np.arange(lines) * np.timedelta64(32_760_000, "ns")
-    return format_power_log(times, rng.normal(-40, 12, lines), ZONE), "synthetic"
-
-
-def seconds(action: Callable[[], Any]) -> float:
-    """Processor time of one call: other work on the machine does not count."""
-    start = time.process_time()
-    action()
-    return time.process_time() - start
-
-
-def measure(lines: int, rounds: int) -> dict[str, Any]:
-    """Median of rounds in which all contestants take turns."""
-    data, source = sounder_bytes(lines)
-    options = ReadOptions(timezone=ZONE)
-    reader = by_name("sounder_log")
-
-    def ours() -> None:
-        result = reader.read(data, options)
-        assert result.lines == result.accepted + result.rejected_count + result.blank == lines
-
-    def plain() -> pd.DataFrame:
-        return pd.read_csv(io.BytesIO(data), engine="c", header=None, sep=r"\s+")
-
-    def with_times() -> None:
-        frame = plain()
-        clock = pd.to_datetime(frame[0].str[1:] + " " + frame[1].str[:-1], format="%Y-%m-%d %H:%M:%S.%f")
-        clock.dt.tz_localize(ZONE).dt.tz_convert("UTC")
-
-    contestants = {"ours_s": ours, "pandas_s": plain, "pandas_with_times_s": with_times}
-    for action in contestants.values():
-        action()
-    taken: dict[str, list[float]] = {name: [] for name in contestants}
-    for _ in range(rounds):
-        for name, action in contestants.items():
-            taken[name].append(seconds(action))
-    median = {name: statistics.median(values) for name, values in taken.items()}
-    return {
-        "lines": lines,
-        "bytes": len(data),
-        "source": source,
-        "rounds": rounds,
-        **median,
-        # how many times faster than the peer, the contract of 'bench --json'
-        "ingest_vs_pandas": median["pandas_s"] / median["ours_s"],
-        "ingest_vs_pandas_with_times": median["pandas_with_times_s"] / median["ours_s"],
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "pandas": pd.__version__,
-    }
-
-
-def measure_others(rows: int) -> dict[str, float]:
-    """Time of the other bulk formats over that of pandas on the same bytes."""
-    rng = np.random.default_rng(7)
-    times = np.datetime64("2025-03-02T15:00:00", "ns") + np.arange(rows) * np.timedelta64(1_005_000_000, "ns")
-    names = ("altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "velocity_north_mps", "velocity_east_mps")
-    track = pd.DataFrame({name: rng.uniform(-9, 9, rows) for name in names})
-    track = track.assign(time=times, latitude_deg=35.73 + track["roll_deg"] / 1e3, longitude_deg=-78.7)
-    track = track.assign(velocity_down_mps=0.5, fix=4, satellites=20)
-    logs = {
-        "vehicle_out": format_vehicle_out(track, ZONE),
-        "quectel_csv": format_quectel_csv(times, rng.integers(1, 5, rows), ZONE),
-    }
-    options, ratios = ReadOptions(timezone=ZONE), {}
-    for name, data in logs.items():
-        reader = by_name(name)
-        peer = io.BytesIO(data.removeprefix(b"OK\n"))
-        ours, pandas_s = [], []
-        for _ in range(5):
-            ours.append(seconds(lambda reader=reader, data=data: reader.read(data, options)))
-            peer.seek(0)
-            pandas_s.append(seconds(lambda peer=peer: pd.read_csv(peer, engine="c", header=None)))
-        ratios[name] = statistics.median(ours[1:]) / statistics.median(pandas_s[1:])
-    return ratios
-
-
-def measure_folder() -> dict[str, Any] | None:
-    """Whole way of every log of the field data, search and sniffing included."""
-    root = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
-    if not root or not Path(root).is_dir():
-        return None
-    found = ingest(root, options=ReadOptions(timezone=ZONE))
-    spent = min(seconds(lambda: ingest(root, options=ReadOptions(timezone=ZONE))) for _ in range(3))
-    return {"files": len(found), "lines": sum(file.result.lines for file in found), "seconds": spent}
-
-
 SCALE_LINES = 5_000_000
-SCALE_HELP = "time and peak memory of a file of so many lines, made here; each contestant in a process of its own"
 START = np.datetime64("2025-03-02T15:00:00", "ns")
 STEP = 250_000
 
@@ -471,42 +371,17 @@ def scale(lines: int, formats: list[str], contestants: list[str], folder: str | 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a tenth of the lines, few rounds")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--scale", type=int, nargs="?", const=SCALE_LINES, metavar="LINES", help=SCALE_HELP)
-    parser.add_argument("--format", action="append", choices=sorted(SCALED), help="of --scale, repeatable; all")
-    parser.add_argument("--contestant", action="append", choices=list(CONTESTANTS), help="of --scale, repeatable; all")
-    parser.add_argument("--folder", help="where --scale puts its files")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scale", type=int, default=SCALE_LINES, metavar="LINES", help="lines of each file")
+    parser.add_argument("--format", action="append", choices=sorted(SCALED), help="repeatable; all")
+    parser.add_argument("--contestant", action="append", choices=list(CONTESTANTS), help="repeatable; all")
+    parser.add_argument("--folder", help="where the files are made")
     parser.add_argument("--contest", nargs=3, metavar=("WHO", "WHAT", "FILE"), help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.contest:
         print(json.dumps(contest(given.contest[0], given.contest[1], Path(given.contest[2]))))
         return
-    if given.scale:
-        scale(given.scale, given.format or list(SCALED), given.contestant or list(CONTESTANTS), given.folder)
-        return
-    answer = measure(LINES // 10 if given.quick else LINES, 5 if given.quick else 31)
-    folder = None if given.quick else measure_folder()
-    if folder:
-        answer["folder"] = folder
-    answer["time_over_pandas"] = measure_others(2_000 if given.quick else 20_000)
-    if given.json:
-        print(json.dumps(answer))
-        return
-    print(
-        f"{answer['lines']} lines, {answer['bytes']} bytes, {answer['source']}; "
-        f"median of {answer['rounds']} rounds, CPU time"
-    )
-    print(f"  ours (UTC, flags, account)         {1e3 * answer['ours_s']:8.2f} ms")
-    print(f"  pandas.read_csv(engine='c')        {1e3 * answer['pandas_s']:8.2f} ms")
-    print(f"  pandas, times converted as well    {1e3 * answer['pandas_with_times_s']:8.2f} ms")
-    print(f"  ours takes {1 / answer['ingest_vs_pandas']:.2f} x the time of pandas (to reach: <= 1.5),")
-    print(f"  {1 / answer['ingest_vs_pandas_with_times']:.2f} x where pandas converts the times too")
-    for name, ratio in answer["time_over_pandas"].items():
-        print(f"  {name}: {ratio:.2f} x the time of pandas on synthetic rows")
-    if folder:
-        print(f"  field data: {folder['files']} logs, {folder['lines']} lines in {folder['seconds']:.2f} s")
+    scale(given.scale, given.format or list(SCALED), given.contestant or list(CONTESTANTS), given.folder)
 
 
 if __name__ == "__main__":

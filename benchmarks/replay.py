@@ -1,11 +1,11 @@
-"""How fast and how right the replay is on this machine; every number is from this one run.
+"""How right and how large the replay is on this machine; every number is from this one run.
 
-1. path search of the image engine against PathSolver at 1e6 samples, 12 buildings + ground, depth 2, 1000 poses;
-2. singular values against 50-digit arithmetic on random links, 20 m to 3 km;
-3. time and memory of 10 000 poses x 5 towers x 4 x 4;
-4. the table of speed against error (--table).
+1. singular values against 50-digit arithmetic on random links, 20 m to 3 km;
+2. time and memory of 10 000 poses x 5 towers x 4 x 4;
+3. a second replay by the sionna engine, whose paths are kept.
 
-Run: python benchmarks/replay.py [--quick] [--table] [--json] [--no-sionna]
+Run: python benchmarks/replay.py [--quick] [--json] [--no-sionna]
+``aerpaw-cmp bench`` prints speed against error and the ratio to PathSolver.
 """
 
 from __future__ import annotations
@@ -22,31 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.jobs.bench import path_search, random_scene, speed_against_error
+from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation.arrays import Link, Poses
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 
 REFERENCE = Path(__file__).parents[1] / "tests" / "propagation" / "reference.py"
-
-
-def brute_force(poses: int) -> dict[str, int]:
-    """Paths of the image engine against one-by-one enumeration (tests/propagation/conftest.py), 12 buildings."""
-    spec = importlib.util.spec_from_file_location("replay_conftest", REFERENCE.with_name("conftest.py"))
-    helpers = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = helpers
-    spec.loader.exec_module(helpers)
-    site, link, some = random_scene(poses)
-    ours = replay(site, link, some)
-    source = next(iter(site.towers.values())).position_m
-    missing = extra = total = 0
-    for pose in range(poses):
-        expected = helpers.brute_force(site, ours.faces, source, some.position_m[pose], 2)
-        found = {tuple(row) for row in ours.paths.faces[ours.paths.pose == pose].tolist()}
-        total += len(expected)
-        missing += len(expected - found)
-        extra += len(found - expected)
-    return {"poses": poses, "paths": total, "missing": missing, "invented": extra}
 
 
 def digits(links: int) -> dict[str, object]:
@@ -153,7 +134,6 @@ def cached(poses: int, folder: str) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small sizes")
-    parser.add_argument("--table", action="store_true", help="also the table of speed against error")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--no-sionna", action="store_true")
     parser.add_argument("--only-size", type=int, help=argparse.SUPPRESS)
@@ -169,26 +149,16 @@ def main() -> None:
     command = [sys.executable, __file__, "--only-size", "500" if quick else "10000"]
     result["size"] = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     result["digits"] = digits(20 if quick else 1000)
-    result["brute_force"] = brute_force(2 if quick else 20)
     if not options.no_sionna:
-        result["path_search"] = path_search(100 if quick else 1000, 10_000 if quick else 1_000_000)
         import tempfile
 
         with tempfile.TemporaryDirectory() as folder:
             result["cache"] = cached(50 if quick else 500, folder)
-        if options.table:
-            site, link, poses = random_scene(50 if quick else 500)
-            samples = (1000,) if quick else (1_000, 10_000, 100_000, 1_000_000)
-            rows = speed_against_error(site, link, poses, samples=samples, explicit_poses=10 if quick else 50)
-            result["rows"] = [row.as_dict() for row in rows]
     if options.json:
         print(json.dumps(result))
         return
     for name, value in result.items():
-        if name != "rows":
-            print(f"{name}: {value}")
-    for row in result.get("rows", []):
-        print(" | ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
+        print(f"{name}: {value}")
 
 
 if __name__ == "__main__":

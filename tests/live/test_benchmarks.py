@@ -43,13 +43,6 @@ def test_replug():
     assert result["received_bytes"] == result["received_bytes_by_the_tap"]
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments", "key"),
-    [
-        ("tap_soak.py", ("--simulated-s", "20"), "memory_last_third_kib"),
-        ("tap_cpu.py", ("--seconds", "1"), "cpu_percent_of_one_core"),
-    ],
-)
-def test_soak_and_cpu(name, arguments, key):
-    _, result = run(name, *arguments)  # their exit codes depend on the machine
-    assert key in result
+def test_soak():
+    _, result = run("tap_soak.py", "--simulated-s", "20")  # its exit code depends on the machine
+    assert result["memory_last_third_kib"] > 0

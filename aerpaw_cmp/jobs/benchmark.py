@@ -73,8 +73,6 @@ class Task(Settings):
     split: Split = "flights"
     train: list[str] = Field(default_factory=list)
     test: Annotated[list[str], Field(min_length=1)]
-    repeat_floor: str | None = None
-    """How well a repeat of the flight predicts it, in words: no model can be expected to do better."""
 
     @property
     def own_offset(self) -> bool:
@@ -98,9 +96,8 @@ class Task(Settings):
             if self.own_offset
             else "Levels count as they are."
         )
-        floor = "" if self.repeat_floor is None else f" Repeat floor: {self.repeat_floor}."
         said = offset if self.kind == "level" else "Scored is the probability of each rank."
-        return f"Known: {known}. {said}{floor}"
+        return f"Known: {known}. {said}"
 
 
 class Manifest(Settings):

@@ -35,6 +35,7 @@ from .benchmark import (
     score_task,
     truth,
 )
+from .benchmark_repeat import repeat_of
 
 Scores = dict[str, dict[str, dict[str, Any]]]
 """By task and entrant."""
@@ -202,7 +203,8 @@ def _page(bench: Bench, scores: Scores) -> str:
     tables = []
     for task, rows in scores.items():
         one = bench.manifest.tasks[task]
-        about = {"title": one.title, "rule": one.rule, "kind": one.kind, "flights": bench.tests(task)}
+        rule = f"{one.rule} {repeat_of(bench, task).words}"
+        about = {"title": one.title, "rule": rule, "kind": one.kind, "flights": bench.tests(task)}
         tables.append(task_table(task, {**about, "skipped": bench.skipped(task, training=False)}, rows))
     lacking = dict.fromkeys(text for task in bench.manifest.tasks for text in bench.skipped(task, training=True))
     made = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")

@@ -20,6 +20,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.jobs import benchmark, benchmark_run, entrants
+from aerpaw_cmp.jobs.benchmark_repeat import repeat_of
 
 TOWER = np.array([0.0, 0.0, 10.0])
 FLIGHT = """
@@ -142,6 +143,37 @@ def _crps(error: float, sd: float) -> float:
     x = np.linspace(-60.0, 60.0, 240_001)
     forecast = 0.5 * (1.0 + np.vectorize(math.erf)(x[::40] / sd / math.sqrt(2.0)))
     return float(np.trapezoid((np.interp(x, x[::40], forecast) - (x >= error)) ** 2, x)) if abs(error) < 60 else 0.0
+
+
+def test_a_repeat_differs_by_the_noise_of_two_visits(tmp_path: Path) -> None:
+    """A circle flown five times with a fixed level per place and noise of 2 dB: two visits differ by 2 sqrt(2) dB."""
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "site.yaml").write_text(SITE)
+    draw, rows = np.random.default_rng(3), ["time,latitude_deg,longitude_deg,altitude_m,level"]
+    for i in range(500):
+        turn = 2.0 * np.pi * i / 100.0
+        level = -60.0 + 8.0 * np.sin(3.0 * turn) + draw.normal(0.0, 2.0)
+        place = f"{35.7275 + 150.0 * np.sin(turn) / 110_950.0:.7f},{-78.696 + 150.0 * np.cos(turn) / 90_400.0:.7f}"
+        rows.append(f"2025-06-01T12:{i // 60:02d}:{i % 60:02d}Z,{place},40.0,{level:.4f}")
+    text = ("\n".join(rows) + "\n").encode()
+    (tmp_path / "logs" / "circle.csv").write_bytes(text)
+    (tmp_path / "manifest.yaml").write_text(
+        f"version: 1\nfiles:\n  circle: {{repository: nobody/c, path: circle.csv, bytes: {len(text)}, "
+        f"sha256: {hashlib.sha256(text).hexdigest()}, licence: CC0-1.0}}\n"
+        f"flights:\n  circle:{FLIGHT.format(site=tmp_path / 'site.yaml', name='circle')}\n"
+        "tasks:\n  unseen: {title: Circle, train: [], test: [circle]}\n"
+    )
+    bench = benchmark_run.open_bench(tmp_path / "logs", tmp_path / "manifest.yaml")
+    repeat = repeat_of(bench, "unseen")
+    assert repeat.rmse_db == pytest.approx(2.0 * math.sqrt(2.0), rel=0.08)
+    assert repeat.share == 1.0
+    assert "RMSE 2." in repeat.words
+
+
+def test_a_straight_flight_has_no_repeat(bench: benchmark.Bench) -> None:
+    """Both spirals are flown once, at 30 and 40 m."""
+    assert repeat_of(bench, "unseen").share == 0.0
+    assert "n/a" in repeat_of(bench, "unseen").words
 
 
 def test_nothing_of_a_fold_is_known(bench: benchmark.Bench) -> None:

@@ -1,12 +1,13 @@
-"""Mutation testing of the modules that hold the physics and the readers.
+"""Mutation testing of the rooms that hold physics, statistics and the rules of honesty.
 
-Each mutant changes one place of one module: an operator, a comparison, a sign, a constant, a condition. Of the tests
-named for the module, those that reach the changed statement run on it in a forked child, where nothing else is changed,
-and end at the first failure.
+Each mutant changes one place of one module: an operator, a comparison, a sign, a constant, a condition. The tests that
+reach the changed statement run on it in a forked child, where nothing else is changed, and end at the first failure.
 A mutant that every test passes has survived; `mutation_equivalent.txt` beside this file lists, with the reason, those
-that change nothing that can be seen. Mutants are drawn at random, with a seed, since all of them would take days.
+that change nothing that can be seen. Mutants are drawn at random over all modules of the rooms, with a seed, since all
+of them would take weeks.
 
-    python benchmarks/mutation.py [--each 30] [--seed 1] [--only compare/offset.py] [--account FILE] [--all]
+    python benchmarks/mutation.py record MAP [--tests tests/compare]   # which test reaches which line (some minutes)
+    python benchmarks/mutation.py draw MAP --count 60 --seed 7 [--part 1/2] [--account FILE] [--only compare/rss.py]
 """
 
 from __future__ import annotations
@@ -15,76 +16,49 @@ import argparse
 import ast
 import contextlib
 import functools
-import gc
 import importlib.abc
 import importlib.machinery
 import importlib.util
 import io
 import json
-import multiprocessing
 import os
 import random
 import select
 import signal
 import sys
+import threading
 import time
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 EQUIVALENT = Path(__file__).with_name("mutation_equivalent.txt")
-_PHYSICS = "tests/propagation/"
-TARGETS: dict[str, tuple[str, ...]] = {
-    "aerpaw_cmp/common/units.py": ("aerpaw_cmp/common/units.py", "tests/common/test_units.py"),
-    "aerpaw_cmp/propagation/arrays.py": (
-        "aerpaw_cmp/propagation/arrays.py", _PHYSICS + "test_channel.py", _PHYSICS + "test_attitude_chain.py",
-        _PHYSICS + "test_reference.py", _PHYSICS + "test_rank_field.py",
-    ),
-    "aerpaw_cmp/propagation/channel.py": (
-        _PHYSICS + "test_channel.py", _PHYSICS + "test_reference.py", _PHYSICS + "test_rank_field.py",
-        _PHYSICS + "test_compiled.py",
-    ),
-    "aerpaw_cmp/propagation/field/foliage.py": (
-        _PHYSICS + "test_foliage.py", _PHYSICS + "test_reference.py", _PHYSICS + "test_hard_cases.py",
-        _PHYSICS + "test_crowns.py", _PHYSICS + "test_foliage_by_hand.py",
-    ),
-    "aerpaw_cmp/compare/offset.py": (
-        "aerpaw_cmp/compare/offset.py", "tests/compare/test_offset.py", "tests/compare/test_offset_by_hand.py"
-    ),
-    "aerpaw_cmp/compare/rank.py": (
-        "aerpaw_cmp/compare/rank.py", "tests/compare/test_rank.py", "tests/compare/test_rank_by_hand.py"
-    ),
-    "aerpaw_cmp/flight/clock.py": ("tests/flight/test_clock.py", "tests/flight/test_clock_by_hand.py"),
-    "aerpaw_cmp/flight/lag.py": (
-        "tests/flight/test_lag_by_hand.py", "tests/flight/test_lag.py", "tests/flight/test_clock.py",
-        "tests/flight/test_clock_by_hand.py",
-    ),
-    "aerpaw_cmp/maps/kriging.py": ("tests/maps/test_kriging.py", "tests/maps/test_kriging_by_hand.py"),
-    "parsers/aerpaw_parsers/_lines.py": (
-        "tests/parsers/test_law.py", "tests/parsers/test_formats.py",
-        "tests/parsers/test_rows.py", "tests/parsers/test_lines.py", "parsers/aerpaw_parsers/_lines.py",
-    ),
-    "parsers/aerpaw_parsers/_rows.py": (
-        "tests/parsers/test_rows.py", "tests/parsers/test_formats.py", "tests/parsers/test_base_stations.py",
-        "tests/parsers/test_phones.py",
-    ),
-    "parsers/aerpaw_parsers/_time.py": ("tests/parsers/test_time.py", "tests/parsers/test_formats.py"),
-    "parsers/aerpaw_parsers/vehicle_out.py": (
-        "tests/parsers/test_formats.py", "tests/parsers/test_law.py",
-    ),
-    "parsers/aerpaw_parsers/sounder_log.py": (
-        "tests/parsers/test_formats.py", "tests/parsers/test_sounder.py", "tests/parsers/test_law.py"
-    ),
-}  # fmt: skip
+ROOMS = ("propagation", "compare", "flight", "maps")
+RULES = ("calibrate", "compare_flight", "levels", "audit_flight", "ladder", "what_if", "flight_run", "over_flights")
+"""Modules of the room `jobs` that decide what is scored, and on what."""
+
+TESTS = (
+    *(f"{base}/{room}" for base in ("tests", "aerpaw_cmp") for room in (*ROOMS, "jobs")),
+    "tests/test_round_trip.py",
+    "tests/test_equations.py",
+    "tests/test_public_face.py",
+)
+COMPILED = {
+    "aerpaw_cmp/propagation/field/kernels.py": ("tests/propagation/test_compiled.py",),
+    "aerpaw_cmp/propagation/search/boxtree.py": ("tests/propagation/test_growth.py",),
+}
+"""Of compiled code no line is seen running: these tests call it."""
+
 PRELOADED = (
     "numpy", "scipy.linalg", "scipy.signal", "scipy.spatial", "scipy.optimize", "scipy.stats", "pandas", "pytest",
     "hypothesis", "pydantic", "yaml", "shapely", "pyproj", "h5py", "mpmath", "numba",
 )  # fmt: skip
-TIMEOUT_S = 300.0
-"""Of processor time; a mutant that loops is killed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,12 +207,10 @@ OPTIONS = ("-q", "-x", "--no-header", "-p", "no:cacheprovider", "-p", "no:xdist"
 QUIET = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
 
 
-def pytest_on(tests: tuple[str, ...], plugins: list[Any]) -> int:
+def pytest_on(tests: tuple[str, ...], plugins: list[Any], options: tuple[str, ...] = OPTIONS) -> int:
     """Pytest in this process, silent."""
-    import pytest
-
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        return int(pytest.main([*OPTIONS, *QUIET, *(t for t in tests if (ROOT / t).exists())], plugins=plugins))
+        return int(pytest.main([*options, *QUIET, *tests], plugins=plugins))
 
 
 def own_folders() -> None:
@@ -246,9 +218,7 @@ def own_folders() -> None:
     import tempfile
 
     os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix="aerpaw-cmp-mutant-")
-    for one in gc.get_objects():
-        if isinstance(one, functools._lru_cache_wrapper) and str(getattr(one, "__module__", "")).startswith("aerpaw"):
-            one.cache_clear()
+    forget("aerpaw")
 
 
 def in_child(work: Callable[[], str], limit_s: float) -> str:
@@ -283,71 +253,137 @@ def in_child(work: Callable[[], str], limit_s: float) -> str:
     return answer or "killed by time or crash"
 
 
-class Trials:
-    """A plug-in of pytest: runs every test once, noting which lines of the module it reaches; then tries the mutants.
+# --- which test reaches which line -----------------------------------------------------------------------------------
 
-    A mutant is tried on the tests that reach its statement, the shortest first, in a forked child whose function has
-    got the changed code. What is no body of a function (constants, defaults, fields) is planted by a new import.
+Reach = dict[str, dict[str, Any]]
+"""By test: ``seconds`` of processor time, ``lines`` by module."""
+
+
+class Recorder:
+    """A plug-in of pytest that notes the lines of the rooms that each test reaches, those of its fixtures with them."""
+
+    def __init__(self) -> None:
+        self.reach: Reach = {}
+        self.failed: list[str] = []
+        self.paths = {str(ROOT / path): path for path in modules()}
+        self.kept_of_tests: set[str] = set()
+        self._lines: set[tuple[str, int]] = set()
+        self._fixtures: dict[Any, set[tuple[str, int]]] = {}
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any, request: Any) -> Iterator[Any]:
+        """A fixture of a module runs once, for all tests that ask for it."""
+        del request
+        outer, self._lines = self._lines, set()
+        try:
+            return (yield)
+        finally:
+            self._fixtures.setdefault(fixturedef, set()).update(self._lines)
+            outer |= self._lines
+            self._lines = outer
+
+    def pytest_runtest_protocol(self, item: Any, nextitem: Any) -> bool:
+        """In place of pytest's own."""
+        from _pytest.runner import runtestprotocol
+
+        forget("aerpaw")
+        if any(isinstance(value, functools._lru_cache_wrapper) for value in vars(item.module or item).values()):
+            self.kept_of_tests.add(str(item.path))
+        self._lines = set()
+        begin = time.process_time()
+        sys.settrace(self._call)
+        threading.settrace(self._call)
+        try:
+            reports = runtestprotocol(item, log=False, nextitem=nextitem)
+        finally:
+            sys.settrace(None)
+            threading.settrace(None)  # type: ignore[arg-type]
+        seconds = time.process_time() - begin
+        if any(r.failed for r in reports):
+            self.failed.append(item.nodeid)
+        if all(r.passed for r in reports):
+            mine = getattr(getattr(item, "_fixtureinfo", None), "name2fixturedefs", {}).values()
+            lines = self._lines.union(*(self._fixtures.get(one, set()) for those in mine for one in those))
+            self.reach[item.nodeid] = {"seconds": round(seconds, 2), "file": str(item.path), "lines": lines}
+        return True
+
+    def _call(self, frame: Any, event: str, argument: Any) -> Any:
+        del argument
+        path = self.paths.get(frame.f_code.co_filename)
+        if path is None or event != "call":
+            return None
+        lines = self._lines
+
+        def line(frame: Any, event: str, argument: Any) -> Any:
+            del event, argument
+            lines.add((path, frame.f_lineno))
+            return line
+
+        return line
+
+    def result(self) -> Reach:
+        """The tests of a file that keeps what its helpers gave share what they reached."""
+        for file in self.kept_of_tests:
+            together = [one for one in self.reach.values() if one["file"] == file]
+            lines = set().union(*(one["lines"] for one in together))
+            for one in together:
+                one["lines"] = lines
+        out: Reach = {}
+        for name, one in self.reach.items():
+            by_module: dict[str, list[int]] = {}
+            for path, number in sorted(one["lines"]):
+                by_module.setdefault(path, []).append(number)
+            out[name] = {"seconds": one["seconds"], "lines": by_module}
+        return out
+
+
+def forget(begin: str) -> None:
+    """What modules whose names begin so keep of earlier calls."""
+    for name, module in list(sys.modules.items()):
+        if name.startswith(begin):
+            for value in list(vars(module).values()):
+                if isinstance(value, functools._lru_cache_wrapper):
+                    value.cache_clear()
+
+
+class Trials:
+    """A plug-in of pytest that tries mutants on the tests that reach them, the shortest first, none in this process.
+
+    What is no body of a function (constants, defaults, fields), and what is compiled, is planted by a new import.
     """
 
-    def __init__(self, path: str, chosen: list[Mutant], pipe: Any) -> None:
-        self.path, self.chosen, self.pipe = path, chosen, pipe
-        self.done = 0
-        self.fault = ""
+    def __init__(self, chosen: list[Mutant], reach: Reach, answer: Callable[[Mutant, str, float], None]) -> None:
+        self.chosen, self.reach, self.answer = chosen, reach, answer
 
     def pytest_runtestloop(self, session: Any) -> bool:
         """In place of pytest's own."""
-        items = session.items
-        reach = [self._reached(item, after) for item, after in zip(items, [*items[1:], None], strict=True)]
-        if self.fault:
-            return True
-        tree = ast.parse((ROOT / self.path).read_text(encoding="utf-8"))
+        items = {item.nodeid: item for item in session.items}
         for mutant in self.chosen:
             begin = time.monotonic()
+            tree = ast.parse((ROOT / mutant.path).read_text(encoding="utf-8"))
             place = place_of(tree, of_code(tree)[mutant.node])
-            if place is None:
-                kind = in_child(lambda one=mutant: planted(self.path, one.source, TARGETS[self.path]), TIMEOUT_S)
+            near = near_tests(self.reach, mutant.path, None if place is None else place.lines)
+            limit = 30 + 10 * sum(self.reach[name]["seconds"] for name in near)
+            if place is None or not near:
+                tests = tuple(near[:MOST_ANEW]) or COMPILED.get(mutant.path, ())
+                kind = in_child(lambda one=mutant, those=tests: planted(one, one.source, those), limit + 300)
+                source = (ROOT / mutant.path).read_text(encoding="utf-8")
+                control = partial(planted, mutant, source, tests)
             else:
-                first, last = place.lines
-                near = sorted((s, k) for k, (s, lines) in enumerate(reach) if any(first <= n <= last for n in lines))
-                limit = min(TIMEOUT_S, 20 + 10 * sum(s for s, _ in near))
-                tests = [items[k] for _, k in near]
-                kind = in_child(lambda one=mutant, at=place, those=tests: self._fails(one, at, those), limit)
-            self.pipe.send((mutant, kind, time.monotonic() - begin))
-            self.done += 1
+                those = [items[name] for name in near if name in items]
+                kind = in_child(lambda one=mutant, at=place, tests=those: self._fails(tests, one, at), limit)
+                control = partial(self._fails, [items[name] for name in near if kind == f"killed by {name}"])
+            if kind.startswith("killed by") and not kind.endswith(("crash", "import")):
+                if in_child(control, limit + 300) != "survived":
+                    raise SystemExit(f"{mutant.name}: {kind}, and so it is without the change")
+            self.answer(mutant, kind, time.monotonic() - begin)
         return True
 
-    def _reached(self, item: Any, after: Any) -> tuple[float, set[int]]:
+    def _fails(self, items: list[Any], mutant: Mutant | None = None, place: Place | None = None) -> str:
         from _pytest.runner import runtestprotocol
 
-        lines: set[int] = set()
-        own = str(ROOT / self.path)
-
-        def local(frame: Any, event: str, argument: Any) -> Any:
-            del event, argument
-            lines.add(frame.f_lineno)
-            return local
-
-        def every(frame: Any, event: str, argument: Any) -> Any:
-            del argument
-            if frame.f_code.co_filename != own or event != "call":
-                return None
-            return local
-
-        begin = time.process_time()
-        sys.settrace(every)
-        try:
-            reports = runtestprotocol(item, log=False, nextitem=after)
-        finally:
-            sys.settrace(None)
-        if any(r.failed for r in reports):
-            self.fault = item.nodeid
-        return time.process_time() - begin, lines
-
-    def _fails(self, mutant: Mutant, place: Place, items: list[Any]) -> str:
-        from _pytest.runner import runtestprotocol
-
-        swap(self.path, mutant, place)
+        if mutant is not None and place is not None:
+            swap(mutant, place)
         for number, item in enumerate(items):
             after = items[number + 1] if number + 1 < len(items) else None
             if any(report.failed for report in runtestprotocol(item, log=False, nextitem=after)):
@@ -355,16 +391,30 @@ class Trials:
         return ""
 
 
-def planted(path: str, source: str, tests: tuple[str, ...]) -> str:
+MOST_ANEW = 60
+"""Tests that a change outside functions is tried on, the shortest of each file first."""
+
+
+def near_tests(reach: Reach, path: str, lines: tuple[int, int] | None) -> list[str]:
+    """Tests that reach lines of a module (None: any), the shortest first."""
+    met = []
+    for name, one in reach.items():
+        reached = one["lines"].get(path, ())
+        if any(lines is None or lines[0] <= number <= lines[1] for number in reached):
+            met.append((one["seconds"], name))
+    return [name for _, name in sorted(met)]
+
+
+def planted(mutant: Mutant, source: str, tests: tuple[str, ...]) -> str:
     """In a child: whether a test fails when the module, and all that imports it, is imported anew from a source."""
     for name in [n for n in sys.modules if n.split(".")[0] in ("aerpaw_cmp", "aerpaw_parsers", "tests", "conftest")]:
         del sys.modules[name]
-    sys.meta_path.insert(0, Planted(module_name(path), ROOT / path, source))
+    sys.meta_path.insert(0, Planted(module_name(mutant.path), ROOT / mutant.path, source))
     try:
-        importlib.import_module(module_name(path))  # before pytest, which would load the file for its doctests
+        importlib.import_module(module_name(mutant.path))  # before pytest, which would load the file for its doctests
     except Exception:
         return "the import"
-    return "a test, imported anew" if pytest_on(tests, []) == 1 else ""
+    return "a test, imported anew" if tests and pytest_on(tests, []) == 1 else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,13 +456,13 @@ def _lines_of(body: list[ast.stmt], node: ast.AST) -> tuple[int, int]:
     return statement.lineno, max(last or statement.lineno, statement.lineno)
 
 
-def swap(path: str, mutant: Mutant, place: Place) -> None:
+def swap(mutant: Mutant, place: Place) -> None:
     """Give the imported function the changed code."""
-    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    tree = ast.parse((ROOT / mutant.path).read_text(encoding="utf-8"))
     target = of_code(tree)[mutant.node]
     other = list(changes(target))[mutant.change]
     _replace(tree, target, ast.copy_location(other, target))
-    code = compile(ast.fix_missing_locations(tree), str(ROOT / path), "exec")
+    code = compile(ast.fix_missing_locations(tree), str(ROOT / mutant.path), "exec")
     for name in place.names[:-1]:
         code = next(c for c in code.co_consts if isinstance(c, types.CodeType) and c.co_name == name)
     code = next(
@@ -420,7 +470,7 @@ def swap(path: str, mutant: Mutant, place: Place) -> None:
         for c in code.co_consts
         if isinstance(c, types.CodeType) and (c.co_name, c.co_firstlineno) == (place.names[-1], place.begin)
     )
-    holder: Any = sys.modules[module_name(path)]
+    holder: Any = importlib.import_module(module_name(mutant.path))
     for name in place.names:
         holder = vars(holder)[name]
         for inner in ("fget", "__func__", "func", "__wrapped__"):
@@ -447,77 +497,90 @@ def change_of(mutant: Mutant) -> str:
     return f"{mutant.path}: {mutant.was} -> {mutant.now} @ {text}"
 
 
-def drawn(path: str, each: int, seed: int) -> list[Mutant]:
-    """Some of the mutants of a module."""
-    every = mutants(path)
-    return random.Random(f"{seed} {path}").sample(every, min(each, len(every)))
+def modules() -> list[str]:
+    """Files of the rooms, and those of `jobs` that hold rules of honesty."""
+    package = ROOT / "aerpaw_cmp"
+    files = [path for room in ROOMS for path in sorted((package / room).rglob("*.py"))]
+    files += [package / "jobs" / f"{name}.py" for name in RULES]
+    return [path.relative_to(ROOT).as_posix() for path in files if path.name != "__init__.py"]
 
 
-def run(path: str, chosen: list[Mutant], account: Path | None, known: dict[str, str]) -> dict[str, Any]:
-    """Try each mutant, in a process of its own; one line of the account for each."""
-    here, there = multiprocessing.get_context("fork").Pipe(duplex=False)
-    child = multiprocessing.get_context("fork").Process(target=_tried, args=(path, chosen, there))
-    child.start()
-    there.close()
-    counts = {"killed": 0, "survived": 0, "equivalent": 0}
-    survivors = []
-    with contextlib.suppress(EOFError):
-        while True:
-            mutant, result, took = here.recv()
-            if mutant is None or result.startswith("broken"):
-                raise SystemExit(f"{path if mutant is None else mutant.name}: {result}")
-            kind = "killed" if result.startswith("killed") else "survived"
-            if kind == "survived" and change_of(mutant) in known:
-                kind = "equivalent"
-            counts[kind] += 1
-            if kind == "survived":
-                survivors.append(f"{mutant.line}: {change_of(mutant)}")
-            row = {"mutant": mutant.name, "outcome": result, "as": kind, "seconds": round(took, 1)}
-            if account is not None:
-                with account.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(row) + "\n")
-    child.join()
-    return {"path": path, **counts, "survivors": survivors}
+def record(target: Path, tests: tuple[str, ...]) -> None:
+    """Add to a map which test reaches which line; a test file that is recorded anew replaces what was known of it."""
+    recorder = Recorder()
+    pytest_on(tests, [recorder], OPTIONS[:1] + OPTIONS[2:])
+    known: Reach = json.loads(target.read_text(encoding="utf-8")) if target.is_file() else {}
+    new = recorder.result()
+    files = {name.partition("::")[0] for name in new}
+    known = {name: one for name, one in known.items() if name.partition("::")[0] not in files}
+    target.write_text(json.dumps(known | new), encoding="utf-8")
+    print(f"{len(new)} tests recorded, {sum(one['seconds'] for one in new.values()):.0f} CPU s")
+    for name in recorder.failed:
+        print(f"fails without any change: {name}")
 
 
-def _tried(path: str, chosen: list[Mutant], pipe: Any) -> None:
-    os.chdir(ROOT)
-    sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
-    importlib.import_module(module_name(path))  # before pytest, which would load the file for its doctests
-    trials = Trials(path, chosen, pipe)
-    code = pytest_on(TARGETS[path], [trials])
-    if trials.fault or trials.done < len(chosen):
-        pipe.send((None, f"its tests fail without any change: {trials.fault or f'pytest ended with {code}'}", 0.0))
-    pipe.close()
-    os._exit(0)
+def drawn(count: int, seed: int, only: str, part: str) -> list[Mutant]:
+    """Mutants at random over the modules, each mutant as likely as any other."""
+    every = [one for path in modules() if path.endswith(only) for one in mutants(path)]
+    chosen = random.Random(seed).sample(every, min(count, len(every)))
+    number, parts = (int(text) for text in part.split("/"))
+    return chosen[number - 1 :: parts]
+
+
+def draw(chosen: list[Mutant], reach: Reach, account: Path | None) -> None:
+    """Try mutants; one line for each, and the shares."""
+    known = equivalents()
+    counts: dict[str, dict[str, int]] = {}
+
+    def answer(mutant: Mutant, outcome: str, took: float) -> None:
+        kind = "killed" if outcome.startswith("killed") else "survived"
+        if kind == "survived" and change_of(mutant) in known:
+            kind = "equivalent"
+        room = counts.setdefault(mutant.path.split("/")[1], {"killed": 0, "survived": 0, "equivalent": 0})
+        room[kind] += 1
+        print(f"{kind:10s} {took:6.1f} s  {mutant.name}  [{outcome}]", file=sys.__stdout__, flush=True)
+        if account is not None:
+            row = {"mutant": mutant.name, "change": change_of(mutant), "outcome": outcome, "as": kind}
+            with account.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+
+    tests = tuple(sorted({name.partition("::")[0] for name in reach}))
+    pytest_on(tests, [Trials(chosen, reach, answer)])
+    counts["all"] = {kind: sum(row[kind] for row in counts.values()) for kind in ("killed", "survived", "equivalent")}
+    for name, row in counts.items():
+        tried = max(row["killed"] + row["survived"], 1)
+        share = f"{row['killed']} of {tried} ({row['killed'] / tried:.1%})"
+        print(f"{name:12s} killed {share}, {row['equivalent']} equivalent")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--each", type=int, default=30, help="mutants per module")
-    parser.add_argument("--all", action="store_true", help="every mutant")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", nargs="+", default=[], help="modules whose path ends so")
-    parser.add_argument("--account", type=Path, help="a line of JSON per mutant is added here")
+    commands = parser.add_subparsers(dest="command", required=True)
+    of_map = commands.add_parser("record", help="which test reaches which line")
+    of_map.add_argument("--tests", nargs="+", default=TESTS)
+    of_draw = commands.add_parser("draw", help="try mutants")
+    of_draw.add_argument("--count", type=int, default=60)
+    of_draw.add_argument("--seed", type=int, default=1)
+    of_draw.add_argument("--part", default="1/1", help="one of several runs that share a draw")
+    of_draw.add_argument("--only", default="", help="modules whose path ends so")
+    of_draw.add_argument("--account", type=Path, help="a line of JSON per mutant is added here")
+    for one in (of_map, of_draw):
+        one.add_argument("map", type=Path)
     arguments = parser.parse_args()
+    os.chdir(ROOT)
+    os.environ["CI"] = "1"  # hypothesis draws the same examples every time
+    sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
     for name in PRELOADED:
         with contextlib.suppress(ImportError):
             importlib.import_module(name)
-    known, total = equivalents(), {"killed": 0, "survived": 0, "equivalent": 0}
-    print(f"{'module':42s} {'mutants':>8} {'killed':>7} {'equiv.':>7} {'left':>5} {'share':>6}")
-    for path in TARGETS:
-        if arguments.only and not any(path.endswith(one) for one in arguments.only):
-            continue
-        chosen = drawn(path, 10**9 if arguments.all else arguments.each, arguments.seed)
-        row = run(path, chosen, arguments.account, known)
-        total = {kind: total[kind] + row[kind] for kind in total}
-        share = row["killed"] / max(row["killed"] + row["survived"], 1)
-        counts = f"{len(chosen):8d} {row['killed']:7d} {row['equivalent']:7d} {row['survived']:5d}"
-        print(f"{path:42s} {counts} {share:6.1%}", flush=True)
-        for name in row["survivors"]:
-            print(f"    survived: {name}", flush=True)
-    share = total["killed"] / max(total["killed"] + total["survived"], 1)
-    print(f"killed {total['killed']} of {total['killed'] + total['survived']} that are not equivalent: {share:.1%}")
+    for path in modules():  # before pytest, which would load each file for its doctests
+        with contextlib.suppress(ImportError):
+            importlib.import_module(module_name(path))
+    if arguments.command == "record":
+        record(arguments.map, tuple(arguments.tests))
+        return
+    reach = json.loads(arguments.map.read_text(encoding="utf-8"))
+    draw(drawn(arguments.count, arguments.seed, arguments.only, arguments.part), reach, arguments.account)
 
 
 if __name__ == "__main__":

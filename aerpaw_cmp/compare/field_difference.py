@@ -27,6 +27,9 @@ class FieldAudit:
         the better half of the links (float32 loses or finds a pair's path at an edge).
     attitude_rows, attitude_max_rad
         Logged attitudes turned into rotations a second time.
+    raw_samples, raw_poses, raw_levels, raw_position_max_m, raw_attitude_max_rad, raw_measured_max_db, raw_level_max_db
+        Recomputed from the bytes of the logs by code of its own: readings, poses with attitude (between telemetry rows
+        too), levels, and the largest differences.
     missing_paths, phantom_paths : int
         Paths that a reference has and whose existence is beyond doubt; paths that cannot exist.
     doubtful : int
@@ -56,6 +59,13 @@ class FieldAudit:
     explicit_max_error: float = 0.0
     attitude_rows: int = 0
     attitude_max_rad: float = 0.0
+    raw_samples: int = 0
+    raw_poses: int = 0
+    raw_levels: int = 0
+    raw_position_max_m: float = 0.0
+    raw_attitude_max_rad: float = 0.0
+    raw_measured_max_db: float = 0.0
+    raw_level_max_db: float = 0.0
     missing_paths: int = 0
     phantom_paths: int = 0
     doubtful: int = 0
@@ -74,7 +84,7 @@ class FieldAudit:
             mine, theirs = getattr(self, name), getattr(other, name)
             if name in ("failures", "not_covered"):
                 values[name] = tuple(dict.fromkeys((*mine, *theirs)))
-            elif name.endswith(("_max_db", "_max_rad", "_max_error", "_max_error_db")):
+            elif name.endswith(("_max_db", "_max_m", "_max_rad", "_max_error", "_max_error_db")):
                 values[name] = max(mine, theirs)
             elif not name.endswith(("_rms_db", "_rms_rad")):
                 values[name] = mine + theirs

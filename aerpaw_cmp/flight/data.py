@@ -564,7 +564,8 @@ def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | N
     position = None
     if {"latitude_deg", "longitude_deg", "altitude_m"} <= set(frame.columns) and frame["latitude_deg"].notna().any():
         east, north = site.frame.to_local(frame["latitude_deg"], frame["longitude_deg"])
-        up = np.maximum(frame["altitude_m"].to_numpy(np.float64), MINIMUM_HEIGHT_M)  # NaN stays NaN
+        above = np.maximum(frame["altitude_m"].to_numpy(np.float64), MINIMUM_HEIGHT_M)  # NaN stays NaN
+        up = above + site.datum.takeoff_ground_m  # as of the track: altitude_m counts from take-off
         position = np.stack([east, north, up], axis=-1)
     sinr = frame["sinr_db"].to_numpy(np.float64) if "sinr_db" in frame else np.full(len(frame), np.nan)
     return RankSeries(

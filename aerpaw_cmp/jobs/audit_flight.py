@@ -7,6 +7,7 @@ of them, so that a fault in between is seen.
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -17,7 +18,7 @@ import numpy as np
 from ..common.stages import Progress, silent
 from ..common.units import AnyArray, FloatArray
 from ..compare.field_difference import FieldAudit
-from ..compare.result import AuditResult, EngineResult
+from ..compare.result import AuditResult, EngineResult, RssResult
 from ..flight.data import FlightData
 from ..flight.losses import path_loss, reflecting_crowns
 from ..flight.replay import Replayed, attitude_rotation, part_of
@@ -26,6 +27,7 @@ from ..logs.ingest import IngestedFile
 from ..propagation.arrays import Poses
 from ..propagation.check.audit import Audit, Second, audit
 from ..propagation.check.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
+from ..propagation.check.raw import gain_table
 from ..propagation.check.reference import (
     C_MPS,
     PATTERNS,
@@ -43,6 +45,7 @@ from ..propagation.options import Field, Run, Search
 from ..propagation.search.interactions import summary
 from ..propagation.search.sionna import free_memory
 from ..site.site import Site
+from .audit_raw import raw_checked
 
 ATTITUDE_ROWS = 200
 """Logged attitudes that are turned into rotations a second time."""
@@ -63,8 +66,24 @@ NOT_COVERED = (
 """What no audit of the replay can see."""
 
 
-def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progress = silent) -> EngineResult:
-    """The engine record, with the audit where ``rt.audit_links`` asks for one and ``report.audit`` is not ``later``."""
+def audit_replays(
+    data: FlightData, replays: Sequence[Replayed], progress: Progress = silent, results: Sequence[RssResult] = ()
+) -> EngineResult:
+    """The engine record, with the audit where ``rt.audit_links`` asks for one and ``report.audit`` is not ``later``.
+
+    Parameters
+    ----------
+    data : FlightData
+    replays : sequence of Replayed
+        Of its RSS series, then of its ranks.
+    progress : Progress
+    results : sequence of RssResult
+        What was made of the RSS series; their scores are checked too.
+
+    Returns
+    -------
+    EngineResult
+    """
     rt, now = data.settings.rt, data.settings.report.audit == "now"
     return EngineResult(
         engine=rt.engine,
@@ -79,7 +98,7 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
             **_crown_settings(rt, replays),
         },
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
-        audit=_audit(data, replays, progress) if rt.audit_links and now else None,
+        audit=_audit(data, replays, results, progress) if rt.audit_links and now else None,
         other_interactions=_other_interactions(replays) if rt.other_interactions else None,
     )
 
@@ -98,7 +117,9 @@ def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, ob
     return {"crown_reflections": rt.crown_reflections, "paths_off_crowns": bounced}
 
 
-def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> AuditResult | None:
+def _audit(
+    data: FlightData, replays: Sequence[Replayed], results: Sequence[RssResult], progress: Progress
+) -> AuditResult | None:
     """One audit over all series: links are shared out in proportion to their poses."""
     ks = data.settings.rank.k
     total = sum(len(r.poses) for r in replays)
@@ -123,6 +144,8 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
     errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
     links = sum(p.links for p in parts)
     fields = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))
+    progress("audit from raw bytes")
+    fields += raw_checked(data, replays, expectations(data, replays), results)
     return AuditResult(
         reference=parts[0].reference,
         links=links,
@@ -263,9 +286,12 @@ def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> 
 
 
 def _pattern(settings: AntennaSettings, folder: Path, carrier_hz: float) -> Pattern:
-    """A formula a second time, or what an antenna file says."""
+    """A formula or a table of gain a second time; other antenna files are taken as the replay reads them."""
     if settings.model in PATTERNS and not settings.installed_db:
         return PATTERNS[settings.model]
+    if settings.model == "sphere" and not settings.installed_db:
+        content = (folder / str(settings.file)).read_bytes()
+        return gain_table(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
     pattern: Pattern = scalar_pattern(load_pattern(settings, folder, carrier_hz))
     return pattern
 

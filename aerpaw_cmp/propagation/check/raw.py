@@ -1,0 +1,378 @@
+"""A second, independent way from the bytes of logs to poses, gains and levels: for the audit.
+
+It shares no code with the readers, the track, the geodesy and the antenna files of this package, and imports none of
+them: lines by the csv module and regular expressions, local time by zoneinfo row by row, positions by way of
+earth-centred coordinates, attitude by quaternions, tables of gain by periodic splines solved with Fourier transforms.
+What it cannot read it leaves to its caller to name.
+"""
+
+from __future__ import annotations
+
+import bisect
+import csv
+import io
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from typing import Any
+from zoneinfo import ZoneInfo
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
+Grid = NDArray[np.float64]
+
+EQUATOR_M, FLATTENING = 6_378_137.0, 1 / 298.257_223_563
+LOWEST_M = 0.5
+"""Poses below this height above the take-off ground are raised to it (arXiv 2502.10324)."""
+
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,6})?(?:[+-]\d\d:?\d\d|Z)?")
+_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+
+
+def utc_us(text: str, zone: str) -> int:
+    """Microseconds since 1970 of a written instant; one without an offset is local to ``zone``.
+
+    Examples
+    --------
+    >>> utc_us("2025-06-01 10:00:00.5", "America/New_York") - utc_us("2025-06-01T14:00:00+00:00", "UTC")
+    500000
+    """
+    head, _, fraction = text.replace("Z", "+00:00").replace("T", " ").partition(".")
+    digits = re.match(r"\d*", fraction)[0] if fraction else ""  # type: ignore[index]
+    moment = datetime.fromisoformat(head + fraction[len(digits) :])
+    moment = moment.replace(tzinfo=ZoneInfo(zone)) if moment.tzinfo is None else moment
+    return (moment - _EPOCH) // timedelta(microseconds=1) + int((digits + "000000")[:6])
+
+
+# ---------------------------------------------------------------- logs
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of telemetry: UTC [us], degrees, metres above take-off; roll, pitch, yaw [deg] where they are written."""
+
+    time_us: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    angles_deg: Vector | None
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A line of a radio log: UTC [us] and its values by name."""
+
+    time_us: int
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """Telemetry rows in the order of the file, and readings by line, counted from 1."""
+
+    rows: Sequence[Row]
+    readings: Mapping[int, Reading]
+
+
+def read_log(data: bytes, zone: str) -> Log | None:
+    """Telemetry and readings of a vehicleOut, a power log, a table with a title line or a merged .mat; else None.
+
+    Parameters
+    ----------
+    data : bytes
+    zone : str
+        IANA name of the zone of times that have no offset.
+
+    Returns
+    -------
+    Log or None
+    """
+    if data[:6] == b"MATLAB":
+        return _of_mat(data, zone)
+    text = data.decode("utf-8", errors="replace")
+    first = text.partition("\n")[0]
+    if re.match(r"\[\d{4}-", first):
+        return Log((), _od_lines(text, zone))
+    if re.match(r"\d+,-?\d", first) and _STAMP.search(first):
+        return Log(tuple(_vehicle_rows(text, zone)), {})
+    if re.match(r"[A-Za-z_ ]+,", first):
+        return _table(text, zone)
+    return None
+
+
+def _od_lines(text: str, zone: str) -> dict[int, Reading]:
+    """``[stamp] octal value`` of od through ts; no value on a line ``*``, which stands for repeated samples."""
+    out = {}
+    for number, line in enumerate(text.split("\n"), start=1):
+        found = re.match(r"\[([^\]]+)\] (?:\*|[0-7]+ +(\S+))\s*$", line)
+        if found and _STAMP.fullmatch(found[1]):
+            try:
+                out[number] = Reading(utc_us(found[1], zone), {"": float(found[2])} if found[2] else {})
+            except ValueError:
+                continue
+    return out
+
+
+def _vehicle_rows(text: str, zone: str) -> Iterable[Row]:
+    """``number, lon, lat, alt, [attitude, velocity,] ..., stamp, fix, satellites``."""
+    for cells in csv.reader(io.StringIO(text)):
+        stamp = next((cell.strip() for cell in cells if _STAMP.fullmatch(cell.strip())), None)
+        if stamp is None or len(cells) not in (8, 9, 10):
+            continue
+        try:
+            longitude, latitude, altitude = (float(cell) for cell in cells[1:4])
+            angles = None
+            if len(cells) == 10:
+                pitch, yaw, roll = (math.degrees(float(part)) for part in cells[4].strip("()").split(","))
+                angles = (roll, pitch, yaw)
+            yield Row(utc_us(stamp, zone), latitude, longitude, altitude, angles)
+        except ValueError:
+            continue
+
+
+def _table(text: str, zone: str) -> Log:
+    """A table with a title line that names its columns; angles in radians."""
+    rows, readings = [], {}
+    lines = list(csv.reader(io.StringIO(text)))
+    names = [cell.strip().lower() for cell in lines[0]]
+    for number, cells in enumerate(lines[1:], start=2):
+        stamp = next((cell.strip() for cell in cells if _STAMP.fullmatch(cell.strip())), None)
+        if stamp is None or len(cells) != len(names):
+            continue
+        time = utc_us(stamp, zone)
+        values = {name: _float(cell) for name, cell in zip(names, cells, strict=True)}
+        readings[number] = Reading(time, {name: value for name, value in values.items() if value is not None})
+        place = [values.get(name) for name in ("latitude", "longitude", "altitude")]
+        turn = [values.get(name) for name in ("roll", "pitch", "yaw")]
+        if None not in place:
+            angles = None if None in turn else tuple(math.degrees(x) for x in turn)  # type: ignore[arg-type]
+            rows.append(Row(time, *place, angles))  # type: ignore[arg-type]
+    return Log(tuple(rows), readings)
+
+
+def _float(cell: str) -> float | None:
+    try:
+        return float(cell)
+    except ValueError:
+        return None
+
+
+def _of_mat(data: bytes, zone: str) -> Log | None:
+    """Flights merged by their authors: local times as text, degrees, one row per reading."""
+    from scipy.io import loadmat
+
+    book: dict[str, Any] = loadmat(io.BytesIO(data))
+    stamps = next((book[name] for name in ("timestamp_power_for_csv", "timestamp_for_csv") if name in book), None)
+    if stamps is None or not {"mX", "mY", "mZ"} <= set(book):
+        return None
+    times = [utc_us(str(stamp).strip(), zone) for stamp in stamps.ravel()]
+    columns = {name: value.ravel() for name, value in book.items() if getattr(value, "size", 0) == len(times)}
+    turned = {"mRoll", "mPitch", "mYaw"} <= set(columns)
+    rows, readings = [], {}
+    for at, time in enumerate(times):
+        angles = tuple(float(columns[name][at]) for name in ("mRoll", "mPitch", "mYaw")) if turned else None
+        place = (float(columns["mY"][at]), float(columns["mX"][at]), float(columns["mZ"][at]))
+        rows.append(Row(time, *place, angles))  # type: ignore[arg-type]
+    levels = {name: column for name, column in columns.items() if column.dtype.kind == "f"}
+    for at, time in enumerate(times):
+        readings[at + 1] = Reading(time, {name: float(column[at]) for name, column in levels.items()})
+    return Log(tuple(rows), readings)
+
+
+# ---------------------------------------------------------------- place
+
+
+def east_north_m(latitude_deg: float, longitude_deg: float, origin_deg: tuple[float, float]) -> tuple[float, float]:
+    """East and north [m] of a place on the ellipsoid, by way of earth-centred coordinates.
+
+    Parameters
+    ----------
+    latitude_deg, longitude_deg : float
+    origin_deg : (2,)
+        Latitude and longitude.
+
+    Returns
+    -------
+    east, north : float
+        On the tangent plane; within 5 km the geodesic is longer by less than a millimetre.
+    """
+    x, y, z = (
+        a - b for a, b in zip(_earth_centred(latitude_deg, longitude_deg), _earth_centred(*origin_deg), strict=True)
+    )
+    latitude, longitude = (math.radians(angle) for angle in origin_deg)
+    outward = math.cos(longitude) * x + math.sin(longitude) * y
+    east = -math.sin(longitude) * x + math.cos(longitude) * y
+    return east, math.cos(latitude) * z - math.sin(latitude) * outward
+
+
+def _earth_centred(latitude_deg: float, longitude_deg: float) -> Vector:
+    latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
+    squeezed = FLATTENING * (2 - FLATTENING)
+    normal = EQUATOR_M / math.sqrt(1 - squeezed * math.sin(latitude) ** 2)
+    flat = normal * math.cos(latitude)
+    return flat * math.cos(longitude), flat * math.sin(longitude), normal * (1 - squeezed) * math.sin(latitude)
+
+
+# ---------------------------------------------------------------- attitude
+
+
+def _times(p: Quaternion, q: Quaternion) -> Quaternion:
+    return (
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    )
+
+
+def body_quaternion(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Quaternion:
+    """Nose-left-up of the aircraft to east-north-up: yaw clockwise from north, nose up +, right wing down +."""
+
+    def about(axis: int, angle_deg: float) -> Quaternion:
+        half = math.radians(angle_deg) / 2
+        parts = [math.cos(half), 0.0, 0.0, 0.0]
+        parts[axis + 1] = math.sin(half)
+        return parts[0], parts[1], parts[2], parts[3]
+
+    return _times(about(2, 90.0 - yaw_deg), _times(about(1, -pitch_deg), about(0, roll_deg)))
+
+
+def between(first: Quaternion, second: Quaternion, share: float) -> Quaternion:
+    """The turn after a share of the way from one to another, at constant rate by the shorter way."""
+    dot = sum(a * b for a, b in zip(first, second, strict=True))
+    other = tuple(-b for b in second) if dot < 0 else second
+    angle = math.acos(min(1.0, abs(dot)))
+    if angle < 1e-9:
+        return first
+    weights = math.sin((1 - share) * angle) / math.sin(angle), math.sin(share * angle) / math.sin(angle)
+    return tuple(weights[0] * a + weights[1] * b for a, b in zip(first, other, strict=True))  # type: ignore[return-value]
+
+
+def matrix(q: Quaternion) -> Matrix:
+    """The rotation matrix of a unit quaternion."""
+    w, x, y, z = q
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def level(turn: Matrix) -> Matrix:
+    """The turn about the vertical alone that keeps the heading of the nose."""
+    size = math.hypot(turn[0][0], turn[1][0])
+    east, north = turn[0][0] / size, turn[1][0] / size
+    return ((east, -north, 0.0), (north, east, 0.0), (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Place [m] and turn at an instant; how far it is from the nearest row [us], and the gap that it lies in [us]."""
+
+    place_m: Vector
+    turn: Matrix | None
+    from_row_us: int
+    gap_us: int
+
+
+class RawPath:
+    """The flight between telemetry rows.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows without a position, and those not later than all before them, are left out; ``out_of_order`` counts the
+        earlier ones.
+    origin_deg : (2,)
+        Latitude and longitude of the site's origin.
+    ground_m : float
+        Height of the take-off point above the origin's ground.
+    """
+
+    def __init__(self, rows: Sequence[Row], origin_deg: tuple[float, float], ground_m: float) -> None:
+        self.rows: list[Row] = []
+        self.times_us: list[int] = []
+        self.out_of_order = 0
+        for row in rows:
+            good = abs(row.latitude_deg) <= 90 and abs(row.longitude_deg) <= 180 and row.altitude_m > -900
+            if not good or not (row.latitude_deg or row.longitude_deg):
+                continue
+            late = not self.rows or row.time_us > self.times_us[-1]
+            self.out_of_order += not late and row.time_us < self.times_us[-1]
+            if late:
+                self.rows.append(row)
+                self.times_us.append(row.time_us)
+        self.origin_deg, self.ground_m = origin_deg, ground_m
+
+    def pose(self, time_us: float) -> Pose | None:
+        """At an instant [us]; None before the first and after the last row."""
+        times = self.times_us
+        if not times or not times[0] <= time_us <= times[-1]:
+            return None
+        after = min(max(bisect.bisect_left(times, time_us), 1), len(times) - 1)
+        one, two = self.rows[max(after - 1, 0)], self.rows[after]
+        gap = two.time_us - one.time_us
+        share = (time_us - one.time_us) / gap if gap else 0.0
+        ends = [east_north_m(row.latitude_deg, row.longitude_deg, self.origin_deg) for row in (one, two)]
+        east, north = ((1 - share) * a + share * b for a, b in zip(*ends, strict=True))
+        up = self.ground_m + (1 - share) * one.altitude_m + share * two.altitude_m
+        turn = None
+        known = [row.angles_deg for row in (one, two) if row.angles_deg is not None and any(row.angles_deg)]
+        if len(known) == 2 and all(math.isfinite(angle) for angles in known for angle in angles):
+            turn = matrix(between(body_quaternion(*known[0]), body_quaternion(*known[1]), share))
+        nearest = min(time_us - one.time_us, two.time_us - time_us)
+        return Pose((east, north, max(up, self.ground_m + LOWEST_M)), turn, int(nearest), gap)
+
+
+# ---------------------------------------------------------------- tables of gain
+
+
+def gain_table(data: bytes) -> Callable[[float, float], tuple[complex, complex]]:
+    """Field of an antenna table ``azimuth_deg,elevation_deg,gain_dbi,...``: cubic splines of the amplitude.
+
+    Parameters
+    ----------
+    data : bytes
+        Of the file, unpacked; comment lines begin with #.
+
+    Returns
+    -------
+    callable
+        ``(theta_rad, phi_rad) -> (E_theta, E_phi)``; all of it in E_theta.
+    """
+    lines = [line for line in data.decode("utf-8-sig").splitlines() if line.strip() and line[0] != "#"]
+    gains = {}
+    for cells in list(csv.reader(lines))[1:]:
+        gains[round(float(cells[0]) % 360, 6), round(float(cells[1]), 6)] = float(cells[2])
+    azimuths = sorted({azimuth for azimuth, _ in gains})
+    elevations = sorted({elevation for _, elevation in gains}, reverse=True)
+    amplitude = np.array([[10 ** (gains[azimuth, up] / 20) for azimuth in azimuths] for up in elevations])
+    amplitude[[0, -1]] = np.sqrt((amplitude[[0, -1]] ** 2).mean(axis=1, keepdims=True))  # a pole is one direction
+    over = np.roll(amplitude[-2:0:-1], len(azimuths) // 2, axis=1)  # beyond the pole, on the opposite meridian
+    knots = np.concatenate([amplitude, over])
+    for axis in (0, 1):  # B-splines through the knots: c[k-1] + 4 c[k] + c[k+1] = 6 y[k], on a circle
+        n = knots.shape[axis]
+        response = ((4 + 2 * np.cos(2 * np.pi * np.arange(n) / n)) / 6).reshape((-1, 1) if axis == 0 else (1, -1))
+        knots = np.fft.ifft(np.fft.fft(knots, axis=axis) / response, axis=axis).real
+    return lambda theta, phi: (complex(max(_spline_at(knots, theta, phi), 0.0)), 0j)
+
+
+def _spline_at(knots: Grid, theta_rad: float, phi_rad: float) -> float:
+    rows, row_weights = _taps(theta_rad, knots.shape[0])
+    columns, column_weights = _taps(phi_rad, knots.shape[1])
+    return float(row_weights @ knots[np.ix_(rows, columns)] @ column_weights)
+
+
+def _taps(angle_rad: float, count: int) -> tuple[list[int], Grid]:
+    """The four knots about an angle on a circle, and their cubic weights."""
+    at = angle_rad % (2 * math.pi) / (2 * math.pi) * count
+    first = math.floor(at)
+    t = at - first
+    weights = [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]
+    return [(first + k) % count for k in (-1, 0, 1, 2)], np.array(weights) / 6

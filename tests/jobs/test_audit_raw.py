@@ -1,0 +1,311 @@
+"""The audit from raw bytes: silent on a right flight, loud on each fault planted between the bytes and the levels."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common import geodesy
+from aerpaw_cmp.compare.field_difference import FieldAudit
+from aerpaw_cmp.compare.result import APPLIED, ClockResult
+from aerpaw_cmp.flight import data as flight_data
+from aerpaw_cmp.flight import replay as flight_replay
+from aerpaw_cmp.flight import settings as flight_settings
+from aerpaw_cmp.flight import track as flight_track
+from aerpaw_cmp.flight.data import FlightData, load_data
+from aerpaw_cmp.flight.replay import Clock, FlightReplay, replay_flight
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs.audit_flight import expectations
+from aerpaw_cmp.jobs.audit_raw import raw_checked
+from aerpaw_cmp.jobs.compare_flight import compare_flight
+from aerpaw_cmp.site import antennas, site
+from aerpaw_cmp.site.sphere_pattern import sphere_csv, sphere_grid
+
+ORIGIN = (35.7275, -78.696)
+TAKEOFF_M = 2.5
+"""Height of the take-off point above the ground of the origin."""
+AHEAD_S = 0.8
+"""The radios show later times than the telemetry."""
+
+SITE = f"""
+name: raw
+origin: {{latitude_deg: {ORIGIN[0]}, longitude_deg: {ORIGIN[1]}, takeoff_ground_m: {TAKEOFF_M}}}
+towers:
+  T1: {{latitude_deg: 35.7285, longitude_deg: -78.6950, antenna_height_m: 12}}
+  T2: {{latitude_deg: 35.7260, longitude_deg: -78.6975, antenna_height_m: 9}}
+"""
+
+FLIGHT = f"""
+flight: raw
+site: site.yaml
+timezone: America/New_York
+logs:
+  - {{path: 2025-06-01_10_00_00_vehicleOut.txt}}
+  - {{path: T1_power_log.txt, node: T1, channel: A}}
+  - {{path: T2_power_log.txt, node: T2, channel: A}}
+  - {{path: modem_ri.csv, reader: quectel_ri, node: T1}}
+link:
+  rss:
+    carrier_hz: 3.3e9
+    uav_transmits: true
+    tower: {{antenna: {{model: sphere, file: tower.csv}}, yaw_deg: 30}}
+    uav: {{antenna: {{model: sphere, file: uav.csv}}, roll_deg: 90, slant_deg: 20}}
+rt: {{engine: image, max_depth: 1, attitude: logged, audit_links: 20}}
+rss: {{lag: {AHEAD_S}, bootstrap: 20}}
+rank: {{tower: T1, bootstrap: 20}}
+"""
+
+
+def write_flight(folder: Path) -> Path:
+    """A flight of two minutes that turns all the time, with antennas that have lobes; returns its flight.yaml."""
+    t = np.arange(0.0, 120.0)
+    north, east = 35.7275 + 1.5e-5 * t, -78.6975 + 1.2e-5 * t
+    up = 40 + 5 * np.sin(t / 9)
+    angles = np.column_stack([0.2 * np.sin(1.1 * t), 0.35 * t % (2 * math.pi) - math.pi, 0.25 * np.cos(0.9 * t)])
+    rows = [
+        f'{n + 1},{east[n]:.9f},{north[n]:.9f},{up[n]:.3f},"({p:.9f},{y:.9f},{r:.9f})","(1.0,1.0,0.0)",48.0,'
+        f"2025-06-01 10:{n // 60:02d}:{n % 60:02d}.000000,4,18\n"
+        for n, (p, y, r) in enumerate(angles)
+    ]
+    (folder / "2025-06-01_10_00_00_vehicleOut.txt").write_text("".join(rows), encoding="utf-8")
+    rng = np.random.default_rng(8)
+    for tower in ("T1", "T2"):
+        seconds = np.round(AHEAD_S + np.arange(2.0, 117.0, 0.4), 3)
+        lines = [
+            f"[2025-06-01 10:{int(s) // 60:02d}:{s % 60:09.6f}] {4 * n:07o} {level:15.6f}\n"
+            for n, (s, level) in enumerate(zip(seconds, rng.normal(-50, 4, len(seconds)), strict=True))
+        ]
+        (folder / f"{tower}_power_log.txt").write_text("".join(lines), encoding="utf-8")
+    ranks = [
+        f"{n},2025-06-01 10:{n // 60:02d}:{n % 60:02d}.000,{east[n]:.9f},{north[n]:.9f},{up[n]:.3f},{1 + n % 3}\n"
+        for n in range(5, 110)
+    ]
+    head = "ID,Time and date,Longitude,Latitude,Altitude,NR RI\n"
+    (folder / "modem_ri.csv").write_text(head + "".join(ranks), encoding="utf-8")
+    for name, seed in (("tower", 1), ("uav", 2)):
+        _, _, vectors = sphere_grid(10.0)
+        gain = sum(4.0 * np.tanh(vectors @ axis) for axis in np.random.default_rng(seed).normal(size=(3, 3)))
+        (folder / f"{name}.csv").write_text(sphere_csv(np.asarray(gain), np.ones_like(gain)), encoding="utf-8")
+    (folder / "site.yaml").write_text(SITE, encoding="utf-8")
+    flight = folder / "flight.yaml"
+    flight.write_text(FLIGHT, encoding="utf-8")
+    return flight
+
+
+def checked(flight: Path, scores: bool = False, clocks: Any = None) -> FieldAudit:
+    """The flight read, replayed and audited from its bytes."""
+    data = load_data(load_flight(flight), flight.parent)
+    replays = replay_flight(data, clocks=None if clocks is None else clocks(data))
+    return audited(data, replays, scores)
+
+
+def audited(data: FlightData, replays: FlightReplay, scores: bool = False) -> FieldAudit:
+    results = compare_flight(data, replays).rss if scores else ()
+    return raw_checked(data, replays.all, expectations(data, replays.all), results)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_flight(tmp_path_factory.mktemp("raw"))
+
+
+def test_a_right_flight_is_recomputed_to_rounding(flight: Path) -> None:
+    found = checked(flight, scores=True)
+    assert found.failures == ()
+    assert found.not_covered == ()
+    assert found.raw_samples >= 40
+    assert found.raw_levels >= 80
+    assert found.raw_poses >= 100
+    assert found.raw_position_max_m < 1e-3
+    assert found.raw_attitude_max_rad < 1e-9
+    assert found.raw_measured_max_db < 1e-9
+    assert found.raw_level_max_db < 1e-3
+
+
+def no_takeoff(patch: pytest.MonkeyPatch) -> None:
+    real = flight_data.Track
+    patch.setattr(flight_data, "Track", lambda *given, **more: real(*given, **{**more, "ground_m": 0.0}))
+
+
+def turns_at(change: Callable[[Any, Any], Any]) -> Callable[[pytest.MonkeyPatch], None]:
+    def plant(patch: pytest.MonkeyPatch) -> None:
+        real = flight_track._slerp
+        patch.setattr(flight_track, "_slerp", lambda t, at, angles: real(change(t, at), at, angles))
+
+    return plant
+
+
+def body(change: Callable[[Any, Any, Any], Any]) -> Callable[[pytest.MonkeyPatch], None]:
+    def plant(patch: pytest.MonkeyPatch) -> None:
+        real = flight_track.body_rotation
+        patch.setattr(flight_track, "body_rotation", lambda r, p, y: real(*change(r, p, y)))
+
+    return plant
+
+
+def places(change: Callable[[Any, Any], Any]) -> Callable[[pytest.MonkeyPatch], None]:
+    def plant(patch: pytest.MonkeyPatch) -> None:
+        real = geodesy.SiteFrame.to_local
+        patch.setattr(geodesy.SiteFrame, "to_local", lambda self, a, b: change(*real(self, a, b)))
+
+    return plant
+
+
+def clock_added(patch: pytest.MonkeyPatch) -> None:
+    real = flight_replay.telemetry_time
+    patch.setattr(flight_replay, "telemetry_time", lambda time, clock: time + (time - real(time, clock)))
+
+
+def patterns_exchanged(patch: pytest.MonkeyPatch) -> None:
+    real = flight_settings.LinkSettings.build
+    patch.setattr(
+        flight_settings.LinkSettings, "build",
+        lambda self, names, folder: real(self.model_copy(update={"uav": self.tower, "tower": self.uav}), names, folder),
+    )  # fmt: skip
+
+
+def roll_of_the_array_missed(patch: pytest.MonkeyPatch) -> None:
+    real = flight_settings.ArraySettings.build
+    patch.setattr(
+        flight_settings.ArraySettings, "build",
+        lambda self, wavelength, folder: real(self.model_copy(update={"roll_deg": 0.0}), wavelength, folder),
+    )  # fmt: skip
+
+
+def table_mirrored(patch: pytest.MonkeyPatch) -> None:
+    real = antennas.MeasuredPattern.field
+    patch.setattr(antennas.MeasuredPattern, "field", lambda self, theta, phi: real(self, theta, -phi))
+
+
+def readings_shifted(patch: pytest.MonkeyPatch) -> None:
+    real = flight_data._rss_series
+
+    def late(*given: Any, **more: Any) -> Any:
+        series = real(*given, **more)
+        return dataclasses.replace(series, measured_db=np.roll(series.measured_db, 1))
+
+    patch.setattr(flight_data, "_rss_series", late)
+
+
+def times_read_as_utc(patch: pytest.MonkeyPatch) -> None:
+    real = flight_settings.LogSettings.options
+    patch.setattr(
+        flight_settings.LogSettings, "options",
+        lambda self, zone: real(self.model_copy(update={"clock": "utc"}), zone),
+    )  # fmt: skip
+
+
+def mast_taller(patch: pytest.MonkeyPatch) -> None:
+    real = site.Tower.position_m.fget  # type: ignore[attr-defined]
+    patch.setattr(site.Tower, "position_m", property(lambda self: real(self) + np.array([0, 0, 0.3])))
+
+
+def towers_exchanged(patch: pytest.MonkeyPatch) -> None:
+    other = {"T1": "T2", "T2": "T1"}
+    real = flight_data._known_tower
+    patch.setattr(flight_data, "_known_tower", lambda name, log, site: other[real(name, log, site)])
+
+
+FAULTS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], str]] = {
+    "take-off ground not added": (no_takeoff, "position"),
+    "attitude late by half a second": (turns_at(lambda t, at: np.clip(t - 0.5, at[0], at[-1])), "rotation"),
+    "attitude held between rows": (turns_at(lambda t, at: np.floor(t + 1e-9 * len(at))), "rotation"),
+    "yaw counter-clockwise": (body(lambda r, p, y: (r, p, -y)), "rotation"),
+    "roll and pitch exchanged": (body(lambda r, p, y: (p, r, y)), "rotation"),
+    "radians taken for degrees": (body(lambda r, p, y: (np.radians(r), np.radians(p), y)), "rotation"),
+    "east and north exchanged": (places(lambda east, north: (north, east)), "position"),
+    "feet": (places(lambda east, north: (east / 0.3048, north / 0.3048)), "position"),
+    "clock added in place of taken off": (clock_added, "position"),
+    "patterns of the two ends exchanged": (patterns_exchanged, "simulated level"),
+    "roll of the UAV's array missed": (roll_of_the_array_missed, "simulated level"),
+    "table of gain mirrored": (table_mirrored, "simulated level"),
+    "levels one row late": (readings_shifted, "measured level"),
+    "local times read as UTC": (times_read_as_utc, "time"),
+    "antenna 0.3 m higher": (mast_taller, "tower"),
+    "towers exchanged": (towers_exchanged, "is of T"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_between_the_bytes_and_the_level_is_seen(
+    name: str, flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant, kind = FAULTS[name]
+    plant(monkeypatch)
+    found = checked(flight)
+    assert any(kind in text for text in found.failures), found.failures
+
+
+def test_scores_are_recomputed_from_the_levels(flight: Path) -> None:
+    data = load_data(load_flight(flight), flight.parent)
+    replays = replay_flight(data)
+    results = list(compare_flight(data, replays).rss)
+    expected = expectations(data, replays.all)
+    for kind, change in (("offset", {"offset_db": 0.1}), ("RMSE", {"rmse_db": 0.01}), ("RMSE", {"n": 1})):
+        score = results[0].score
+        wrong = dataclasses.replace(score, **{key: getattr(score, key) + by for key, by in change.items()})
+        changed = [dataclasses.replace(results[0], score=wrong), *results[1:]]
+        found = raw_checked(data, replays.all, expected, changed)
+        assert any(kind in text for text in found.failures), (kind, found.failures)
+
+
+def test_a_clock_of_the_wrong_sign_is_seen(flight: Path, tmp_path: Path) -> None:
+    """Levels that follow the right clock: taking off its opposite varies more, and is named."""
+    for path in flight.parent.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    data = load_data(load_flight(flight), flight.parent)
+    right = replay_flight(data)
+    for series, replayed in zip(data.rss, right.rss, strict=True):
+        assert replayed.valid.all()
+        lines = (tmp_path / f"{series.tower}_power_log.txt").read_text().splitlines()
+        levels = replayed.replay.rss_dbm[:, 0] - 90.0
+        text = [f"{line[:36]} {level:15.6f}\n" for line, level in zip(lines, levels, strict=True)]
+        (tmp_path / f"{series.tower}_power_log.txt").write_text("".join(text))
+
+    def clocks(sign: float) -> Callable[[FlightData], list[Clock]]:
+        def of(data: FlightData) -> list[Clock]:
+            ahead = sign * AHEAD_S
+            known = {"drift_s_per_s": 0.0, "verdict": "ok", "reason": "", "applied": APPLIED}
+            return [
+                Clock(
+                    result=ClockResult(
+                        receiver=s.tower,
+                        radio_minus_telemetry_s=ahead,
+                        ci95_s=(ahead, ahead),
+                        **known,  # type: ignore[arg-type]
+                    ),
+                    applied_s=np.full(len(s.time), ahead),
+                )
+                for s in data.rss
+            ]
+
+        return of
+
+    assert checked(tmp_path / "flight.yaml", clocks=clocks(1.0)).failures == ()
+    found = checked(tmp_path / "flight.yaml", clocks=clocks(-1.0))
+    assert sum("wrong sign" in text for text in found.failures) == 2
+
+
+def test_the_take_off_ground_carries_the_ranks_too(flight: Path) -> None:
+    data = load_data(load_flight(flight), flight.parent)
+    (series,) = data.rank
+    assert series.position_m is not None
+    place, valid = data.poses_at(series.time).position_m, data.poses_at(series.time).valid
+    assert series.position_m[valid][:, 2] == pytest.approx(place[valid][:, 2], abs=1e-6)
+
+
+def test_what_cannot_be_read_a_second_time_is_named(flight: Path, tmp_path: Path) -> None:
+    for path in flight.parent.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    text = FLIGHT.replace("node: T2, channel: A", 'node: T2, channel: A, time_origin: "2025-06-01T10:00:00Z"')
+    (tmp_path / "flight.yaml").write_text(text)
+    found = checked(tmp_path / "flight.yaml")
+    assert any("T2_power_log.txt" in line for line in found.not_covered)
+    assert found.raw_samples >= 20
+    assert found.failures == ()

@@ -78,7 +78,7 @@ SMALLEST: dict[str, list[str]] = {
     "kriging": ["--quick", "--pairs", "60"],
     "kriging_field": ["--quick"],
     "long_flight": ["--hours", "0.3", "--shares", "1"],
-    "mutation": ["--each", "1", "--seed", "5", "--only", "offset.py"],
+    "mutation": ["record", "{folder}/map.json", "--tests", "tests/compare/test_offset.py"],
     "output_faults": ["--kills", "5"],
     "pages": ["--only", "long", "--repeats", "1"],
     "performance": ["--docs", "{folder}/performance.md"],

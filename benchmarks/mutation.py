@@ -365,7 +365,7 @@ class Trials:
             near = near_tests(self.reach, mutant.path, None if place is None else place.lines)
             limit = 30 + 10 * sum(self.reach[name]["seconds"] for name in near)
             if place is None or not near:
-                tests = tuple(near[:MOST_ANEW]) or COMPILED.get(mutant.path, ())
+                tests = COMPILED.get(mutant.path) or tuple(near_tests(self.reach, mutant.path, None)[:MOST_ANEW])
                 kind = in_child(lambda one=mutant, those=tests: planted(one, one.source, those), limit + 300)
                 source = (ROOT / mutant.path).read_text(encoding="utf-8")
                 control = partial(planted, mutant, source, tests)
@@ -373,9 +373,9 @@ class Trials:
                 those = [items[name] for name in near if name in items]
                 kind = in_child(lambda one=mutant, at=place, tests=those: self._fails(tests, one, at), limit)
                 control = partial(self._fails, [items[name] for name in near if kind == f"killed by {name}"])
-            if kind.startswith("killed by") and not kind.endswith(("crash", "import")):
-                if in_child(control, limit + 300) != "survived":
-                    raise SystemExit(f"{mutant.name}: {kind}, and so it is without the change")
+            sure = not kind.startswith("killed by") or kind.endswith(("crash", "import"))
+            if not sure and in_child(control, limit + 300) != "survived":
+                kind = f"unclear: {kind}, and so it is without the change"
             self.answer(mutant, kind, time.monotonic() - begin)
         return True
 
@@ -390,6 +390,9 @@ class Trials:
                 return str(item.nodeid)
         return ""
 
+
+KINDS = ("killed", "survived", "equivalent", "unclear")
+"""Unclear: the test fails without the change too, where it runs alone; such mutants do not count."""
 
 MOST_ANEW = 60
 """Tests that a change outside functions is tried on, the shortest of each file first."""
@@ -533,10 +536,10 @@ def draw(chosen: list[Mutant], reach: Reach, account: Path | None) -> None:
     counts: dict[str, dict[str, int]] = {}
 
     def answer(mutant: Mutant, outcome: str, took: float) -> None:
-        kind = "killed" if outcome.startswith("killed") else "survived"
+        kind = next((one for one in ("killed", "survived") if outcome.startswith(one)), "unclear")
         if kind == "survived" and change_of(mutant) in known:
             kind = "equivalent"
-        room = counts.setdefault(mutant.path.split("/")[1], {"killed": 0, "survived": 0, "equivalent": 0})
+        room = counts.setdefault(mutant.path.split("/")[1], dict.fromkeys(KINDS, 0))
         room[kind] += 1
         print(f"{kind:10s} {took:6.1f} s  {mutant.name}  [{outcome}]", file=sys.__stdout__, flush=True)
         if account is not None:
@@ -546,11 +549,11 @@ def draw(chosen: list[Mutant], reach: Reach, account: Path | None) -> None:
 
     tests = tuple(sorted({name.partition("::")[0] for name in reach}))
     pytest_on(tests, [Trials(chosen, reach, answer)])
-    counts["all"] = {kind: sum(row[kind] for row in counts.values()) for kind in ("killed", "survived", "equivalent")}
+    counts["all"] = {kind: sum(row[kind] for row in counts.values()) for kind in KINDS}
     for name, row in counts.items():
         tried = max(row["killed"] + row["survived"], 1)
         share = f"{row['killed']} of {tried} ({row['killed'] / tried:.1%})"
-        print(f"{name:12s} killed {share}, {row['equivalent']} equivalent")
+        print(f"{name:12s} killed {share}, {row['equivalent']} equivalent, {row['unclear']} unclear")
 
 
 def main() -> None:

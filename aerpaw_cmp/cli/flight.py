@@ -136,11 +136,7 @@ def audit(
     if recorded is None:
         print("nothing to audit: no link was replayed")
     else:
-        field = recorded["field"] or {}
-        print(
-            f"audit: {recorded['links']} links against {recorded['reference']}, {recorded['missing_paths']} paths "
-            f"missing, {recorded['extra_paths']} only in our engine; fields: {field.get('failed', 0)} checks failed"
-        )
+        print(recorded["summary"])
     print(f"report: {outcome.folder / 'report.html'}")
     return _verdict(outcome, strict)
 
@@ -208,6 +204,8 @@ def _print_report_summary(outcome: Any) -> None:
     if len(warnings) > _WARNINGS:
         say.warn(f"and {len(warnings) - _WARNINGS} more warnings, all in the report")
     print(f"report: {outcome.folder / 'report.html'}")
+    if audited := (outcome.metrics.get("rt") or {}).get("audit"):
+        print(audited["summary"])
     if outcome.metrics.get("audit_command"):
         print(f"next: {outcome.metrics['audit_command']}")
 

@@ -60,7 +60,7 @@ TIMES = "The time of the engine is its share for the audited links; that of the 
 
 NOT_COVERED = (
     "whether reflection off smooth half-spaces and flat walls is what the place does",
-    "positions of towers, footprints and trees, and the track's positions",
+    "positions of footprints and trees; intervals",
     "geometry of paths off crowns; terrain that blocks",
 )
 """What no audit of the replay can see."""

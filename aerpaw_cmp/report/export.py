@@ -14,6 +14,7 @@ from ..common.provenance import KEY, union
 from ..logs.records import has_wall_clock
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
+from .words import audit_summary
 
 DECIMALS = 4
 """0.1 mm and 1e-4 dB: finer than any log, and the files stay readable."""
@@ -139,6 +140,7 @@ def _engine_metrics(engine: Engine) -> dict[str, Any]:
         "audit": None
         if audit is None
         else {
+            "summary": audit_summary(audit),
             "reference": audit.reference,
             "links": audit.links,
             "missing_paths": audit.missing_paths,

@@ -17,6 +17,7 @@ from .words import (
     NOTHING_COMPARED,
     TOO_FEW_COMPARED,
     Judged,
+    audit_paths,
     count,
     first_sentence,
     local_error,
@@ -219,21 +220,15 @@ def headlines(data: ReportData) -> list[Headline]:
 
 
 def _audit(audit: AuditResult) -> Headline:
-    """What the audit of paths and fields found wrong; what the other engine's sampling misses is no fault of ours."""
+    """Failed checks of the audit; paths that the other engine did not sample are no fault of ours."""
     fields = audit.fields
+    beside = f"{count(audit.links)} links against {audit.reference}"
     if fields is None:
-        return Headline(
-            label="Audit of the engine",
-            value=f"{count(audit.missing_paths)} paths missing",
-            interval=f"{count(audit.extra_paths)} that only we have, {audit.rss_max_error_db:.2f} dB at most",
-            beside=f"{count(audit.links)} links against {audit.reference}",
-        )
-    return Headline(
-        label="Audit of paths and fields",
-        value=f"{count(len(fields.failures))} failed",
-        interval=f"worst: {fields.power_max_db:.3f} dB, {fields.phase_max_rad:.4f} rad, {count(fields.paths)} paths",
-        beside=f"against {audit.reference}'s own coefficients, {count(audit.links)} links",
-    )
+        value = f"{count(audit.missing_paths)} paths missing"
+    else:
+        value = f"{count(len(fields.failures))} failed"
+        beside += f"; {count(fields.raw_poses)} poses, {count(fields.raw_levels)} levels from raw bytes"
+    return Headline(label="Audit", value=value, interval=audit_paths(audit), beside=beside)
 
 
 def _error(panels: Sequence[RssPanel]) -> Headline:

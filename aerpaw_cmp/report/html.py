@@ -158,6 +158,7 @@ def environment() -> Any:
     environment.filters.update(
         num=number, interval=interval, percent=percent, duration=duration, data_uri=data_uri, k=k_key,
         flat=lambda s: list(flat(s)), clock=clock, picture_uri=picture_uri, more=more,
+        audit_summary=words.audit_summary,
     )  # fmt: skip
     return environment
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from ..common.provenance import KEY
 from ..compare.ladder import LadderRow
-from ..compare.result import BASELINE_TITLE
+from ..compare.result import BASELINE_TITLE, AuditResult
 from .data import ErrorSpan, Interval, RankPanel, ReportData, RssPanel
 
 FEW_SAMPLES = 30
@@ -140,6 +140,48 @@ def local_error(panel: RssPanel, span: ErrorSpan) -> str:
 def _field_failures(data: ReportData) -> int:
     audit = None if data.engine is None else data.engine.audit
     return 0 if audit is None or audit.fields is None else len(audit.fields.failures)
+
+
+def audit_summary(audit: AuditResult) -> str:
+    """The audit in a few sentences: the card, the page, the terminal and metrics.json have these words alone.
+
+    Parameters
+    ----------
+    audit : AuditResult
+
+    Returns
+    -------
+    str
+    """
+    fields = audit.fields
+    texts = [f"Audit, {count(audit.links)} links against {audit.reference}: {audit_paths(audit)}."]
+    if fields is not None:
+        texts.append(
+            f"Field: {count(fields.paths)} paths against {audit.reference}'s own coefficients, worst "
+            f"{fields.power_max_db:.2g} dB and {fields.phase_max_rad:.2g} rad."
+        )
+        worst_db = max(fields.raw_level_max_db, fields.raw_measured_max_db)
+        texts.append(
+            f"Recomputed from raw bytes: {count(fields.raw_samples)} readings, {count(fields.raw_poses)} poses, "
+            f"{count(fields.raw_levels)} levels, worst {fields.raw_position_max_m:.2g} m, "
+            f"{fields.raw_attitude_max_rad:.2g} rad, {worst_db:.2g} dB."
+        )
+        texts.append(f"Checks failed: {count(len(fields.failures))}.")
+    return " ".join(texts)
+
+
+def audit_paths(audit: AuditResult) -> str:
+    """Paths that one engine alone has, and the level that they make: half a sentence of the card and of the summary."""
+    parts = [f"{count(audit.missing_paths)} paths missing"]
+    if audit.extra_paths:
+        tested = audit.fields is not None and not audit.fields.phantom_paths
+        parts.append(
+            f"{count(audit.extra_paths)} only in our engine ({audit.reference} did not sample them"
+            + ("; each passed a second test)" if tested else ")")
+        )
+    if math.isfinite(audit.rss_max_error_db):
+        parts.append(f"RSS of the two engines within {audit.rss_max_error_db:.2g} dB")
+    return ", ".join(parts)
 
 
 def _missing_paths(data: ReportData) -> int:
@@ -343,12 +385,8 @@ def warnings(data: ReportData) -> list[str]:
             if data.audit_command
             else "The replay engine was not audited against the other engine in this report."
         )
-    if audit is not None and (audit.missing_paths or audit.extra_paths):
-        texts.append(
-            f"The audit found {count(audit.missing_paths)} paths that only the {audit.reference} engine has and "
-            f"{count(audit.extra_paths)} that only the {data.engine.engine if data.engine else ''} engine has, "
-            f"on {count(audit.links)} links."
-        )
+    if audit is not None and audit.missing_paths:
+        texts.append(audit_summary(audit))
     if audit is not None and audit.fields is not None and audit.fields.failed:
         texts.append(
             "The audit of the field failed, so no level or rank below can be relied on: "

@@ -48,7 +48,7 @@ def no_other_engine(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The audit without Sionna: how often it was asked for, with how many links."""
     asked: list[int] = []
 
-    def audit(data: Any, _replays: Any, _progress: Any) -> None:
+    def audit(data: Any, _replays: Any, _results: Any, _progress: Any) -> None:
         asked.append(data.settings.rt.audit_links)
 
     monkeypatch.setattr(audit_flight, "_audit", audit)

@@ -152,7 +152,7 @@ def _table(text: str, zone: str) -> Log:
         turn = [values.get(name) for name in ("roll", "pitch", "yaw")]
         if None not in place:
             angles = None if None in turn else tuple(math.degrees(x) for x in turn)  # type: ignore[arg-type]
-            rows.append(Row(time, *place, angles))  # type: ignore[arg-type]
+            rows.append(Row(time, place[0], place[1], place[2], angles))  # type: ignore[arg-type]
     return Log(tuple(rows), readings)
 
 

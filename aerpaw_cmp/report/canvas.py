@@ -259,17 +259,48 @@ def start_of(data: ReportData) -> np.datetime64:
     return times[0] if data.track is not None and len(data.track.time) else min(times)
 
 
-def time_label(start: np.datetime64) -> str:
-    """Label of a time axis.
+_CLOCK_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 86400)
+
+
+def clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 7) -> tuple[FloatArray, list[str]]:
+    """Ticks at round times of day.
+
+    Parameters
+    ----------
+    low_s, high_s : float
+        Ends of the axis, seconds after ``start``.
+    start : datetime64
+        UTC.
+    most : int
+        Ticks at most, about.
+
+    Returns
+    -------
+    tuple of (n,) and list of str
+        Seconds after ``start``, and the times.
 
     Examples
     --------
-    >>> time_label(np.datetime64("2025-06-01T14:00:00.25")), time_label(np.datetime64("1970-01-01T00:02:29"))
-    ('Time after 2025-06-01 14:00:00 UTC [s]', 'Time after the first sample [s]')
+    >>> clock_ticks(0.0, 200.0, np.datetime64("2025-06-01T14:00:13.5"))[1]
+    ['14:00:30', '14:01:00', '14:01:30', '14:02:00', '14:02:30', '14:03:00', '14:03:30']
     """
+    step = next((s for s in _CLOCK_STEPS_S if (high_s - low_s) / s <= most), _CLOCK_STEPS_S[-1])
+    begun = float((start - start.astype("datetime64[D]")) / np.timedelta64(1, "s"))
+    ticks = np.arange(np.ceil((low_s + begun) / step), np.floor((high_s + begun) / step) + 1) * step
+    pattern = slice(11, 19 if step < 60 else 16)
+    day = start.astype("datetime64[D]").astype("datetime64[s]")
+    return ticks - begun, [str(day + np.timedelta64(int(tick), "s"))[pattern] for tick in ticks]
+
+
+def time_axis(ax: Axes, start: np.datetime64) -> None:
+    """Label and ticks of a time axis whose curves are drawn, seconds after ``start``: UTC, where the logs have it."""
     if not has_wall_clock(start):
-        return "Time after the first sample [s]"
-    return f"Time after {str(start)[:19].replace('T', ' ')} UTC [s]"
+        ax.set_xlabel("Time after the first sample [s]")
+        return
+    ax.set_xlabel(f"Time of day, {str(start)[:10]} (UTC)")
+    low, high = ax.get_xlim()
+    ax.set_xticks(*clock_ticks(low, high, start))
+    ax.set_xlim(low, high)
 
 
 def count(n: int) -> str:

@@ -132,13 +132,17 @@ def _forecast_of(panel: RankPanel) -> Mapping[str, Any] | None:
 
 
 def _forecast_sentence(panel: RankPanel, found: Mapping[str, Any]) -> str:
-    side = "below" if found["log_score_gain"] > 0 else "above"
     return (
         f"Rank forecast at {panel.tower} by the receiver learned on other flights: kappa {found['kappa']:.2f} (0 is "
-        f"chance), log score {abs(100 * found['log_score_gain']):.0f} % {side} the constant forecast."
+        f"chance), {_log_score(found)}."
         f" The forecast rank agrees in {100 * found['agreement']:.0f} % of samples; always "
         f"guessing the commonest agrees in {100 * found['majority_agreement']:.0f} %."
     )
+
+
+def _log_score(found: Mapping[str, Any]) -> str:
+    side = "below" if found["log_score_gain"] > 0 else "above"
+    return f"log score {abs(100 * found['log_score_gain']):.0f} % {side} the constant forecast"
 
 
 def _forecast_card(panel: RankPanel, found: Mapping[str, Any]) -> Headline:
@@ -147,7 +151,7 @@ def _forecast_card(panel: RankPanel, found: Mapping[str, Any]) -> Headline:
         label=f"Rank forecast at {panel.tower}",
         value=f"kappa {found['kappa']:.2f}",
         interval=NO_INTERVAL if low is None or high is None else f"95 %: {low:.2f} to {high:.2f}",
-        beside=f"log score {100 * found['log_score_gain']:+.0f} % against the constant (positive: lower loss)",
+        beside=_log_score(found),
     )
 
 
@@ -290,8 +294,9 @@ def _rank(panel: RankPanel, at: RankAtK) -> Headline:
     agree = f"agreement {100 * at.agreement:.0f} %" if math.isfinite(at.agreement) else "no pose in common"
     return Headline(
         label=f"Rank at {panel.tower}, K = {at.k:.10g}",
-        value=f"total variation {at.total_variation:.2f}",
-        interval=f"95 %: {bounds[0]:.2f} to {bounds[1]:.2f}" if known and bounds is not None else agree,
+        value=f"{100 * at.total_variation:.0f} percentage points",
+        interval="between predicted and reported shares"
+        + (f" (95 %: {100 * bounds[0]:.0f} to {100 * bounds[1]:.0f})" if known and bounds is not None else ""),
         beside=f"{agree}; always saying {commonest['rank']}: {100 * commonest['agreement']:.0f} %"
         if commonest.get("rank")
         else agree,

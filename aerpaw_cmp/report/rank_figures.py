@@ -27,7 +27,7 @@ from .canvas import (
     rank_colour,
     seconds_since,
     start_of,
-    time_label,
+    time_axis,
 )
 from .data import RANKS, Histogram, RankAtK, RankPanel, ReportData
 from .names import k_key
@@ -161,7 +161,7 @@ def rank_over_time(data: ReportData, panel: RankPanel) -> Figure:
         axes[rows].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
     if panel.singular_ratio_db is not None:
         draw_singular_values(axes[-1], seconds, panel.singular_ratio_db, panel)
-    axes[-1].set_xlabel(time_label(start))
+    time_axis(axes[-1], start)
     return fig
 
 

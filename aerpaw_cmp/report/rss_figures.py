@@ -36,7 +36,7 @@ from .canvas import (
     start_of,
     thinned,
     thinned_plan,
-    time_label,
+    time_axis,
     used_towers,
 )
 from .data import GEOMETRY, ChannelPair, RankPanel, ReportData, RssPanel, Track, tower_way
@@ -78,7 +78,7 @@ def overview(data: ReportData, panel: RssPanel) -> Figure:
         label="measured, calibrated",
     )  # fmt: skip
     right.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing")
-    right.set_xlabel(time_label(start))
+    time_axis(right, start)
     right.set_ylabel("RSS [dBm]")
     robust_limits(right, [calibrated, panel.simulated_dbm])
     fig.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=2)
@@ -143,7 +143,7 @@ def altitude(data: ReportData, track: Track) -> Figure:
     ax = fig.subplots()
     ax.plot(*thinned(seconds, track.up_m), color=SIMULATED, linewidth=1.2, label="height of the UAV")
     draw_waypoints(ax, data, start)
-    ax.set_xlabel(time_label(start))
+    time_axis(ax, start)
     ax.set_ylabel("Height above ground [m]")
     ax.set_ylim(bottom=min(0.0, float(np.nanmin(track.up_m, initial=0.0))))
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
@@ -204,7 +204,7 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
     draw_waypoints(below, data, start, names=False)
     robust_limits(below, [residual], around=0.0)
     below.set_ylabel("Residual [dB]")
-    below.set_xlabel(time_label(start))
+    time_axis(below, start)
     handles, labels = only(below, ("measured − simulated", f"RMSE {panel.rmse_db:.1f} dB"))
     below.legend(
         handles, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1
@@ -458,7 +458,7 @@ def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
     robust_limits(ax, levels, around=0.0)
     reach = max(ax.get_ylim()[1], 1.1 * pair.limit_db)  # the limit is drawn, so it is seen
     ax.set_ylim(-reach, reach)
-    ax.set_xlabel(time_label(start))
+    time_axis(ax, start)
     ax.set_ylabel(f"{pair.first} − {pair.second} [dB]")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4, markerscale=3)
     return fig

@@ -19,7 +19,9 @@ from tests.report.browsing import (
     reload_page,
     serious_findings,
     set_scheme,
+    set_width,
     start,
+    usual_width,
 )
 
 pytest.importorskip("selenium", reason="selenium is not installed")
@@ -141,6 +143,39 @@ def test_no_serious_finding_of_accessibility(driver):
     assert serious_findings(driver) == {}
 
 
+def test_times_on_the_axes_are_round_and_say_utc(driver):
+    shown = driver.execute_script("return explorer.times()")
+    assert len(shown) >= 3
+    for texts in shown:
+        assert texts[0].endswith(" UTC")
+        times = [np.datetime64(f"1970-01-01T{text[:8]}", "s").astype(int) for text in texts]
+        steps = set(np.diff(times).tolist())
+        assert len(steps) == 1
+        step = steps.pop()
+        assert 3600 % step == 0
+        assert all(time % step == 0 for time in times)
+
+
+def test_the_readouts_stay_inside_a_small_window(driver):
+    set_width(driver, 1440, 900)
+    try:
+        for place in ("#charts", "#map"):
+            found = driver.execute_script(
+                "document.querySelector(arguments[0]).scrollIntoView(); explorer.choose(explorer.series(explorer.data.rss[0].time)[5]);"
+                "return ['pose', 'span'].map(id => document.getElementById(id).getBoundingClientRect().bottom)",
+                place,
+            )
+            assert max(found) <= 900
+    finally:
+        usual_width(driver)
+
+
+def test_no_two_elements_share_an_identifier(driver):
+    found = driver.execute_script("return Array.from(document.querySelectorAll('[id]'), e => e.id)")
+    assert len(found) > 10
+    assert sorted({one for one in found if found.count(one) > 1}) == []
+
+
 @pytest.mark.parametrize("width", [1440, 768, 390])
 def test_nothing_overflows(driver, width):
     page, charts = extents(driver, width, ".u-wrap")
@@ -163,7 +198,7 @@ def test_with_scripts_off_the_static_figures_stand(driver):
     try:
         driver.refresh()
         assert not driver.find_element("id", "explorer").is_displayed()
-        assert driver.find_element("id", "overview").is_displayed()
+        assert driver.find_element("id", "figure-overview").is_displayed()
         assert driver.find_element("css selector", ".numbers").is_displayed()
     finally:
         driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})

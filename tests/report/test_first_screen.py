@@ -163,3 +163,13 @@ def test_a_rank_forecast_is_the_headline_where_there_is_one(report_data):
     assert (card.value, card.interval) == ("kappa 0.37", "95 %: 0.17 to 0.61")
     unscored = dataclasses.replace(panel, extra={**panel.extra, "receiver": {**found, "kappa": None}})
     assert "Rank forecast" not in verdict(dataclasses.replace(data, rank=(unscored,)))[0]
+
+
+def test_sentence_and_card_of_a_rank_show_the_same_digits(report_data):
+    data = dataclasses.replace(report_data, rss=())
+    sentence, *_ = verdict(data)
+    card = next(one for one in headlines(data) if one.label.startswith("Rank"))
+    best = min(data.rank[0].simulated, key=lambda at: at.total_variation)
+    shown = f"{100 * best.total_variation:.0f} percentage points"
+    assert shown in sentence
+    assert card.value == shown

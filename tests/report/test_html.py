@@ -108,7 +108,7 @@ def test_every_figure_has_a_place(report_data):
     from aerpaw_cmp.report.figures import figure_specs
 
     page = render(report_data)
-    assert [p.name for p in figure_specs(report_data) if p.name not in page.ids] == []
+    assert [p.name for p in figure_specs(report_data) if f"figure-{p.name}" not in page.ids] == []
 
 
 def test_first_screen_says_what_and_how_well(report_data):

@@ -30,7 +30,7 @@ def test_files(few_maps, tmp_path):
     assert files[0].name == "map.html"
     page = files[0].read_text()
     names = {p.name for p in maps_figures.figure_specs(few_maps)}
-    assert all(f'id="{name}"' in page for name in names)
+    assert all(f'id="figure-{name}"' in page for name in names)
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
     assert page.count("<script") == 2  # its data and its one script
     assert max(f.stat().st_size for f in files if f.suffix == ".svg") < 500_000

@@ -62,6 +62,6 @@ def test_it_stands_in_the_report(report_data, serving):
     assert [p.name for p in specs] == ["serving_confusion"]
     pictures = [canvas.render(p, ("png",)) for p in specs]
     page = html.page(data, pictures, [])
-    assert 'id="serving_confusion"' in page
+    assert 'id="figure-serving_confusion"' in page
     assert "The prediction is no better than that." in page
     assert 'id="serving"' not in html.page(report_data, [], [])

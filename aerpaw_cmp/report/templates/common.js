@@ -26,7 +26,7 @@ const common = (() => {
 
   function cells(target, rows) {
     target.replaceChildren(...rows.map(([name, value]) => {
-      const row = document.createElement("div"), dt = document.createElement("dt"), dd = document.createElement("dd");
+      const row = document.createElement("dl"), dt = document.createElement("dt"), dd = document.createElement("dd");
       dt.textContent = name; dd.textContent = value; row.append(dt, dd);
       return row;
     }));
@@ -69,6 +69,13 @@ const common = (() => {
     for (let v = Math.ceil(low / step - 1e-9) * step; v <= high + 1e-9 * step; v += step) out.push(Math.abs(v) < 1e-9 * step ? 0 : v);
     return out;
   }
+  // instants at round times of day between two, all in seconds; "begun" is the time of day of zero
+  function clockTicks(low, high, most, begun) {
+    const step = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600].find(s => (high - low) / s <= most) ?? 86400, out = [];
+    for (let v = Math.ceil((low + begun) / step - 1e-9) * step; v <= high + begun; v += step) out.push(v - begun);
+    return high - low < 1.5 ? ticks(low, high, most) : out;
+  }
+  const clockText = seconds => new Date(Math.round(seconds * 1000)).toISOString().slice(11, seconds % 1 ? 21 : 19);
   const digits = marks => { const step = marks.length > 1 ? Math.abs(marks[1] - marks[0]) : 1; return Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9))); };
 
   // axes of a small chart; gives the two scales. x and y: {low, high, label, marks?, words?}
@@ -134,5 +141,5 @@ const common = (() => {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => later(job));
   }
 
-  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, whenResized, digits };
+  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, whenResized, digits, clockTicks, clockText };
 })();

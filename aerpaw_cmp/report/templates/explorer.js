@@ -134,9 +134,10 @@
       grid: { stroke: css("--line"), width: 1 }, ticks: { stroke: css("--line"), width: 1 } };
   }
   function timeAxis() {
-    const a = axis("", 30);
-    a.values = (u, splits) => splits.map(v => data.start ? new Date(Date.parse(data.start + "Z") + v * 1000).toISOString().slice(11, 19) : String(Math.round(v * 10) / 10));
-    a.space = 80;
+    const a = axis("", 30), begun = Date.parse(data.start + "Z") / 1000;
+    if (!data.start) return { ...a, space: 80, values: (u, splits) => splits.map((v, i) => number(v, v % 1 ? 1 : 0) + (i ? "" : " s")) };
+    a.splits = (u, which, low, high) => common.clockTicks(low, high, u.width / 110, begun);
+    a.values = (u, splits) => splits.map((v, i) => common.clockText(v + begun) + (i ? "" : " UTC"));
     return a;
   }
 
@@ -525,5 +526,5 @@
   document.documentElement.classList.add("live");
   controls();
   everything();
-  window.explorer = { state, statistics, rankStatistics, choose, span, series: i => Array.from(get(i)), labels: () => labels, keyTop: () => canvas.clientHeight - KEY, data };
+  window.explorer = { times: () => charts.map(c => c.chart.axes[0]._values), state, statistics, rankStatistics, choose, span, series: i => Array.from(get(i)), labels: () => labels, keyTop: () => canvas.clientHeight - KEY, data };
 })();

@@ -119,7 +119,7 @@
     const host = at("modems");
     while (host.children.length < state.modems.length) {
       const card = make("button", "card"), index = host.children.length, name = make("span", "name");
-      card.type = "button"; name.append(make("span", ""), make("i", "")); card.append(name, make("span", "big"), make("dl", "readings"));
+      card.type = "button"; name.append(make("span", ""), make("i", "")); card.append(name, make("span", "big"), make("div", "readings"));
       card.addEventListener("click", () => { state.chosen = index; state.pose = null; later(draw); });
       host.append(card);
     }
@@ -210,8 +210,7 @@
     const canvas = at(id);
     if (!canvas || !canvas.clientWidth) return;
     const [low, high] = range(), [pen, w, h] = common.frame(canvas);
-    const seconds = (high - low) / 1000, step = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200].find(s => seconds / s <= Math.max(2, w / 110)) ?? 14400, marks = [];
-    for (let t = Math.ceil(low / 1000 / step) * step * 1000; t <= high - 0.04 * (high - low); t += step * 1000) marks.push(t); // no label is cut at the edge
+    const end = high - 0.04 * (high - low), marks = common.clockTicks(low / 1000, end / 1000, Math.max(2, w / 110), 0).map(t => t * 1000); // no label is cut at the edge
     const g = common.axes(pen, w, h + 16, { low, high, label: "", marks, words: t => clock(t) }, y, 52);
     scales.set(id, { g, low, high });
     pen.save(); pen.beginPath(); pen.rect(g.left, g.top - 4, g.right - g.left, g.bottom - g.top + 8); pen.clip();

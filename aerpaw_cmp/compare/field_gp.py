@@ -86,7 +86,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "height_m": (5.0, 100.0),
     "turn": (0.2, 5.0),
     "drift_sd_db": (0.05, 12.0),
-    "drift_s": (10.0, 600.0),
+    "drift_s": (3.0, 600.0),
     "noise_sd_db": (0.2, 12.0),
 }
 """What may be learned, and between which values."""

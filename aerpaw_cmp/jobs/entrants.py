@@ -12,8 +12,10 @@ import pandas as pd
 from ..common.units import BoolArray, FloatArray
 from ..compare import calibration
 from ..compare.calibration import Observed, Recipe
-from ..compare.direction_gain import TOWER_TERMS, UAV_TERMS, GainModel
+from ..compare.correction import BIN_S, Base, Predictor, choose, fixed_base
+from ..compare.direction_gain import TOWER_TERMS, UAV_TERMS, GainModel, LinkSamples
 from ..compare.forecast import constant_forecast
+from ..compare.spread import fading_of
 from ..flight.data import FlightData
 from ..flight.replay import attitude_rotation
 from ..propagation.arrays import Poses
@@ -30,12 +32,6 @@ Answer = tuple[FloatArray, FloatArray]
 """Level and standard deviation (n,) [dB]."""
 
 Entrant = Callable[[Question, Bench], list[Answer]]
-
-TARGETS_AT_ONCE = 2048
-"""Bounds the matrices between samples and targets (some 25 MB)."""
-
-MOST_TRAINING = 1500
-"""Samples of the residual field and of Kriging: their cost grows with the cube."""
 
 
 def anchored(question: Question, gain: GainOf) -> list[Answer]:
@@ -137,106 +133,60 @@ def _replay(level: str, engine: str = "image", **options: Any) -> Entrant:
     return answer
 
 
+_FITS: dict[tuple[int, ...], calibration.Learned] = {}
+
+
+def learned_base(train: Sequence[LinkSamples]) -> Predictor:
+    """Antennas learned on these samples, as a base of a correction; each fit is made once."""
+    key = tuple(hash(s.residual_db.tobytes()) for s in train)
+    if key not in _FITS:
+        recipe = Recipe(model=GainModel(terms=UAV_TERMS + TOWER_TERMS, bin_s=BIN_S), rotation=rotation)
+        _FITS[key] = calibration.learn(train, recipe)
+    return _FITS[key].predict
+
+
+def _fit(train: Sequence[Observed]) -> calibration.Learned:
+    samples = [o.samples for o in train]
+    learned_base(samples)
+    return _FITS[tuple(hash(s.residual_db.tobytes()) for s in samples)]
+
+
 def _learned(question: Question, _: Bench) -> list[Answer]:
     fit = _fit(question.train)
-    answers = anchored(question, fit.mean_of)
-    return [(level, fit.sd_of(one)) for one, (level, _) in zip(question.asked, answers, strict=True)]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Antennas:
-    """Learned antennas as an entrant asks for them."""
-
-    learned: calibration.Learned
-
-    def mean_of(self, o: Observed) -> FloatArray:
-        """Gain (n,) [dB]."""
-        return self.learned.mean(o.samples)
-
-    def sd_of(self, o: Observed, nuisance: FloatArray | None = None) -> FloatArray:
-        """Standard deviation (n,) of gain, the flight's own nuisance, noise and fading [dB].
-
-        ``nuisance`` (n,) stands in for the flight's own, where something is known of it.
-        """
-        _, gain = self.learned.predict(o.samples)
-        spread = self.learned.spread(o.samples.antenna)
-        if nuisance is None:
-            return spread.total_db(gain)
-        return np.asarray(np.hypot(dataclasses.replace(spread, own_sd_db=0.0).total_db(gain), nuisance))
-
-
-_FITS: dict[tuple[int, ...], _Antennas] = {}
-
-
-def _fit(train: Sequence[Observed]) -> _Antennas:
-    """Antennas learned on these samples; one fit serves both entrants that ask."""
-    key = tuple(hash(o.samples.residual_db.tobytes()) for o in train)
-    if key not in _FITS:
-        recipe = Recipe(model=GainModel(terms=UAV_TERMS + TOWER_TERMS, bin_s=4.0), rotation=rotation)
-        _FITS[key] = _Antennas(calibration.learn([o.samples for o in train], recipe))
-    return _FITS[key]
+    answers = anchored(question, lambda o: fit.mean(o.samples))
+    return [
+        (level, fit.spread(one.samples.antenna).total_db(fit.predict(one.samples)[1]))
+        for one, (level, _) in zip(question.asked, answers, strict=True)
+    ]
 
 
 def _learned_residual(question: Question, _: Bench) -> list[Answer]:
-    """Learned antennas, and a Gaussian process over place on what they leave."""
-    fit = _fit(question.train)
-    answers = anchored(question, fit.mean_of)
-    train = [dataclasses.replace(o.samples, residual_db=o.samples.residual_db - fit.mean_of(o)) for o in question.train]
-    out = []
-    for one, (level, _spread) in zip(question.asked, answers, strict=True):
-        near = [s.binned(4.0) for s in train if s.antenna == one.samples.antenna]
-        if not near or not len(one.samples):
-            out.append((level, fit.sd_of(one)))
-            continue
-        value = np.concatenate([s.residual_db - s.residual_db.mean() for s in near])
-        place = np.concatenate([s.position_m for s in near])
-        mean, sd = _field(place, value, one.samples.position_m)
-        out.append((level + mean, fit.sd_of(one, sd)))
-    return out
-
-
-def _field(place_m: FloatArray, value: FloatArray, targets_m: FloatArray) -> Answer:
-    """Gaussian process over place with an exponential covariance; strength and length by likelihood."""
-    step = max(1, len(value) // MOST_TRAINING)
-    place_m, value = place_m[::step], value[::step]
-    apart = np.linalg.norm(place_m[:, None] - place_m[None], axis=2)
-    power, best = float(value.var()) + 1e-9, None
-    for length in (15.0, 30.0, 60.0, 120.0):
-        for share in (0.1, 0.3, 0.5, 0.7):
-            matrix = power * (share * np.exp(-apart / length) + (1 - share) * np.eye(len(value)))
-            factor = np.linalg.cholesky(matrix)
-            white = np.linalg.solve(factor, value)
-            likelihood = -0.5 * white @ white - np.log(np.diag(factor)).sum()
-            if best is None or likelihood > best[0]:
-                best = (likelihood, length, share, factor, white)
-    assert best is not None
-    _, length, share, factor, white = best
-    mean, sd = np.empty(len(targets_m)), np.empty(len(targets_m))
-    for start in range(0, len(targets_m), TARGETS_AT_ONCE):
-        part = slice(start, start + TARGETS_AT_ONCE)
-        across = np.linalg.norm(targets_m[part, None] - place_m[None], axis=2)
-        half = np.linalg.solve(factor, power * share * np.exp(-across / length).T)
-        mean[part] = half.T @ white
-        sd[part] = np.sqrt(np.maximum(power * share - (half**2).sum(axis=0), 0.0))
-    return mean, sd
+    """Learned antennas, and the residual field on what they leave where it helps inside the training flights."""
+    return _corrected(
+        question, [o.samples for o in question.train], learned_base, [o.free_space_db for o in question.asked]
+    )
 
 
 def _kriging(question: Question, _: Bench) -> list[Answer]:
     """The level itself over place, without any model of propagation."""
-    answers = anchored(question, lambda o: -o.free_space_db)
+    levels = [
+        dataclasses.replace(o.samples, residual_db=o.samples.residual_db + o.free_space_db) for o in question.train
+    ]
+    constant = fixed_base(lambda s: np.zeros(len(s)))
+    return _corrected(question, levels, constant, [np.zeros(len(o.samples)) for o in question.asked])
+
+
+def _corrected(
+    question: Question, train: Sequence[LinkSamples], base: Base, above: Sequence[FloatArray]
+) -> list[Answer]:
+    """A base and its residual field; ``above`` (n,) is what both count from, of each asked series [dB]."""
+    correction = choose(train, {"base": base})
     out = []
-    for one, (level, spread) in zip(question.asked, answers, strict=True):
-        near = [
-            dataclasses.replace(o.samples, residual_db=o.samples.residual_db + o.free_space_db).binned(4.0)
-            for o in question.train
-            if o.samples.antenna == one.samples.antenna
-        ]
-        if not near or not len(one.samples):
-            out.append((level, spread))
-            continue
-        value = np.concatenate([s.residual_db - s.residual_db.mean() for s in near])
-        mean, sd = _field(np.concatenate([s.position_m for s in near]), value, one.samples.position_m)
-        out.append((level + mean, np.maximum(np.hypot(sd, 0.3 * spread), 0.1)))
+    for one, level in zip(question.asked, above, strict=True):
+        known = any(_same(o, one) for o in question.train)
+        fading, _ = fading_of([s for s in train if s.antenna == one.samples.antenna], BIN_S)
+        mean, shape, whole = correction.predict(one.samples, one.samples.flight if known else None)
+        out.append((level + mean, np.hypot(whole if known else shape, fading)))
     return out
 
 

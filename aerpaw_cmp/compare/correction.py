@@ -1,0 +1,277 @@
+"""Which prediction to trust, and what to add to it: chosen on flights (or blocks) left out inside those that are known.
+
+A *base* predicts levels above free space: nothing at all (a constant level), free space, a replay, learned antennas. A
+*correction* is the residual field (:mod:`.field_gp`) of a base. Both are chosen by the CRPS of what is left out, and
+the correction stays off unless it lowers it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..common.units import FloatArray, IntArray
+from .calibration import groups_of
+from .direction_gain import LinkSamples
+from .entries import crps_normal
+from .field_gp import NEW_FLIGHT, PARTS, FieldFit, FieldModel, Part, Rows, fit_field
+
+Predictor = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
+"""Level above free space (n,) and its standard deviation (n,) [dB] of samples whose residual is not used."""
+
+Base = Callable[[Sequence[LinkSamples]], Predictor]
+"""Learns from samples whose residual is measured minus free space."""
+
+BIN_S = 4.0
+"""Residuals are means over this time [s]."""
+
+BLOCK_M = 300.0
+"""Side of the blocks of a single flight that are left out."""
+
+OFF = "no correction"
+
+_NUISANCE = ("drift_sd_db", "drift_s", "noise_sd_db")
+
+_STARTS: dict[str, FieldModel | None] = {
+    OFF: FieldModel(place_sd_db=1e-3, turn=math.inf, drift_s=8.0),
+    "field of 2 dB, 30 m": FieldModel(place_sd_db=2.0, length_m=30.0, height_m=20.0, turn=0.35, drift_s=8.0),
+    "field of 2.5 dB, 50 m": FieldModel(place_sd_db=2.5, length_m=50.0, height_m=40.0, turn=0.35, drift_s=8.0),
+    "field of 1.5 dB, 50 m": FieldModel(place_sd_db=1.5, length_m=50.0, height_m=40.0, turn=math.inf, drift_s=8.0),
+    "field by likelihood": None,
+}
+"""Scales of the place part that are tried; drift and noise always come from the likelihood. Between few flights the
+likelihood alone confuses place with direction and height: measured, free lengths lost 0.3 dB on flights left out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Channel:
+    """Binned rows of one tower and channel over all flights, and what a base leaves there (n,) [dB]."""
+
+    rows: Rows
+    left_db: FloatArray
+    base_sd_db: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Correction:
+    """What was chosen, conditioned on all that is known.
+
+    Parameters
+    ----------
+    base : str
+    predictor : callable
+        Of the base, learned from all flights.
+    title : str
+        Of the residual field, or :data:`OFF`.
+    model : FieldModel
+    channels : mapping of str to Channel
+        By antenna (``tower.channel``).
+    flights : tuple of str
+        Their places are the codes of :class:`Rows`.
+    crps_db : mapping of (base, title) to float
+        Of what was left out.
+    rmse_db : mapping of (base, title) to float
+    sd_factor : float
+        On all standard deviations: makes the errors of what was left out as large as stated.
+    """
+
+    base: str
+    predictor: Predictor
+    title: str
+    model: FieldModel
+    channels: Mapping[str, Channel]
+    flights: tuple[str, ...]
+    crps_db: Mapping[tuple[str, str], float]
+    rmse_db: Mapping[tuple[str, str], float]
+    sd_factor: float = 1.0
+
+    @property
+    def on(self) -> bool:
+        """Whether a residual field is added."""
+        return self.title != OFF
+
+    def rows_of(self, samples: LinkSamples, flight: str | None = None) -> Rows:
+        """Samples as targets; of a flight that is not known they are a new one."""
+        code = self.flights.index(flight) if flight in self.flights else NEW_FLIGHT
+        return _rows(samples, code)
+
+    def predict(self, samples: LinkSamples, flight: str | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Level above free space (n,), its standard deviation without and with the offset between flights [dB].
+
+        The standard deviations are those of a mean over :data:`BIN_S`: base, field, drift and noise.
+        """
+        channel = self.channels.get(samples.antenna)
+        gain, gain_sd = self.predictor(samples)
+        if channel is None:
+            raise InputError(f"no flight has {samples.antenna}", expected="one of " + ", ".join(self.channels))
+        targets = self.rows_of(samples, flight)
+        fit = FieldFit(self.model, channel.rows, channel.left_db)
+        mean, whole = fit.predict(targets)
+        _, shape = fit.predict(targets, ("place", "drift"))
+        rest = gain_sd**2 + self.model.noise_sd_db**2
+        return gain + mean, self.sd_factor * np.sqrt(shape**2 + rest), self.sd_factor * np.sqrt(whole**2 + rest)
+
+
+def _rows(samples: LinkSamples, code: int) -> Rows:
+    return Rows(
+        position_m=samples.position_m,
+        direction=samples.at_uav,
+        time_s=samples.time_s,
+        flight=np.full(len(samples), code),
+    )
+
+
+def _channels(series: Sequence[LinkSamples], predictor: Predictor, flights: Sequence[str]) -> dict[str, Channel]:
+    """Residuals of a base, by antenna."""
+    parts: dict[str, list[Channel]] = {}
+    for samples in series:
+        binned = samples.binned(BIN_S)
+        gain, sd = predictor(binned)
+        good = np.isfinite(gain)
+        one = Channel(
+            rows=_rows(binned, flights.index(samples.flight)).part(good),
+            left_db=(binned.residual_db - gain)[good],
+            base_sd_db=sd[good],
+        )
+        if good.any():
+            parts.setdefault(samples.antenna, []).append(one)
+    return {
+        antenna: Channel(
+            rows=Rows.joined([p.rows for p in each]),
+            left_db=np.concatenate([p.left_db for p in each]),
+            base_sd_db=np.concatenate([p.base_sd_db for p in each]),
+        )
+        for antenna, each in parts.items()
+    }
+
+
+def _model(title: str, channels: Mapping[str, Channel]) -> FieldModel:
+    known = [(c.rows, c.left_db) for c in channels.values()]
+    start = _STARTS[title]
+    return fit_field(known) if start is None else fit_field(known, start, _NUISANCE)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fold:
+    """What is known, and what is asked, of one part that is left out."""
+
+    known: list[LinkSamples]
+    asked: list[LinkSamples]
+
+
+def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
+    """Each flight left out (or each of six groups); of a single flight, blocks of :data:`BLOCK_M`."""
+    names = list(dict.fromkeys(s.flight for s in series))
+    if len(names) > 1:
+        return [
+            _Fold([s for s in series if s.flight not in group], [s for s in series if s.flight in group])
+            for group in groups_of(names)
+        ]
+    cells = [np.floor(s.position_m[:, :2] / BLOCK_M).astype(np.int64) for s in series]
+    every, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
+    out = []
+    for cell in every[np.argsort(-count)[:6]]:
+        inside: list[IntArray] = [np.flatnonzero((c == cell).all(axis=1)) for c in cells]
+        rest = [np.setdiff1d(np.arange(len(s)), rows) for s, rows in zip(series, inside, strict=True)]
+        out.append(_Fold([s.part(r) for s, r in zip(series, rest, strict=True) if len(r)],
+                         [s.part(r) for s, r in zip(series, inside, strict=True) if len(r)]))  # fmt: skip
+    return out
+
+
+@dataclass(slots=True)
+class _Tally:
+    """Sums of one candidate over all that was left out: CRPS, squared error, squared error over variance."""
+
+    crps: float = 0.0
+    square: float = 0.0
+    ratio: float = 0.0
+    rows: int = 0
+
+    def add(self, error: FloatArray, sd: FloatArray) -> None:
+        self.crps += float(crps_normal(error, sd).sum())
+        self.square += float((error**2).sum())
+        self.ratio += float(((error / sd) ** 2).sum())
+        self.rows += len(error)
+
+
+def _score_fold(fold: _Fold, base: Base, titles: Sequence[str], tallies: Mapping[str, _Tally]) -> None:
+    """Add the errors of every residual field of a base; new flights count about their own mean."""
+    flights = list(dict.fromkeys(s.flight for s in fold.known))
+    predictor = base(fold.known)
+    channels = _channels(fold.known, predictor, flights)
+    asked = [s for s in fold.asked if s.antenna in channels and np.isfinite(s.residual_db).any()]
+    own = bool(asked) and asked[0].flight not in flights
+    binned = [s.binned(BIN_S) for s in asked]
+    said = [predictor(s) for s in binned]
+    for title in titles:
+        model = _model(title, channels)
+        parts: tuple[Part, ...] = ("place", "drift") if own else PARTS
+        for samples, (gain, gain_sd) in zip(binned, said, strict=True):
+            channel = channels[samples.antenna]
+            code = NEW_FLIGHT if own else flights.index(samples.flight)
+            mean, sd = FieldFit(model, channel.rows, channel.left_db).predict(_rows(samples, code), parts)
+            error = samples.residual_db - gain - mean
+            good = np.isfinite(error)
+            error = error[good] - (error[good].mean() if own else 0.0)
+            tallies[title].add(error, np.sqrt(sd[good] ** 2 + gain_sd[good] ** 2 + model.noise_sd_db**2))
+
+
+def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, field: bool = True) -> Correction:
+    """The base and the residual field with the lowest CRPS on what is left out, learned from all that is known.
+
+    Parameters
+    ----------
+    series : sequence of LinkSamples
+        Measured minus free space of every flight, tower and channel that is known.
+    bases : mapping of str to callable
+        In order of preference where scores are equal.
+    field : bool
+        Try residual fields.
+
+    Returns
+    -------
+    Correction
+
+    Raises
+    ------
+    InputError
+        No sample has a level and a pose.
+    """
+    series = [s for s in series if np.isfinite(s.residual_db).any()]
+    if not series:
+        raise InputError("no sample has a level and a pose", expected="RSS with positions")
+    titles = list(_STARTS) if field else [OFF]
+    folds, tallies = _folds(series), {(base, title): _Tally() for base in bases for title in titles}
+    for name, base in bases.items():
+        for fold in folds:
+            if fold.known and fold.asked:
+                _score_fold(fold, base, titles, {t: tallies[name, t] for t in titles})
+    crps = {key: one.crps / one.rows if one.rows else math.inf for key, one in tallies.items()}
+    best = min(crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
+    one, flights = tallies[best], tuple(dict.fromkeys(s.flight for s in series))
+    predictor = bases[best[0]](series)
+    channels = _channels(series, predictor, flights)
+    return Correction(
+        base=best[0],
+        predictor=predictor,
+        title=best[1],
+        model=_model(best[1], channels),
+        channels=channels,
+        flights=flights,
+        crps_db=crps,
+        rmse_db={key: math.sqrt(t.square / t.rows) if t.rows else math.nan for key, t in tallies.items()},
+        sd_factor=min(max(math.sqrt(one.ratio / one.rows), 0.8), 1.6) if one.rows else 1.0,
+    )
+
+
+def fixed_base(gain: Callable[[LinkSamples], FloatArray]) -> Base:
+    """A base that learns nothing: its level above free space is known to it."""
+
+    def learn(_: Sequence[LinkSamples]) -> Predictor:
+        return lambda samples: (gain(samples), np.zeros(len(samples)))
+
+    return learn

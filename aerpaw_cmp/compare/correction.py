@@ -220,7 +220,7 @@ def _score_fold(fold: _Fold, base: Base, titles: Sequence[str], tallies: Mapping
             tallies[title].add(error, np.sqrt(sd[good] ** 2 + gain_sd[good] ** 2 + model.noise_sd_db**2))
 
 
-def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, field: bool = True) -> Correction:
+def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, beyond: bool = False) -> Correction:
     """The base and the residual field with the lowest CRPS on what is left out, learned from all that is known.
 
     Parameters
@@ -229,8 +229,8 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, field: b
         Measured minus free space of every flight, tower and channel that is known.
     bases : mapping of str to callable
         In order of preference where scores are equal.
-    field : bool
-        Try residual fields.
+    beyond : bool
+        The targets lie beyond the flown places: free lengths, which remember places, are not tried.
 
     Returns
     -------
@@ -244,7 +244,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, field: b
     series = [s for s in series if np.isfinite(s.residual_db).any()]
     if not series:
         raise InputError("no sample has a level and a pose", expected="RSS with positions")
-    titles = list(_STARTS) if field else [OFF]
+    titles = [title for title, start in _STARTS.items() if start is not None or not beyond]
     folds, tallies = _folds(series), {(base, title): _Tally() for base in bases for title in titles}
     for name, base in bases.items():
         for fold in folds:

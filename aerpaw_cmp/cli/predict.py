@@ -1,0 +1,82 @@
+"""``predict``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+
+from .app import Force, Json, LogsRoot, Out, command
+from .shown import number, print_json, say, table
+
+
+@command(
+    "predict",
+    examples=[
+        "aerpaw-cmp predict plan.kml --with flight1.yaml --with flight2.yaml -o prediction",
+        "aerpaw-cmp predict next_flight.yaml --with flight1.yaml --threshold -95",
+        "aerpaw-cmp predict lake_wheeler --with flight1.yaml --height 40 --height 80 --spacing 30",
+    ],
+)
+def predict(
+    where: Annotated[
+        Path,
+        typer.Argument(
+            metavar="WHERE",
+            help="A route (.plan, KML, CSV, a vehicle log), flight.yaml (its plan), points (CSV with east_m, north_m, "
+            "height_m), or a site (a grid).",
+        ),
+    ],
+    flights: Annotated[
+        Optional[list[Path]],  # noqa: UP045
+        typer.Option("--with", metavar="FLIGHT", help="flight.yaml to learn from; repeatable."),
+    ] = None,
+    out: Out = None,
+    height: Annotated[
+        Optional[list[float]],  # noqa: UP045
+        typer.Option(help="Height of a grid [m], repeatable; of route points without one [default: 40]."),
+    ] = None,
+    spacing: Annotated[float, typer.Option(min=1.0, help="Spacing of a grid [m].")] = 30.0,
+    heading: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="Heading of the nose on a grid [deg]; without it all headings count alike."),
+    ] = None,
+    threshold: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="Also the probability that the level exceeds this, in the unit of the logs."),
+    ] = None,
+    logs_root: LogsRoot = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Predict level and rank with error bars where nobody has flown yet."""
+    from ..jobs.predict_run import run_predict
+    from ..jobs.where import Asked
+
+    outcome = run_predict(
+        where,
+        flights or (),
+        Asked(heights_m=tuple(height or (40.0,)), spacing_m=spacing, heading_deg=heading),
+        threshold_db=threshold,
+        out=out,
+        logs_root=logs_root,
+        force=force,
+        progress=say,
+    )
+    print_json(outcome.metrics) if as_json else _print_summary(outcome)
+
+
+def _print_summary(outcome: Any) -> None:
+    m = outcome.metrics
+    print(m["sentence"])
+    rows = [
+        [name, one["unit"], number(one["mean_level_db"], "{:.1f}"), number(one["mean_sd_db"], "{:.1f}"),
+         number(one.get("mean_p_above"), "{:.2f}"), f"{100 * one['share_outside_flown']:.0f} %", str(one["points"])]
+        for name, one in m["series"].items()
+    ]  # fmt: skip
+    heads = ["series", "unit", "mean level", "mean SD dB", "P(above)", "outside flown", "points"]
+    table(heads, rows, "Prediction")
+    for text in m["warnings"][:10]:
+        say.warn(f"warning: {text}")
+    print(f"page: {outcome.folder / 'prediction.html'}")

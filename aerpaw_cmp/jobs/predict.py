@@ -1,0 +1,455 @@
+"""The ``predict`` job: level, its interval, probabilities and ranks where nobody has flown yet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ..common.errors import InputError, UsageError
+from ..common.provenance import union
+from ..common.stages import Progress, Stages
+from ..common.units import BoolArray, FloatArray
+from ..compare.calibration import Observed
+from ..compare.correction import BIN_S, OFF, Base, Correction, choose, fixed_base
+from ..compare.direction_gain import LinkSamples
+from ..compare.spread import BAND, Spread, fading_of
+from ..flight.data import FlightData, RssSeries, load_data
+from ..flight.replay import replay_poses
+from ..flight.settings import load_flight
+from ..flight.track import body_rotation
+from ..flight.training import common, counted_once, flight_logs, learned_patterns
+from ..propagation.arrays import Poses
+from ..propagation.field.baselines import free_space_dbm
+from ..site.learned import BAND as CARRIER_BAND
+from ..site.learned import folder_of, read_learned
+from ..site.site import Site
+from ..site.siteyaml import load_site
+from .calibrate import observe
+from .calibrate_rank import RankSamples, read_receiver
+from .entrants import learned_base
+from .where import Asked, Targets, find_targets, flight_of, is_settings
+
+HEADINGS = 8
+"""Directions of the nose that count alike where it is not known."""
+
+HULL_M = 60.0
+HULL_UP_M = 20.0
+"""Targets further than this from every sample that is known are flagged, horizontally and in height [m]."""
+
+AT_ONCE = 20_000
+"""Targets that are predicted together: bounds the memory."""
+
+RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
+
+TITLES = {
+    "learned": "antennas learned from the named flights",
+    "replay": "ray tracing with the flights' own settings",
+    "free space": "free space",
+    "none": "a constant level",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Link of one tower and channel, as the first flight that has it describes it."""
+
+    data: FlightData
+    series: RssSeries
+
+    @property
+    def antenna(self) -> str:
+        """``tower.channel``."""
+        return f"{self.series.tower}.{self.series.channel}"
+
+    @property
+    def tower_m(self) -> FloatArray:
+        """Place of the array (3,)."""
+        return np.asarray(self.data.site.towers[self.series.tower].position_m)
+
+    def free_space_db(self, position_m: FloatArray) -> FloatArray:
+        """Level (n,) of free space [dBm]."""
+        link = self.series.link
+        place = self.tower_m[None, :]
+        return np.asarray(free_space_dbm(place, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
+
+    def samples(self, position_m: FloatArray, yaw_deg: FloatArray) -> LinkSamples:
+        """Targets (n,) of a level aircraft as samples without a level."""
+        ray = position_m - self.tower_m
+        at_tower = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
+        rotation = body_rotation(np.zeros(len(yaw_deg)), np.zeros(len(yaw_deg)), yaw_deg)
+        return LinkSamples(
+            flight="",
+            tower=self.series.tower,
+            channel=self.series.channel,
+            time_s=np.zeros(len(ray)),
+            position_m=position_m,
+            at_uav=np.einsum("nji,nj->ni", rotation, -at_tower),
+            at_tower=at_tower,
+            residual_db=np.zeros(len(ray)),
+        )
+
+    def replayed_db(self, samples: LinkSamples) -> FloatArray:
+        """Replayed level above free space (n,) of a level aircraft [dB]; NaN without a path."""
+        data, series = self.data, self.series
+        link = series.link.build([series.tower], data.folder)
+        body, world = samples.at_uav, -samples.at_tower
+        turn = np.arctan2(world[:, 1], world[:, 0]) - np.arctan2(body[:, 1], body[:, 0])
+        flat = np.zeros(len(turn))
+        known = data.settings.rt.attitude != "ignored"
+        rotation = body_rotation(flat, flat, 90.0 - np.degrees(turn) if known else flat + 90.0)
+        replayed = replay_poses(data.site, data.settings.rt, link, Poses(samples.position_m, rotation))
+        level = replayed.rss_dbm if data.settings.rss.field == "coherent" else replayed.rss_power_dbm
+        return np.asarray(level[:, 0] - self.free_space_db(samples.position_m))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """All that a run of ``predict`` found; ``table`` has a row per target, tower and channel (and receiver)."""
+
+    targets: Targets
+    site: Site
+    table: pd.DataFrame
+    correction: Correction
+    sources: Mapping[str, Source]
+    trained_on: tuple[str, ...]
+    flights: tuple[str, ...]
+    threshold_db: float | None
+    warnings: tuple[str, ...]
+    samples: Sequence[LinkSamples]
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Of the base and the residual field that were chosen."""
+        return self.correction.base, self.correction.title
+
+
+def predict(
+    where: Path,
+    flights: Sequence[Path],
+    asked: Asked | None = None,
+    *,
+    threshold_db: float | None = None,
+    logs_root: Path | None = None,
+    stages: Stages | None = None,
+) -> Prediction:
+    """Predict levels and ranks at the places that WHERE names.
+
+    Parameters
+    ----------
+    where : Path
+        See :func:`.where.find_targets`.
+    flights : sequence of Path
+        Flight files to learn from.
+    asked : Asked, optional
+    threshold_db : float, optional
+        P(level > threshold) is given for it, in the unit of the logs.
+    logs_root : Path, optional
+        Where logs resolve.
+    stages : Stages, optional
+
+    Returns
+    -------
+    Prediction
+
+    Raises
+    ------
+    UsageError, InputError
+        No flight that shares a tower and band, no place to predict.
+    """
+    stages = stages or Stages()
+    with stages("read"):
+        planned = flight_of(where)
+        datas = [load_data(load_flight(path), path.parent, logs_root) for path in flights]
+        if not datas:
+            raise UsageError(
+                "no flight to learn from", expected="--with flight.yaml (repeatable), a flight of this site"
+            )
+        known, said = counted_once(datas)
+        observed, warnings = observe(known)
+        site = _site_of(where, known)
+        _check_shared(where, planned, known, site)
+        targets = find_targets(where, site, asked or Asked(), logs_root)
+    sources = _sources(known, observed)
+    with stages("choose"):
+        samples = [o.samples for o in observed if o.samples.antenna in sources]
+        beyond = bool(np.mean(_outside(targets, samples)[targets.known]) > 0.5)
+        bases = _bases(sources, known, samples)
+        if beyond:
+            said = [*said, "Most points lie outside the flown places: models that remember places are left out."]
+            bases.pop("none")
+        correction = choose(samples, bases, beyond=beyond)
+    with stages("predict"):
+        parts = [
+            _levels(targets, source, correction, samples, threshold_db, stages.progress) for source in sources.values()
+        ]
+        table = pd.concat(parts, ignore_index=True)
+        table["p_serving"] = _serving(table, len(targets), len(parts))
+        ranks = _ranks(targets, known, site)
+        table = pd.concat([table, *ranks], ignore_index=True).reindex(columns=_columns(table, bool(ranks)))
+    notes = [w for w in warnings if "scored" not in w]
+    return Prediction(
+        targets=targets,
+        site=site,
+        table=table,
+        correction=correction,
+        sources=sources,
+        trained_on=union(*map(flight_logs, known)),
+        flights=tuple(data.settings.flight.name for data in known),
+        threshold_db=threshold_db,
+        warnings=(*said, *notes, *targets.remarks),
+        samples=samples,
+    )
+
+
+def _site_of(where: Path, known: Sequence[FlightData]) -> Site:
+    """Of WHERE where it is a site, else of the flights; all must share a frame."""
+    site = known[0].site
+    if (is_settings(where) and flight_of(where) is None) or not where.exists():
+        site = load_site(where if where.is_file() else str(where))
+    for data in known:
+        east, north = site.frame.to_local(np.array([data.site.frame.latitude_deg]), [data.site.frame.longitude_deg])
+        if np.hypot(east[0], north[0]) > 1.0:
+            raise UsageError(
+                f"flight {data.settings.flight.name} has site {data.site.name!r}, the prediction {site.name!r}",
+                expected="flights of one site",
+            )
+    return site
+
+
+def _check_shared(where: Path, planned: Any, known: Sequence[FlightData], site: Site) -> None:
+    """UsageError where the flights share no tower with the site, or none with the planned flight and its band."""
+    towers = {s.tower for data in known for s in data.rss}
+    bands = {s.link.carrier_hz for data in known for s in data.rss}
+    wanted = {log.node for log in planned.logs if log.node} if planned is not None else set(site.towers) | towers
+    links = [planned.link.rss, *planned.link.channels.values()] if planned is not None else []
+    carriers = {link.carrier_hz for link in links if "carrier_hz" in link.model_fields_set}
+    near = not carriers or any(abs(a / b - 1.0) <= CARRIER_BAND for a in carriers for b in bands)
+    if (not wanted or wanted & towers) and near:
+        return
+    heard = ", ".join(f"{t}" for t in sorted(towers)) or "no tower"
+    raise UsageError(
+        f"the flights heard {heard} at {', '.join(f'{b / 1e9:g} GHz' for b in sorted(bands)) or 'no band'}; "
+        f"{where.name} asks for {', '.join(sorted(wanted)) or 'any tower'}"
+        + (f" at {', '.join(f'{c / 1e9:g} GHz' for c in sorted(carriers))}" if carriers else ""),
+        expected="--with a flight that shares a tower and the band",
+    )
+
+
+def _sources(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
+    heard = {o.samples.antenna for o in observed if np.isfinite(o.samples.residual_db).any()}
+    out: dict[str, Source] = {}
+    for data in known:
+        for series in data.rss:
+            source = Source(data=data, series=series)
+            if source.antenna in heard and series.tower not in data.nodes and series.unit != "dB":
+                out.setdefault(source.antenna, source)
+    if not out:
+        raise InputError("no flight has levels of a tower that stands still", expected="RSS logs with positions")
+    return out
+
+
+def _bases(
+    sources: Mapping[str, Source], known: Sequence[FlightData], samples: Sequence[LinkSamples]
+) -> dict[str, Base]:
+    """Models that may carry the prediction; those that learned from these very flights elsewhere are left out."""
+
+    def each(gain: Callable[[Source, LinkSamples], FloatArray]) -> Base:
+        return fixed_base(lambda s: gain(sources[s.antenna], s))
+
+    bases: dict[str, Base] = {
+        "learned": learned_base,
+        "free space": each(lambda _, s: np.zeros(len(s))),
+        "none": each(lambda source, s: -source.free_space_db(s.position_m)),
+    }
+    logs = union(*map(flight_logs, known))
+    learned = [
+        p.trained_on
+        for source in sources.values()
+        for p in learned_patterns(source.series.link.build([source.series.tower], source.data.folder))
+    ]
+    if not common(logs, [*learned, *(data.settings.trained_on for data in known)]):
+        bases["replay"] = each(lambda source, s: source.replayed_db(s))
+    if len({s.flight for s in samples}) < 2:
+        bases = {"free space": bases.pop("free space"), **bases}
+    return bases
+
+
+# --- levels --------------------------------------------------------------------------------------------------------
+
+
+def _levels(
+    targets: Targets,
+    source: Source,
+    correction: Correction,
+    samples: Sequence[LinkSamples],
+    threshold_db: float | None,
+    progress: Progress,
+) -> pd.DataFrame:
+    """Rows of one tower and channel."""
+    n, mine = len(targets), [s for s in samples if s.antenna == source.antenna]
+    sd_db, kurtosis = fading_of(mine, BIN_S)
+    fading = Spread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)
+    level, slow = np.full((2, n), np.nan)
+    good = np.flatnonzero(targets.known)
+    for start in range(0, len(good), AT_ONCE):
+        rows = good[start : start + AT_ONCE]
+        level[rows], slow[rows] = _over_headings(targets, rows, source, correction)
+        progress(f"predict {source.antenna}", (start + len(rows)) / len(good))
+    half = fading.half_width_db(slow, BAND)
+    frame: pd.DataFrame = pd.DataFrame(
+        {
+            "point": np.arange(n),
+            "time_s": targets.time_s,
+            **dict(zip(("east_m", "north_m", "height_m"), targets.position_m.T, strict=True)),
+            "yaw_deg": targets.yaw_deg,
+            "tower": source.series.tower,
+            "channel": source.series.channel,
+            "level_db": level,
+            "sd_db": fading.total_db(slow),
+            "slow_sd_db": slow,
+            "q05_db": level - half,
+            "q95_db": level + half,
+        }
+    )
+    if threshold_db is not None:
+        from scipy.special import ndtr
+
+        frame["p_above"] = ndtr((level - threshold_db) / frame["sd_db"].to_numpy())
+    frame["flag"] = _flags(targets, mine, level)
+    return frame
+
+
+def _over_headings(
+    targets: Targets, rows: Any, source: Source, correction: Correction
+) -> tuple[FloatArray, FloatArray]:
+    """Level and standard deviation of 4 s means (m,); all headings count alike where none is known."""
+    position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
+    free, unknown = source.free_space_db(position), ~np.isfinite(yaw)
+    turns = np.arange(HEADINGS) * (360.0 / HEADINGS) if unknown.any() else np.zeros(1)
+    means, variances = [], []
+    for turn in turns:
+        gain, _, sd = correction.predict(source.samples(position, np.where(unknown, turn, yaw)))
+        means.append(gain)
+        variances.append(sd**2)
+    level = np.mean(means, axis=0)
+    return free + level, np.sqrt(np.mean(variances, axis=0) + np.var(means, axis=0))
+
+
+def _outside(targets: Targets, flown: Sequence[LinkSamples]) -> BoolArray:
+    """Targets (n,) that are further than :data:`HULL_M` or :data:`HULL_UP_M` from every sample."""
+    from scipy.spatial import cKDTree
+
+    scaled = np.array([HULL_M, HULL_M, HULL_UP_M])
+    places = np.concatenate([s.position_m for s in flown])
+    out = np.zeros(len(targets), dtype=np.bool_)
+    out[targets.known] = cKDTree(places / scaled).query(targets.position_m[targets.known] / scaled)[0] > 1.0
+    return out
+
+
+def _flags(targets: Targets, mine: Sequence[LinkSamples], level: FloatArray) -> list[str]:
+    """What a reader must know of each target: empty, or why its level is a guess or missing."""
+    flag = np.where(_outside(targets, mine), "outside_flown", "").astype(object)
+    flag[~targets.known] = "no_position"
+    flag[targets.known & ~np.isfinite(level)] = "out_of_coverage"
+    return list(flag)
+
+
+def _serving(table: pd.DataFrame, n: int, series: int) -> FloatArray:
+    """Probability that each row's tower is the strongest at its target, among the towers of its channel.
+
+    By Gauss-Hermite quadrature over the row's own level; levels of towers are taken as independent.
+    """
+    from scipy.special import ndtr
+
+    nodes, weight = np.polynomial.hermite_e.hermegauss(24)
+    out = np.ones(len(table))
+    groups = [table["channel"].iloc[k * n] for k in range(series)]
+    level, sd = (np.nan_to_num(table[c].to_numpy().reshape(series, n), nan=f)
+                 for c, f in (("level_db", -1e9), ("slow_sd_db", 1.0)))  # fmt: skip
+    for k in range(series):
+        total = np.zeros(n)
+        others = [j for j in range(series) if groups[j] == groups[k] and j != k]
+        for node, w in zip(nodes, weight / weight.sum(), strict=True):
+            at = level[k] + node * sd[k]
+            total += w * np.prod([ndtr((at - level[j]) / sd[j]) for j in others], axis=0)
+        out[k * n : (k + 1) * n] = total
+    return np.where(np.isfinite(table["level_db"]), out, np.nan)
+
+
+# --- ranks ---------------------------------------------------------------------------------------------------------
+
+
+def _ranks(targets: Targets, known: Sequence[FlightData], site: Site) -> list[pd.DataFrame]:
+    """Rows of every tower whose receiver the flights name or the site remembers."""
+    receivers: dict[str, tuple[Any, FlightData]] = {}
+    for data in known:
+        if data.settings.rank.receiver is not None:
+            for tower, one in read_receiver(data.folder / data.settings.rank.receiver).items():
+                receivers.setdefault(tower, (one, data))
+    memory = read_learned(known[0].settings.site.file)
+    for entry in memory.entries.values():
+        for remembered in entry.receivers:
+            path = folder_of(known[0].settings.site.file) / remembered.file
+            for tower, one in read_receiver(path).items():
+                receivers.setdefault(tower, (one, known[0]))
+    out = []
+    rows = np.flatnonzero(targets.known & np.isfinite(targets.yaw_deg))
+    for tower, (receiver, data) in receivers.items():
+        if tower not in site.towers or not len(rows):
+            continue
+        position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
+        link = data.settings.link.rank.build([tower], data.folder)
+        if {len(link.uav_array), len(link.tower_arrays[tower])} != {4}:
+            continue
+        samples = RankSamples(
+            flight="",
+            tower=tower,
+            tower_m=np.asarray(site.towers[tower].position_m),
+            poses=Poses(position, body_rotation(np.zeros(len(yaw)), np.zeros(len(yaw)), yaw)),
+            rank=np.full(len(rows), np.nan),
+            link=link,
+            time_s=targets.time_s[rows],
+        )
+        p, _ = receiver.forecast(samples)
+        frame: pd.DataFrame = pd.DataFrame(
+            {
+                "point": rows,
+                "time_s": targets.time_s[rows],
+                **dict(zip(("east_m", "north_m", "height_m"), position.T, strict=True)),
+                "yaw_deg": yaw,
+                "tower": tower,
+                "channel": "rank",
+                **dict(zip(RANKS, p.T, strict=True)),
+                "flag": "",
+            }
+        )
+        out.append(frame)
+    return out
+
+
+def _columns(table: pd.DataFrame, ranked: bool) -> list[str]:
+    names = [name for name in table.columns if name not in ("flag", "slow_sd_db")]
+    return [*names, "slow_sd_db", *(RANKS if ranked else ()), "flag"]
+
+
+def sentence(prediction: Prediction) -> str:
+    """What error to expect, and whether the residual field is added: the first line of terminal and page."""
+    correction, key = prediction.correction, prediction.key
+    rmse = correction.rmse_db[key]
+    free = correction.rmse_db.get(("free space", OFF), float("nan"))
+    over = "flights" if len(correction.flights) > 1 else "300 m blocks"
+    expect = f"Expect an RMSE of {rmse:.1f} dB over 4 s means ({over} left out; free space {free:.1f} dB)."
+    raw = correction.crps_db[key[0], OFF]
+    with_field = min(v for (base, title), v in correction.crps_db.items() if base == key[0] and title != OFF)
+    field = (
+        f"The residual field is on: it lowers the CRPS from {raw:.2f} to {with_field:.2f} dB on what is left out."
+        if correction.on
+        else f"The residual field is off: it does not lower the CRPS on what is left out "
+        f"({with_field:.2f} against {raw:.2f} dB)."
+    )
+    return f"{expect} Model: {TITLES[correction.base]}. {field}"

@@ -1,0 +1,122 @@
+"""The ``predict`` command as named stages: read, choose, predict, write."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.inputs import input_files
+from ..common.outputs import OutputFolder
+from ..common.stages import Progress, Stages, silent
+from ..common.versions import versions
+from ..flight.settings import load_flight
+from ..report.prediction_html import PredictionPage, prediction_metrics, write_prediction
+from .predict import TITLES, Prediction, predict, sentence
+from .where import Asked
+
+
+@dataclass(frozen=True, slots=True)
+class PredictOutcome:
+    """What ``aerpaw-cmp predict`` made: the folder, its files (the page first), metrics.json as a dict."""
+
+    folder: Path
+    files: tuple[Path, ...]
+    metrics: dict[str, Any]
+
+
+def run_predict(
+    where: Path,
+    flights: Sequence[Path],
+    asked: Asked,
+    *,
+    threshold_db: float | None = None,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+) -> PredictOutcome:
+    """Predict and write ``prediction.csv``, ``.nc``, ``.html``, ``metrics.json`` and figures.
+
+    Parameters
+    ----------
+    where : Path
+        See :func:`.where.find_targets`.
+    flights : sequence of Path
+        Flight files to learn from.
+    asked : Asked
+    threshold_db : float, optional
+    out : Path, optional
+        Output folder, by default ``reports/prediction-NAME``.
+    logs_root : Path, optional
+    force : bool
+    progress : Progress
+
+    Returns
+    -------
+    PredictOutcome
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
+    """
+    inputs = [where] if where.is_file() else []
+    for path in flights:
+        inputs += input_files(load_flight(path), path, logs_root)
+    folder, stages = out or Path("reports") / f"prediction-{where.stem}", Stages(progress)
+    with OutputFolder(folder, job="predict", inputs=inputs, force=force) as output:
+        prediction = predict(where, flights, asked, threshold_db=threshold_db, logs_root=logs_root, stages=stages)
+        record = page_of(prediction, stages.seconds)
+        with output.filling() as place:
+            progress("page")
+            written, said = write_prediction(record, place)
+        for text in said:
+            progress(text)
+    return PredictOutcome(folder, tuple(folder / p.relative_to(place) for p in written), prediction_metrics(record))
+
+
+def page_of(prediction: Prediction, seconds: dict[str, float]) -> PredictionPage:
+    """The record of the page."""
+    correction, targets = prediction.correction, prediction.targets
+    title, field = TITLES[correction.base], correction.title
+    return PredictionPage(
+        name=targets.name,
+        kind=targets.kind,
+        site=prediction.site,
+        table=prediction.table,
+        units={a.replace(".", " ", 1): s.series.unit for a, s in prediction.sources.items()},
+        shape=None if targets.grid is None else targets.grid.shape,
+        heights_m=targets.heights_m,
+        verdict=sentence(prediction),
+        candidates=[
+            {"base": TITLES[base], "field": name, "rmse_db": correction.rmse_db[base, name], "crps_db": crps}
+            for (base, name), crps in sorted(correction.crps_db.items(), key=lambda item: item[1])
+        ],
+        model=asdict(correction.model),
+        chosen={
+            "title": f"{title}, {field}",
+            "base": correction.base,
+            "corrected": correction.on,
+            "field": field,
+            "sd_factor": correction.sd_factor,
+            "rmse_db": correction.rmse_db[prediction.key],
+            "crps_db": correction.crps_db[prediction.key],
+            "left_out": "flights" if len(correction.flights) > 1 else "300 m blocks",
+        },
+        flown={
+            f"{s.flight} {s.antenna}": np.asarray(s.position_m[:: max(1, len(s) // 500), :2].T)
+            for s in prediction.samples
+        },
+        flights=prediction.flights,
+        trained_on=prediction.trained_on,
+        threshold_db=prediction.threshold_db,
+        warnings=prediction.warnings,
+        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        versions=versions(),
+        stages_s=dict(seconds),
+    )

@@ -1,0 +1,249 @@
+"""prediction.html with metrics.json, prediction.csv, prediction.nc and figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from ..common.cells import guarded
+from ..common.cf import dataset, file_attributes, netcdf_bytes
+from ..common.errors import UsageError
+from ..common.jsonable import json_safe
+from ..common.provenance import KEY
+from ..site.site import Site
+from . import canvas
+from .canvas import FigureSpec, Picture
+from .export import write_file
+from .html import by_section, environment, policy
+from .names import safe_name
+
+FLAGS = {
+    "outside_flown": "outside the flown places: the standard deviation is that of the model alone",
+    "out_of_coverage": "no path",
+    "no_position": "no position",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictionPage:
+    """What a page of ``predict`` shows; ``table`` as prediction.csv has it, ``rows`` of candidates and their errors."""
+
+    name: str
+    kind: str
+    site: Site
+    table: pd.DataFrame
+    units: Mapping[str, str]
+    shape: tuple[int, int] | None
+    heights_m: tuple[float, ...]
+    verdict: str
+    candidates: Sequence[Mapping[str, Any]]
+    model: Mapping[str, float]
+    chosen: Mapping[str, Any]
+    flown: Mapping[str, Any]
+    flights: Sequence[str]
+    trained_on: Sequence[str]
+    threshold_db: float | None
+    warnings: Sequence[str]
+    generated: str
+    versions: Mapping[str, str]
+    stages_s: Mapping[str, float]
+
+    @property
+    def series(self) -> list[tuple[str, pd.DataFrame]]:
+        """Rows of each tower and channel that has levels."""
+        levels = self.table[self.table["channel"] != "rank"]
+        return [(f"{t} {c}", part) for (t, c), part in levels.groupby(["tower", "channel"], sort=False)]
+
+
+def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
+    """The numbers of the page under stable names."""
+    series = {
+        name: {
+            "unit": data.units.get(name, ""),
+            "points": len(part),
+            "mean_level_db": part["level_db"].mean(),
+            "mean_sd_db": part["sd_db"].mean(),
+            **{f"share_{flag}": float((part["flag"] == flag).mean()) for flag in FLAGS},
+            **({"mean_p_above": part["p_above"].mean()} if "p_above" in part else {}),
+        }
+        for name, part in data.series
+    }
+    ranks = data.table[data.table["channel"] == "rank"]
+    safe: dict[str, Any] = json_safe(
+        {
+            "prediction": data.name,
+            "kind": data.kind,
+            "generated": data.generated,
+            "versions": dict(sorted(data.versions.items())),
+            "flights": list(data.flights),
+            KEY: list(data.trained_on),
+            "sentence": data.verdict,
+            "threshold_db": data.threshold_db,
+            "chosen": dict(data.chosen),
+            "candidates": list(data.candidates),
+            "field": dict(data.model),
+            "series": series,
+            "ranks": {tower: {k: part[f"p_rank{k}"].mean() for k in "1234"} for tower, part in ranks.groupby("tower")},
+            "warnings": list(data.warnings),
+            "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
+        }
+    )
+    return safe
+
+
+def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], list[str]]:
+    """Write the page and all files beside it; also what could not be written, and why.
+
+    Parameters
+    ----------
+    data : PredictionPage
+    folder : Path
+
+    Returns
+    -------
+    files : list of Path
+        The page first.
+    said : list of str
+    """
+    written = [write_file(folder / "metrics.json", json.dumps(prediction_metrics(data), indent=2) + "\n")]
+    rounded = data.table.round({c: 3 for c in data.table.columns if c.endswith(("_db", "_m", "_deg", "_s"))})
+    rounded = rounded.round({c: 4 for c in data.table.columns if c.startswith("p_")})
+    guarded(rounded).to_csv(folder / "prediction.csv", index=False, lineterminator="\n")
+    written.append(folder / "prediction.csv")
+    said = []
+    try:
+        (folder / "prediction.nc").write_bytes(netcdf_bytes(_dataset(data)))
+        written.append(folder / "prediction.nc")
+    except UsageError as missing:
+        said.append(str(missing))
+    drawn, files = canvas.write_figures(_figures(data), folder / "figures")
+    page = write_file(folder / "prediction.html", _page(data, drawn))
+    return [page, *written, *files], said
+
+
+def _dataset(data: PredictionPage) -> Any:
+    """Points along one dimension, towers and channels along another."""
+    names = [name for name, _ in data.series]
+    first = data.series[0][1]
+    variables: dict[str, Any] = {"series": ("series", np.array(names), {"long_name": "tower and channel"})}
+    for name, unit in (("time_s", "s"), ("east_m", "m"), ("north_m", "m"), ("height_m", "m"), ("yaw_deg", "degree")):
+        variables[name] = ("point", first[name].to_numpy(np.float64), {"units": unit})
+    for name in ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db", "p_above", "p_serving"):
+        if name in first:
+            values = np.stack([part[name].to_numpy(np.float64) for _, part in data.series]).astype(np.float32)
+            variables[name] = (("series", "point"), values, {"units": "dB" if name.endswith("_db") else "1"})
+    variables["level_db"][2]["comment"] = ", ".join(f"{name}: {unit}" for name, unit in data.units.items())
+    about = file_attributes(
+        f"Predicted levels, {data.name}",
+        f"{data.chosen['title']}, learned from {', '.join(data.flights)}",
+        data.generated,
+        str(data.versions.get("aerpaw-cmp", "")),
+        data.verdict,
+    )
+    return dataset(variables, about)
+
+
+# --- figures -------------------------------------------------------------------------------------------------------
+
+
+def _figures(data: PredictionPage) -> list[FigureSpec]:
+    out = []
+    for name, part in data.series:
+        if data.shape is not None:
+            for k, height in enumerate(data.heights_m):
+                count = data.shape[0] * data.shape[1]
+                some = part.iloc[k * count : (k + 1) * count]
+                out.append(_spec(data, f"{name}, {height:g} m", some, partial(_draw_map, data, some)))
+        else:
+            out.append(_spec(data, name, part, partial(_draw_map, data, part)))
+            if data.kind == "route":
+                out.append(_profile(data, name, part))
+    return out
+
+
+def _spec(data: PredictionPage, name: str, part: pd.DataFrame, draw: Any) -> FigureSpec:
+    unit = data.units.get(" ".join(name.split(",")[0].split()), "dB")
+    return FigureSpec(
+        name=f"map_{safe_name(name)}",
+        section="maps",
+        title=name,
+        caption=f"Median level [{unit}] and the standard deviation of one sample [dB]. Grey lines: flights that were "
+        f"learned from. Median SD {part['sd_db'].median():.1f} dB.",
+        alt=f"Map of predicted level and standard deviation, {name}",
+        draw=draw,
+        page=True,
+    )
+
+
+def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
+    fig = canvas.figure((9.2, 5.2))
+    axes = fig.subplots(1, 2, sharex=True, sharey=True)
+    east, north = part["east_m"].to_numpy(), part["north_m"].to_numpy()
+    for ax, column, label, colours in (
+        (axes[0], "level_db", "level", "viridis"),
+        (axes[1], "sd_db", "standard deviation [dB]", "magma"),
+    ):
+        values = part[column].to_numpy()
+        for line in data.flown.values():
+            ax.plot(line[0], line[1], color="0.7", linewidth=0.6, zorder=1)
+        if data.shape is None:
+            shown = ax.scatter(east, north, c=values, s=7, cmap=colours, zorder=2, rasterized=True)
+        else:
+            grid = [v.reshape(data.shape) for v in (east, north, values)]
+            shown = ax.pcolormesh(*grid, cmap=colours, shading="nearest", rasterized=True, zorder=0)
+        fig.colorbar(shown, ax=ax, label=label, pad=0.02, shrink=0.85)
+        for tower in data.site.towers.values():
+            ax.plot(tower.position_m[0], tower.position_m[1], "^", color="black", markersize=5, zorder=3)
+        ax.set_aspect("equal")
+        ax.set_xlabel("east [m]")
+    span = [(np.nanmin(v), np.nanmax(v)) for v in (east, north)]
+    reach = [max(0.05 * (high - low), 30.0) for low, high in span]
+    axes[0].set_xlim(span[0][0] - reach[0], span[0][1] + reach[0])
+    axes[0].set_ylim(span[1][0] - reach[1], span[1][1] + reach[1])
+    axes[0].set_ylabel("north [m]")
+    return fig
+
+
+def _profile(data: PredictionPage, name: str, part: pd.DataFrame) -> FigureSpec:
+    def draw() -> Figure:
+        fig = canvas.figure((9.2, 3.2))
+        ax = fig.subplots()
+        time = part["time_s"].to_numpy()
+        ax.fill_between(time, part["q05_db"], part["q95_db"], color=canvas.SIMULATED, alpha=0.25, linewidth=0,
+                        label="90 % interval of one sample")  # fmt: skip
+        ax.plot(time, part["level_db"], color=canvas.SIMULATED, linewidth=1.2, label="median")
+        if data.threshold_db is not None:
+            ax.axhline(data.threshold_db, color="0.4", linestyle="--", linewidth=1, label="threshold")
+        ax.set_xlabel("time along the route [s]")
+        ax.set_ylabel(f"level [{data.units.get(name, 'dB')}]")
+        canvas.legend_below(ax, 3)
+        return fig
+
+    return FigureSpec(
+        name=f"route_{safe_name(name)}",
+        section="routes",
+        title=f"{name} along the route",
+        caption="The interval holds one sample in nine of ten cases: model, field, flight, noise and fading.",
+        alt=f"Predicted level of {name} over time with its 90 % interval",
+        draw=draw,
+        page=True,
+    )
+
+
+def _page(data: PredictionPage, pictures: Sequence[Picture]) -> str:
+    text: str = environment().get_template("prediction.html.jinja").render(
+        data=data,
+        metrics=prediction_metrics(data),
+        flags=FLAGS,
+        sections=by_section(pictures),
+        content_policy=policy(),
+    )  # fmt: skip
+    return text

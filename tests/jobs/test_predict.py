@@ -1,0 +1,128 @@
+"""``predict``: what is said where, on the sample flight whose levels and offsets are planted."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.jobs import predict as job
+from aerpaw_cmp.jobs.predict_run import page_of
+from aerpaw_cmp.jobs.where import Asked, find_targets
+from aerpaw_cmp.report.prediction_html import write_prediction
+from aerpaw_cmp.site.siteyaml import load_site
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
+POINTS = """east_m,north_m,height_m,yaw_deg
+-300,150,45,20
+-300,150,,20
+-210,330,50,
+5000,5000,40,0
+"""
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """The sample flight with the logs of two towers, and a renamed copy of it."""
+    folder = tmp_path_factory.mktemp("flight")
+    for name in ("LW1", "LW2", "UAV"):
+        shutil.copytree(SAMPLE.parent / name, folder / name)
+    wanted = [line for line in SAMPLE.read_text().splitlines() if not re.search("path: LW[345]/", line)]
+    text = "\n".join(wanted)
+    (folder / "a.yaml").write_text(text)
+    (folder / "b.yaml").write_text(text.replace("name: sample", "name: copy"))
+    (folder / "points.csv").write_text(POINTS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def prediction(small):
+    return job.predict(small / "points.csv", [small / "a.yaml", small / "b.yaml"], threshold_db=-60.0)
+
+
+def rows(prediction, point):
+    table = prediction.table
+    return table[(table["point"] == point) & (table["channel"] != "rank")]
+
+
+def test_a_copy_of_a_flight_counts_once(prediction):
+    assert prediction.flights == ("sample",)
+    assert any("counted once" in text for text in prediction.warnings)
+
+
+def test_points_without_a_position_and_outside_are_flagged(prediction):
+    assert set(rows(prediction, 1)["flag"]) == {"no_position"}
+    assert rows(prediction, 1)["level_db"].isna().all()
+    assert set(rows(prediction, 3)["flag"]) == {"outside_flown"}
+    assert set(rows(prediction, 0)["flag"]) == {""}
+    near, far = (rows(prediction, k)["sd_db"].to_numpy() for k in (0, 3))
+    assert (far > near).all()
+
+
+def test_columns_are_those_of_the_contract(prediction):
+    contract = ["time_s", "east_m", "north_m", "height_m", "tower", "channel", "level_db", "sd_db", "q05_db", "q95_db"]
+    assert set(contract) <= set(prediction.table.columns)
+    levels = prediction.table[prediction.table["level_db"].notna()]
+    assert ((levels["q05_db"] < levels["level_db"]) & (levels["level_db"] < levels["q95_db"])).all()
+    by_point = levels.groupby(["point", "channel"])["p_serving"].sum()
+    np.testing.assert_allclose(by_point, 1.0, atol=2e-3)
+
+
+def test_p_above_is_the_normal_probability(prediction):
+    from scipy.stats import norm
+
+    levels = prediction.table[prediction.table["level_db"].notna()]
+    np.testing.assert_allclose(levels["p_above"], norm.sf((-60.0 - levels["level_db"]) / levels["sd_db"]), atol=1e-9)
+
+
+def test_no_flight_that_shares_a_tower_is_one_message(small):
+    other = small / "other.yaml"
+    text = (small / "a.yaml").read_text().replace("node: LW1", "node: LW4").replace("node: LW2", "node: LW5")
+    other.write_text(text)
+    with pytest.raises(UsageError, match="asks for LW4, LW5"):
+        job.predict(other, [small / "a.yaml"])
+    with pytest.raises(UsageError, match="no flight to learn from"):
+        job.predict(small / "points.csv", [])
+
+
+def test_a_file_without_positions_is_refused(tmp_path):
+    (tmp_path / "p.csv").write_text("east_m,north_m,height_m\n,,\n")
+    with pytest.raises(InputError, match="no point has a position"):
+        find_targets(tmp_path / "p.csv", load_site("lake_wheeler"), Asked())
+
+
+def test_files_agree_with_each_other(tmp_path, prediction):
+    files, _ = write_prediction(page_of(prediction, {}), tmp_path)
+    table = pd.read_csv(tmp_path / "prediction.csv")
+    levels = table[table["channel"] != "rank"]
+    np.testing.assert_allclose(levels["level_db"], prediction.table["level_db"][: len(levels)], atol=1e-3)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["trained_on"] == list(prediction.trained_on)
+    assert metrics["sentence"].startswith("Expect an RMSE of")
+    assert metrics["sentence"] in files[0].read_text()
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("netCDF4")
+    with xarray.open_dataset(tmp_path / "prediction.nc") as book:
+        np.testing.assert_allclose(book["level_db"].to_numpy().ravel(), levels["level_db"], atol=1e-3)
+
+
+def test_a_grid_has_its_heights_one_after_the_other():
+    site = load_site("lake_wheeler")
+    targets = find_targets(Path("lake_wheeler"), site, Asked(heights_m=(30.0, 50.0), spacing_m=300.0))
+    half = len(targets) // 2
+    assert half == len(targets.grid)
+    assert set(targets.position_m[:half, 2]) == {30.0}
+    assert np.isnan(targets.yaw_deg).all()
+
+
+def test_a_planned_flight_faces_its_course():
+    targets = find_targets(SAMPLE, load_site("lake_wheeler"), Asked())
+    east = targets.position_m[:, 0]
+    leg = (targets.time_s > 30) & (targets.time_s < 40)
+    step = np.diff(targets.position_m[leg][:, :2], axis=0)[0]
+    assert targets.yaw_deg[leg][0] == pytest.approx(np.degrees(np.arctan2(step[0], step[1])) % 360.0, abs=1e-6)
+    assert east.min() < -375

@@ -37,7 +37,6 @@ site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(site_app, name="site", help=COMMANDS["site"])
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else there.")]
-Out = Annotated[Optional[Path], typer.Option("-o", "--out", help="Output folder.")]  # noqa: UP045  typer on 3.10
 Force = Annotated[bool, typer.Option("--force", help="Replace files that this tool did not write; never an input.")]
 Export = Annotated[
     Optional[list[str]],  # noqa: UP045

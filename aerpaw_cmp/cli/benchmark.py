@@ -8,7 +8,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from ..common.errors import UsageError
-from .app import Force, Json, Out, command
+from .app import Force, Json, command
 from .shown import number, print_json, say, table
 
 ACTIONS = ("run", "score", "template", "fetch", "tasks")
@@ -32,7 +32,15 @@ def benchmark(
         ),
     ] = None,
     data: Annotated[Path, typer.Option(help="Folder of the published logs, whatever the files are called.")] = Path(),
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="DIR",
+            help="Output folder; of template a CSV  [default: reports/benchmark, predictions.csv; of fetch --data]",
+        ),
+    ] = None,
     task: Annotated[Optional[list[str]], typer.Option(help="Only this task; repeatable.")] = None,  # noqa: UP045
     entrant: Annotated[Optional[list[str]], typer.Option(help="Only this model of ours; repeatable.")] = None,  # noqa: UP045
     leaderboard: Annotated[
@@ -41,7 +49,7 @@ def benchmark(
     ] = None,
     manifest: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Another manifest [default: the packaged one]."),
+        typer.Option(help="Another manifest [default: the packaged one]"),
     ] = None,
     accept_levels: Annotated[
         bool, typer.Option("--accept-levels", help="Score levels whose sign or unit looks wrong.")

@@ -9,7 +9,7 @@ import typer
 
 from ..common.errors import UsageError
 from ..common.stages import duration
-from .app import Export, Force, Json, LogsRoot, Out, Scheduler, Workers, command
+from .app import Export, Force, Json, LogsRoot, Scheduler, Workers, command
 from .shown import number, print_json, say, table
 
 
@@ -18,7 +18,7 @@ from .shown import number, print_json, say, table
     examples=[
         "aerpaw-cmp campaign campaign.yaml --workers 4",
         "aerpaw-cmp campaign campaign.yaml -o reports/spring --keep outcomes --strict",
-        "aerpaw-cmp campaign campaign.yaml --scheduler tcp://scheduler:8786 --keep s3://lab/season",
+        "aerpaw-cmp campaign campaign.yaml --scheduler tls://scheduler:8786 --keep s3://lab/season",
         "aerpaw-cmp campaign status campaign.yaml",
     ],
 )
@@ -30,7 +30,10 @@ def campaign(
             help="campaign.yaml; with 'status', what is kept and what is to do; with 'resume', that and then the rest.",
         ),
     ],
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/<campaign>]"),
+    ] = None,
     logs_root: LogsRoot = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,

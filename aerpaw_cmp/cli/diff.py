@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Optional
 
 import typer
 
 from ..common.errors import one_line
-from .app import Force, Json, Out, command
+from .app import Force, Json, command
 from .shown import number, print_json, say, table
 
 
@@ -23,7 +23,12 @@ from .shown import number, print_json, say, table
 def diff(
     first: Annotated[Path, typer.Argument(help="Folder of a report, or its metrics.json.")],
     second: Annotated[Path, typer.Argument(help="The other report of the same flight.")],
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "-o", "--out", metavar="DIR", help="Folder for diff.html and diff.json  [default: none is written]"
+        ),
+    ] = None,
     tolerance: Annotated[float, typer.Option(help="Differences up to so many dB count as none.")] = 0.01,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when numbers differ by more.")] = False,
     force: Force = False,

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Optional
 import typer
 
 from ..common.errors import one_line
-from .app import DryRun, Export, Force, Json, LogsRoot, Out, Scheduler, Workers, command
+from .app import DryRun, Export, Force, Json, LogsRoot, Scheduler, Workers, command
 from .shown import number, print_files, print_json, print_plan, say, table
 
 
@@ -27,7 +27,10 @@ from .shown import number, print_files, print_json, print_plan, say, table
 )
 def report(
     flight: Annotated[Path, typer.Argument(help="flight.yaml")],
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/<flight>]"),
+    ] = None,
     logs_root: LogsRoot = None,
     engine: Annotated[
         Optional[Literal["image", "sionna"]],  # noqa: UP045
@@ -118,7 +121,12 @@ def _verdict(outcome: Any, strict: bool) -> int:
 )
 def audit(
     target: Annotated[Path, typer.Argument(metavar="REPORT_OR_FLIGHT", help="A report's folder, or its flight.yaml.")],
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "-o", "--out", metavar="DIR", help="Folder of the report  [default: the named report, or reports/<flight>]"
+        ),
+    ] = None,
     logs_root: LogsRoot = None,
     links: Annotated[Optional[str], typer.Option(help="Number of audited links, or 'full'.")] = None,  # noqa: UP045
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
@@ -221,7 +229,15 @@ def _print_report_summary(outcome: Any) -> None:
 )
 def calibrate(
     calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="FILE",
+            help="File for the learned settings  [default: <calibration>.calibrated.yaml]",
+        ),
+    ] = None,
     logs_root: LogsRoot = None,
     into_site: Annotated[
         Optional[str],  # noqa: UP045
@@ -291,7 +307,10 @@ def calibrate(
 )
 def simulate(
     flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: the folder of flight.yaml]"),
+    ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -309,9 +328,9 @@ def simulate(
     ],
 )
 def sample(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder that gets flight.yaml and the logs.")] = Path(
-        "sample"
-    ),
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="DIR", help="Folder that gets flight.yaml and the logs.")
+    ] = Path("sample"),
     force: Force = False,
     as_json: Json = False,
 ) -> None:

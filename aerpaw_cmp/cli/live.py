@@ -47,7 +47,10 @@ def tap(
         typer.Argument(help="Serial port, or several; without it the first AT port of a Quectel."),
     ] = None,
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder of the log segments; of several ports, a folder in it for each.")
+        Path,
+        typer.Option(
+            "-o", "--out", metavar="DIR", help="Folder of the log segments; of several ports, a folder in it for each."
+        ),
     ] = Path("tap"),
     status: Annotated[bool, typer.Option("--status/--no-status", help="A status line on standard error.")] = True,
     enable_csi: Annotated[

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Optional
 
 import typer
 
-from .app import Force, Json, Out, command
+from .app import Force, Json, command
 from .shown import print_json, say, table
 
 
@@ -21,7 +21,12 @@ from .shown import print_json, say, table
 )
 def ingest(
     paths: Annotated[list[Path], typer.Argument(help="Log files and folders.")],
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            "-o", "--out", metavar="FILE", help="Flight file (HDF5) with every record  [default: none is written]"
+        ),
+    ] = None,
     draft: Annotated[Optional[Path], typer.Option(help="Also write a first flight.yaml that names these logs.")] = None,  # noqa: UP045
     site: Annotated[
         Optional[str],  # noqa: UP045

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from .app import Force, Json, LogsRoot, Out, command
+from .app import Force, Json, LogsRoot, command
 from .shown import number, print_json, say, table
 
 
@@ -32,7 +32,10 @@ def predict(
         Optional[list[Path]],  # noqa: UP045
         typer.Option("--with", metavar="FLIGHT", help="flight.yaml to learn from; repeatable."),
     ] = None,
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/predict-<WHERE>]"),
+    ] = None,
     height: Annotated[
         Optional[list[float]],  # noqa: UP045
         typer.Option(help="Height of a grid [m], repeatable; of route points without one [default: 40]."),

@@ -83,9 +83,13 @@ say = ProgressLines()
 """What all commands of this process say on standard error."""
 
 
+SCHEMA = 1
+"""Version of what ``--json`` prints (docs/reference/json.md): it rises when a key is renamed or removed."""
+
+
 def print_json(value: dict[str, Any]) -> None:
-    """One object on standard output."""
-    print(json.dumps(value, indent=1, allow_nan=False), flush=True)
+    """One object on standard output, which begins with the version of its schema."""
+    print(json.dumps({"schema": SCHEMA, **value}, indent=1, allow_nan=False), flush=True)
 
 
 def print_plan(plan: Any, as_json: bool = False) -> None:

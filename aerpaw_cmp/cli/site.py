@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Optional
 
 import typer
 
-from .app import DryRun, Force, Json, LogsRoot, Out, Scheduler, Workers, command, site_app
+from .app import DryRun, Force, Json, LogsRoot, Scheduler, Workers, command, site_app
 from .shown import print_files, print_json, print_plan, say, table
 
 
@@ -23,7 +23,7 @@ from .shown import print_files, print_json, print_plan, say, table
 )
 def site_import(
     files: Annotated[list[Path], typer.Argument(help="Map files, or one Mitsuba XML.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The site.yaml to write.")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The site.yaml to write.")],
     base: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(help="Site whose towers and settings are kept. Default: lake_wheeler; none for a scene."),
@@ -79,11 +79,11 @@ def site_import(
     "export",
     of=site_app,
     text="A site as Mitsuba XML with PLY meshes, which sionna.rt.load_scene opens.",
-    examples=["aerpaw-cmp site export lake_wheeler --sionna scene", "aerpaw-cmp site export site.yaml --sionna out"],
+    examples=["aerpaw-cmp site export lake_wheeler -o scene", "aerpaw-cmp site export site.yaml -o out"],
 )
 def site_export(
     site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")],
-    sionna: Annotated[Path, typer.Option("--sionna", help="Folder to write.")],
+    out: Annotated[Path, typer.Option("-o", "--out", "--sionna", metavar="DIR", help="Output folder.")],
     trees: Annotated[bool, typer.Option("--trees/--no-trees", help="Crowns and trunks, too.")] = True,
     force: Force = False,
     as_json: Json = False,
@@ -91,7 +91,7 @@ def site_export(
     """Write a site for Sionna."""
     from ..jobs.site_scene import run_site_export
 
-    files = run_site_export(site, sionna, trees=trees, force=force)
+    files = run_site_export(site, out, trees=trees, force=force)
     print_files(files if as_json else files[:1], as_json)
 
 
@@ -107,7 +107,10 @@ def site_export(
 )
 def site_show(
     site: Annotated[Optional[str], typer.Argument(help="site.yaml or packaged site; else the flight's.")] = None,  # noqa: UP045
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/site-<site>]"),
+    ] = None,
     flight: Annotated[Optional[Path], typer.Option(help="Draw the track of this flight.yaml.")] = None,  # noqa: UP045
     logs_root: LogsRoot = None,
     pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045
@@ -138,7 +141,10 @@ def site_show(
 )
 def map_(
     site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
-    out: Out = None,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/map-<site>]"),
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A coarse map in seconds: 120 m, three heights.")] = False,
     foliage: Annotated[
         Optional[list[str]],  # noqa: UP045

@@ -90,8 +90,10 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
 
     Raises
     ------
+    InputError
+        There is no such file, or it cannot be read.
     UsageError
-        With path and line: no such file, not text, not YAML, duplicate or unknown key (the nearest valid key
+        With path and line: not text, not YAML, duplicate or unknown key (the nearest valid key
         is named), wrong or missing values (all of them at once).
     """
     return parse_yaml(_read_text(Path(path)), model, path)
@@ -160,9 +162,9 @@ def _read_text(path: Path) -> str:
     except InputError as error:
         raise UsageError(error.found, expected=error.expected, path=path) from None
     except FileNotFoundError:
-        raise UsageError("no such file", path=path) from None
+        raise InputError("no such file", cause="a misspelt path", path=path) from None
     except OSError as error:
-        raise UsageError(f"cannot be read ({error.strerror})", path=path) from None
+        raise InputError(f"cannot be read ({error.strerror})", path=path) from None
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

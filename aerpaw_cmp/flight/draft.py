@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ..common.errors import UsageError, one_line
+from ..common.errors import InputError, UsageError, one_line
 from ..common.yamlfile import parse_yaml
 from ..logs.ingest import IngestedFile, read_log
 from ..logs.records import Stream, has_wall_clock
@@ -232,7 +232,7 @@ def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
     series = [(tower, channel, reader) for tower, channel, reader in entries.series]
     try:
         known = read_learned(_place_of(site, folder))
-    except UsageError as error:
+    except (InputError, UsageError) as error:
         entries.out.append(f"what site {site} remembers: {error.found}")
         known = Learned()
     return propose(known, str(Path(site).with_suffix("")), series)

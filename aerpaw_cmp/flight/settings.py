@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from ..common.errors import UsageError
+from ..common.errors import InputError, UsageError
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, noise_floor_dbm, wavelength_m
 from ..common.yamlfile import load_yaml
 from ..logs.readers import ReadOptions
@@ -646,7 +646,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
         try:
             named = find_named(name, folder)
             channels |= _with_antenna(settings, channels, key, named)
-        except UsageError as error:
+        except (InputError, UsageError) as error:
             notes.append(f"antennas.{key}: {error.found}; isotropic in its place")
     if channels != settings.link.channels:
         content["link"] = settings.link.model_copy(update={"channels": channels})
@@ -657,7 +657,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
             if named.entry.receivers:
                 file = str(named.folder / named.entry.receivers[0].file)
                 content["rank"] = settings.rank.model_copy(update={"receiver": file})
-        except UsageError:
+        except (InputError, UsageError):
             pass  # a file of another place: reading it says what is wrong
     if notes:
         content["flight"] = settings.flight.model_copy(update={"notes": [*settings.flight.notes, *notes]})

@@ -399,6 +399,8 @@ def read_entry(path: Path) -> Entry:
         text = read_bounded(path, LARGEST_ENTRY, "a table of predictions").decode()
     except UnicodeDecodeError:
         raise InputError("not a text file", expected="a CSV of predictions in UTF-8", path=path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", expected="a CSV of predictions", path=path) from None
     lines = text.splitlines()
     count = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     head = {k.strip(): v.strip() for k, _, v in (line[1:].partition(":") for line in lines[:count])}

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ..common.errors import AerpawCmpError, UsageError
+from ..common.errors import AerpawCmpError, InputError, UsageError
 from ..common.stages import Progress, silent
 from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
@@ -300,7 +300,7 @@ def _flight_files(
         path = folder / entry
         try:
             flight = load_flight(path)
-        except UsageError as error:
+        except (InputError, UsageError) as error:
             failures.append(Failure(flight=Path(entry).stem, setting="every setting", message=str(error)))
             continue
         name = flight.flight.name

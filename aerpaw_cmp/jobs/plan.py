@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import UsageError
+from ..common.errors import InputError
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
 from ..flight.data import FlightData
@@ -308,7 +308,7 @@ def map_plan(
     from .coverage_map import make_maps
 
     if flight is not None and not flight.is_file():
-        raise UsageError("there is no such file", path=flight)
+        raise InputError("no such file", cause="a misspelt path", path=flight)
     OutputFolder(out, job="map", inputs=inputs, force=force).refuse()
     place = load_site(site)
     positions = len(Grid.over_area(place.area_m, settings.spacing_m))

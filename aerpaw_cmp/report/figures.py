@@ -144,9 +144,6 @@ SPREAD_PARTS = {
 }
 
 
-_HATCHED = "Hatched spans marked Z have no path in the simulation and are not scored. "
-
-
 def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
     stem = f"{safe_name(panel.tower)}_{safe_name(panel.channel)}"
     section = f"rss/{panel.tower}/{panel.channel}"
@@ -158,7 +155,11 @@ def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
             title=f"{panel.name}: RSS over time",
             caption="Top: the measurement after its offset, the ray tracing, and the baselines, each baseline moved to "
             "its own best fit. "
-            + _HATCHED * bool(panel.simulated_out_of_coverage.any())
+            + (
+                "Hatched spans marked Z have no path in the simulation and are not scored. "
+                if panel.simulated_out_of_coverage.any()
+                else ""
+            )
             + "Bottom: residual; dashed lines are plus and minus one RMSE."
             + _band_words(panel)
             + (

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field
 
-from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.yamlfile import StrictModel, load_yaml, parse_yaml
 
 
@@ -97,7 +97,7 @@ def test_anchors_and_merge_keys_work() -> None:
 
 
 def test_files(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no such file"):
+    with pytest.raises(InputError, match="no such file"):
         load_yaml(tmp_path / "absent.yaml", Settings)
     with pytest.raises(UsageError, match="folder"):
         load_yaml(tmp_path, Settings)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pyproj import Geod
 
-from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.site.heights import Height, HeightReference, VerticalDatum
 from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, SceneModel, SiteModel, build_site, load_site
@@ -153,7 +153,7 @@ def test_antenna_inside_a_building_is_noted(tmp_path: Path) -> None:
 def test_no_such_site(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no site 'lake_weeler'.*did you mean 'lake_wheeler'"):
         load_site("lake_weeler")
-    with pytest.raises(UsageError, match="no such file"):
+    with pytest.raises(InputError, match="no such file"):
         load_site(tmp_path / "absent.yaml")
 
 

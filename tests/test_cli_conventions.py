@@ -1,0 +1,96 @@
+"""One convention for all commands: ``-o`` says what it takes and its default, a missing input is exit code 3."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.cli.app import app
+from aerpaw_cmp.common.commands import COMMANDS
+
+PROGRAM: Any = typer.main.get_command(app)
+VERBS = {name: command for name, command in PROGRAM.commands.items() if not hasattr(command, "commands")}
+VERBS |= {f"site {name}": command for name, command in PROGRAM.commands["site"].commands.items()}
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_the_output_option_says_what_it_takes_and_its_default(name: str) -> None:
+    for option in VERBS[name].params:
+        if "-o" in option.opts:
+            assert "--out" in option.opts
+            assert option.metavar in ("DIR", "FILE")
+            assert option.required or option.default is not None or "[default: " in option.help
+
+
+WITHOUT_INPUT = {"bench", "doctor", "formats", "sample", "site", "tap", "modem-sim"}
+MISSING = [
+    "ingest nope",
+    "report nope.yaml",
+    "report nope.yaml --dry-run",
+    "audit nope.yaml",
+    "calibrate nope.yaml",
+    "campaign nope.yaml",
+    "benchmark --data nope",
+    "benchmark score nope.csv",
+    "explain nope.yaml --time 1 --tower LW1",
+    "diff nope other",
+    "tap --play nope",
+    "tap nope --flight nope.yaml",
+    "map nope.yaml",
+    "map lake_wheeler --flight nope.yaml --dry-run",
+    "predict nope.kml --with nope.yaml",
+    "simulate nope.yaml",
+    "site show nope.yaml",
+    "site export nope.yaml -o scene",
+    "site import nope.osm -o site.yaml",
+]
+
+
+def test_every_command_that_reads_is_tried() -> None:
+    assert {line.split()[0] for line in MISSING} >= set(COMMANDS) - WITHOUT_INPUT
+
+
+@pytest.mark.parametrize("line", MISSING)
+def test_a_missing_input_is_exit_code_3(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(line.split()) == 3
+    said = capsys.readouterr().err
+    assert re.search(r"nope", said)
+    assert "Traceback" not in said
+    assert list(tmp_path.iterdir()) == []
+
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "reference" / "json.md").read_text()
+QUICK = {
+    "doctor": "doctor",
+    "formats": "formats",
+    "sample": "sample -o sample",
+    "ingest": f"ingest {ROOT}/sample_logs/UAV --timezone America/New_York",
+    "report --dry-run": f"report {ROOT}/sample_logs/flight.yaml --dry-run",
+    "site export": "site export lake_wheeler -o scene",
+}
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_the_page_lists_what_json_prints(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    main([*QUICK[name].split(), "--json"])
+    printed = json.loads(capsys.readouterr().out)
+    (row,) = re.findall(rf"^\| `{name}` \| (.*?) \|", PAGE, re.MULTILINE)
+    assert ["schema", *re.findall(r"`(\w+)", row)] == list(printed)
+    assert f"`schema` is {printed['schema']}" in PAGE
+
+
+def test_the_page_has_every_command() -> None:
+    assert set(re.findall(r"^\| `([\w -]+)`", PAGE, re.MULTILINE)) >= set(VERBS)

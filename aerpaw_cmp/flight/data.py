@@ -350,6 +350,11 @@ def gather(
                 f"{log.path}: nothing is skipped by {', '.join(unknown)}: its streams are {', '.join(names)}"
             )
         warnings += _of_ratios(settings.link, log, file.result.streams)
+    if rank and settings.link.rank.noise_floor_dbm is None and settings.link.rank.bandwidth_hz is None:
+        warnings.append(
+            "link.rank: no bandwidth_hz and no noise_floor_dbm: ranks count as in coverage down to the thermal noise "
+            "of 1 Hz (-174 dBm)"
+        )
     if idle := set(settings.link.channels) - {series.channel for _, series in rss}:
         warnings.append(f"link.channels names {', '.join(sorted(idle))}: no log is of such a channel")
     if len(telemetry) > 1:

@@ -41,7 +41,10 @@ LINK = (
     " bandwidth_hz: 20e6}  # out of coverage below the noise of this bandwidth; all as in your experiment?\n"
 )
 NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
-RANK = "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz unless link.rank names others: is that your modem?\n"
+RANK = (
+    "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz, above the noise of 20 MHz, unless link.rank names"
+    " others: is that your modem?\n"
+)
 
 SITE = "lake_wheeler"
 

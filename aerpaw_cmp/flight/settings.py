@@ -205,6 +205,7 @@ def _rank_link() -> LinkSettings:
     return LinkSettings(
         carrier_hz=3.4e9,
         uav_transmits=False,
+        bandwidth_hz=20e6,  # rank is reported above the noise of a modem's channel, not of 1 Hz
         tower=ArraySettings(layout="tower_comparison", slant_deg=[45.0, -45.0, 45.0, -45.0], yaw_deg=45.0),
         uav=ArraySettings(layout="uav_comparison", slant_deg=[45.0, -45.0, -45.0, 45.0], yaw_deg=315.0, roll_deg=90.0),
     )

@@ -687,6 +687,8 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
         *_crown_note(outcome),
         *([note] if "attenuating" in modes and (note := p833_note(s.carrier_hz)) else []),
         "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element.",
+        "No receiver bandwidth is assumed: a link is in coverage where a path arrives above the thermal noise of 1 Hz "
+        "(-174 dBm)" + (f", in maps of RSS above {s.threshold_dbm:g} dBm." if np.isfinite(s.threshold_dbm) else "."),
         f"Spread, condition number, correlation and interpolation are those of foliage {s.shown}.",
     )
 

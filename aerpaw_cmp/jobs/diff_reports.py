@@ -15,6 +15,7 @@ from ..common.cells import unguarded
 from ..common.errors import InputError, UsageError, one_line
 from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.outputs import OutputFolder, changed_files
+from ..common.provenance import KEY
 from ..common.units import FloatArray
 from ..compare.report_difference import (
     LevelDifference,
@@ -231,7 +232,7 @@ def _against_metrics(metrics: Mapping[str, Any], rss: Any, folder: Path) -> list
     for tower, channels in metrics["rss"].items():
         for channel, numbers in channels.items():
             n = int(scored.get((tower, channel), 0))
-            if n != numbers.get("n"):
+            if n != numbers.get("n") and not numbers.get(KEY):
                 wrong.append(f"{tower} {channel} ({n} against {numbers.get('n')})")
     if not wrong:
         return []
@@ -275,8 +276,16 @@ def compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float =
         links_first_only=tuple(alone[0]),
         links_second_only=tuple(alone[1]),
         tolerance_db=tolerance_db,
-        remarks=(*first.remarks, *second.remarks),
+        remarks=(*first.remarks, *second.remarks, *_learned_here(first, second)),
     )
+
+
+def _learned_here(first: ReadReport, second: ReadReport) -> Iterator[str]:
+    """Links whose model was learned from this very log in one of the reports."""
+    for side in (first, second):
+        for tower, channels in side.metrics["rss"].items():
+            if names := [f"{tower} {channel}".strip() for channel, one in channels.items() if one.get(KEY)]:
+                yield f"{side.place}: {', '.join(names)}: learned from this flight's own log; no error is compared."
 
 
 def _side(side: ReadReport) -> ReportSide:
@@ -423,8 +432,8 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[LevelDifference]
     for tower, channels in mine.metrics["rss"].items():
         for channel, numbers in channels.items():
             other = theirs.metrics["rss"].get(tower, {}).get(channel)
-            if other is None:
-                continue
+            if other is None or numbers.get(KEY) or other.get(KEY):
+                continue  # no error of a model is compared on a log that it was learned from
             tables = [s.rss[(s.rss["tower"] == tower) & (s.rss["channel"] == channel)] for s in (mine, theirs)]
             overlap, a, b = _matched(*tables)
             first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))

@@ -15,7 +15,9 @@ import multiprocessing
 import os
 import pickle
 import platform
+import shutil
 import signal
+import tempfile
 import threading
 import time
 import uuid
@@ -385,7 +387,47 @@ def open_workers(
     elif workers <= 1:
         yield Here()
     else:
+        remove_left_folders(Path(tempfile.gettempdir()))
         yield Processes(workers)
+
+
+def remove_left_folders(root: Path) -> list[Path]:
+    """Remove folders that local clusters of 0.3 left where they were killed.
+
+    Parameters
+    ----------
+    root : Path
+        The folder of temporary files.
+
+    Returns
+    -------
+    list of Path
+        The removed ones: of this user, no links, and no process works in them or has a file of them open. None where
+        the system does not tell (no ``/proc``).
+    """
+    if not Path("/proc/self/fd").is_dir() or not hasattr(os, "getuid"):
+        return []
+    mine = [
+        folder
+        for folder in root.glob("aerpaw-cmp-dask-*")
+        if folder.is_dir() and not folder.is_symlink() and folder.stat().st_uid == os.getuid()
+    ]
+    used = _places_in_use() if mine else set()
+    left = [folder for folder in mine if not any(place.is_relative_to(folder.resolve()) for place in used)]
+    for folder in left:
+        shutil.rmtree(folder, ignore_errors=True)
+    return left
+
+
+def _places_in_use() -> set[Path]:
+    """Working folders and open files of the processes that this user may look at."""
+    places = set()
+    for process in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            for link in (process / "cwd", *(process / "fd").iterdir()):
+                with contextlib.suppress(OSError):
+                    places.add(link.readlink())
+    return places
 
 
 def _quiet() -> None:

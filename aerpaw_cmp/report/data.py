@@ -18,6 +18,7 @@ from ..common.provenance import KEY
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.ladder import LadderRow
 from ..compare.result import AuditResult, EngineResult
+from ..compare.rss import LEARNED_HERE
 from ..compare.serving import ServingComparison
 from ..compare.statistics import PairedDifference
 from ..logs.records import RejectedLine
@@ -290,7 +291,9 @@ class RssPanel:
 
     @property
     def residual_db(self) -> FloatArray:
-        """Calibrated measurement minus simulation (n,); NaN where a side is missing."""
+        """Calibrated measurement minus simulation (n,); NaN where a side is missing, or was learned on this flight."""
+        if LEARNED_HERE in self.fitted:
+            return np.full(len(self.time), np.nan)
         return self.calibrated_db - self.simulated_dbm
 
 

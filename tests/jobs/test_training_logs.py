@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -22,6 +23,7 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.training import counted_once, flight_logs
 from aerpaw_cmp.jobs.calibrate import calibrate
 from aerpaw_cmp.jobs.calibrate_rank import FittedReceiver, RankSamples
+from aerpaw_cmp.jobs.diff_reports import run_diff
 from tests.jobs.test_calibrate import YAW_DEG, settings, write
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -111,6 +113,23 @@ def test_a_copy_of_a_training_log_is_not_scored(folder: Path, copy: Callable[[Pa
     rungs = [row for row in metrics["ladder"] if "learned" in row["model"]]
     assert len(rungs) >= 2
     assert all(row["rmse_heldout_db"] is None and not row["recommended"] for row in rungs)
+
+
+def test_no_residual_and_no_difference_of_a_training_flight(folder: Path) -> None:
+    """rss.csv lists no residual of the learned model, and two such reports are not compared by their errors."""
+    learned = yaml.safe_load((folder / "calibrated.yaml").read_text())
+    places = []
+    for depth in (0, 1):
+        flight = copy_of(folder, renamed, link=learned["link"], rt={"max_depth": depth})
+        places.append(folder / f"diff{depth}")
+        assert main(["report", str(flight), "-o", str(places[-1]), "--audit", "none", "--figures", "none"]) == 0
+        table = pd.read_csv(places[-1] / "rss.csv", comment="#")
+        assert len(table) > 100
+        assert table["residual_db"].isna().all()
+    difference = run_diff(*places)
+    assert difference.levels == ()
+    assert difference.pooled is None
+    assert sum("learned from this flight's own log" in text for text in difference.remarks) == 2
 
 
 def test_an_unseen_flight_is_scored_with_the_same_antennas(folder: Path) -> None:

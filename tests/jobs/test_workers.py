@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from aerpaw_cmp.jobs import workers
-from aerpaw_cmp.jobs.workers import Lost, open_workers
+from aerpaw_cmp.jobs.workers import Lost, open_workers, remove_left_folders
 
 
 def dies(item: tuple[int, str]) -> int:
@@ -212,3 +212,22 @@ def test_a_scheduler_without_workers_is_spoken_of(monkeypatch: pytest.MonkeyPatc
     assert found == {0: 2, 1: 3}
     assert len(told) == 2
     assert "no worker is with the scheduler at tcp://there" in told[0]
+
+
+def test_left_folders_of_killed_clusters_go_and_those_in_use_stay(tmp_path: Path) -> None:
+    names = ("aerpaw-cmp-dask-left", "aerpaw-cmp-dask-open", "aerpaw-cmp-dask-cwd", "somebody-else")
+    for name in names:
+        (tmp_path / name / "dask-scratch-space").mkdir(parents=True)
+        (tmp_path / name / "dask-scratch-space" / "global.lock").touch()
+    target = tmp_path / "target"
+    target.mkdir()
+    (tmp_path / "aerpaw-cmp-dask-link").symlink_to(target)
+    waiting = subprocess.Popen(["sleep", "60"], cwd=tmp_path / "aerpaw-cmp-dask-cwd")
+    try:
+        with (tmp_path / "aerpaw-cmp-dask-open" / "dask-scratch-space" / "global.lock").open():
+            assert [one.name for one in remove_left_folders(tmp_path)] == ["aerpaw-cmp-dask-left"]
+    finally:
+        waiting.kill()
+        waiting.wait()
+    assert sorted(one.name for one in tmp_path.iterdir()) == sorted([*names[1:], "aerpaw-cmp-dask-link", "target"])
+    assert sorted(one.name for one in remove_left_folders(tmp_path)) == ["aerpaw-cmp-dask-cwd", "aerpaw-cmp-dask-open"]

@@ -138,7 +138,7 @@ def test_json_of_the_commands_that_only_write_files(
     for name, line in (("run_site_show", ["site", "show"]), ("run_simulate", ["simulate", "plan.yaml"])):
         monkeypatch.setattr(run, name, lambda *_, **__: [Path("a.txt"), Path("b.txt")])
         assert main([*line, "--json"]) == 0
-        assert json.loads(capsys.readouterr().out) == {"files": ["a.txt", "b.txt"]}
+        assert json.loads(capsys.readouterr().out) == {"schema": 1, "files": ["a.txt", "b.txt"]}
         assert main(line) == 0
         assert capsys.readouterr().out.split() == ["a.txt", "b.txt"]
 

@@ -355,7 +355,7 @@ def test_page_and_json_are_written_as_a_set_and_replace_no_report(noisy, tmp_pat
     out = tmp_path / "out"
     assert main(["diff", str(first), str(second), "-o", str(out), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed == json.loads((out / "diff.json").read_text(encoding="utf-8"))
+    assert printed == {"schema": 1, **json.loads((out / "diff.json").read_text(encoding="utf-8"))}
     assert printed["differs"] is True
     assert printed["levels"][0]["rmse"]["verdict"] == "worse"
     assert (out / "SHA256SUMS").is_file()

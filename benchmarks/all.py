@@ -63,7 +63,7 @@ COMMANDS: dict[str, list[str]] = {
 SMALLEST: dict[str, list[str]] = {
     "aligned_paths": ["--links", "20"],
     "all": ["--only", "kriging", "--no-history"],
-    "clock_verdict": ["--flights", "1"],
+    "clock_power": ["sample_logs/UAV", "--quiet"],
     "coverage_of_intervals": ["--flights", "20", "--replicates", "100"],
     "drafts": ["sample_logs"],
     "estimate": [],
@@ -96,7 +96,7 @@ SMALLEST: dict[str, list[str]] = {
 }
 """How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards."""
 
-ON_FIELD_DATA = ("clock_verdict", "kriging_field")
+ON_FIELD_DATA = ("kriging_field",)
 
 AXES = ("poses", "towers", "faces", "samples", "report", "flights", "workers")
 

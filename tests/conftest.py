@@ -54,7 +54,6 @@ DEAREST = (
     "propagation/test_sionna.py",
     "report/test_browser.py",
     "jobs/test_calibrate_rank.py",
-    "flight/test_lag.py",
     "live/test_tap.py",
     "report/test_diff.py",
     "jobs/test_compare_flight.py",

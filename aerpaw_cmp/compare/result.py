@@ -48,7 +48,6 @@ class ClockResult:
     receiver: str
     radio_minus_telemetry_s: float
     ci95_s: Interval
-    drift_s_per_s: float
     verdict: str
     reason: str
     applied: str

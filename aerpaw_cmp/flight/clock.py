@@ -1,559 +1,433 @@
-"""Whether the radio clock and the telemetry clock agree, and by how much they do not.
+"""Radio clock against telemetry clock: the likelihood of a flight's residuals over the lag.
 
 One sign everywhere: ``radio_minus_telemetry_s`` is how much later the radio's clock shows than the telemetry's; radio
 times are corrected by subtracting it.
-
-A search (:mod:`aerpaw_cmp.flight.lag`) finds a best lag in any two curves, also where the model is wrong.
-:func:`judge_clock` therefore says "ok" only after every check that a wrong model fails.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..common.units import AnyArray, BoolArray, FloatArray
 from ..compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
-from ..compare.statistics import PairedDifference, paired_difference, plain
-from .lag import (
-    DRIFT_FROM_S,
-    DRIFT_LIMIT,
-    FEWEST,
-    LAG_LIMIT_S,
-    LAG_WINDOW_S,
-    LagFit,
-    Sampled,
-    best_of,
-    combine_lags,
-    fit_lag,
-    no_lag,
-    sample,
-    symmetric,
-)
-from .track import NO_TIME, nanoseconds
+from ..compare.statistics import plain
 
-EXPLAINED = 0.5
-"""Share of the level's variance (means over one second) that a model must explain before its lag is believed."""
+OK, SHIFTED, CANNOT_TELL = "ok", "shifted", "cannot tell"
+"""Verdicts."""
 
-AGREE_S = 0.5
-"""Halves of the flight, channels and free patterns may differ from the pooled lag by this [s]."""
+EVIDENCE_NAT = 4.0
+"""Lags whose log likelihood is this much below the best one are excluded [nat]."""
 
-_CHECK_WITH = 2000
-"""Samples per channel for the check on blocks kept out."""
+SAME_S = 0.5
+"""Lags up to this are no shift [s]: positions, models and time stamps of real flights are no better."""
 
-_FREE_WITH, _FREE_STEP_S = 1000, 0.25
-"""Samples per channel, and spacing of lags [s], for the check with free patterns."""
+AGREE_S = 1.0
+"""Clocks agree where every lag beyond this is excluded [s]."""
 
-Verdict = Literal["ok", "agree", "ambiguous", "failed"]
+STAMPS_S = 0.25
+"""Autopilots and loggers stamp their rows no better [s]: the interval is wider by this on either side."""
+
+_STEP_S, _FINEST_S, _MOST_FINE = 0.5, 0.02, 40
+"""First and last spacing of the lags; no finer where so many are still possible."""
+_BINS = 900
+"""Means of the level per channel, one a second or longer."""
+_FEWEST = 60
+_PER_BIN = 8
+"""Instants at which the prediction is averaged over a mean."""
+
+_CHORDS = ((0.2, 0.4, 0.8), (0.2, 0.45, 0.9))
+"""Lengths (chord of the unit sphere) over which the gain of tower and UAV changes: fine, broad, both at once."""
+_FEATURES, _LEFT = 64, 0.01
+"""Most features of an end's gain, and the variance that may be left out of it."""
+
+_FREE = 1e3
+"""Standard deviation of offset and slope, in that of the residual: they are free."""
+
+_MEMORY_S = (2.0, 5.0, 15.0, 40.0)
+_WHITE = (0.1, 0.3, 0.9)
+_GAIN = (0.05, 0.5, 1.0, 2.0)
+"""Tried for :class:`_Parts`."""
+
+
+class _Parts(NamedTuple):
+    """Memory of the residual [s], its white part and the gains, in standard deviations of the part with memory."""
+
+    memory_s: float
+    white: float
+    gain: float
+
+
+class _Fitted(NamedTuple):
+    """Largest log likelihood at a lag, and the parts that have it."""
+
+    log_likelihood: float
+    parts: _Parts
+
+
+_START = _Parts(5.0, 0.3, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Along:
+    """What the level of a channel depends on, at equally spaced instants of the telemetry; NaN where no pose is known.
+
+    Parameters
+    ----------
+    start_s, step_s : float
+        First instant and spacing [s].
+    predicted_db : mapping of str to (g,)
+        Levels of one or more models, by name [dB].
+    distance_m : (g,)
+    directions : (g, 6)
+        Unit vectors from the tower to the UAV (site frame) and from the UAV to the tower (body frame).
+    """
+
+    start_s: float
+    step_s: float
+    predicted_db: Mapping[str, FloatArray]
+    distance_m: FloatArray
+    directions: FloatArray
+
+    def tables(self) -> tuple[FloatArray, FloatArray]:
+        """Features (g, p) of offset, slope and the gains of both ends; levels (g, models)."""
+        ends = [_gain_features(self.directions[:, 3 * end : 3 * end + 3], _CHORDS[end]) for end in (0, 1)]
+        slope = np.log10(self.distance_m) - 2.0
+        return np.column_stack([np.ones_like(slope), slope, *ends]), np.column_stack(list(self.predicted_db.values()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockChannel:
-    """One channel of a receiver, and what should be measured at instants of the telemetry clock.
-
-    Parameters
-    ----------
-    name : str
-        Of the channel.
-    times : (n,)
-        Instants by the radio's clock, datetime64 (UTC) or seconds.
-    measured_db : (n,)
-        Levels [dB]; NaN does not count.
-    predictor : callable
-        ``predictor(times) -> level_db`` (n,); NaN where there is no pose or no path.
-    terms : callable, optional
-        ``terms(times) -> (n, q)``, such as :func:`direction_terms`: what unknown antennas could add.
-    resolution_s : float
-        Spacing at which the predictor is sampled [s].
-    """
+    """One channel of a receiver: levels (n,) [dB] at radio times (n,) [s], and what they depend on."""
 
     name: str
-    times: AnyArray
+    time_s: FloatArray
     measured_db: FloatArray
-    predictor: Callable[[AnyArray], ArrayLike]
-    terms: Callable[[AnyArray], ArrayLike] | None = None
-    resolution_s: float = 0.05
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HeldOutBlocks:
-    """Error of blocks of a flight, with a lag estimated on the other blocks, against no correction.
-
-    Parameters
-    ----------
-    blocks, improved : int
-        How many there are, and in how many the error is lower.
-    paired : PairedDifference
-        Corrected against uncorrected, over seconds.
-    """
-
-    blocks: int
-    improved: int
-    paired: PairedDifference
-
-    @property
-    def better(self) -> bool:
-        """The error is lower in all, and in more blocks than chance would have it (sign test at 10 %)."""
-        from math import comb
-
-        chance = sum(comb(self.blocks, k) for k in range(self.improved, self.blocks + 1)) / 2.0**self.blocks
-        return self.paired.difference_db < 0 and (self.paired.verdict == "better" or chance < 0.1)
-
-    def as_dict(self) -> dict[str, Any]:
-        """For metrics.json."""
-        return {"blocks": self.blocks, "improved": self.improved, **self.paired.as_dict()}
+    along: Along
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockEstimate:
-    """The clock of one receiver on one flight: a pooled estimate, and what was checked before it is believed.
+    """The clock of one receiver on one flight.
 
     Parameters
     ----------
     radio_minus_telemetry_s : float
-        How much later the radio's clock shows [s], at ``reference_s``; NaN if failed. Corrected by subtracting.
+        Most likely lag [s]; NaN where nothing could be estimated.
     ci95_s : (low, high)
-        Its 95 % interval; the whole window where the data say nothing.
-    drift_s_per_s : float
-        Its growth; 0 where it was not fitted.
-    drift_ci95_s_per_s : (low, high)
-        NaN where it was not fitted.
-    reference_s, start_ns : float, int
-        Instant of the estimate [s after ``start_ns``]; the receiver's first sample [ns since 1970].
-    verdict : {"ok", "agree", "ambiguous", "failed"}
-        "ok": a difference is shown, and correcting it lowers the error of blocks kept out of the estimate. "agree":
-        every other check holds and the difference is none that matters. Only "ok" may be applied.
+        Lags that are not excluded, inside the window; the window where the data say nothing.
+    verdict : {"ok", "shifted", "cannot tell"}
     reason : str
-        Why not ok.
+        Why it cannot be told.
+    window_s : float
+        Lags searched on either side.
     model : str
-        The prediction that was used.
-    explained : float
-        Share of the variance of means over one second that it explains at this lag.
-    halves_s : tuple of float
-        Estimates of the first and of the second half; empty where not checked.
+        The prediction that explains the level best.
     channels_s : mapping of str to float
         Estimates of the channels alone.
-    free_patterns_s : float
-        Estimate with the antennas' patterns free; NaN where not checked.
-    held_out : HeldOutBlocks or None
-        Error of blocks kept out, corrected against uncorrected; None where not checked.
-    n, window_s : int, float
-        Samples; lags searched on either side [s].
+    n : int
+        Means of the level that count.
+    against_zero_nat : float
+        Log likelihood of the best lag above that of the best lag within :data:`SAME_S`.
     """
 
     radio_minus_telemetry_s: float
     ci95_s: tuple[float, float]
-    drift_s_per_s: float
-    drift_ci95_s_per_s: tuple[float, float]
-    reference_s: float
-    start_ns: int
-    verdict: Verdict
+    verdict: str
     reason: str
-    model: str
-    explained: float
-    halves_s: tuple[float, ...]
-    channels_s: Mapping[str, float]
-    free_patterns_s: float
-    held_out: HeldOutBlocks | None
-    n: int
     window_s: float
+    model: str = ""
+    channels_s: Mapping[str, float] = field(default_factory=dict)
+    n: int = 0
+    against_zero_nat: float = 0.0
 
-    def correction_s(self, times: ArrayLike) -> FloatArray:
-        """What is to be subtracted from radio times (n,) [s]."""
-        since = (nanoseconds(times) - self.start_ns) * 1e-9
-        return np.asarray(self.radio_minus_telemetry_s + self.drift_s_per_s * (since - self.reference_s))
+    @property
+    def correction_s(self) -> float:
+        """To be subtracted from radio times: the estimate where it is shown to differ from zero, else 0."""
+        low, high = self.ci95_s
+        return 0.0 if self.verdict == CANNOT_TELL or low <= 0.0 <= high else self.radio_minus_telemetry_s
 
     def result(self, receiver: str, *, apply: bool) -> ClockResult:
-        """The estimate as a number of the flight; only a verdict "ok" is applied, where ``apply`` asks for it."""
-        asked = NOT_APPLIED if apply and self.verdict != "agree" else ESTIMATED
+        """The estimate as a number of the flight; applied where ``apply`` asks for it and it is shown."""
+        applied = ESTIMATED
+        if (apply and self.verdict != OK) or (apply and self.correction_s):
+            applied = APPLIED if self.correction_s else NOT_APPLIED
         return ClockResult(
             receiver=receiver,
             radio_minus_telemetry_s=self.radio_minus_telemetry_s,
             ci95_s=self.ci95_s,
-            drift_s_per_s=self.drift_s_per_s,
             verdict=self.verdict,
-            reason=f"by the {self.model}" + (f": {self.reason}" if self.reason else ""),
-            applied=APPLIED if apply and self.verdict == "ok" else asked,
+            reason=self.reason,
+            applied=applied,
             checks=self.as_dict(),
         )
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json; NaN becomes None."""
-        names = {name: getattr(self, name) for name in self.__slots__ if name not in ("start_ns", "held_out")}
-        names["drift_ms_per_min"] = 60e3 * names.pop("drift_s_per_s")
-        names["drift_ci95_ms_per_min"] = [60e3 * v for v in names.pop("drift_ci95_s_per_s")]
-        names["held_out"] = None if self.held_out is None else self.held_out.as_dict()
-        return dict(plain(names))
+        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
 
 
-def judge_clock(
-    channels: Sequence[ClockChannel],
-    *,
-    model: str = "",
-    window_s: float = LAG_WINDOW_S,
-    limit_s: float = LAG_LIMIT_S,
-    drift: bool | None = None,
-) -> ClockEstimate:
-    """One estimate for the channels of a receiver, which share a clock, and whether it can be believed.
+def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> ClockEstimate:
+    """One estimate for the channels of a receiver, which share a clock.
 
     Parameters
     ----------
     channels : sequence of ClockChannel
-        Of one receiver and flight.
-    model : str
-        Name of the prediction, for reports.
-    window_s, limit_s, drift
-        As in :func:`estimate_lag`.
+        At least one, all with the same models.
+    window_s : float
+        Lags searched on either side [s].
 
     Returns
     -------
     ClockEstimate
         Nothing is applied here.
 
-    Raises
-    ------
-    ValueError
-        Without a channel.
-
     Notes
     -----
-    Checked in this order, the first failure gives the reason: the pooled likelihood has one optimum inside the search
-    (lag and drift); the model explains :data:`EXPLAINED` of the variance; each channel alone, both halves of the
-    flight, and a fit with free antenna patterns come within :data:`AGREE_S` or their own interval of the pooled lag; a
-    correction estimated on the other blocks of the flight lowers the error of each block in turn
-    (:func:`~aerpaw_cmp.compare.statistics.paired_difference`).
+    Means y over a second are normal with mean offset + slope log10(d) + p(t - lag), p the prediction of a model, and
+    three parts that vary: gains over the direction at either end (Gaussian processes), a residual with memory
+    (Ornstein-Uhlenbeck) and a white one. Offset, slope and gains are integrated out, the scale is profiled; memory,
+    white share and gain are those of largest likelihood on a small grid, per channel. The model is that of the largest
+    likelihood of all channels. A level that depends on no position must be less likely than that.
     """
-    if not channels:
-        raise ValueError("a clock needs at least one channel")
-    start = min(
-        (int(stamp.min()) for c in channels if len(stamp := _timed(c.times))),
-        default=0,
-    )
-    lags = symmetric(window_s, 0.1)
-    sampled_channels: dict[str, Sampled] = {}
-    reasons = []
-    for channel in channels:
-        sampled = sample(
-            channel.times, channel.measured_db, channel.predictor,
-            window_s=window_s, resolution_s=channel.resolution_s, origin_ns=start,
-        )  # fmt: skip
-        if isinstance(sampled, str):
-            reasons.append(sampled)
-        else:
-            sampled_channels[channel.name] = sampled
-    if not sampled_channels:
-        return _estimate(no_lag(reasons[0], 0, window_s, lags), start, model)
-    span = max(s.t[-1] for s in sampled_channels.values()) - min(s.t[0] for s in sampled_channels.values())
-    drifting = span >= DRIFT_FROM_S if drift is None else drift
-    own = {
-        name: fit_lag(s.t, s.measured_db, s.prediction, lags, limit_s, drifting) for name, s in sampled_channels.items()
-    }
-    pooled = combine_lags(list(own.values()), limit_s=limit_s)
-    estimate = _estimate(pooled, start, model, {name: fit.radio_minus_telemetry_s for name, fit in own.items()})
-    if pooled.verdict == "failed":
-        return estimate
-    estimate = replace(estimate, explained=_explained_share(list(sampled_channels.values()), estimate))
-    if pooled.verdict == "ambiguous":
-        return estimate
-    return _checked(estimate, channels, sampled_channels, own, lags, limit_s)
+    models = list(channels[0].along.predicted_db)
+    tables = {id(c.along): c.along.tables() for c in {id(c.along): c for c in channels}.values()}
+    bins = {c.name: b for c in channels if (b := _Bins.of(c, tables[id(c.along)], window_s)) is not None}
+    if not bins:
+        return _nothing(NO_OVERLAP, window_s)
+    lags = _symmetric(window_s, _STEP_S)
+    first = np.sum([b.likelihood(lags, _START) for b in bins.values()], axis=0)
+    fits = [[b.fitted(float(lags[first[:, m].argmax()]), m) for b in bins.values()] for m in range(len(models))]
+    likeliest = [sum(fit.log_likelihood for fit in fit_of) for fit_of in fits]
+    model = int(np.argmax(likeliest))
+    fitted = dict(zip(bins, fits[model], strict=True))
+
+    def likelihood(some: FloatArray) -> FloatArray:
+        return np.stack([b.likelihood(some, fitted[name].parts)[:, model] for name, b in bins.items()])
+
+    tried = _finer(lags, likelihood, window_s)
+    estimate = _judged(*tried, tuple(bins), window_s)
+    estimate = replace(estimate, model=models[model], n=sum(b.n for b in bins.values()))
+    explained = likeliest[model] - sum(b.constant() for b in bins.values())
+    if explained < EVIDENCE_NAT + np.log(len(lags)):  # so much is had by trying as many lags
+        return replace(estimate, verdict=CANNOT_TELL, reason=NO_DEPENDENCE)
+    return estimate
 
 
-def _timed(times: ArrayLike) -> AnyArray:
-    stamp = nanoseconds(times)
-    return np.asarray(stamp[stamp != NO_TIME])
+NO_OVERLAP = "too few samples at which the telemetry gives a position for every lag of the window"
+NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
 
 
-def _estimate(fit: LagFit, start: int, model: str, channels: Mapping[str, float] | None = None) -> ClockEstimate:
-    """A pooled fit before its checks; refining the best lag between two tried ones never leaves interval and window."""
-    low, high = np.clip(fit.ci95_s, -fit.window_s, fit.window_s)
+def _finer(
+    lags: FloatArray, likelihood: Callable[[FloatArray], FloatArray], window_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Lags (m,), finer where the log likelihood (channels, m) of all channels is near its largest."""
+    own, step = likelihood(lags), _STEP_S
+    while step > _FINEST_S:
+        total = own.sum(axis=0)
+        near = lags[total > total.max() - EVIDENCE_NAT - 2.0]
+        if len(near) > _MOST_FINE:
+            break
+        step /= 5.0
+        fine = np.unique(np.round((near[:, None] + step * np.arange(-4, 5)).ravel(), 6))
+        fine = fine[(np.abs(fine) <= window_s) & ~np.isin(fine, np.round(lags, 6))]
+        lags, own = np.concatenate([lags, fine]), np.concatenate([own, likelihood(fine)], axis=1)
+        order = np.argsort(lags)
+        lags, own = lags[order], own[:, order]
+    return lags, own
+
+
+def _symmetric(limit: float, step: float) -> FloatArray:
+    """Multiples of ``step`` from -limit to limit."""
+    count = int(limit / step + 1e-9)
+    return np.asarray(np.arange(-count, count + 1) * step, dtype=np.float64)
+
+
+def _nothing(reason: str, window_s: float) -> ClockEstimate:
     return ClockEstimate(
-        radio_minus_telemetry_s=float(np.clip(fit.radio_minus_telemetry_s, low, high)),
-        ci95_s=fit.ci95_s,
-        drift_s_per_s=fit.drift_s_per_s,
-        drift_ci95_s_per_s=fit.drift_interval_s_per_s,
-        reference_s=fit.reference,
-        start_ns=start,
-        verdict=fit.verdict,
-        reason=fit.reason,
-        model=model,
-        explained=float("nan"),
-        halves_s=(),
-        channels_s=channels or {},
-        free_patterns_s=float("nan"),
-        held_out=None,
-        n=fit.n,
-        window_s=fit.window_s,
+        radio_minus_telemetry_s=float("nan"), ci95_s=(-window_s, window_s), verdict=CANNOT_TELL, reason=reason,
+        window_s=window_s,
+    )  # fmt: skip
+
+
+def _judged(lags: FloatArray, own: FloatArray, names: Sequence[str], window_s: float) -> ClockEstimate:
+    """The verdict of log likelihoods (channels, lags)."""
+    total = own.sum(axis=0)
+    total = total - total.max()
+    left = np.flatnonzero(total > -EVIDENCE_NAT)
+    first, last = lags[max(left[0] - 1, 0)], lags[min(left[-1] + 1, len(lags) - 1)]  # the nearest that are excluded
+    low, high = max(float(first) - STAMPS_S, -window_s), min(float(last) + STAMPS_S, window_s)
+    against = -float(total[np.abs(lags) <= SAME_S + 1e-9].max())
+    verdict, reason = CANNOT_TELL, f"lags from {low:+.1f} to {high:+.1f} s explain the level about as well"
+    if against > EVIDENCE_NAT and (left[0] == 0 or left[-1] == len(lags) - 1):
+        reason = f"the best lag lies near the edge of the window ({window_s:g} s): widen rss.lag_window_s"
+    elif against > EVIDENCE_NAT and not low <= 0.0 <= high:
+        verdict, reason = SHIFTED, ""
+    elif first >= -AGREE_S and last <= AGREE_S:
+        verdict, reason = OK, ""
+    return ClockEstimate(
+        radio_minus_telemetry_s=float(lags[total.argmax()]),
+        ci95_s=(low, high),
+        verdict=verdict,
+        reason=reason,
+        channels_s={name: float(lags[value.argmax()]) for name, value in zip(names, own, strict=True)},
+        window_s=window_s,
+        against_zero_nat=against,
     )
-
-
-def _checked(
-    estimate: ClockEstimate,
-    channels: Sequence[ClockChannel],
-    sampled_channels: Mapping[str, Sampled],
-    own: Mapping[str, LagFit],
-    lags: FloatArray,
-    limit_s: float,
-) -> ClockEstimate:
-    """The estimate after every check; the first that fails gives the verdict."""
-
-    def doubt(reason: str, **more: Any) -> ClockEstimate:
-        return replace(estimate, verdict="ambiguous", reason=reason, **more)
-
-    if estimate.explained < EXPLAINED:
-        return doubt(
-            f"the model explains {100 * max(estimate.explained, 0.0):.0f} % of the level's variance; "
-            f"{100 * EXPLAINED:.0f} % are wanted before its lag is believed"
-        )
-    if abs(estimate.drift_s_per_s) > 0.95 * DRIFT_LIMIT:
-        return doubt("the best drift lies at the edge of the search")
-    lag = estimate.radio_minus_telemetry_s
-    for name, fit in own.items():
-        if not _near(fit, lag):
-            return doubt(f"channel {name} alone gives {fit.radio_minus_telemetry_s:+.1f} s")
-    halves = _halves(list(sampled_channels.values()), estimate, lags, limit_s)
-    estimate = replace(estimate, halves_s=tuple(half.radio_minus_telemetry_s for half in halves))
-    for name, half in zip(("first", "second"), halves, strict=True):
-        if not _near(half, lag):
-            return doubt(f"the {name} half of the flight alone gives {half.radio_minus_telemetry_s:+.1f} s")
-    free = _with_free_patterns(channels, sampled_channels, estimate, limit_s)
-    if free is not None:
-        estimate = replace(estimate, free_patterns_s=free.radio_minus_telemetry_s)
-        if not _near(free, lag):
-            return doubt(f"with the antennas' patterns free it is {free.radio_minus_telemetry_s:+.1f} s")
-    held_out = _held_out(list(sampled_channels.values()), estimate, lags)
-    estimate = replace(estimate, held_out=held_out)
-    low, high = estimate.ci95_s
-    none = low <= 0.0 <= high or abs(lag) <= _NOT_RESOLVED_S
-    if held_out.better and not none:
-        return estimate
-    if none or abs(lag) <= _NO_MATTER_S:
-        return replace(estimate, verdict="agree", reason="no difference that matters: nothing to correct")
-    return doubt(
-        f"correcting it lowers the error of {held_out.improved} of {held_out.blocks} blocks kept out, by "
-        f"{-held_out.paired.difference_db:.2f} dB in all"
-    )
-
-
-_NOT_RESOLVED_S = 0.05
-"""A difference that no telemetry of one row a second resolves [s]."""
-
-_NO_MATTER_S = 0.2
-"""A smaller difference moves a UAV at 10 m/s by less than the error of its position [s]."""
-
-
-def _near(fit: LagFit, lag: float) -> bool:
-    """Whether a fit to part of the evidence comes near the pooled lag, or cannot tell it from its own optimum."""
-    if not np.isfinite(fit.radio_minus_telemetry_s):
-        return False
-    at = int(np.argmin(np.abs(fit.curve_lag_s - lag)))
-    possible = bool(fit.evidence[max(at - 1, 0) : at + 2].min() <= 3.84)
-    return abs(fit.radio_minus_telemetry_s - lag) <= AGREE_S or (possible and fit.verdict != "ok")
-
-
-def _halves(
-    sampled_channels: Sequence[Sampled], estimate: ClockEstimate, lags: FloatArray, limit_s: float
-) -> tuple[LagFit, LagFit]:
-    """Pooled fits to the first and the second half, without a drift of their own."""
-    middle = 0.5 * (min(s.t[0] for s in sampled_channels) + max(s.t[-1] for s in sampled_channels))
-
-    def fit(side: Callable[[FloatArray], BoolArray]) -> LagFit:
-        fits = []
-        for s in sampled_channels:
-            part = side(s.t)
-            if part.sum() >= FEWEST:
-                t = s.t[part]
-                moved = t - estimate.drift_s_per_s * (t - estimate.reference_s)
-                fits.append(fit_lag(moved, s.measured_db[part], s.prediction, lags, limit_s, False))
-        nothing = no_lag("too few samples", 0, float(lags[-1]), lags)
-        return combine_lags(fits, limit_s=limit_s) if fits else nothing
-
-    return fit(lambda t: np.asarray(t <= middle)), fit(lambda t: np.asarray(t > middle))
-
-
-def _with_free_patterns(
-    channels: Sequence[ClockChannel], sampled_channels: Mapping[str, Sampled], estimate: ClockEstimate, limit_s: float
-) -> LagFit | None:
-    """Pooled fit with free terms of direction beside the prediction; None where no terms were given."""
-    lags = symmetric(estimate.window_s, _FREE_STEP_S)
-    fits = []
-    for channel in channels:
-        if channel.terms is None or channel.name not in sampled_channels:
-            continue
-        s = sampled_channels[channel.name]
-        free = s.prediction.beside(channel.terms(_instants(channel.times, estimate.start_ns, s.prediction.times())))
-        few = slice(None, None, -(-len(s.t) // _FREE_WITH))
-        moved = s.t[few] - estimate.drift_s_per_s * (s.t[few] - estimate.reference_s)
-        fits.append(fit_lag(moved, s.measured_db[few], free, lags, limit_s, False))
-    return combine_lags(fits, limit_s=limit_s) if fits else None
-
-
-def _instants(like: AnyArray, start_ns: int, seconds: FloatArray) -> AnyArray:
-    """Seconds after the start as instants of the kind of ``like``: datetime64, or seconds since 1970."""
-    stamp = np.round(seconds * 1e9).astype(np.int64) + start_ns
-    return np.asarray(stamp.astype("datetime64[ns]") if np.asarray(like).dtype.kind not in "fiu" else stamp * 1e-9)
-
-
-def _explained_share(sampled_channels: Sequence[Sampled], estimate: ClockEstimate) -> float:
-    """Share of the variance of one-second means that the prediction explains at the estimate."""
-    left = total = 0.0
-    for s in sampled_channels:
-        lag = estimate.radio_minus_telemetry_s + estimate.drift_s_per_s * (s.t - estimate.reference_s)
-        predicted = s.prediction.at(s.t - lag)
-        ok = np.isfinite(predicted)
-        measured, residual = s.measured_db[ok], s.measured_db[ok] - predicted[ok]
-        _, place = np.unique(np.floor(s.t[ok]), return_inverse=True)
-        count = np.bincount(place)
-        left += len(residual) * float(np.var(np.bincount(place, residual) / count))
-        total += len(residual) * float(np.var(np.bincount(place, measured) / count))
-    return 1.0 - left / total if total > 0 else float("nan")
-
-
-def _held_out(sampled_channels: Sequence[Sampled], estimate: ClockEstimate, lags: FloatArray) -> HeldOutBlocks:
-    """Error of blocks of the flight, with a lag and offsets estimated on the other blocks, against no lag.
-
-    Errors are root mean squares over one second and all channels: channels of one receiver hear the same fades.
-    """
-    first, last = min(s.t[0] for s in sampled_channels), max(s.t[-1] for s in sampled_channels)
-    blocks = int(np.clip((last - first) / _BLOCK_S, 4, 10))
-    tables = [_block_table(s, estimate, lags, np.linspace(first, last, blocks + 1)[1:-1]) for s in sampled_channels]
-    squares: dict[str, list[FloatArray]] = {"corrected": [], "uncorrected": []}
-    improved = 0
-    for block in range(blocks):
-        others = [table.without(block) for table in tables]
-        scale = [squared[len(lags) // 2] / n[len(lags) // 2] for n, _, squared in others]
-        cost = np.sum([squared / n / unit for (n, _, squared), unit in zip(others, scale, strict=True)], axis=0)
-        best, gain = best_of(cost, lags), 0.0
-        for table, (_, mean, _) in zip(tables, others, strict=True):
-            inside = table.block == block
-            squares["corrected"].append((table.residual[best, inside] - mean[best]) ** 2)
-            squares["uncorrected"].append((table.unshifted[inside] - table.unshifted[~inside].mean()) ** 2)
-            gain += float(np.sum(squares["uncorrected"][-1] - squares["corrected"][-1]))
-        improved += gain > 0
-    second = np.concatenate([t.t[t.block == block] for block in range(blocks) for t in tables])
-    with_clock, without_clock = (np.concatenate(squares[name]) for name in ("corrected", "uncorrected"))
-    ok = np.isfinite(with_clock) & np.isfinite(without_clock)
-    _, place = np.unique(np.floor(second[ok]), return_inverse=True)
-    count = np.bincount(place)
-    corrected, uncorrected = (np.sqrt(np.bincount(place, side[ok]) / count) for side in (with_clock, without_clock))
-    paired = paired_difference(corrected, uncorrected, free_offset=False)
-    return HeldOutBlocks(blocks=blocks, improved=improved, paired=paired)
-
-
-_BLOCK_S = 60.0
-"""Length of the blocks kept out [s], at least 4 and at most 10 of them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _BlockTable:
-    """Residuals of one channel: (lags, n) at every lag and the drift found, (n,) without either; block per sample."""
+class _Bins:
+    """Means (n,) of a channel; the instants (s,) at which predictions are averaged, and the first of each mean."""
 
-    t: FloatArray
-    block: AnyArray
-    residual: FloatArray
-    unshifted: FloatArray
+    mean_db: FloatArray
+    mean_s: FloatArray
+    at_s: FloatArray
+    first: AnyArray
+    along: Along
+    features: FloatArray
+    levels: FloatArray
 
-    def without(self, block: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Samples, mean and sum of squares about it per lag (lags,), of all other blocks."""
-        kept = self.residual[:, self.block != block]
-        n, mean = np.isfinite(kept).sum(axis=1), np.nanmean(kept, axis=1)
-        return n, mean, np.nansum((kept - mean[:, None]) ** 2, axis=1)
+    @property
+    def n(self) -> int:
+        return len(self.mean_s)
+
+    @classmethod
+    def of(cls, channel: ClockChannel, tables: tuple[FloatArray, FloatArray], window_s: float) -> _Bins | None:
+        """Bins whose every shift within the window has a prediction; None where there are too few."""
+        along, (features, levels) = channel.along, tables
+        t, y = np.asarray(channel.time_s), np.asarray(channel.measured_db)
+        lost = np.asarray(~(np.isfinite(features).all(axis=1) & np.isfinite(levels).all(axis=1)))
+        missing = np.concatenate([[0], np.cumsum(lost)])
+        with np.errstate(invalid="ignore"):
+            low, high = (np.floor((t + side - along.start_s) / along.step_s) for side in (-window_s, window_s))
+            ok: BoolArray = np.isfinite(y) & (low >= 0) & (high + 1 < len(lost))
+        begin, end = (np.where(ok, side, 0).astype(np.int64) for side in (low, high))
+        ok = np.asarray(ok & (missing[end + 2] == missing[begin]))
+        order = np.flatnonzero(ok)[np.argsort(t[ok], kind="stable")]
+        t, y = t[order], y[order]
+        if not len(t):
+            return None
+        width = max(1.0, (t[-1] - t[0]) / _BINS)
+        _, first, count = np.unique(np.floor(t / width), return_index=True, return_counts=True)
+        if len(first) < _FEWEST:
+            return None
+        place = np.arange(len(t)) - np.repeat(first, count)
+        few = place % np.repeat(-(-count // _PER_BIN), count) == 0
+        starts = np.concatenate([[0], np.cumsum(few)])[first]
+        mean = [np.add.reduceat(v, first) / count for v in (y, t)]
+        return cls(
+            mean_db=mean[0], mean_s=mean[1], at_s=t[few], first=starts, along=along, features=features, levels=levels
+        )  # fmt: skip
+
+    def _between(self, at_s: FloatArray, table: FloatArray) -> FloatArray:
+        place = (at_s - self.along.start_s) / self.along.step_s
+        low = place.astype(np.int64)
+        share = (place - low)[:, None]
+        return np.asarray(table[low] * (1.0 - share) + table[low + 1] * share)
+
+    def system(self, lag: float) -> tuple[FloatArray, FloatArray]:
+        """Features (n, p) of offset, slope and gains, and residuals (n, models) at a lag."""
+        count = np.diff(np.append(self.first, len(self.at_s)))[:, None]
+        predicted = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
+        residual = self.mean_db[:, None] - predicted
+        return self._between(self.mean_s - lag, self.features), residual - residual.mean(axis=0)
+
+    def likelihood(self, lags: FloatArray, parts: _Parts) -> FloatArray:
+        """Log likelihood (lags, models)."""
+        memory = _Memory(self.mean_s, parts.memory_s, parts.white)
+        return np.stack([memory.likelihood(*self.system(lag), (parts.gain,))[0] for lag in lags])
+
+    def fitted(self, lag: float, model: int) -> _Fitted:
+        """The parts of largest likelihood at a lag."""
+        features, residual = self.system(lag)
+        return self._fitted(features, residual[:, [model]], _GAIN)
+
+    def constant(self) -> float:
+        """Largest log likelihood of a level that depends on no position."""
+        level = np.column_stack([np.ones(self.n), np.zeros(self.n)])
+        return self._fitted(level, (self.mean_db - self.mean_db.mean())[:, None], (0.0,)).log_likelihood
+
+    def _fitted(self, features: FloatArray, residual: FloatArray, gains: Sequence[float]) -> _Fitted:
+        tried = []
+        for memory_s, white in product(_MEMORY_S, _WHITE):
+            values = _Memory(self.mean_s, memory_s, white).likelihood(features, residual, gains)[:, 0]
+            best = int(values.argmax())
+            tried.append((float(values[best]), _Parts(memory_s, white, gains[best])))
+        return _Fitted(*max(tried, key=lambda fit: fit[0]))
 
 
-def _block_table(s: Sampled, estimate: ClockEstimate, lags: FloatArray, cuts: FloatArray) -> _BlockTable:
-    step = -(-len(s.t) // _CHECK_WITH)
-    t, m = s.t[::step], s.measured_db[::step]
-    drifted = t - estimate.drift_s_per_s * (t - estimate.reference_s)
-    residual = np.stack([m - s.prediction.at(drifted - lag) for lag in lags])
-    unshifted = m - s.prediction.at(t)
-    ok = np.isfinite(residual).all(axis=0) & np.isfinite(unshifted)
-    return _BlockTable(
-        t=t[ok], block=np.searchsorted(cuts, t[ok], side="right"), residual=residual[:, ok], unshifted=unshifted[ok]
-    )
+def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray:
+    """Features (g, q) whose products are the covariance of a gain of unit variance over directions (g, 3).
 
-
-# --- whole hours ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class ClockTrap:
-    """Two logs of one flight that only overlap after a shift of whole (or half) hours.
-
-    Parameters
-    ----------
-    hours : float
-        To be added to radio times.
-    overlap_s, shifted_overlap_s : float
-        Overlap with the telemetry before and after the shift [s].
-    explanation : str
-        What this looks like.
+    A pivoted Cholesky factorisation picks the directions of the flight that say most about the others.
     """
+    from scipy.linalg import solve_triangular
 
-    hours: float
-    overlap_s: float
-    shifted_overlap_s: float
-    explanation: str
+    known = np.isfinite(direction).all(axis=1)
+    unit = direction[known] / np.linalg.norm(direction[known], axis=1, keepdims=True)
 
+    def covariance(one: FloatArray, two: FloatArray) -> FloatArray:
+        squared = np.maximum(2.0 - 2.0 * one @ two.T, 0.0)
+        return np.asarray(np.mean([np.exp(-squared / (2.0 * chord**2)) for chord in chords], axis=0))
 
-def clock_trap(
-    radio_span: tuple[Any, Any], telemetry_span: tuple[Any, Any], timezone: str | None = None
-) -> ClockTrap | None:
-    """Recognise a clock that is off by whole hours, such as local time stored as if it were UTC.
-
-    Parameters
-    ----------
-    radio_span, telemetry_span : (first, last)
-        datetime64 (UTC) or epoch seconds.
-    timezone : str, optional
-        IANA zone of the site: a shift that equals its offset from UTC on that day is named so.
-
-    Returns
-    -------
-    ClockTrap or None
-        None if the logs overlap as they are, or if no shift of up to 14 h (in half hours) brings them together.
-
-    Examples
-    --------
-    >>> trap = clock_trap((0.0, 600.0), (4 * 3600.0, 4 * 3600.0 + 620.0), "America/New_York")
-    >>> trap.hours
-    4.0
-    """
-    radio = nanoseconds(np.asarray(radio_span)) * 1e-9
-    telemetry = nanoseconds(np.asarray(telemetry_span)) * 1e-9
-
-    def overlap(hours: FloatArray) -> FloatArray:
-        start = np.maximum(radio[0] + 3600.0 * hours, telemetry[0])
-        return np.asarray(np.maximum(0.0, np.minimum(radio[1] + 3600.0 * hours, telemetry[1]) - start))
-
-    shifts = np.asarray(np.arange(-28, 29) * 0.5, dtype=np.float64)
-    shared = overlap(shifts)
-    now = float(overlap(np.zeros(1))[0])
-    # whole hours before half hours, near ones before far ones
-    order = [(-round(float(shared[i])), shifts[i] % 1 != 0, abs(float(shifts[i])), i) for i in range(len(shifts))]
-    best = min(order)[-1]
-    shorter = min(radio[1] - radio[0], telemetry[1] - telemetry[0])
-    if now >= 0.5 * shorter or shared[best] < max(0.5 * shorter, 1e-9):
-        return None
-    hours = float(shifts[best])
-    return ClockTrap(hours, now, float(shared[best]), _explain_hours(hours, float(telemetry[0]), timezone))
+    some = unit[:: max(1, len(unit) // 1500)]
+    left, factor = np.ones(len(some)), np.zeros((len(some), _FEATURES))
+    picked: list[int] = []
+    for column in range(min(_FEATURES, len(some))):
+        at = int(left.argmax())
+        if left[at] < _LEFT:
+            break
+        picked.append(at)
+        factor[:, column] = covariance(some, some[[at]])[:, 0] - factor[:, :column] @ factor[at, :column]
+        factor[:, column] /= np.sqrt(left[at])
+        left = np.maximum(left - factor[:, column] ** 2, 0.0)
+    base = some[picked]
+    lower = np.linalg.cholesky(covariance(base, base) + 1e-9 * np.eye(len(base)))
+    out = np.full((len(direction), len(base)), np.nan)
+    out[known] = solve_triangular(lower, covariance(unit, base).T, lower=True).T
+    return out
 
 
-def _explain_hours(hours: float, instant: float, timezone: str | None) -> str:
-    if timezone is not None:
-        from datetime import datetime
-        from datetime import timezone as utc
-        from zoneinfo import ZoneInfo
+class _Memory:
+    """Covariance of a residual with memory: exp(-|dt| / memory) + white^2 on the diagonal."""
 
-        moment = datetime.fromtimestamp(instant, utc.utc).astimezone(ZoneInfo(timezone))
-        offset = moment.utcoffset()
-        east = offset.total_seconds() / 3600.0 if offset else 0.0
-        if east and hours == -east:
-            return f"radio times are local time ({timezone}) stored as if they were UTC"
-        if east and hours == east:
-            return f"telemetry times are local time ({timezone}) stored as if they were UTC"
-        if abs(hours) == 1.0:
-            return "one hour: daylight saving taken into account in one log only"
-    return f"the clocks differ by {hours:+g} h: a time zone was taken into account in one log only"
+    def __init__(self, time_s: FloatArray, memory_s: float, white: float) -> None:
+        from scipy.linalg import cholesky_banded
+
+        keeps = np.exp(-np.diff(time_s) / memory_s)
+        loses = 1.0 - keeps**2
+        precision = np.zeros((2, len(time_s)))  # of the part with memory: tridiagonal
+        precision[0] = 1.0
+        precision[0, :-1] += keeps**2 / loses
+        precision[0, 1:] += keeps**2 / loses
+        precision[1, :-1] = -keeps / loses
+        inner = white**2 * precision
+        inner[0] += 1.0
+        self._factor = cholesky_banded(inner, lower=True)
+        self._white = white
+        self.log_det = 2.0 * float(np.log(self._factor[0]).sum()) + float(np.log(loses).sum())
+
+    def likelihood(self, features: FloatArray, residual: FloatArray, gains: Sequence[float]) -> FloatArray:
+        """Log likelihood (gains, models), offset, slope and gains integrated out, the scale profiled."""
+        from scipy.linalg import cho_solve_banded, solve_triangular
+
+        columns = np.column_stack([features, residual])
+        solved = columns - cho_solve_banded((self._factor, True), columns)
+        gram = columns.T @ solved / self._white**2
+        n, p = features.shape
+        out = np.empty((len(gains), residual.shape[1]))
+        for row, gain in enumerate(gains):
+            spread = np.full(p, gain)
+            spread[:2] = _FREE
+            inner = spread[:, None] * gram[:p, :p] * spread
+            inner[np.diag_indices(p)] += 1.0
+            lower = np.linalg.cholesky(inner)
+            half = solve_triangular(lower, spread[:, None] * gram[:p, p:], lower=True)
+            left = np.diag(gram[p:, p:]) - (half**2).sum(axis=0)
+            out[row] = -0.5 * n * np.log(left / n) - np.log(np.diag(lower)).sum() - 0.5 * self.log_det
+        return out

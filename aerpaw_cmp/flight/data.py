@@ -20,8 +20,8 @@ from ..logs.ingest import IngestedFile, ingest, read_log
 from ..logs.records import Stream
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
-from .clock import clock_trap
 from .heights import at_height, lacks_height
+from .hour_shift import clock_trap
 from .lock import lock_of
 from .scored import scored_rows, unscored
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, SiteChoice

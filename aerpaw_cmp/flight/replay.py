@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -25,18 +24,13 @@ from ..propagation.paths import Faces, PathSet
 from ..propagation.replay import NOT_IN_RANKS, Replay, replay
 from ..propagation.search.effort import Estimate
 from ..site.site import Site
-from .clock import ClockChannel, ClockEstimate, judge_clock
+from .clock import Along, ClockChannel, ClockEstimate, judge_clock
 from .data import FlightData, RssSeries, Times, rank_positions
-from .lag import DIRECTION_TERMS, terms_from
+from .lock import LOCK_FLOOR_DB
 from .losses import path_loss, reflecting_crowns
 from .settings import RtSettings
-from .track import TrackPoses
-
-COHERENT_STEP_S = 0.02
-"""Sampling of the coherent prediction: two-ray ripples near a tower pass within 0.05 s at 10 m/s."""
-
-POWER_STEP_S = 0.1
-"""Sampling of its power sum, which is smooth."""
+from .track import TrackPoses, nanoseconds
+from .training import learned_here
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,11 +186,12 @@ def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock
         return [None] * len(data.rss)
     if isinstance(wanted, float):
         return [_given_clock(series.tower, wanted, len(series.time)) for series in data.rss]
-    predict, estimated = _Predictions(data), dict[str, ClockEstimate]()
+    estimated = dict[str, ClockEstimate]()
     towers = list(dict.fromkeys(series.tower for series in data.rss))
     for tower in towers:
         progress(f"clock {tower}")
-        estimated[tower] = _estimated_clock(data, [s for s in data.rss if s.tower == tower], predict)
+        channels = clock_channels(data, [s for s in data.rss if s.tower == tower])
+        estimated[tower] = judge_clock(channels, window_s=data.settings.rss.lag_window_s)
     return [_clock_of(series, estimated[series.tower], apply=wanted == "apply") for series in data.rss]
 
 
@@ -206,7 +201,6 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
         receiver=receiver,
         radio_minus_telemetry_s=radio_minus_telemetry_s,
         ci95_s=(radio_minus_telemetry_s, radio_minus_telemetry_s),
-        drift_s_per_s=0.0,
         verdict="given",
         reason="",
         applied=GIVEN,
@@ -215,65 +209,75 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
 
 
 BLOCK = 100_000
-"""Instants of a clock's prediction that are replayed at once: bounds memory on flights of more than half an hour."""
+"""Instants that are replayed at once: bounds memory on flights of more than half an hour."""
+
+CLOCK_STEP_S, CLOCK_INSTANTS = 0.05, 40_000
+"""Sampling of the prediction that a clock is judged by [s]; longer flights take wider steps."""
+
+MOVING_CLOCK_STEP_S = 0.25
+"""The same of a tower that moves: each place is traced for itself."""
 
 
-class _Predictions:
-    """Image-engine RSS along the track; channels with one link that were sampled together share the replay."""
+def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[ClockChannel]:
+    """Levels of one receiver and what they depend on along the telemetry, to judge its clock by.
 
-    def __init__(self, data: FlightData) -> None:
-        self._data = data
-        self._kept: dict[tuple[str, str, bytes], dict[str, FloatArray]] = {}
-        self._tracks: dict[bytes, TrackPoses] = {}
-
-    def __call__(self, series: RssSeries, field: str, times: Any) -> FloatArray:
-        """Level ``rss_dbm`` or ``rss_power_dbm`` at instants (n,) [dBm]; NaN without a pose or path."""
-        key = (series.tower, series.settings_key, _digest(times))
-        if key not in self._kept:
-            link = series.link.build([series.tower], self._data.folder)
-            parts = [self._levels(link, series.tower, part) for part in _in_blocks(times)]
-            self._kept = {k: v for k, v in self._kept.items() if k[0] == series.tower}  # towers come one after another
-            self._kept[key] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return self._kept[key][field]
-
-    def _levels(self, link: Link, tower: str, times: Any) -> dict[str, FloatArray]:
-        data = self._data
-        place, known = data.tower_at(tower, times)
-        track = self.track_at(times).where(known)
-        poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
-        if tower in data.nodes:
-            replayed = replay_moving(data.site, link, poses, place[track.valid], Search(max_depth=depth))
-        else:
-            replayed = replay(data.site, link, poses, Search("image", max_depth=depth))
-        levels = {"rss_dbm": replayed.rss_dbm[:, 0], "rss_power_dbm": replayed.rss_power_dbm[:, 0]}
-        return {name: _spread(track.valid, level) for name, level in levels.items()}
-
-    def track_at(self, times: Any) -> TrackPoses:
-        """Poses at instants (n,); the last few answers are kept, as channels and models ask for the same ones."""
-        key = _digest(times)
-        if key not in self._tracks:
-            kept = list(self._tracks.items())[-_TRACKS_KEPT + 1 :]
-            self._tracks = {**dict(kept), key: self._data.poses_at(times)}
-        return self._tracks[key]
-
-    def terms_at(self, tower: str, times: Any) -> FloatArray:
-        """Terms of direction (n, 12) as seen from a tower, for antennas that are not known."""
-        terms, start = np.empty((len(times), DIRECTION_TERMS)), 0
-        for part in _in_blocks(times):
-            track = self.track_at(part)
-            place = self._data.tower_at(tower, part)[0]
-            some = terms_from(place, track.position_m, track.heading_deg)
-            terms[start : start + len(part)] = some
-            start += len(part)
-        return terms
+    Ratios (the sounder's ``quality``, an SNR) saturate and lose lock where levels do not: they take part only where
+    nothing else was logged.
+    """
+    assert data.track is not None
+    channels = [series for series in channels if series.unit != "dB"] or channels
+    start, end = data.track.start_ns, data.track.end_ns
+    step = MOVING_CLOCK_STEP_S if channels[0].tower in data.nodes else CLOCK_STEP_S
+    step = max(step, (end - start) * 1e-9 / CLOCK_INSTANTS)
+    instants = (start + np.round(np.arange(0.0, (end - start) * 1e-9, step) * 1e9).astype(np.int64)).astype(
+        "datetime64[ns]"
+    )
+    along: dict[str, Along] = {}
+    for series in channels:
+        if series.settings_key not in along:
+            along[series.settings_key] = _along(data, series, instants, step)
+    return [
+        ClockChannel(
+            name=series.channel,
+            time_s=(nanoseconds(series.time) - start) * 1e-9,
+            measured_db=_clock_levels(data, series),
+            along=along[series.settings_key],
+        )
+        for series in channels
+    ]
 
 
-_TRACKS_KEPT = 4
-"""Coherent and power-sum predictions of two channels."""
+def _along(data: FlightData, series: RssSeries, instants: Times, step_s: float) -> Along:
+    """What the level of a series depends on along the telemetry; the replay has at most one reflection."""
+    link = series.link.build([series.tower], data.folder)
+    parts = [_levels_along(data, link, series.tower, part) for part in _in_blocks(instants)]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    distance, directions = columns.pop("distance_m"), columns.pop("directions")
+    if learned_here(data, series, link):  # antennas that were learned from this very log know its lag
+        columns = {"free space": columns["free space"]}
+    return Along(start_s=0.0, step_s=step_s, predicted_db=columns, distance_m=distance, directions=directions)
 
 
-def _digest(times: Any) -> bytes:
-    return sha256(np.asarray(times).tobytes()).digest()
+def _levels_along(data: FlightData, link: Link, tower: str, instants: Times) -> dict[str, FloatArray]:
+    """Levels of three models, distance and directions at instants (n,)."""
+    place, known = data.tower_at(tower, instants)
+    track = data.poses_at(instants).where(known)
+    poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
+    if tower in data.nodes:
+        replayed = replay_moving(data.site, link, poses, place[track.valid], Search(max_depth=depth))
+    else:
+        replayed = replay(data.site, link, poses, Search("image", max_depth=depth))
+    line = track.position_m - place
+    distance = np.linalg.norm(line, axis=1)
+    unit = line / distance[:, None]
+    body = -np.einsum("nij,ni->nj", track.rotation, unit)
+    return {
+        "coherent replay": _spread(track.valid, replayed.rss_dbm[:, 0]),
+        "power sum of the replay": _spread(track.valid, replayed.rss_power_dbm[:, 0]),
+        "free space": -20.0 * np.log10(distance),
+        "distance_m": distance,
+        "directions": np.column_stack([unit, body]),
+    }
 
 
 def _in_blocks(times: Any) -> list[Any]:
@@ -281,40 +285,10 @@ def _in_blocks(times: Any) -> list[Any]:
     return np.array_split(times, max(1, -(-len(times) // BLOCK)))
 
 
-def _estimated_clock(data: FlightData, channels: Sequence[RssSeries], predictions: _Predictions) -> ClockEstimate:
-    """Clock of one receiver by the coherent replay and by its power sum; the one that explains more decides.
-
-    Ratios (the sounder's ``quality``, an SNR) saturate and lose lock where levels do not: they take part only where
-    nothing else was logged. Interference of direct and ground path pins a clock to milliseconds where the field shows
-    it. Where it does not (directive antennas, rough ground), its wrong ripple finds a sharp optimum anywhere: measured
-    on real flights.
-    """
-    tower = channels[0].tower
-    channels = [series for series in channels if series.unit != "dB"] or channels
-
-    def channel(series: RssSeries, field: str, resolution_s: float) -> ClockChannel:
-        return ClockChannel(
-            name=series.channel,
-            times=series.time,
-            measured_db=_high_enough(data, series),
-            predictor=lambda times: predictions(series, field, times),
-            terms=lambda times: predictions.terms_at(tower, times),
-            resolution_s=resolution_s,
-        )
-
-    models = (
-        ("coherent replay", "rss_dbm", COHERENT_STEP_S),
-        ("power sum of the replay", "rss_power_dbm", POWER_STEP_S),
-    )
-    fits = [
-        judge_clock(
-            [channel(series, field, resolution) for series in channels],
-            model=name,
-            window_s=data.settings.rss.lag_window_s,
-        )
-        for name, field, resolution in models
-    ]
-    return max(fits, key=lambda fit: np.nan_to_num(fit.explained, nan=-np.inf))
+def _clock_levels(data: FlightData, series: RssSeries) -> FloatArray:
+    """Levels (n,) that the clock is judged by: those of a sounder no lower than where it loses its lock."""
+    levels = _high_enough(data, series)
+    return levels if series.locked is None else np.maximum(levels, LOCK_FLOOR_DB)
 
 
 def _high_enough(data: FlightData, series: RssSeries) -> FloatArray:
@@ -331,7 +305,7 @@ def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
     """The clock of a receiver as that of one of its series."""
     result = fit.result(series.tower, apply=apply)
     used = result.applied == APPLIED
-    return Clock(result=result, applied_s=fit.correction_s(series.time) if used else np.zeros(len(series.time)))
+    return Clock(result=result, applied_s=np.full(len(series.time), fit.correction_s if used else 0.0))
 
 
 def part_of(whole: Replay, start: int, stop: int) -> Replay:

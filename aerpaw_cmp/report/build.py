@@ -218,28 +218,22 @@ def clocks_of(result: FlightResult) -> dict[str, ClockResult]:
 
 
 def clock_warnings(result: FlightResult) -> tuple[str, ...]:
-    """What the reader must know of each receiver's clock; a correction that was asked for and not made comes first."""
+    """Clocks that were corrected, should be, or cannot be judged; a correction that was not made comes first."""
     asked, other = [], []
     for receiver, clock in clocks_of(result).items():
         low, high = clock.ci95_s
-        shown = f"{clock.radio_minus_telemetry_s:+.2f} s ({low:+.2f} .. {high:+.2f})"
+        side = "ahead of" if clock.radio_minus_telemetry_s > 0 else "behind"
+        shown = f"{abs(clock.radio_minus_telemetry_s):.2f} s {side} the telemetry clock [{low:+.2f}, {high:+.2f}]"
         if clock.applied == NOT_APPLIED:
             asked.append(
-                f"{receiver}: rss.lag: apply was asked for, but the radio clock was NOT corrected: the check is "
-                f"{clock.verdict} ({clock.reason})."
+                f"{receiver}: rss.lag: apply was asked for, but the radio clock was not corrected: {clock.reason}."
             )
         elif clock.applied == APPLIED:
-            other.append(f"{receiver}: the radio clock shows {shown} more than the telemetry clock; it was corrected.")
-        elif clock.verdict == "ok":
-            other.append(
-                f"{receiver}: the radio clock shows {shown} more than the telemetry clock; not corrected "
-                "(rss.lag: apply would)."
-            )
-        elif clock.verdict in ("ambiguous", "failed"):
-            other.append(
-                f"{receiver}: the check of the radio clock against the telemetry clock is {clock.verdict} "
-                f"({clock.reason})."
-            )
+            other.append(f"{receiver}: the radio clock is {shown}; it was corrected.")
+        elif clock.verdict == "shifted":
+            other.append(f"{receiver}: the radio clock is {shown}; it was not corrected (rss.lag: apply would).")
+        elif clock.verdict == "cannot tell":
+            other.append(f"{receiver}: the radio clock could not be checked: {clock.reason}.")
     return (*asked, *other)
 
 

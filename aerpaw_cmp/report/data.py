@@ -225,7 +225,7 @@ class RssPanel:
         Sample size after autocorrelation; NaN when not estimated.
     lag_s, lag_verdict : float, str
         Radio clock minus telemetry clock as estimated (positive: the radio's shows later times), and ``"ok"``,
-        ``"ambiguous"``, ``"failed"`` or ``""``.
+        ``"shifted"``, ``"cannot tell"`` or ``""``.
     fitted : tuple of str
         Names of the numbers that were fitted on the very data they are scored on.
     geometry : mapping

@@ -124,7 +124,7 @@ def first_sentence(facts: Judged) -> str:
 def local_error(panel: RssPanel, span: ErrorSpan) -> str:
     """Where a channel is missed most, and the likely causes, those of the measurement first."""
     causes = []
-    if panel.lag_verdict in ("ambiguous", "failed"):
+    if panel.lag_verdict == "cannot tell":
         causes.append("a clock that could not be confirmed")
     if panel.extra.get("detection"):
         causes.append("a receiver that lost its lock")
@@ -197,7 +197,7 @@ DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
     (lambda d: d.engine is not None and d.engine.audit is None and not d.audit_command, "no audit"),
     (lambda d: _missing_paths(d) > 0, "the audit misses {missing} paths"),
     (lambda d: _field_failures(d) > 0, "the audit of the field failed {failed} times"),
-    (lambda d: any(p.lag_verdict in ("ambiguous", "failed") for p in d.rss), "the radio clock could not be confirmed"),
+    (lambda d: any(p.lag_verdict == "cannot tell" for p in d.rss), "the radio clock could not be confirmed"),
     (lambda d: d.synthetic, "synthetic data"),
     (
         lambda d: not d.synthetic and d.site.illustrative and bool(d.site.buildings),

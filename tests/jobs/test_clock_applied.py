@@ -1,4 +1,4 @@
-"""``rss.lag: apply`` corrects a clock only where its verdict is "ok", and says before anything else where it did not."""
+"""``rss.lag: apply`` corrects a clock whose difference is shown, and says before anything else where it did not."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from aerpaw_cmp.compare.result import ESTIMATED
 from aerpaw_cmp.flight.clock import ClockEstimate
 from aerpaw_cmp.flight.replay import _clock_of, telemetry_time
 from aerpaw_cmp.report.build import clock_warnings, clocks_of, metrics_beyond_panels
@@ -19,10 +20,8 @@ SERIES: Any = SimpleNamespace(tower="LW1", time=TIME)
 def estimate(verdict: str, **more: Any) -> ClockEstimate:
     """A radio that shows 2.5 s more."""
     keys: dict[str, Any] = {
-        "radio_minus_telemetry_s": 2.5, "ci95_s": (2.3, 2.7), "drift_s_per_s": 0.0, "drift_ci95_s_per_s": (np.nan, np.nan),
-        "reference_s": 50.0, "start_ns": int(TIME[0].astype(np.int64)), "verdict": verdict,
-        "reason": "" if verdict == "ok" else "told", "model": "replay", "explained": 0.7, "halves_s": (2.4, 2.6),
-        "channels_s": {"USRP1": 2.5}, "free_patterns_s": 2.5, "held_out": None, "n": 100, "window_s": 15.0,
+        "radio_minus_telemetry_s": 2.5, "ci95_s": (2.3, 2.7), "verdict": verdict,
+        "reason": "flat level" if verdict == "cannot tell" else "", "window_s": 15.0, "channels_s": {"USRP1": 2.5},
     }  # fmt: skip
     return ClockEstimate(**{**keys, **more})
 
@@ -37,11 +36,11 @@ def result(clock: Any) -> Any:
     )
 
 
-@pytest.mark.parametrize("verdict", ["ok", "agree", "ambiguous", "failed"])
+@pytest.mark.parametrize("verdict", ["ok", "shifted", "cannot tell"])
 @pytest.mark.parametrize("apply", [True, False])
-def test_only_ok_is_applied(verdict: str, apply: bool) -> None:
+def test_an_estimate_that_is_told_from_zero_is_applied(verdict: str, apply: bool) -> None:
     clock = _clock_of(SERIES, estimate(verdict), apply=apply)
-    used = apply and verdict == "ok"
+    used = apply and verdict != "cannot tell"
     shift = (TIME - telemetry_time(TIME, clock)) / np.timedelta64(1, "s")
     np.testing.assert_allclose(shift, 2.5 if used else 0.0)
     written = metrics_beyond_panels(result(clock))["clock"]
@@ -54,15 +53,23 @@ def test_only_ok_is_applied(verdict: str, apply: bool) -> None:
     }.items() <= written["LW1"].items()
 
 
+def test_an_interval_that_holds_zero_is_not_applied() -> None:
+    clock = _clock_of(SERIES, estimate("ok", ci95_s=(-0.1, 2.7)), apply=True)
+    assert clock.result.applied == ESTIMATED
+    assert not clock.applied_s.any()
+
+
 def test_a_correction_that_was_asked_for_and_not_made_is_said() -> None:
-    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("ambiguous"), apply=True)))
-    assert "NOT corrected" in text
-    assert "told" in text
-    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("ok"), apply=True)))
+    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("cannot tell"), apply=True)))
+    assert "not corrected: flat level" in text
+    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("shifted"), apply=True)))
+    assert "2.50 s ahead of the telemetry clock" in text
     assert "it was corrected" in text
-    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("ok"), apply=False)))
+    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("shifted"), apply=False)))
     assert "rss.lag: apply would" in text
-    assert clock_warnings(result(_clock_of(SERIES, estimate("agree"), apply=True))) == ()
+    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("cannot tell"), apply=False)))
+    assert "could not be checked: flat level" in text
+    assert clock_warnings(result(_clock_of(SERIES, estimate("ok", ci95_s=(-0.3, 0.2)), apply=True))) == ()
 
 
 def test_channels_of_a_receiver_share_a_clock() -> None:

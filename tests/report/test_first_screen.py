@@ -90,7 +90,7 @@ def test_no_sentence_contradicts_its_numbers(better, worse, channels):
 
 
 def test_a_local_error_is_a_stretch_and_names_the_clock(report_data):
-    panel = dataclasses.replace(report_data.rss[0], lag_verdict="ambiguous")
+    panel = dataclasses.replace(report_data.rss[0], lag_verdict="cannot tell")
     at = np.datetime64("2025-06-01T14:00:00")
     spans = [
         ErrorSpan(

@@ -1,0 +1,96 @@
+"""Power of the clock check: lags planted in every real flight of a folder that holds levels along a track.
+
+Each flight is drafted as it comes and its radio times are shifted. A planted lag of a second and more is found (called
+shifted, the lag in the interval), wrong (the interval misses it) or undecided; a smaller one is found where nothing but
+"ok", or a shift whose interval holds it, is said. The clocks of these logs agree within some second: the count allows
+for that, so an interval that lies beside a small lag is not counted; "called shifted as logged" is.
+
+    python benchmarks/clock_power.py FOLDER [--timezone America/New_York] [--only TEXT] [--quiet]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from aerpaw_cmp.common.errors import AerpawCmpError
+from aerpaw_cmp.flight.clock import CANNOT_TELL, SHIFTED, ClockEstimate, judge_clock
+from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.draft import drafts
+from aerpaw_cmp.flight.replay import clock_channels
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import ReadOptions
+
+PLANTED_S = (0.0, 0.3, -0.7, 1.0, -1.5, 3.0, -6.0, 10.0)
+UNSHIFTED_WITHIN_S = 1.0
+
+
+def drafted(path: Path, timezone: str) -> FlightData | None:
+    """The flight of one file as its draft has it; None where it has no levels along a track."""
+    try:
+        files = ingest([path], options=ReadOptions(timezone=timezone))
+        with tempfile.TemporaryDirectory() as folder:
+            (made,) = drafts(files, Path(folder), timezone=timezone)
+            flight = Path(folder) / "flight.yaml"
+            flight.write_text(made.text)
+            settings = load_flight(flight)
+            data = gather(settings, Path(folder), read_logs(settings, Path(folder)))
+    except (AerpawCmpError, ValueError):
+        return None
+    return data if data.rss and data.track is not None else None
+
+
+def judged(data: FlightData) -> Iterator[tuple[float, ClockEstimate]]:
+    """The estimate of each planted lag, receiver by receiver."""
+    for tower in dict.fromkeys(series.tower for series in data.rss):
+        channels = clock_channels(data, [s for s in data.rss if s.tower == tower])
+        for planted in PLANTED_S:
+            yield planted, judge_clock([replace(c, time_s=c.time_s + planted) for c in channels])
+
+
+def outcome(planted: float, clock: ClockEstimate) -> str:
+    """``found``, ``wrong`` or ``undecided``."""
+    if clock.verdict == CANNOT_TELL:
+        return "undecided"
+    low, high = clock.ci95_s
+    if not low - UNSHIFTED_WITHIN_S <= planted <= high + UNSHIFTED_WITHIN_S:
+        return "wrong"
+    return "found" if clock.verdict == SHIFTED or abs(planted) < 1.0 else "undecided"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--timezone", default="America/New_York")
+    parser.add_argument("--only", default="", help="files whose path holds this")
+    parser.add_argument("--quiet", action="store_true", help="the table alone")
+    asked = parser.parse_args()
+    counts: dict[tuple[str, float], Counter[str]] = {}
+    for path in sorted(p for p in asked.folder.rglob("*") if p.is_file() and asked.only in str(p)):
+        data = drafted(path, asked.timezone)
+        for planted, clock in judged(data) if data is not None else ():
+            said, (low, high) = outcome(planted, clock), clock.ci95_s
+            count = counts.setdefault((path.parent.name, abs(planted)), Counter())
+            count[said] += 1
+            count["shifted"] += clock.verdict == SHIFTED
+            if not asked.quiet:
+                print(
+                    f"{path.stem:40} {planted:+5.1f} {said:9} {clock.verdict:11} {clock.radio_minus_telemetry_s:+6.2f}"
+                    f" [{low:+.2f}, {high:+.2f}]  {clock.reason}",
+                    flush=True,
+                )
+    print("folder        planted  found  wrong  undecided  called shifted")
+    for (kind, planted), count in sorted(counts.items()):
+        numbers = (count[name] for name in ("found", "wrong", "undecided", "shifted"))
+        print(f"{kind:12} {planted:6.1f} s  {{:5}}  {{:5}}  {{:9}}  {{:14}}".format(*numbers))
+    return int(any(count["wrong"] for count in counts.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -360,10 +360,7 @@ class _Series:
         clock = self.replayed.clock
         if clock is None or clock.result.applied not in (APPLIED, GIVEN):
             return stamp
-        ahead = clock.result.radio_minus_telemetry_s
-        if abs(clock.result.drift_s_per_s) > 0:  # the line of a drift is the estimate's own
-            ahead = float(clock.applied_s[row])
-        return stamp - ahead * 1e6
+        return stamp - clock.result.radio_minus_telemetry_s * 1e6
 
     def _level(self, reference: Reference, at: int, pose: Pose, where: str) -> None:
         """Level of direct and ground path, where the replay has no others."""

@@ -340,7 +340,7 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
     options : ReadOptions
     clock : str
         ``wall`` (text, local unless it carries an offset), ``epoch_s``, ``epoch_ms``, ``epoch_us`` (UTC),
-        ``relative_s`` or ``relative_ms`` (from ``time_origin``, else from 1970-01-01).
+        ``relative_s``, ``relative_ms`` or ``relative_us`` (from ``time_origin``, else from 1970-01-01).
     reader : str
         Its name, for messages.
 
@@ -451,13 +451,13 @@ def of_ues(
     flag: AnyArray,
     about: Mapping[str, Attribute | None],
 ) -> list[Stream | None]:
-    """A stream per UE where several were attached at once, else one: a UE that attaches again gets another RNTI.
+    """A stream per UE (RNTI, cell) where several were attached at once, else one: who attaches again gets a new RNTI.
 
     Parameters
     ----------
     rows : Rows
     kind, name : str
-        Of the stream; of several each name ends in ``_rnti<hex>``.
+        Of the stream; of several each name ends in ``_rnti<hex>``, of one RNTI in several cells in ``_pci<n>``.
     values : mapping
         Columns of shape (m,), ``rnti`` among them (NaN where the log names none).
     pick : int array, shape (m,), optional
@@ -471,13 +471,17 @@ def of_ues(
     list of Stream or None
     """
     pick, rnti = np.arange(len(rows)) if pick is None else pick, values["rnti"]
-    rnti = np.where((rnti >= 0) & (rnti <= _MOST_RNTI) & (rnti == np.round(rnti)), rnti, np.nan)
-    known = np.unique(rnti[np.isfinite(rnti)]).astype(int).tolist()
-    if not _together([np.flatnonzero(rnti == one)[[0, -1]] for one in known]):
-        one = {"rnti": known[0]} if len(known) == 1 else {"identity_from": "assumed"}
-        return [rows.stream(kind, name, values, pick=pick, flag=flag, about={**about, **one})]
-    parts = [(f"{name}_rnti{one:04x}", rnti == one, {"rnti": one}) for one in known]
-    parts.append((name, np.isnan(rnti), {"identity_from": "assumed"}))
+    rnti = _identity(rnti, _MOST_RNTI)
+    parts: list[tuple[str, BoolArray, dict[str, Attribute | None]]] = [
+        (ue, mine, {"identity_from": "assumed"} if one is None else {"rnti": int(one)})
+        for ue, mine, one in _divided(name, np.ones(len(rnti), dtype=bool), rnti, "rnti{:04x}")
+    ]
+    if "pci" in values:  # two cells may give one RNTI at one time
+        parts = [
+            (cell, within, {**more, "pci": int(one)} if cell != ue and one is not None else more)
+            for ue, mine, more in parts
+            for cell, within, one in _divided(ue, mine, _identity(values["pci"], _MOST_PCI), "pci{}")
+        ]
     return [
         rows.stream(
             kind, ue, {key: column[mine] for key, column in values.items()}, pick=pick[mine], flag=flag[mine],
@@ -487,8 +491,24 @@ def of_ues(
     ]  # fmt: skip
 
 
-_MOST_RNTI = 0xFFFFFF
-"""RNTIs have sixteen bits; programs print up to six hex digits. A fraction is no identity."""
+def _divided(name: str, where: BoolArray, column: FloatArray, label: str) -> list[tuple[str, BoolArray, float | None]]:
+    """Rows by the values of a column where several of these are there at once, with that value; else all as one."""
+    known = np.unique(column[where & np.isfinite(column)]).tolist()
+    if not _together([np.flatnonzero(where & (column == one))[[0, -1]] for one in known]):
+        return [(name, where, known[0] if len(known) == 1 else None)]
+    parts: list[tuple[str, BoolArray, float | None]] = [
+        (f"{name}_{label.format(int(one))}", where & (column == one), one) for one in known
+    ]
+    return [*parts, (name, where & np.isnan(column), None)]
+
+
+def _identity(numbers: FloatArray, most: int) -> FloatArray:
+    """Numbers that can be an identity, NaN for others: a fraction is none."""
+    return np.where((numbers >= 0) & (numbers <= most) & (numbers == np.round(numbers)), numbers, np.nan)
+
+
+_MOST_RNTI, _MOST_PCI = 0xFFFFFF, 1007
+"""RNTIs have sixteen bits; programs print up to six hex digits."""
 
 
 def _together(spans: list[IntArray]) -> bool:

@@ -25,6 +25,7 @@ CLOCKS = {
     "nemo_csv": "program: milliseconds from time_origin",
     "nemo_kml": "program: milliseconds from time_origin",
     "drive_test": "assumed: local wall time",
+    "gnettrack_kml": "assumed: local wall time",
     "aadm_snr": "program: AADM controller datetime.now(), local wall time",
     "controller_log": _TS,
     "srsenb_log": _TS,

@@ -14,17 +14,18 @@ from . import _sheet
 
 LATITUDE = (r"(osd |gps )?(lat|latitude)( deg| degrees)?", r".* (lat|latitude)")
 LONGITUDE = (r"(osd |gps )?(lon|lng|long|longitude)( deg| degrees)?", r".* (lon|lng|longitude)")
+_LENGTH = r"( m| meters| metres| ft| feet)?"
 ABOVE_TAKEOFF = (
-    r"height above takeoff( feet| m| ft)?", r"osd height( ft| m)?", r"(rel|relative) (alt|altitude|height)( m)?",
-    r"relalt", r"height( m)?", r"alt m",
+    rf"height above takeoff{_LENGTH}", rf"osd height{_LENGTH}", rf"(rel|relative) (alt|altitude|height){_LENGTH}",
+    rf"(altitude ?relative|relalt){_LENGTH}", rf"height{_LENGTH}", rf"ascent{_LENGTH}", r"alt m",
 )  # fmt: skip
 ALTITUDE = (
-    r"(gps )?(alt|altitude|ele|elevation)( m| ft| meters)?",
-    r"osd altitude( ft| m)?",
+    rf"(gps )?(alt|altitude|ele|elevation){_LENGTH}",
+    rf"osd altitude{_LENGTH}",
     r"altitude above ?sea ?level.*",
-    r"(altitude|alt|height|elevation) (amsl|msl|asl)( m)?|(amsl|msl)( altitude| alt)?( m)?",
+    rf"(altitude|alt|height|elevation) ?(amsl|msl|asl){_LENGTH}|(amsl|msl)( altitude| alt)?{_LENGTH}",
 )
-_SEA_LEVEL = re.compile(r"sea ?level|\b(amsl|msl|asl|ele|elevation)\b|^gps |^osd ")
+_SEA_LEVEL = re.compile(r"sea ?level|(\b|altitude)(amsl|msl|asl)\b|\b(ele|elevation)\b|^gps |^osd ")
 _OF_AERPAW = {
     "gpsfix",
     "numberofsatellites",
@@ -34,7 +35,18 @@ _OF_AERPAW = {
     "volt",
     "voltage",
 }
-_OF_RECEIVERS = ({"gcrs", "spd"}, {"networktech"}, {"networkmode"})
+_OF_RECEIVERS = (
+    {"gcrs", "spd"},
+    {"networktech"},
+    {"networkmode"},
+    {"cellname"},
+    {"psc or pci"},
+    {"timestamp sample", "eph"},
+    {"time utc usec"},
+)
+_OF_PHONES = {"networktech", "networkmode"}
+_PX4_GPS = "time utc usec"
+"""PX4's receiver: positions in 1e-7 degrees, altitudes in mm, where they are whole numbers."""
 _REST_S, _REST_M, _REST_RISE_M = 5.0, 2.0, 0.3
 ANGLES = {
     "roll_deg": (r"(osd |gimbal )?roll( deg| degrees| rad)?",),
@@ -42,13 +54,15 @@ ANGLES = {
     "yaw_deg": (r"(osd )?yaw( deg| degrees| rad)?", r"compass heading( degrees)?", r"heading( deg)?", r"bearing"),
 }
 VELOCITIES = {
-    "velocity_north_mps": (r"velocity ?(north|x)( mps)?", r"vn", r"(osd )?x ?speed.*", r"speed ?x"),
-    "velocity_east_mps": (r"velocity ?(east|y)( mps)?", r"ve", r"(osd )?y ?speed.*", r"speed ?y"),
-    "velocity_down_mps": (r"velocity ?(down|z)( mps)?", r"vd", r"vz", r"(osd )?z ?speed.*", r"speed ?z"),
+    "velocity_north_mps": (r"velocity ?(north|x)( mps)?", r"vn", r"vel n m s", r"(osd )?x ?speed.*", r"speed ?x"),
+    "velocity_east_mps": (r"velocity ?(east|y)( mps)?", r"ve", r"vel e m s", r"(osd )?y ?speed.*", r"speed ?y"),
+    "velocity_down_mps": (r"velocity ?(down|z)( mps)?", r"vd", r"vz", r"vel d m s", r"(osd )?z ?speed.*", r"speed ?z"),
 }
 COUNTS = {
-    "fix": (r"(gps )?fix( type)?", r"gpsfix"),
-    "satellites": (r"(number of satellites?|satellites|num ?sat|osd gpsnum|nsats|numberofsatellites)",),
+    "fix": (r"(gps )?fix( type)?", r"gpsfix", r"gps lock"),
+    "satellites": (
+        r"(number of satellites?|satellites( used)?|num ?sat|osd gpsnum|nsats|numberofsatellites|gps count)",
+    ),
 }
 
 
@@ -76,7 +90,11 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     latitude, longitude = sheet.find(*LATITUDE), sheet.find(*LONGITUDE)
     if latitude is None or longitude is None:
         return None
-    values: dict[str, AnyArray] = {"latitude_deg": sheet.numbers(latitude), "longitude_deg": sheet.numbers(longitude)}
+    scale = 1e-7 if _is_px4_gps(sheet, latitude) else 1.0
+    values: dict[str, AnyArray] = {
+        "latitude_deg": scale * sheet.numbers(latitude),
+        "longitude_deg": scale * sheet.numbers(longitude),
+    }
     lost = clean(rows, values)
     values["altitude_m"] = _altitude(rows, sheet, lost)
     values |= _angles(rows, sheet)
@@ -89,6 +107,11 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
     where = None if lost.all() else ~lost
     return rows.stream("telemetry", name, values, where=where, source=source, height_from=rows.height_from)
+
+
+def _is_px4_gps(sheet: _sheet.Sheet, latitude: int) -> bool:
+    """Whether positions are PX4's integers."""
+    return _PX4_GPS in sheet.plain and bool((np.abs(sheet.numbers(latitude)) > 180.0).any())
 
 
 def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
@@ -116,15 +139,16 @@ _TAKEN_OFF = "altitudes are above sea level: {:.1f} m, that of the first positio
 
 
 def _altitude(rows: _rows.Rows, sheet: _sheet.Sheet, lost: BoolArray) -> FloatArray:
-    column = sheet.find(*ABOVE_TAKEOFF)
-    if column is not None:
+    above, column = sheet.find(*ABOVE_TAKEOFF), sheet.find(*ALTITUDE)
+    if above is not None and not (column is not None and _OF_PHONES & set(sheet.plain)):  # there a height of the floor
         rows.height_from = "written"
-        return sheet.numbers(column)
-    column = sheet.find(*ALTITUDE)
+        return sheet.numbers(above)
     if column is None:
         rows.warnings.append("the log has no altitude: give the track another log, or heights are unknown")
         return np.full(len(rows), np.nan)
     altitude = sheet.numbers(column)
+    if _PX4_GPS in sheet.plain and sheet.plain[column] == "alt":
+        altitude = altitude / 1e3
     first = altitude[np.isfinite(altitude) & ~lost][:1]
     if not len(first) or abs(first[0]) < 10.0:  # what begins within a few metres of zero is relative to take-off
         return altitude

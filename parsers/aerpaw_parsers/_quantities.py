@@ -63,6 +63,45 @@ def quantity(name: str) -> Quantity | None:
     return next((meaning for pattern, meaning in _COMPILED if pattern.search(text)), None)
 
 
+OF_GNETTRACK = ("networktech", "networkmode")
+"""Columns that it alone has."""
+_GNETTRACK = {
+    r"level": "rsrp", r"qual": "rsrq", r"psc": "pci", r"nrxlev(\d)": r"rsrp neighbour \1",
+    r"nqual(\d)": r"rsrq neighbour \1", r"ncell(\d)": r"pci neighbour \1", r"narfcn(\d)": r"arfcn neighbour \1",
+    r"lterssi": "rssi",
+}  # fmt: skip
+SRSUE = {"time", "cc", "earfcn", "rsrp", "cfo"}
+"""Columns of srsUE's metrics file, whose time counts milliseconds."""
+_SRSUE = {r"pl": "path loss"}
+_BARE = {r"rank": "rank indicator"}
+"""By itself the word may be that of any list; beside a level of a cell it is the channel's."""
+_CELLMAPPER = {r"signal": "rsrp", r"psc or pci": "pci"}
+
+
+def in_common_words(names: list[str]) -> list[str]:
+    """Plain names, those that only one program uses in the words of all: G-NetTrack Pro's, srsUE's metrics file's."""
+    given = set(names)
+    if {"level", "qual"} <= given and not given.isdisjoint(OF_GNETTRACK):
+        table = _GNETTRACK
+    elif given >= SRSUE:
+        table = _SRSUE
+    elif {"signal", "psc or pci"} <= given:
+        table = _CELLMAPPER
+    elif "rank" in given and any(is_level(name) for name in names):
+        table = _BARE
+    else:
+        return names
+    for pattern, word in table.items():
+        names = [re.sub(f"^{pattern}$", word, name) for name in names]
+    return names
+
+
+def is_level(name: str) -> bool:
+    """Whether a name is that of a level."""
+    meaning = quantity(name)
+    return meaning is not None and meaning.kind == "rss"
+
+
 def is_rank(name: str) -> bool:
     """Whether a name is that of a rank."""
     meaning = quantity(name)

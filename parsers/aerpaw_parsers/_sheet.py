@@ -21,13 +21,14 @@ from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
 from . import _stamps
-from ._quantities import plain
+from ._quantities import SRSUE, plain
 
 SEPARATORS = (",", ";", "\t", "|")
 TITLES = 60
 """Lines in front of a header, at most."""
 _NUMBER = re.compile(r"[-+]?\d{0,20}(?:[.,]\d{0,20})?(?:[eE][-+]?\d{1,3})?")
 _UNIT = re.compile(r"[\[(]([^\[\]()]{1,12})[\])]\s*$")
+_A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5%\u00b0]{1,7}(/[a-z]{1,3})?")
 _READ_IN = {
     "m": {"ft": 0.3048, "feet": 0.3048, "m": 1.0, "meters": 1.0},
     "m/s": {"mph": 0.44704, "m/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kts": 0.514444, "knots": 0.514444},
@@ -144,9 +145,9 @@ class Sheet:
         return found[1].strip().lower() if found else self.units.get(column, "")
 
     def unit_read(self, column: int) -> str:
-        """Unit of :meth:`numbers`."""
+        """Unit of :meth:`numbers`; empty where the brackets hold something else, such as ``(LTE scell0)``."""
         unit = self.unit(column)
-        return _FACTORS[unit][0] if unit in _FACTORS else unit
+        return _FACTORS[unit][0] if unit in _FACTORS else unit if _A_UNIT.fullmatch(unit) else ""
 
     def silence(self, where: BoolArray, columns: Iterable[int]) -> None:
         """Read the cells of some rows as empty."""
@@ -239,9 +240,10 @@ def _fitted(fields: list[str], names: list[str]) -> list[str]:
 
 
 TIME_NAMES = (
+    r"time utc usec",
     r"(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| iso| unix)?",
     r"(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s)?",
-    r"(custom )?(update ?)?time( utc| ms| s| local)?",
+    r"(custom )?(update ?)?time( utc| ms| s| local| epoch)?",
     r"time ?millisecond",
     r"(rel|relative|elapsed) ?time( ms| s)?",
     r"t",
@@ -249,8 +251,8 @@ TIME_NAMES = (
 """Names of the column of times, the surest first."""
 
 
-SRSUE = {"time", "cc", "earfcn", "rsrp", "cfo"}
-"""Columns of srsUE's metrics file, whose time counts milliseconds."""
+PX4 = {"timestamp", "timestamp sample"}
+"""Columns of ulog2csv's tables, whose time counts microseconds since the autopilot was switched on."""
 
 
 def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str] = ()) -> _rows.Rows | None:
@@ -272,8 +274,9 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str]
     name, unit = sheet.plain[column], sheet.unit(column)
     in_ms = unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) is not None
     count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s" if unit or name.endswith(" s") else None
+    count = "us" if set(sheet.plain) >= PX4 and name == "timestamp" else count
     utc = re.search(r"\b(utc|gps|gmt)\b", name) is not None
-    clock, cells, warnings = _stamps.read(texts, options, unit=count)
+    clock, cells, warnings = _stamps.read(texts, options, unit=count, european=_has_decimal_commas(sheet))
     if clock == "wall" and utc and not np.char.endswith(cells, b"Z").all():
         cells = np.array([cell if re.search(rb"(Z|[+-]\d\d:?\d\d)$", cell) else cell + b"Z" for cell in cells.tolist()])
     made = _rows.built(
@@ -286,6 +289,14 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str]
     if (counter := sheet.find("time millisecond")) not in (None, column):
         _finer(made, sheet.numbers(counter))
     return made
+
+
+_DECIMAL_COMMA = re.compile(r"-?\d{1,4},\d{1,9}")
+
+
+def _has_decimal_commas(sheet: Sheet) -> bool:
+    """Whether the first row has numbers with a decimal comma."""
+    return bool(sheet.cells) and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in sheet.cells[0])
 
 
 _MOST_APART_NS = 1_500_000_000

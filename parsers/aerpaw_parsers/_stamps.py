@@ -90,14 +90,25 @@ def _day_first(texts: Iterable[str]) -> bool | None:
     return None
 
 
-def read(texts: Sequence[str], options: ReadOptions, *, unit: str | None = None) -> tuple[str, AnyArray, list[str]]:
+def _first_by_name(texts: Sequence[str], name: str) -> bool | None:
+    """Whether the day stands first if the first date is to be that of the file name; None where it is no help."""
+    date = date_in_name(name)
+    fits = [first for first in (True, False) if date and (_dated(texts[0], first) or b"").startswith(date.encode())]
+    return fits[0] if len(fits) == 1 else None
+
+
+def read(
+    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, european: bool = False
+) -> tuple[str, AnyArray, list[str]]:
     """A column of times in any of the known forms.
 
     Parameters
     ----------
     texts : sequence of str
-    unit : {"s", "ms"}, optional
+    unit : {"s", "ms", "us"}, optional
         Of numbers, where the head of the column says so and they count from no known origin.
+    european : bool
+        Has the table decimal commas? Where they stand, the day comes before the month.
 
     Returns
     -------
@@ -115,7 +126,14 @@ def read(texts: Sequence[str], options: ReadOptions, *, unit: str | None = None)
     if sum(_OF_DAY.fullmatch(text) is not None for text in some) * 2 > len(some):
         return _of_day(shown, options)
     first = _day_first(some)
-    warnings = ["the dates can be read with the day or the month first: the month was taken"] if first is None else []
+    warnings = []
+    if first is None:
+        first = _first_by_name(some, options.file_name)
+        reason = "as the date in the file name"
+        if first is None:
+            first, reason = european, "as where decimal commas are written" if european else "a guess"
+        word = "day" if first else "month"
+        warnings = [f"the dates can be read with the day or the month first: the {word} was taken, {reason}"]
     made = [text.encode() if _COMMON.fullmatch(text) else _dated(text, bool(first)) or b"-" for text in shown]
     return "wall", np.array(made or [b"-"], dtype=np.bytes_)[: len(made)], warnings
 

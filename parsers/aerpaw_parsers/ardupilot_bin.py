@@ -1,13 +1,15 @@
-"""ArduPilot dataflash log (``.bin``): positions, attitude and velocity of the aircraft's own log.
+"""ArduPilot dataflash log (``.bin``, or ``.log`` as Mission Planner writes it): the aircraft's own pose and velocity.
 
 The format describes itself: every message begins with A3 95 and its number, ``FMT`` messages give the length and
-columns of each. Read are ``POS`` (else ``GPS``), ``ATT``, ``XKF1`` or ``NKF1`` (velocity) and ``GPS`` (UTC, fix).
+columns of each; in text each message is a line, ``NAME, value, value``.
+Read are ``POS`` (else ``GPS``), ``ATT``, ``XKF1`` or ``NKF1`` (velocity) and ``GPS`` (UTC, fix).
 Heights are above home (``RelHomeAlt``), else above the first position. Source: ArduPilot
 ``libraries/AP_Logger/LogStructure.h``.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 
 import numpy as np
@@ -46,9 +48,12 @@ _TYPES = {
 _WANTED = ("POS", "GPS", "ATT", "XKF1", "NKF1", "EKF1")
 
 
+_TEXT = re.compile(rb"FMT, ?128, ?89, ?FMT,")
+
+
 def sniff(head: bytes) -> bool:
     """Whether it begins with the description of the description."""
-    return head[:3] == _MARK + bytes([_FMT])
+    return head[:3] == _MARK + bytes([_FMT]) or _TEXT.match(head) is not None
 
 
 class _Form:
@@ -104,6 +109,32 @@ def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
     return found, count, damaged
 
 
+def _text_messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
+    """The same of a log in text, whose values have their scales already; every line is a message."""
+    columns: dict[str, tuple[str, ...]] = {}
+    found: _Rows = {name: {} for name in _WANTED}
+    damaged: list[RejectedLine] = []
+    lines = data.decode("utf-8", "replace").splitlines()
+    for number, line in enumerate(lines):
+        name, *cells = (cell.strip() for cell in line.split(","))
+        if name == "FMT" and len(cells) > 4:
+            columns[cells[2]] = tuple(cells[4:])
+        elif name in found:
+            values = [_number(cell) for cell in cells]
+            if name in columns and len(values) == len(columns[name]):
+                found[name].setdefault(columns[name], []).append((number, tuple(values)))
+            else:
+                damaged.append(RejectedLine(number + 1, "a message without the fields of its FMT line", line[:500]))
+    return found, len(lines) - len(damaged), damaged
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return float("nan")
+
+
 def _series(found: _Rows, name: str) -> _autopilot.Series:
     """Messages of one name: of its descriptions the commonest, of instances (sensors, filters) the first."""
     timed = {names: rows for names, rows in found[name].items() if "TimeUS" in names}
@@ -123,7 +154,7 @@ def _series(found: _Rows, name: str) -> _autopilot.Series:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Telemetry ``vehicle``."""
-    found, count, damaged = _messages(data)
+    found, count, damaged = _text_messages(data) if _TEXT.match(data) else _messages(data)
     series = {name: _series(found, name) for name in _WANTED}
     gps = series["GPS"]
     place = series["POS"] if len(series["POS"].time_s) else gps
@@ -176,7 +207,7 @@ def _offset(gps: _autopilot.Series) -> float | None:
 
 READER = Reader(
     name="ardupilot_bin",
-    title="ArduPilot dataflash log (.bin)",
+    title="ArduPilot dataflash log (.bin, or .log in text)",
     kinds=("telemetry",),
     sample="binary: POS, GPS, ATT, XKF1",
     sniff=sniff,

@@ -29,48 +29,21 @@ _NEIGHBOUR = re.compile(
 )
 _NR = re.compile(r"\b(nr|5g|spcell|ss ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss")
 _LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
+_SECONDARY = re.compile(r"\bsc(?:ell|c) ?(\d{0,2})\b")
+"""A secondary carrier: it serves beside the primary one."""
 _NUMBER = re.compile(r"(?:^| )n?(\d{1,2})(?: |$)")
 _BESIDE = {"RSRQ": "rsrq_db", "RSSI": "rssi_dbm", "SINR": "sinr_db", "path loss": "pathloss_db"}
 _TOWER_SNR = re.compile(r"snr (lw\d)")
 
 
-_OF_GNETTRACK = ("networktech", "networkmode")
-"""Columns that it alone has."""
-_GNETTRACK = {
-    r"level": "rsrp", r"qual": "rsrq", r"psc": "pci", r"nrxlev(\d)": r"rsrp neighbour \1",
-    r"nqual(\d)": r"rsrq neighbour \1", r"ncell(\d)": r"pci neighbour \1", r"narfcn(\d)": r"arfcn neighbour \1",
-    r"lterssi": "rssi",
-}  # fmt: skip
-_SRSUE = {r"pl": "path loss"}
-_BARE = {r"rank": "rank indicator"}
-"""By itself the word may be that of any list; beside a level of a cell it is the channel's."""
+_REGISTERED = (r"(is )?(registered|serving|connected)( cell)?",)
+"""Columns of tables with a cell a row: whether the cell serves."""
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
-
-
-def known(names: list[str]) -> list[str]:
-    """Plain names, those that only one program uses in the words of all: G-NetTrack Pro's, srsUE's metrics file's."""
-    given = set(names)
-    if {"level", "qual"} <= given and not given.isdisjoint(_OF_GNETTRACK):
-        table = _GNETTRACK
-    elif given >= _sheet.SRSUE:
-        table = _SRSUE
-    elif "rank" in given and any(_is_level(name) for name in names):
-        table = _BARE
-    else:
-        return names
-    for pattern, word in table.items():
-        names = [re.sub(f"^{pattern}$", word, name) for name in names]
-    return names
-
-
-def _is_level(name: str) -> bool:
-    meaning = _quantities.quantity(name)
-    return meaning is not None and meaning.kind == "rss"
 
 
 def is_header(names: list[str]) -> bool:
     """Whether names hold a time and a level, ratio or rank."""
-    names = known(names)
+    names = _quantities.in_common_words(names)
     times = any(_sheet.matches(name, (*_sheet.TIME_NAMES, "date")) for name in names)
     return times and any(pose_csv.has_radio(name) for name in names) and len(names) > 2
 
@@ -110,8 +83,8 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
             continue
         rat = "nr" if _NR.search(name) else "lte" if _LTE.search(name) else ""
         neighbour = _NEIGHBOUR.search(name) is not None
-        number = _NUMBER.search(re.sub(r"\b[45] ?g\b", "", name))
-        role = f"n{number[1] if number else 0}" if neighbour else "serving"
+        number, second = _NUMBER.search(re.sub(r"\b[45] ?g\b", "", name)), _SECONDARY.search(name)
+        role = f"n{number[1] if number else 0}" if neighbour else f"scell{second[1]}" if second else "serving"
         cell = cells.setdefault((rat, role), _Cell(rat, not neighbour))
         _put(cell, i, meaning, is_pci=is_pci, is_arfcn=is_arfcn, others=others)
     return _completed(cells, others), others, ranks
@@ -164,6 +137,11 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
 
 def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
     tables = []
+    tech, registered = sheet.find(*_quantities.OF_GNETTRACK), sheet.find(*_REGISTERED)
+    of_row = None if tech is None else np.array([_rat(text) for text in sheet.texts(tech)], dtype=np.int8)
+    idle = None
+    if registered is not None:
+        idle = np.array([text.lower() in ("false", "0", "no") for text in sheet.texts(registered)], dtype=bool)
     for cell in cells:
         assert cell.rsrp is not None
         level = sheet.numbers(cell.rsrp)
@@ -172,11 +150,21 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
         beside = np.stack([_or_nan(sheet, cell.beside.get(name), len(level))[row] for name in _cells.BESIDE])
         pci = np.where(pci == np.round(pci), pci, np.nan)  # a fraction is no identity of a cell
         rat = np.full(len(row), _cells.RATS.index(cell.rat), dtype=np.int8)
+        if of_row is not None and not cell.rat:
+            rat = of_row[row]
         serving = np.full(len(row), cell.serving)
+        if idle is not None:
+            serving &= ~idle[row]
         tables.append(
             _cells.Table(row=row, rat=rat, pci=pci, arfcn=arfcn, rsrp_dbm=level[row], serving=serving, beside=beside)
         )
     return _cells.joined(tables)
+
+
+def _rat(technology: str) -> int:
+    """Index into ``RATS`` of what G-NetTrack calls a technology."""
+    word = technology.strip().lower()
+    return _cells.RATS.index("lte" if word in ("4g", "lte") else "nr" if word in ("5g", "nr") else "")
 
 
 def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:
@@ -189,6 +177,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows = None if sheet is None else _sheet.rows(sheet, options, reader="drive_test")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "drive_test", "no header with a time and a level, ratio or rank")
+    return of_sheet(rows, sheet)
+
+
+def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
+    """Streams of a table whose columns have the names of a drive-test program."""
     _settle_names(sheet)
     cells, others, ranks = _places(sheet)
     track = _pose.from_sheet(rows, sheet, name="phone", source="table of a phone")
@@ -213,11 +206,11 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
 
     Its ``LTERSSI`` is in dBm, from older phones in steps from 0 that are no level.
     """
-    words = known(sheet.plain)
-    if not set(words).isdisjoint(_OF_GNETTRACK):
+    words = _quantities.in_common_words(sheet.plain)
+    if not set(words).isdisjoint(_quantities.OF_GNETTRACK):
         sheet.units |= {i: "kbit/s" for i, name in enumerate(words) if name in ("dl bitrate", "ul bitrate")}
     if words != sheet.plain and "level" in sheet.plain:
-        places, tech = [sheet.plain.index(name) for name in ("level", "qual")], sheet.find(*_OF_GNETTRACK)
+        places, tech = [sheet.plain.index(name) for name in ("level", "qual")], sheet.find(*_quantities.OF_GNETTRACK)
         if tech is not None:
             texts = sheet.texts(tech)
             other = {text for text in set(texts) if not _TECH.search(text)}

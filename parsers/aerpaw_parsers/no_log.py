@@ -14,7 +14,18 @@ from aerpaw_cmp.logs.matfile import MAGIC
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import flight_mat, gpx, iq_burst, nemo_kml, oai_log, srsenb_log, srsran_gnb, srsue_log, vehicle_log
+from . import (
+    flight_mat,
+    gnettrack_kml,
+    gpx,
+    iq_burst,
+    nemo_kml,
+    oai_log,
+    srsenb_log,
+    srsran_gnb,
+    srsue_log,
+    vehicle_log,
+)
 
 _PATTERN = re.compile(rb"Frequency ?= ?\d{1,6} ?\(MHz\)")
 _CUT = re.compile(rb"Phi ?= ?-?\d{1,3}(?:\.\d{1,6})? ?\(deg\)")
@@ -60,7 +71,7 @@ def _other_mat(head: bytes) -> bool:
 
 
 def _kml(head: bytes) -> bool:
-    return b"<kml" in head[:2048] and not nemo_kml.sniff(head)
+    return b"<kml" in head[:2048] and not nemo_kml.sniff(head) and not gnettrack_kml.sniff(head)
 
 
 def _plain_kml(head: bytes) -> bool:
@@ -150,7 +161,7 @@ _KINDS: tuple[tuple[str, str, Callable[[bytes], bool]], ...] = (
     ("antenna_gain", "antenna gain over frequency, without directions", lambda head: _GAIN.match(head) is not None),
     (
         "kml_levels",
-        "a KML with levels in a layout that is not read (G-NetTrack, ...): give the program's text log or CSV",
+        "a KML with levels in a layout that is not read: give the program's text log or CSV",
         lambda head: _kml(head) and _LEVELS.search(head) is not None,
     ),
     ("kml_other", "a KML without measurements (a geofence, a map, a route for 'aerpaw-cmp predict')", _plain_kml),

@@ -6,15 +6,25 @@ brought to heights above the first position. Times without a zone are local unle
 
 from __future__ import annotations
 
+import re
+
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
 from . import _nemo, _pose, _quantities, _sheet, quectel_ri, vehicle_out
 
+_LIKE_A_LEVEL = re.compile(
+    r"^(?!.*(batt|volt|throttle|gps)).*(\b(rx|received?) ?power|signal|\bdbm\b|\brss\b|strength)"
+)
+
 
 def is_header(names: list[str]) -> bool:
     """Whether names hold a position and a time, and no quantity of a radio."""
-    return _pose.has_position(names) and _has_time(names) and not any(has_radio(name) for name in names)
+    return (
+        _pose.has_position(names)
+        and _has_time(names)
+        and not any(has_radio(name) for name in _quantities.in_common_words(names))
+    )
 
 
 def has_radio(name: str) -> bool:
@@ -39,6 +49,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows = None if sheet is None else _sheet.rows(sheet, options, reader="pose_csv")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "pose_csv", "no header with a time, a latitude and a longitude")
+    unread = [name for name, text in zip(sheet.names, sheet.plain, strict=True) if _LIKE_A_LEVEL.search(text)]
+    if unread:
+        rows.warnings.append(f"columns that are not read: {', '.join(unread[:5])}; '--map' reads a level")
     return rows.result([_pose.from_sheet(rows, sheet, name="vehicle", source="table of positions")])
 
 

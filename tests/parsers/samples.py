@@ -119,6 +119,17 @@ _DESCRIPTION = (
     b"&lt;p&gt;PDSCH rank (NR) = %s &lt;/p&gt;&lt;p&gt;(lat, lon) = (35.7300001,-78.7000002)&lt;/p&gt;"
     b"&lt;p&gt; altitude = 10.25 m&lt;/p&gt;&lt;p&gt; index = 7&lt;/p&gt;</description>\n"
 )
+GNETTRACK_KML = (
+    b"<?xml version='1.0'?>\n<kml><Document>\n"
+    + b"".join(
+        b'<Placemark><ExtendedData>\n<Data name="TIME"><value>2025.03.02_10.00.0%d</value></Data>\n'
+        b'<Data name="RSRP"><value>-8%d</value></Data><Data name="PCI"><value>7</value></Data></ExtendedData>\n'
+        b"<Point><coordinates>-78.7,35.73,7%d</coordinates></Point></Placemark>\n" % (s, s, s)
+        for s in (1, 2)
+    )
+    + b"</Document></kml>\n"
+)
+
 NEMO_KML = (
     b'<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">\n  <Document>\n'
     b"    <Placemark>\n" + _DESCRIPTION % (b"-1500.25", b"2.0") + b"    </Placemark>\n"
@@ -506,6 +517,7 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
     },
     "quectel_ri": {"table": (RI_TABLE, 2, 1)},
     "nemo_csv": {"table": (NEMO_CSV, 3, 0)},
+    "gnettrack_kml": {"pretty": (GNETTRACK_KML, 2, 0)},
     "nemo_kml": {"placemarks": (NEMO_KML, 2, 1)},
     "aadm_snr": {"table": (SNR_CSV, 2, 1)},
     "controller_log": {"console": (CONTROLLER, 3, 1)},

@@ -95,7 +95,7 @@ def test_a_neighbour_that_nobody_names_is_no_level_of_the_serving_cell() -> None
             b"Timestamp,NetworkMode,RSRP," + name + b"\n2025.03.02_10.00.00,LTE,-90,-99\n2025.03.02_10.00.01,LTE,,-98\n"
         )
         result = read("drive_test", data)
-        assert stream(result, "rsrp").frame["rss_db"].tolist() == [-90.0]
+        assert stream(result, "lte_rsrp").frame["rss_db"].tolist() == [-90.0]
         other = stream(result, name.decode().lower().replace(" ", "_"))
         assert (other.kind, other.frame["value"].tolist()) == ("kpi", [-99.0, -98.0]), "no report compares it"
 
@@ -146,7 +146,7 @@ def test_g_nettrack_neighbours_are_not_the_serving_cell() -> None:
 def test_g_nettrack_pro_rssi_is_beside_its_level_and_steps_are_none() -> None:
     rows = samples.GNETTRACK_PRO.splitlines(keepends=True)
     result = read("drive_test", b"".join([*rows[:2], rows[1].replace(b"|-70|", b"|17|").replace(b"00.00|", b"00.02|")]))
-    (cell,) = (one for one in result.streams if one.name == "pci42")
+    (cell,) = (one for one in result.streams if one.name == "lte_pci42")
     assert cell.frame["rssi_dbm"].tolist()[:1] == [-70.0]
     assert np.isnan(cell.frame["rssi_dbm"].to_numpy()[1:]).all(), "older phones: steps from 0, no level"
 

@@ -198,6 +198,245 @@ CASES |= {
 }
 
 
+DJI = "OSD.latitude,OSD.longitude,OSD.height [ft],OSD.yaw"
+CASES |= {
+    "AirData in metres begins in the air": Case(
+        "airdata.csv",
+        "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(meters),altitude_above_seaLevel(meters)\n"
+        + "".join(f"{500 * i},2025-03-02 15:00:{i // 2:02d},35.73,-78.7,{10 + i},{110 + i}\n" for i in range(4)),
+        {"vehicle": {"time": [0, 0.5, 1, 1.5], "altitude_m": [10, 11, 12, 13]}},
+        "pose_csv",
+    ),
+    "FlyTrex and Litchi: ascent is above take-off, UTC beside local": Case(
+        "flight.csv",
+        "latitude,longitude,altitude(feet),ascent(feet),time(millisecond),datetime(utc),datetime(local),satellites\n"
+        "35.73,-78.7,400,0,0,2025-03-02 15:00:00,2025-03-02 10:00:00,12\n"
+        "35.73,-78.7,500,100,1000,2025-03-02 15:00:01,2025-03-02 10:00:01,12\n",
+        {"vehicle": {"time": [0, 1], "altitude_m": [0, 30.48], "satellites": [12, 12]}},
+        "pose_csv",
+    ),
+    "DJI Flight Reader: decimal commas, twelve hours, home beside the aircraft": Case(
+        "dji.csv",
+        '"CUSTOM.date [local]","CUSTOM.updateTime [local]","HOME.latitude","HOME.longitude","OSD.latitude","OSD.longitude",'
+        '"OSD.height [ft]","OSD.yaw","GIMBAL.yaw"\n'
+        '"2025-03-02","10:00:01,5 am","35,5","-78,5","35,73","-78,7","10,0","-9,5","0,0"\n',
+        {"vehicle": {"time": [1.5], "latitude_deg": [35.73], "altitude_m": [3.048], "yaw_deg": [-9.5]}},
+        "pose_csv",
+    ),
+    "DJI Flight Reader: UTC beside local": Case(
+        "dji.csv",
+        f"CUSTOM.date [UTC],CUSTOM.updateTime [UTC],CUSTOM.date [local],CUSTOM.updateTime [local],{DJI}\n"
+        "2025-03-02,3:00:01.25 pm,2025-03-02,10:00:01.25 am,35.73,-78.7,10,-9.5\n",
+        {"vehicle": {"time": [1.25], "yaw_deg": [-9.5]}},
+        "pose_csv",
+    ),
+    "DJI Flight Reader: epochs": Case(
+        "dji.csv",
+        f"CUSTOM.updateTime [epoch],{DJI}\n1740927601.5,35.73,-78.7,10,-9.5\n",
+        {"vehicle": {"time": [1.5], "altitude_m": [3.048]}},
+        "pose_csv",
+    ),
+    "QGroundControl's CSV": Case(
+        "qgc.csv",
+        "Timestamp,roll,pitch,heading,altitudeRelative,altitudeAMSL,gps.lat,gps.lon,gps.courseOverGround,gps.lock,gps.count\n"
+        "2025-03-02 10:00:01.125,1.5,-2,270,12.3,102.3,35.73,-78.7,265,3,14\n",
+        {"vehicle": {"time": [1.125], "altitude_m": [12.3], "yaw_deg": [270], "fix": [3], "satellites": [14]}},
+        "pose_csv",
+    ),
+    "PX4's receiver through ulog2csv": Case(
+        "log_vehicle_gps_position_0.csv",
+        "timestamp,time_utc_usec,lat,lon,alt,alt_ellipsoid,vel_n_m_s,vel_e_m_s,vel_d_m_s,fix_type,satellites_used\n"
+        "112684000,1740927600250000,357300001,-787000001,120500,86500,0.5,0.25,-0.1,3,14\n"
+        "112884000,1740927600450000,357300101,-787000001,121500,87500,0.5,0.25,-0.1,3,14\n",
+        {
+            "vehicle": {
+                "time": [0.25, 0.45],
+                "latitude_deg": [35.7300001, 35.7300101],
+                "altitude_m": [0, 1],
+                "velocity_north_mps": [0.5, 0.5],
+            }
+        },
+        "pose_csv",
+    ),
+    "PX4's estimate through ulog2csv counts microseconds": Case(
+        "log_vehicle_global_position_0.csv",
+        "timestamp,timestamp_sample,lat,lon,alt,eph,epv\n1500000,1490000,35.73,-78.7,120.5,1,1\n2000000,1990000,35.73,-78.7,121.5,1,1\n",
+        {"vehicle": {"time": [1.5, 2.0], "altitude_m": [0, 1]}},
+        "pose_csv",
+        replace(LOCAL, time_origin="2025-03-02T15:00:00Z"),
+    ),
+    "ArduPilot's log in text": Case(
+        "x.log",
+        "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n"
+        "FMT, 130, 45, GPS, QBIHBLLe, TimeUS,Status,GMS,GWk,NSats,Lat,Lng,Alt\n"
+        "FMT, 131, 29, ATT, Qccc, TimeUS,Roll,Pitch,Yaw\n"
+        "GPS, 50000000, 3, 54018250, 2356, 12, 35.73, -78.7, 120.5\n"
+        "ATT, 50000000, 1.5, -2.5, 270.5\n"
+        "GPS, 50200000, 3, 54018450, 2356, 12, 35.7301, -78.7, 121.5\n",
+        {"vehicle": {"time": [0.25, 0.45], "altitude_m": [0, 1], "yaw_deg": [270.5, 270.5], "satellites": [12, 12]}},
+        "ardupilot_bin",
+    ),
+}
+
+GNETTRACK = "Timestamp\tLongitude\tLatitude\tNetworkTech\tLevel\tQual\tARFCN\tPSC\tAltitude\tHeight\n"
+NEMO = "Time,Longitude,Latitude,{c} (LTE pcell),Channel number (LTE pcell),RSRP (LTE pcell)," + (
+    "{c} (LTE scell0),Channel number (LTE scell0),RSRP (LTE scell0)\n"
+)
+CASES |= {
+    "G-NetTrack: 4G and 5G share a PCI, 3G has none; heights are the altitudes'": Case(
+        "x.txt",
+        GNETTRACK
+        + "".join(
+            f"2025.03.02_10.00.0{s}\t-78.7\t35.73\t{tech}\t{level}\t-9\t{arfcn}\t7\t{74 + s}\t0\n"
+            for s, (tech, level, arfcn) in enumerate((("4G", -80, 2850), ("5G", -90, 631000), ("3G", -70, 10700)))
+        ),
+        {
+            "lte_pci7": {"time": [0], "rss_db": [-80]},
+            "nr_pci7": {"time": [1], "rss_db": [-90]},
+            "phone": {"altitude_m": [0, 1, 2]},
+        },
+        "drive_test",
+    ),
+    "G-NetTrack's KML": Case(
+        "x.kml",
+        "<kml><Document>\n"
+        + "".join(
+            f'<Placemark><ExtendedData>\n<Data name="TIME"><value>2025.03.02_10.00.0{s}</value></Data>\n'
+            f'<Data name="RSRP"><value>{-80 - s}</value></Data><Data name="PCI"><value>7</value></Data></ExtendedData>\n'
+            f"<Point><coordinates>-78.7,35.73,{74 + s}</coordinates></Point></Placemark>\n"
+            for s in (1, 2)
+        )
+        + "</Document></kml>\n",
+        {"pci7": {"time": [1, 2], "rss_db": [-81, -82]}, "phone": {"altitude_m": [0, 1], "latitude_deg": [35.73] * 2}},
+        "gnettrack_kml",
+    ),
+    "Nemo: two carriers serve at once": Case(
+        "x.csv",
+        NEMO.format(c="Physical cell identity")
+        + "2025-03-02 10:00:01.250,-78.7,35.73,7,1300,-80.5,22,2850,-87\n"
+        + "2025-03-02 10:00:02.250,-78.7,35.73,7,1300,-81.5,7,2850,-77\n",
+        {
+            "lte_pci7_arfcn1300": {"time": [1.25, 2.25], "rss_db": [-80.5, -81.5], "serving": [1, 1]},
+            "lte_pci22": {"time": [1.25], "rss_db": [-87], "serving": [1]},
+            "lte_pci7_arfcn2850": {"time": [2.25], "rss_db": [-77], "serving": [1]},
+        },
+        "drive_test",
+    ),
+    "TEMS: decimal commas say that the day comes first": Case(
+        "x.csv",
+        "Time;Longitude;Latitude;Serving PCI;Serving EARFCN (DL);Serving RSRP (dBm);Neighbor PCI[0];Neighbor EARFCN[0];"
+        "Neighbor RSRP (dBm)[0]\n02/03/2025 10:00:00.250;-78,7;35,73;12;1300;-80,5;12;2850;-91,5\n",
+        {
+            "pci12_arfcn1300": {"time": [0.25], "rss_db": [-80.5]},
+            "pci12_arfcn2850": {"time": [0.25], "rss_db": [-91.5]},
+        },
+        "drive_test",
+    ),
+    "TEMS: the file's name says which is the day": Case(
+        "run_2025-03-02.csv",
+        "Time,PCI,EARFCN,RSRP (dBm)\n02/03/2025 10:00:00.250,12,1300,-80.5\n",
+        {"pci12": {"time": [0.25], "rss_db": [-80.5]}},
+        "drive_test",
+    ),
+    "TEMS: words for months, tabs": Case(
+        "x.txt",
+        "Time\tServing PCI\tServing EARFCN\tServing RSRP (dBm)\n02-Mar-2025 10:00:00.250\t12\t1300\t-80.5\n",
+        {"pci12": {"time": [0.25], "rss_db": [-80.5]}},
+        "drive_test",
+    ),
+    "XCAL: NR and LTE in one row, a row without fix": Case(
+        "x.csv",
+        "TIME_STAMP,Lat,Lon,5G KPI PCell RF Serving PCI,5G KPI PCell RF Serving NR-ARFCN,5G KPI PCell RF Serving SS-RSRP [dBm],"
+        "5G KPI PCell RF RI,LTE KPI PCell Serving PCI,LTE KPI PCell Serving RSRP[dBm]\n"
+        "2025-03-02 10:00:00.250,35.73,-78.7,101,631000,-85.5,2,7,-80.5\n2025-03-02 10:00:01.250,,,101,631000,-86.5,3,7,-81.5\n",
+        {
+            "nr_pci101": {"time": [0.25, 1.25], "rss_db": [-85.5, -86.5]},
+            "lte_pci7": {"time": [0.25, 1.25], "rss_db": [-80.5, -81.5]},
+            "5g_kpi_pcell_rf_ri": {"time": [0.25, 1.25], "rank": [2, 3]},
+        },
+        "drive_test",
+    ),
+    "XCAL: a layer number, times of the day, a date in the name": Case(
+        "2025-03-02_xcal.csv",
+        "TIME_STAMP,Lat,Lon,5G KPI PCell Layer1 DL Layer Num (Mode),5G KPI PCell RF Serving PCI,5G KPI PCell RF Serving SS-RSRP [dBm]\n"
+        "10:00:00.250,35.73,-78.7,2,101,-85.5\n10:00:01.250,35.73,-78.7,4,101,-86.5\n",
+        {"nr_pci101": {"time": [0.25, 1.25]}, "5g_kpi_pcell_layer1_dl_layer_num_mode": {"rank": [2, 4]}},
+        "drive_test",
+    ),
+    "XCAL: title lines, epochs in ms": Case(
+        "x.csv",
+        "XCAL export\n\nTIMESTAMP,Serving PCI,SS-RSRP [dBm]\n1740927600250,101,-85.5\n1740927601250,102,-86.5\n",
+        {"nr_pci101": {"time": [0.25], "rss_db": [-85.5]}, "nr_pci102": {"time": [1.25], "rss_db": [-86.5]}},
+        "drive_test",
+    ),
+    "QualiPoc: date and time apart": Case(
+        "x.csv",
+        "Date,Time,GPS Latitude,GPS Longitude,LTE Serving Cell PCI,LTE Serving Cell RSRP [dBm],LTE Rank Indicator\n"
+        "02.03.2025,10:00:00.250,35.73,-78.7,7,-80.5,1\n02.03.2025,10:00:01.250,35.73,-78.7,7,-81.5,2\n",
+        {"lte_pci7": {"time": [0.25, 1.25], "rss_db": [-80.5, -81.5]}, "lte_rank_indicator": {"rank": [1, 2]}},
+        "drive_test",
+    ),
+    "QualiPoc: UTC by the column's name": Case(
+        "x.csv",
+        "Time UTC;LTE Serving Cell PCI;LTE Serving Cell RSRP [dBm]\n2025-03-02 15:00:00.250;7;-80,5\n",
+        {"lte_pci7": {"time": [0.25], "rss_db": [-80.5]}},
+        "drive_test",
+    ),
+    "QualiPoc: twelve hours, month first": Case(
+        "x.csv",
+        "Time,LTE Serving Cell PCI,LTE Serving Cell RSRP [dBm]\n03/02/2025 10:00:00.250 AM,7,-80.5\n03/13/2025 10:00:00 AM,7,-80.5\n",
+        {"lte_pci7": {"time": [0.25, 946800.0], "rss_db": [-80.5, -80.5]}},
+        "drive_test",
+    ),
+    "a cell a row: the registered one serves": Case(
+        "phone.csv",
+        "timestamp,latitude,longitude,rat,pci,earfcn,rsrp,is_registered\n"
+        "2025-03-02T10:00:00.250-05:00,35.73,-78.7,LTE,7,1300,-80,true\n"
+        "2025-03-02T10:00:00.250-05:00,35.73,-78.7,LTE,8,1300,-90,false\n"
+        "2025-03-02T10:00:01.250-05:00,35.73,-78.7,LTE,7,2850,-81,true\n",
+        {
+            "pci7_arfcn1300": {"time": [0.25], "serving": [1]},
+            "pci8": {"time": [0.25], "serving": [0]},
+            "pci7_arfcn2850": {"time": [1.25], "serving": [1]},
+        },
+        "drive_test",
+    ),
+    "CellMapper: signal of a PCI": Case(
+        "cm.csv",
+        "Latitude,Longitude,MCC,MNC,CID,Signal,Type,ARFCN,PSC or PCI,Timestamp\n35.73,-78.7,310,260,2,-85,LTE,2850,325,1740927600250\n",
+        {"pci325": {"time": [0.25], "rss_db": [-85]}},
+        "drive_test",
+    ),
+    "one RNTI in two cells of an srsRAN gNB": Case(
+        "gnb.json",
+        "".join(
+            f'{{"timestamp": "2025-03-02T15:00:0{s}.500", "cells": [{{"cell_metrics": {{"pci": {pci}}}, "ue_list": '
+            f'[{{"pci": {pci}, "rnti": 17921, "dl_ri": {pci}.0}}]}}]}}\n'
+            for s in (1, 2)
+            for pci in (1, 2)
+        ),
+        {"gnb_pci1": {"time": [1.5, 2.5], "rank": [1, 1]}, "gnb_pci2": {"time": [1.5, 2.5], "rank": [2, 2]}},
+        "srsran_json",
+    ),
+    "OAI's newest layout": Case(
+        "oai.log",
+        "".join(
+            TWO.format(
+                s=s,
+                text="UE RNTI 2460 CU-UE-ID 2 in-sync PH 28 dB PCMAX 24 dBm, average RSRP -74 (8 meas), average SINR 40.0",
+            )
+            + TWO.format(
+                s=s, text="UE 2460: dlsch_rounds 9/5/1/0, dlsch_errors 2, BLER 0.19557 MCS (1) 23 (Qm 8) CCE fail 3"
+            )
+            + TWO.format(s=s, text=f"UE 2460: CSI [CQI {16 - s} RI {s} PMI (14,1)] SRS [UL-RI 2 TPMI 0]")
+            for s in (1, 2)
+        ),
+        {"oai": {"time": [1, 2], "rank": [1, 2], "cqi": [15, 14]}, "nr_rsrp": {"rss_db": [-74, -74]}},
+        "oai_log",
+    ),
+}
+
+
 def shown(values: Any) -> list[Any]:
     """A column as it is compared: times in seconds, numbers to the microunit."""
     if values.dtype.kind == "M":

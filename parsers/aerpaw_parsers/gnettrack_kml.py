@@ -1,0 +1,86 @@
+"""G-NetTrack's KML: a placemark per reading, its quantities as ``<Data name="RSRP"><value>-81</value></Data>``.
+
+The names are those of the program's text log, in capitals; time, place and levels are read as from there. Patterns, no
+XML parser: see :mod:`.nemo_kml`.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult
+
+from . import _sheet, drive_test
+
+_PLACEMARK = re.compile(rb"<Placemark\b")
+_DATA = re.compile(rb'<Data name="([A-Za-z][A-Za-z0-9 _-]{0,39})">\s{0,40}<value>([^<]{0,200})</value>')
+_POINT = re.compile(rb"<coordinates>\s{0,40}(-?[\d.]{1,20}),(-?[\d.]{1,20})(?:,(-?[\d.]{1,20}))?")
+_SIGNS = (re.compile(rb'<Data name="TIME">'), re.compile(rb'<Data name="(?:RSRP|LEVEL|NRXLEV\d?|SSRSRP)">'))
+_PLACE = ("Longitude", "Latitude", "Altitude above sea level")
+
+
+def sniff(head: bytes) -> bool:
+    """Whether it is a KML with times and levels in named data."""
+    return b"<kml" in head[:2048] and all(sign.search(head) for sign in _SIGNS)
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Cells, KPIs and the track of the phone.
+
+    Raises
+    ------
+    InputError
+        If placemarks share a line.
+    UsageError
+        If no time zone is given.
+    """
+    lines = _lines.split(data)
+    begin = np.array([match.start() for match in _PLACEMARK.finditer(data)], dtype=np.int64)
+    row = np.searchsorted(lines.starts, begin, side="right") - 1
+    if len(np.unique(row)) < len(row):
+        raise InputError(
+            "several placemarks on a line",
+            expected="a line break before each <Placemark>, as G-NetTrack writes it",
+            cause="a KML that another program wrote anew: its XML has to be indented",
+        )
+    texts = [data[first:last] for first, last in zip(begin, [*begin[1:], len(data)][: len(begin)], strict=True)]
+    cut = [i for i, text in enumerate(texts) if b"</Placemark>" not in text]
+    found = [_reading(text) for text in texts]
+    kept = [i for i, one in enumerate(found) if one.get("TIME") and i not in cut]
+    names = list(dict.fromkeys(name for i in kept for name in found[i]))
+    sheet = _sheet.Sheet(
+        lines=lines,
+        names=names,
+        row=row[kept],
+        cells=[[found[i].get(name, "") for name in names] for i in kept],
+        blank_rows=np.setdiff1d(np.flatnonzero(~lines.blank), row[[*kept, *cut]]),
+        rejected=lines.reject_all(row[cut], "a placemark without its end (a cut file?)"),
+    )
+    rows = _sheet.rows(sheet, options, reader="gnettrack_kml") if kept else None
+    if rows is None:
+        return _sheet.nothing(data, "gnettrack_kml", "no placemark with a time")
+    return drive_test.of_sheet(rows, sheet)
+
+
+def _reading(text: bytes) -> dict[str, str]:
+    """Names and values of a placemark."""
+    values = {name.decode(): value.decode("utf-8", "replace").strip() for name, value in _DATA.findall(text)}
+    if (point := _POINT.search(text)) is not None:
+        place = [b"" if cell is None else cell for cell in point.groups()]
+        values |= {name: cell.decode() for name, cell in zip(_PLACE, place, strict=True)}
+    return values
+
+
+READER = Reader(
+    name="gnettrack_kml",
+    title="G-NetTrack KML: cells by PCI, KPIs, positions",
+    kinds=("rss", "rank", "kpi", "telemetry"),
+    sample='<Data name="TIME"><value>2025.03.02_10.00.00</value></Data><Data name="RSRP"><value>-81</value></Data>',
+    sniff=sniff,
+    read=read,
+)

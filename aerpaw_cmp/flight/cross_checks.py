@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta, tzinfo
 from datetime import timezone as zones
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from ..logs.ingest import IngestedFile
+from ..logs import archives
+from ..logs.ingest import IngestedFile, read_bytes
 from ..logs.records import Stream, has_wall_clock
 
 _IN_NAME = re.compile(
@@ -94,15 +95,28 @@ def _summary_starts(path: Path) -> list[tuple[str, datetime, str, timedelta]]:
     """Start of the measurement in a Nemo summary beside a log."""
     starts = []
     stem = path.name.split(".")[0]
-    for beside in sorted(path.parent.glob("*.csv")) if path.parent.is_dir() else []:
-        if beside == path or not beside.name.startswith(stem) or not beside.is_file():
-            continue
-        with beside.open("rb") as stream:
-            head = stream.read(2000).decode("utf-8", "replace")
-        if (match := _NEMO_START.search(head)) is not None:
+    for name, head in _tables_beside(path):
+        if name.startswith(stem) and (match := _NEMO_START.search(head)) is not None:
             said = datetime.strptime(match[1], "%Y %b %d %H:%M").replace(tzinfo=zones.utc)
-            starts.append((f"Measurement start in {beside.name}", said, "%Y-%m-%d %H:%M", _OF_THE_MINUTE))
+            starts.append((f"Measurement start in {name}", said, "%Y-%m-%d %H:%M", _OF_THE_MINUTE))
     return starts
+
+
+def _tables_beside(path: Path) -> Iterator[tuple[str, str]]:
+    """Names and beginnings of the CSVs in a log's folder, or in the folder of the archive that holds it."""
+    if path.parent.is_dir():
+        for beside in sorted(path.parent.glob("*.csv")):
+            if beside != path and beside.is_file():
+                with beside.open("rb") as stream:
+                    yield beside.name, stream.read(_HEAD_BYTES).decode("utf-8", "replace")
+    elif (part := archives.inside(path)) is not None:
+        place, own = part
+        for name, member in archives.members(read_bytes(place)[0], place).items():
+            if name != own and name.endswith(".csv") and PurePosixPath(name).parent == PurePosixPath(own).parent:
+                yield PurePosixPath(name).name, member.read(_HEAD_BYTES).decode("utf-8", "replace")
+
+
+_HEAD_BYTES = 2000
 
 
 def _apart(said: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:

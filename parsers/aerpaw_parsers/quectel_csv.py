@@ -9,7 +9,8 @@ row                       columns gives
 ========================= ======= ============================================================
 ``+QNWCFG lte_csi`` and   11, 19  rank ``lte_csi`` and ``nr5g_csi`` (MCS, RI, CQI, PMI each)
 ``nr5g_csi``
-LTE + NR5G-NSA            32, 28  rss ``lte_rsrp`` and ``nr_rsrp`` (order RSRP, SINR, RSRQ)
+LTE + NR5G-NSA            32, 28  rss ``lte_rsrp`` and ``nr_rsrp`` (order RSRP, SINR, RSRQ); of several cells, a
+                                  stream each, ``lte_pci7``
 LTE                       20      rss ``lte_rsrp``
 NR5G-SA                   18      rss ``nr_rsrp`` (order RSRP, RSRQ, SINR)
 ========================= ======= ============================================================
@@ -22,6 +23,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,7 +32,10 @@ from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import make_frames as _frames
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _C = rb"[^,\n]{0,80}"
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
@@ -62,25 +67,36 @@ _CSI = re.compile(
     re.MULTILINE,
 )
 _SERVING = _T + _token(b"QENG", b"servingcell") + rb"," + _C + rb","
-_LTE_BODY = _token(b"QENG", b"LTE") + rb"," + _skip(10) + rb",".join([_V] * 4) + rb"," + rb",".join([_C] * 3)
+_CELL = _V + rb"," + _V + rb","  # PCI and carrier
+_LTE_BODY = (
+    _token(b"QENG", b"LTE") + rb"," + _skip(4) + _CELL + _skip(4) + rb",".join([_V] * 4) + rb"," + rb",".join([_C] * 3)
+)
 _LTE = re.compile(
     _SERVING
     + _LTE_BODY
     + rb"(?:,"
     + _token(b"QENG", b"NR5G-NSA")
     + rb","
-    + _skip(3)
-    + rb",".join([_V] * 3)
-    + rb"(?:(?:,"
+    + _skip(2)
+    + rb",".join([_V] * 4)
+    + rb"(?:,"
+    + _V
+    + rb"(?:,"
     + _C
-    + rb"){4})?)?[ \t]*\r?$",
+    + rb"){3})?)?[ \t]*\r?$",
     re.MULTILINE,
 )
 _SA = re.compile(
     _SERVING
     + _token(b"QENG", b"NR5G-SA")
     + rb","
-    + _skip(9)
+    + _skip(4)
+    + _V
+    + rb","
+    + _skip(1)
+    + _V
+    + rb","
+    + _skip(2)
     + rb",".join([_V] * 3)
     + rb","
     + _C
@@ -172,32 +188,72 @@ def _rank(rows: _Rows, first: int, name: str, lines: _lines.Lines, options: Read
     return Stream("rank", name, frame, _frames.attributes(options, channel=name, ri_base="one", source="CSI report"))
 
 
-def _level(
-    name: str, parts: list[tuple[_Rows, AnyArray, AnyArray | None]], lines: _lines.Lines, options: ReadOptions
-) -> Stream | None:
-    """RSRP stream of one RAT from (rows, RSRP text, SINR text) parts; None where no row carries it."""
+@dataclass
+class _Part:
+    """Levels of one kind of row: rows, and their texts of PCI, carrier, RSRP and SINR (None: not printed)."""
+
+    rows: _Rows
+    pci: AnyArray
+    arfcn: AnyArray
+    rsrp: AnyArray
+    sinr: AnyArray | None
+
+
+def _levels(rat: str, parts: list[_Part], lines: _lines.Lines, options: ReadOptions) -> list[Stream]:
+    """RSRP of one RAT, a stream per cell where the log has several; a log of one cell gives one stream."""
     import pandas as pd
 
-    frames = []
-    for rows, rsrp_text, sinr_text in parts:
-        rsrp = _values(rsrp_text)
-        flag = _flag_column(rows, lines)
-        good = (rsrp >= _RSRP_RANGE[0]) & (rsrp <= _RSRP_RANGE[1])
-        _lines.add_flag(flag, ~good, "out_of_coverage")
-        values = {"rss_db": np.where(good, rsrp, np.nan)}
-        if sinr_text is not None:
-            sinr = _values(sinr_text)
-            fits = (sinr >= _SINR_RANGE[0]) & (sinr <= _SINR_RANGE[1])
-            # tenths of a decibel on 2020 firmware look like this: never divided silently
-            _lines.add_flag(flag, good & ~fits & ~np.isnan(sinr), "sinr_out_of_range")
-            values["sinr_db"] = np.where(fits, sinr, np.nan)
-        frames.append(_frames.frame("rss", rows.instants.time, rows.number + 1, flag, values))
-    if not frames or not any(len(frame) for frame in frames):
-        return None
+    frames = [_level(part, lines) for part in parts]
+    if not any(len(frame) for frame in frames):
+        return []
     frame = frames[0] if len(frames) == 1 else pd.concat(frames).sort_values("line").reset_index(drop=True)
-    return Stream(
-        "rss", name, frame, _frames.attributes(options, channel=name, unit=options.unit or "dBm", quantity="RSRP")
+    pci, arfcn = frame.pop("pci"), frame.pop("arfcn")
+    cells = (
+        pd.DataFrame({"pci": pci, "arfcn": arfcn}).dropna(subset="pci").drop_duplicates().sort_values(["pci", "arfcn"])
     )
+    common: dict[str, Attribute] = {"unit": options.unit or "dBm", "quantity": "RSRP", "rat": rat}
+    whole = f"{rat}_rsrp"
+    found: list[Stream] = []
+    for one in cells.itertuples() if len(cells) > 1 else ():
+        mine = (pci == one.pci) & ((arfcn == one.arfcn) | (np.isnan(one.arfcn) & arfcn.isna()))
+        twice = (cells["pci"] == one.pci).sum() > 1 and not np.isnan(one.arfcn)
+        name = f"{rat}_pci{int(one.pci)}" + (f"_arfcn{int(one.arfcn)}" if twice else "")
+        about = common | _identity(one.pci, one.arfcn)
+        attributes = _frames.attributes(options, channel=name, **about)
+        found.append(Stream("rss", name, frame[mine].reset_index(drop=True), attributes))
+    if len(cells) == 1:
+        common |= _identity(*cells.iloc[0])
+    rest = frame[pci.isna()] if len(cells) > 1 else frame
+    if len(rest):
+        attributes = _frames.attributes(options, channel=whole, **common)
+        found.append(Stream("rss", whole, rest.reset_index(drop=True), attributes))
+    return found
+
+
+def _identity(pci: float, arfcn: float) -> dict[str, Attribute]:
+    return {"pci": int(pci), **({} if np.isnan(arfcn) else {"arfcn": int(arfcn)})}
+
+
+def _level(part: _Part, lines: _lines.Lines) -> pd.DataFrame:
+    """Records of some rows, with their cells beside."""
+    rsrp = _values(part.rsrp)
+    flag = _flag_column(part.rows, lines)
+    good = (rsrp >= _RSRP_RANGE[0]) & (rsrp <= _RSRP_RANGE[1])
+    _lines.add_flag(flag, ~good, "out_of_coverage")
+    values = {"rss_db": np.where(good, rsrp, np.nan)}
+    if part.sinr is not None:
+        sinr = _values(part.sinr)
+        fits = (sinr >= _SINR_RANGE[0]) & (sinr <= _SINR_RANGE[1])
+        # tenths of a decibel on 2020 firmware look like this: never divided silently
+        _lines.add_flag(flag, good & ~fits & ~np.isnan(sinr), "sinr_out_of_range")
+        values["sinr_db"] = np.where(fits, sinr, np.nan)
+    pci, arfcn = _values(part.pci), _values(part.arfcn)
+    known = (pci >= 0) & (pci <= _MOST_PCI)
+    values |= {"pci": np.where(known, pci, np.nan), "arfcn": np.where(known & (arfcn > 0), arfcn, np.nan)}
+    return _frames.frame("rss", part.rows.instants.time, part.rows.number + 1, flag, values)
+
+
+_MOST_PCI = 1007
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -217,16 +273,16 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     streams: list[Stream | None] = []
     if csi is not None and len(csi.number):
         streams += [_rank(csi, 5, "nr5g_csi", lines, options), _rank(csi, 1, "lte_csi", lines, options)]
-    nr_parts: list[tuple[_Rows, AnyArray, AnyArray | None]] = []
+    nr_parts: list[_Part] = []
     if lte is not None:
-        streams.append(_level("lte_rsrp", [(lte, lte.column[1], None)], lines, options))
-        with_nr = np.flatnonzero(lte.column[5] != b"")
+        streams += _levels("lte", [_Part(lte, lte.column[1], lte.column[2], lte.column[3], None)], lines, options)
+        with_nr = np.flatnonzero(lte.column[8] != b"")
         instants = lte.instants.take(with_nr)
         nsa = _Rows(lte.number[with_nr], instants, [cells[with_nr] for cells in lte.column])
-        nr_parts.append((nsa, nsa.column[5], nsa.column[6]))
+        nr_parts.append(_Part(nsa, nsa.column[7], nsa.column[11], nsa.column[8], nsa.column[9]))
     if sa is not None:
-        nr_parts.append((sa, sa.column[1], sa.column[3]))
-    streams.append(_level("nr_rsrp", nr_parts, lines, options))
+        nr_parts.append(_Part(sa, sa.column[1], sa.column[2], sa.column[3], sa.column[5]))
+    streams += _levels("nr", nr_parts, lines, options)
     found = [part for part in (csi, lte, sa) if part is not None]
     numbers = [part.number for part in found]
     wrong = np.array([line.number - 1 for line in rejected], dtype=np.int64)

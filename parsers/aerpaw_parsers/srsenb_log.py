@@ -27,7 +27,7 @@ _ROW = re.compile(
     rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] *"
     rb"(?:(?:lte|nr)(?: +\d{1,4}(?= +[0-9a-fA-F]{2,5} ))? +)?(?P<rnti>[0-9a-fA-F]{1,5})"
     + _N % b"cqi" + _N % b"ri" + _N % b"mcs"
-    + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2} +\d{1,3}% [^\n]{0,160}$",
+    + rb" +[0-9.]{1,12}[kMG]?(?:(?: +\d{1,9}){2})? +\d{1,3}% [^\n]{0,160}$",
     re.MULTILINE,
 )  # fmt: skip
 _CHANNELS = re.compile(rb"^\[[^\]\n]{19,40}\] *Opening (?P<kind>\d{1,2}) channels in RF device", re.MULTILINE)

@@ -1,6 +1,7 @@
 """srsUE console (through ``ts``): RSRP, path loss, CFO and SNR of each carrier, once a second.
 
-``[time] cc pci rsrp pl cfo | mcs snr iter brate bler ta_us | mcs buff brate bler``; RSRP in dBm of an uncalibrated
+``[time] cc pci rsrp pl cfo | mcs snr iter brate bler ta_us | mcs buff brate bler``, before 2020 without ``pci`` and
+bars; RSRP in dBm of an uncalibrated
 front end (the level follows the gain), path loss in dB as the UE reckons it, CFO with SI suffix in Hz. It prints no
 rank. A level stream per cell, and the carrier offset as KPI.
 """
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,14 +24,15 @@ from . import _cells
 _N = rb" +(?P<%s>[-+]?\d{1,7}(?:\.\d{1,6})?[kMGmun]?|n/a|-?inf|nan)"
 _ROW = re.compile(
     rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] *(?P<cc>\d{1,2}|lte|nr)"
-    + _N % b"pci" + _N % b"rsrp" + _N % b"pl" + _N % b"cfo"
-    + rb" \|" + _N % b"mcs" + _N % b"snr" + rb"[^\n|]{0,80}\|[^\n]{0,80}$", re.MULTILINE,
+    + rb"(?:" + _N % b"pci" + rb"(?=(?: +\S+){3} \|))?" + _N % b"rsrp" + _N % b"pl" + _N % b"cfo"
+    + rb"(?: \|)?" + _N % b"mcs" + _N % b"snr" + rb"[^\n|]{0,80}(?:\|[^\n]{0,80})?$", re.MULTILINE,
 )  # fmt: skip
 
 
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     rsrp, loss, snr, cfo, pci = (rows.si(name) for name in ("rsrp", "pl", "snr", "cfo", "pci"))
     rats = ["nr" if cc == "nr" else "lte" for cc in rows.text("cc")]
+    carrier = np.array([int(cc) if cc.isdigit() else 0 for cc in rows.text("cc")])
     readings = [
         _cells.Reading(
             row=i,
@@ -42,7 +45,11 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
         )
         for i in range(len(rows))
     ]
-    yield from _cells.streams(rows, readings, source="srsUE")
+    for cc in np.unique(carrier).tolist():  # two carriers may share a PCI, and the console prints no ARFCN
+        of_carrier = [one for one in readings if carrier[one.row] == cc]
+        for stream in _cells.streams(rows, of_carrier, source="srsUE"):
+            name = f"{stream.name}_cc{cc}" if cc else stream.name
+            yield replace(stream, name=name, attributes={**stream.attributes, "channel": rows.options.channel or name})
     yield rows.stream("kpi", "cfo", {"value": cfo}, quantity="CFO", unit="Hz")
 
 
@@ -51,7 +58,9 @@ READER = _text.reader(
     "srsUE console: RSRP, path loss, CFO",
     kinds=("rss", "kpi"),
     sample="[2025-01-01 12:00:07.000000]   0    1   -61   61 -4.3k |   0   25   1.0   4.5k    0%  1.6 |  23  83k  19M",
-    mark=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:cc|rat) +pci +rsrp +pl +cfo +\|", re.MULTILINE),
+    mark=re.compile(
+        rb"^\[[^\]\n]{19,40}\] *(?:(?:cc|rat) +pci +rsrp +pl +cfo +\||cc +rsrp +pl +cfo +mcs +snr)", re.MULTILINE
+    ),
     row=_ROW,
     torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:\d{1,2}|lte|nr) +\d{1,4} +-?\d"),
     streams=_streams,

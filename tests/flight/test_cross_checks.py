@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,16 @@ def test_a_nemo_summary_beside_a_log_is_compared_with_its_start(tmp_path: Path, 
     assert bool(found) is asked
     if asked:
         assert "Measurement start in 24Feb09_172055.1.csv says 2024-02-09 17:20" in found[0]
+
+
+def test_a_nemo_summary_in_the_zip_that_holds_the_log(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "set.zip", "w") as archive:
+        archive.writestr("day/24Feb09_172055.1.csv", "guid\nDevice ID;1\nMeasurement start;2024 Feb 09 17:20\n")
+        archive.writestr("other/24Feb09_172055.1.csv", "guid\nDevice ID;1\nMeasurement start;2001 Jan 01 17:20\n")
+    inside = tmp_path / "set.zip" / "day" / "24Feb09_172055.1.gpx"
+    assert _asked(_log(inside, "2024-02-09T22:20:56")) == []
+    (asked,) = _asked(_log(inside, "2009-02-24T22:20:56"))
+    assert "Measurement start in 24Feb09_172055.1.csv says 2024-02-09 17:20" in asked
 
 
 @pytest.mark.parametrize(("low_m", "asked"), [(0.4, False), (-2.0, False), (24.3, True), (110.0, True), (-40.0, True)])

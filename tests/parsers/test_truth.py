@@ -437,6 +437,55 @@ CASES |= {
 }
 
 
+ENDC = (
+    '2025-03-02 10:00:0{s}.250,"+QENG: ""servingcell""","NOCONN","LTE","FDD",310,410,ABCDEF,{lte},3,5,5,1234,{level},-9,-55,20,'
+    '12,230,40,"+QENG: ""NR5G-NSA""",310,410,{nr}\n'
+)
+UE = "   0    {pci}  {level}   61 -4.2k |   2   25   1.0   3.9k    0%    1.6 |  18    0.0    35k    0%"
+CASES |= {
+    "Quectel: a handover to another cell on the way, and NR lost": Case(
+        "Serving_cell_Params_ENDC.csv",
+        ENDC.format(s=0, lte="7,1300", level=-85, nr="101,-88,25,-11,631000,78,12,1")
+        + ENDC.format(s=1, lte="8,2850", level=-86, nr="65535,-32768,-32768,-32768")
+        + ENDC.format(s=2, lte="7,2850", level=-87, nr="101,-89,24,-11,631000,78,12,1"),
+        {
+            "lte_pci7_arfcn1300": {"time": [0.25], "rss_db": [-85]},
+            "lte_pci8": {"time": [1.25], "rss_db": [-86]},
+            "lte_pci7_arfcn2850": {"time": [2.25], "rss_db": [-87]},
+            "nr_rsrp": {"time": [0.25, 1.25, 2.25], "rss_db": [-88, np.nan, -89], "sinr_db": [25, np.nan, 24]},
+        },
+        "quectel_csv",
+    ),
+    "srsUE: two carriers share a PCI": Case(
+        "x_radio_log.txt",
+        TWO.format(s=0, text=" cc  pci  rsrp   pl   cfo | mcs  snr  iter  brate  bler  ta_us | mcs   buff  brate  bler")
+        + "".join(
+            TWO.format(s=s, text=UE.format(pci=1, level=level).replace("   0 ", f"   {cc} ", 1))
+            for s in (1, 2)
+            for cc, level in ((0, -60 - s), (1, -70 - s))
+        ),
+        {"lte_pci1": {"time": [1, 2], "rss_db": [-61, -62]}, "lte_pci1_cc1": {"time": [1, 2], "rss_db": [-71, -72]}},
+        "srsue_log",
+    ),
+    "srsUE of srsLTE, before 2020": Case(
+        "x_radio_log.txt",
+        TWO.format(s=0, text="cc  rsrp    pl    cfo   mcs   snr turbo  brate   bler   ta_us  mcs   buff  brate   bler")
+        + TWO.format(
+            s=1, text=" 0   -77    78   1.2k    24    33  0.84   5.8M     0%   0.0    18   193k   624k     0%"
+        ),
+        {"lte_rsrp": {"time": [1], "rss_db": [-77], "sinr_db": [33], "pathloss_db": [78]}},
+        "srsue_log",
+    ),
+    "srsENB of srsLTE, before 2020": Case(
+        "x_radio_enb_log.txt",
+        TWO.format(s=0, text="rnti  cqi    ri   mcs  brate   bler   snr   phr   mcs  brate   bler    bsr")
+        + TWO.format(s=1, text="  46  15.0     2  27.5   1.2M     0%  33.1  40.0  22.9   624k     0%    0.0"),
+        {"srsenb": {"time": [1], "rank": [2], "cqi": [15]}},
+        "srsenb_log",
+    ),
+}
+
+
 def shown(values: Any) -> list[Any]:
     """A column as it is compared: times in seconds, numbers to the microunit."""
     if values.dtype.kind == "M":

@@ -19,6 +19,7 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.propagation.faces import inside_solids, site_faces
+from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.mirror import find_paths
 from aerpaw_cmp.site.site import Building, Site, Tower
 
@@ -44,7 +45,9 @@ def wrong(exact: ModuleType, rng: np.random.Generator, boxes: int) -> tuple[int,
     site = Site("integers", SiteFrame(35.7275, -78.696), {"LW1": tower}, buildings)
     faces = site_faces(site)
     targets = np.array(poses, dtype=float)
-    found = find_paths(faces, np.array([source], dtype=float), targets, excluded=inside_solids(site, targets)[None])
+    found = find_paths(
+        faces, Links(np.array([source], dtype=float), targets, excluded=inside_solids(site, targets)[None])
+    )
     counts = np.zeros(4, dtype=int)
     started = time.perf_counter()
     for pose, target in enumerate(poses):

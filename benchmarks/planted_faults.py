@@ -307,13 +307,14 @@ def remembered() -> None:
     known: dict[bytes, Any] = {}
     ask = sionna.own_coefficients
 
-    def own_coefficients(faces: Any, sources_m: Any, poses: Any, probe: Any, turns: Any, **options: Any) -> Any:
-        arrays = (faces.normal, faces.offset_m, faces.lower, faces.upper, sources_m, poses.position_m, *turns)
+    def own_coefficients(faces: Any, links: Any, probe: Any, turns: Any, rays: Any, **options: Any) -> Any:
+        ends = links.sources_m, links.targets_m, links.usable
+        arrays = (faces.normal, faces.offset_m, faces.lower, faces.upper, *ends, *turns)
         slants = [a.slant_rad for a in (*probe.tower_arrays.values(), probe.uav_array)]
-        key = b"".join(np.ascontiguousarray(a).tobytes() for a in (*arrays, *slants, options["usable"]))
+        key = b"".join(np.ascontiguousarray(a).tobytes() for a in (*arrays, *slants))
         key += repr((probe.carrier_hz, faces.material)).encode()
         if key not in known:
-            known[key] = ask(faces, sources_m, poses, probe, turns, **options)
+            known[key] = ask(faces, links, probe, turns, rays, **options)
         return known[key]
 
     sionna.own_coefficients = own_coefficients

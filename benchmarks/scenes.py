@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 from shapely.geometry import box
 
+from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.beams import grow_paths
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.mitsuba import TriangleScene, read_scene
@@ -98,7 +99,7 @@ def warm_up() -> float:
     """Compile, or load what was compiled."""
     clock = Clock()
     scene = read_scene(shipped("simple_street_canyon"))
-    grow_paths(merged(scene), *ends("simple_street_canyon", 4), max_depth=2)
+    grow_paths(merged(scene), Links(*ends("simple_street_canyon", 4)), max_depth=2)
     return clock.since()[0]
 
 
@@ -115,7 +116,7 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
     setup = clock.since()
     clock = Clock()
     paths, effort = grow_paths(
-        surfaces, sources, targets, max_depth=task["depth"], shadows=task["shadows"], beams=task["beams"]
+        surfaces, Links(sources, targets), max_depth=task["depth"], shadows=task["shadows"], beams=task["beams"]
     )
     search = clock.since()
     row = {
@@ -134,10 +135,12 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
         "duplicates": len(paths) - len(plane_keys(paths, surfaces.plane)),
     }
     if task.get("check"):
-        other, _ = grow_paths(surfaces, sources, targets, max_depth=task["depth"], shadows=False)
+        other, _ = grow_paths(surfaces, Links(sources, targets), max_depth=task["depth"], shadows=False)
         row["differ_without_shadows"] = len(keys(paths) ^ keys(other))
         small = merged(crop(scene, sources[0], 600))
-        on, off = (grow_paths(small, sources, targets, max_depth=task["depth"], beams=b)[0] for b in (True, False))
+        on, off = (
+            grow_paths(small, Links(sources, targets), max_depth=task["depth"], beams=b)[0] for b in (True, False)
+        )
         row["differ_without_beams_on_600_triangles"] = len(keys(on) ^ keys(off))
     return row
 
@@ -167,9 +170,7 @@ def prism_row(task: dict[str, Any]) -> dict[str, Any]:
     scene = Scene.of(site, Link(CARRIER_HZ, {"T": single_element()}, single_element()), poses)
     setup = clock.since()
     clock = Clock()
-    paths, effort = prisms.find_paths(
-        scene.faces, scene.sources_m, targets, max_depth=task["depth"], usable=scene.usable, excluded=scene.excluded
-    )
+    paths, effort = prisms.find_paths(scene.faces, scene.links_to(poses), max_depth=task["depth"])
     return {
         **task,
         "scene": f"{count} prisms",
@@ -197,12 +198,13 @@ def sionna_row(task: dict[str, Any]) -> dict[str, Any]:
         sionna.SPECULAR_TABLE_SLOTS = 2 ** task["slots"]
     surfaces = merged(read_scene(shipped(task["scene"])))
     sources, targets = ends(task["scene"], task["receivers"])
-    ours, _ = grow_paths(surfaces, sources, targets, max_depth=task["depth"])
+    ours, _ = grow_paths(surfaces, Links(sources, targets), max_depth=task["depth"])
     sionna.load_variant()
     clock = Clock()
     theirs = sionna.find_paths(
-        surfaces.faces, sources, targets, carrier_hz=CARRIER_HZ, max_depth=task["depth"], samples=task["samples"],
-        batch=25, surfaces=surfaces,
+        surfaces.faces, Links(sources, targets),
+        sionna.Rays(max_depth=task["depth"], samples=task["samples"], batch=25),
+        carrier_hz=CARRIER_HZ, surfaces=surfaces,
     )  # fmt: skip
     spent = clock.since()
     mine, other = plane_keys(ours, surfaces.plane), plane_keys(theirs, surfaces.plane)

@@ -249,20 +249,17 @@ class _Case:
 
     def own_arrays(self, samples: int, kind: str, chosen: IntArray) -> Row:
         """Channels as Sionna evaluates them."""
-        from ..propagation.search.sionna import own_channels
+        from ..propagation.search.sionna import Rays, own_channels
 
         explicit = kind == "explicit"
-        batch = EXPLICIT_BATCH if explicit else BATCH
+        rays = Rays(max_depth=DEPTH, samples=samples, batch=EXPLICIT_BATCH if explicit else BATCH)
         poses = _take(self.poses, chosen)
         scene = Scene.of(self.site, self.link, poses)
 
         def channels(some: Poses) -> ComplexArray:
-            return own_channels(
-                scene.faces, scene.sources_m, some, self.link,
-                explicit=explicit, max_depth=DEPTH, samples=samples, batch=batch, usable=scene.usable,
-            )  # fmt: skip
+            return own_channels(scene.faces, scene.links_to(some), some.rotation, self.link, rays, explicit=explicit)
 
-        channels(_take(poses, slice(batch)))
+        channels(_take(poses, slice(rays.batch)))
         h, spent = _measured(lambda: channels(poses))
         difference = self._difference(h, rss_dbm(mean_pair_power(h), self.link.transmit_power_dbm), chosen)
         return self._row(difference, spent, poses=len(chosen), engine="sionna", samples=samples, arrays=kind)
@@ -353,10 +350,7 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
 
     def search() -> float:
         started = time.perf_counter()
-        mirror.find_paths(
-            scene.faces, scene.sources_m, some.position_m,
-            max_depth=DEPTH, usable=scene.usable, excluded=scene.excluded,
-        )  # fmt: skip
+        mirror.find_paths(scene.faces, scene.links_to(some), max_depth=DEPTH)
         return time.perf_counter() - started
 
     search()

@@ -122,35 +122,24 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
 
 
 def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run) -> PathSet:
-    common: dict[str, Any] = {"usable": scene.usable, "excluded": scene.excluded, "progress": run.progress}
-    common |= {"max_depth": search.max_depth}
-    ends = scene.sources_m, poses.position_m
+    common: dict[str, Any] = {"max_depth": search.max_depth, "progress": run.progress}
+    links = scene.links_to(poses)
     extent = None if run.whole is None else run.whole.extent_m
     if by_beams(scene, search, _links(scene, run)):
         from .search import beams as search_beams
         from .search import prisms  # compiled: loaded where there are many faces
 
-        common |= {"longest_m": _longest_m(scene, poses, search), "threads": run.threads}
-        common |= {"on_estimate": run.on_estimate or _long_search}
+        links = replace(links, longest_m=_longest_m(scene, poses, search))
+        common |= {"threads": run.threads, "on_estimate": run.on_estimate or _long_search}
         if scene.surfaces is not None:
-            return search_beams.grow_paths(scene.surfaces, *ends, **common)[0]
-        return prisms.find_paths(scene.faces, *ends, extent_m=extent, **common)[0]
+            return search_beams.grow_paths(scene.surfaces, links, **common)[0]
+        return prisms.find_paths(scene.faces, links, extent_m=extent, **common)[0]
     if search.engine == "image":
-        return mirror.find_paths(scene.faces, *ends, extent_m=extent, **common)
+        return mirror.find_paths(scene.faces, links, extent_m=extent, **common)
     from .search import sionna
 
-    return sionna.find_paths(scene.faces, *ends, **(common | _rays(scene, link, search)))
-
-
-def _rays(scene: Scene, link: Link, search: Search) -> dict[str, Any]:
-    """What Sionna is asked with besides the ends."""
-    return {
-        "carrier_hz": link.carrier_hz,
-        "samples": search.samples,
-        "batch": search.batch,
-        "surfaces": scene.surfaces,
-        "variant": search.variant,
-    }
+    about: dict[str, Any] = {"carrier_hz": link.carrier_hz, "surfaces": scene.surfaces, "progress": run.progress}
+    return sionna.find_paths(scene.faces, links, sionna.Rays(**search.rays), **about)
 
 
 def other_paths(
@@ -176,18 +165,11 @@ def other_paths(
         return
     from .search import sionna
 
-    rays = _rays(scene, link, search)
+    rays = sionna.Rays(**search.rays)
     if other.scattering:
-        rays["samples"] = min(rays["samples"], SCATTERING_SAMPLES)
+        rays = replace(rays, samples=min(rays.samples, SCATTERING_SAMPLES))
     batches = sionna.find_others(
-        scene.faces,
-        scene.sources_m,
-        poses.position_m,
-        search=other,
-        max_depth=search.max_depth,
-        usable=scene.usable,
-        excluded=scene.excluded,
-        **rays,
+        scene.faces, scene.links_to(poses), rays, other, carrier_hz=link.carrier_hz, surfaces=scene.surfaces
     )
     if cache is None:
         yield from batches
@@ -255,15 +237,10 @@ def estimate_search(
     from .search import beams as search_beams
     from .search import prisms  # compiled: loaded where there are many faces
 
-    solids = scene.surfaces is None
     return search_beams.estimate(
         scene.surfaces or prisms.solid_surfaces(scene.faces, scene.sources_m, poses.position_m),
-        scene.sources_m,
-        poses.position_m,
+        replace(scene.links_to(poses), longest_m=_longest_m(scene, poses, search)),
         max_depth=search.max_depth,
-        usable=scene.usable,
-        excluded=scene.excluded,
-        longest_m=_longest_m(scene, poses, search),
         threads=threads,
-        solids=solids,
+        solids=scene.surfaces is None,
     )

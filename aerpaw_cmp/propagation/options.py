@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
@@ -76,6 +76,11 @@ class Search:
     def variant(self) -> str | None:
         """Mitsuba's name of the device."""
         return {"cpu": "llvm", "cuda": "cuda"}.get(self.device)
+
+    @property
+    def rays(self) -> dict[str, Any]:
+        """What Sionna's search takes of this."""
+        return {name: getattr(self, name) for name in ("max_depth", "samples", "batch", "variant")}
 
     @property
     def deciding(self) -> dict[str, object]:

@@ -16,6 +16,30 @@ from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
+class Links:
+    """Ends of the links whose paths are searched.
+
+    Parameters
+    ----------
+    sources_m : (towers, 3)
+    targets_m : (poses, 3)
+        NaN positions have no path.
+    usable : (towers, faces) bool, optional
+        Faces that may reflect for each tower (default: all). All faces hide.
+    excluded : (towers, poses) bool, optional
+        Links without any path, e.g. poses inside buildings.
+    longest_m : float or (towers, poses)
+        Longer paths may be left out [m]: the power cut.
+    """
+
+    sources_m: FloatArray
+    targets_m: FloatArray
+    usable: BoolArray | None = None
+    excluded: BoolArray | None = None
+    longest_m: float | FloatArray = np.inf
+
+
+@dataclass(frozen=True, slots=True)
 class Faces:
     """Planar reflecting faces of a scene.
 

@@ -17,7 +17,7 @@ from ..site.site import Site
 from . import compiled
 from .arrays import Link, Poses
 from .faces import inside_solids, site_faces
-from .paths import Faces, PathSet
+from .paths import Faces, Links, PathSet
 from .search.crowns import Crowns
 from .surfaces import Surfaces
 
@@ -72,6 +72,10 @@ class Scene:
         buried = up[None, :] < np.minimum(ground, 0.0)[:, None]
         excluded = buried | inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
         return cls(faces, sources, usable, excluded)
+
+    def links_to(self, poses: Poses) -> Links:
+        """Ends of the links from the towers to the poses."""
+        return Links(self.sources_m, poses.position_m, self.usable, self.excluded)
 
     def with_bounces(self, site: Site, poses: Poses, crowns: Crowns, max_depth: int) -> tuple[Scene, PathSet]:
         """Scene with the facets of crowns that reflect, as hidden by nothing else than before, and their paths.

@@ -28,6 +28,7 @@ from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, 
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.field import sum as field_sum
 from aerpaw_cmp.propagation.options import Run
+from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import mirror as image
@@ -213,9 +214,9 @@ def same_paths(one, two):
     np.testing.assert_allclose(one.vertices_m, two.vertices_m, rtol=0, atol=1e-9)
 
 
-def searched(faces, sources, targets, **options):
-    mirrors = image.find_paths(faces, sources, targets, **options)
-    beams, _ = prisms.find_paths(faces, sources, targets, **options, threads=2)
+def searched(faces, sources, targets, usable=None, excluded=None, **options):
+    mirrors = image.find_paths(faces, Links(sources, targets, usable, excluded), **options)
+    beams, _ = prisms.find_paths(faces, Links(sources, targets, usable, excluded), **options, threads=2)
     same_paths(mirrors, beams)
     return beams
 

@@ -7,6 +7,7 @@ from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.propagation.check.explain import _chosen, near_an_edge, why_not
 from aerpaw_cmp.propagation.faces import site_faces
+from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.mirror import find_paths
 from aerpaw_cmp.site.site import Building
 
@@ -29,7 +30,7 @@ def test_reasons_of_geometry(scenes):
     # every path that is found has no reason not to be there, and every one that is not has one
     rng = np.random.default_rng(3)
     targets = np.column_stack([rng.uniform(-80, 80, (40, 2)), rng.uniform(2, 40, 40)])
-    found = find_paths(faces, source[None], targets, max_depth=1)
+    found = find_paths(faces, Links(source[None], targets), max_depth=1)
     for pose, place in enumerate(targets):
         there = set(found.faces[(found.pose == pose) & (found.depth == 1), 0].tolist())
         for face in range(len(faces)):

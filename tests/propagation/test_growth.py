@@ -14,7 +14,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.check.obstacles import why_not_there
 from aerpaw_cmp.propagation.engines import estimate_search
 from aerpaw_cmp.propagation.options import Run, Search
-from aerpaw_cmp.propagation.paths import path_lengths
+from aerpaw_cmp.propagation.paths import Links, path_lengths
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import mirror as image
@@ -56,7 +56,7 @@ def test_tilted_overlapping_open_quads_against_enumeration(seed):
     expected = enumerate_.paths(scene.vertices_m[scene.triangles], sources, targets, 2)
     assert sum(len(v) for v in expected.values()) > 6
     for way in WAYS:
-        paths, _ = grow_paths(merged(scene), sources, targets, max_depth=2, **way)
+        paths, _ = grow_paths(merged(scene), Links(sources, targets), max_depth=2, **way)
         assert enumerate_.compare(paths, expected) == (0, 0), way
 
 
@@ -74,7 +74,7 @@ def test_cropped_scenes_against_enumeration(name, middle, count):
     targets = np.column_stack([rng.uniform(-40, 40, (8, 2)) + middle, rng.uniform(1.5, 40, 8)])
     expected = enumerate_.paths(corners[near], source, targets, 2)
     for way in WAYS:
-        paths, _ = grow_paths(merged(crop), source, targets, max_depth=2, **way)
+        paths, _ = grow_paths(merged(crop), Links(source, targets), max_depth=2, **way)
         assert enumerate_.compare(paths, expected) == (0, 0), way
 
 
@@ -89,7 +89,7 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     words: list[str] = []
     found = [
         grow_paths(
-            surfaces, source, targets, max_depth=2, shadows=on, on_estimate=lambda told: words.append(str(told))
+            surfaces, Links(source, targets), max_depth=2, shadows=on, on_estimate=lambda told: words.append(str(told))
         )[0]
         for on in (True, False)
     ]
@@ -123,9 +123,9 @@ def test_only_a_convex_face_leaves_out_what_its_outline_covers(name):
     scene = enumerate_.scene_of([*occluder, *mirror], shapes=[0] * len(occluder) + [1, 1])
     surfaces, ends = merged(scene), (np.array([[0.0, 0, 0]]), np.array([[0.0, 0.5, 0.5]]))
     assert len(surfaces) == 2
-    paths, effort = grow_paths(surfaces, *ends, max_depth=1)
-    everything, _ = grow_paths(surfaces, *ends, max_depth=1, shadows=False)
-    wrong, _ = grow_paths(replace(surfaces, convex=np.ones(len(surfaces), np.bool_)), *ends, max_depth=1)
+    paths, effort = grow_paths(surfaces, Links(*ends), max_depth=1)
+    everything, _ = grow_paths(surfaces, Links(*ends), max_depth=1, shadows=False)
+    wrong, _ = grow_paths(replace(surfaces, convex=np.ones(len(surfaces), np.bool_)), Links(*ends), max_depth=1)
     if name == "a square":  # itself a mirror, at (5, 1/4, 1/4); the one behind it is not followed
         assert effort.hidden == 1
         assert [p[0].round(9).tolist() for p in paths.vertices_m[1:]] == [[5.0, 0.25, 0.25]]
@@ -140,7 +140,7 @@ def test_a_mirror_works_on_both_sides_and_hides_from_both():
     wall = enumerate_.scene_of(quad((0, -50, -50), (0, 100, 0), (0, 0, 100)))
     for side in (1.0, -1.0):
         source, targets = np.array([[3.0 * side, 0, 0]]), np.array([[5.0 * side, 4.0, 2.0], [-5.0 * side, 4.0, 2.0]])
-        paths, _ = grow_paths(merged(wall), source, targets, max_depth=1)
+        paths, _ = grow_paths(merged(wall), Links(source, targets), max_depth=1)
         assert paths.pose.tolist() == [0, 0]
         assert paths.depth.tolist() == [0, 1]
         # the image of the source is at -3: the line to (5, 4, 2) crosses the wall at 3/8 of its way
@@ -152,7 +152,7 @@ def test_coincident_faces_give_one_path():
     again = quad((-5, -5, 0), (12, 0, 0), (0, 12, 0))  # overlaps, in the same plane, of another shape
     close = quad((-9, -9, -0.0004), (18, 0, 0), (0, 18, 0))  # the back of a double face
     scene = enumerate_.scene_of([*sheet, *again, *close], shapes=[0, 0, 1, 1, 2, 2])
-    paths, _ = grow_paths(merged(scene), np.array([[0, 0, 3.0]]), np.array([[2.0, 1, 4]]), max_depth=2)
+    paths, _ = grow_paths(merged(scene), Links(np.array([[0, 0, 3.0]]), np.array([[2.0, 1, 4]])), max_depth=2)
     assert paths.depth.tolist() == [0, 1]
 
 
@@ -168,10 +168,10 @@ def test_flipped_and_degenerate_triangles_change_nothing():
     flipped[1] = flipped[1][::-1]
     needle = np.array([[[0, 0, 1], [1, 0, 1], [2, 0, 1]]], dtype=float)
     ends = np.array([[0, 0, 3.0]]), np.array([[2.0, 1, 4]])
-    expected, _ = grow_paths(merged(enumerate_.scene_of(sheet)), *ends, max_depth=2)
+    expected, _ = grow_paths(merged(enumerate_.scene_of(sheet)), Links(*ends), max_depth=2)
     surfaces = merged(enumerate_.scene_of(np.concatenate([flipped, needle])))
     assert surfaces.notes == ("1 triangles without an area were dropped",)
-    paths, _ = grow_paths(surfaces, *ends, max_depth=2)
+    paths, _ = grow_paths(surfaces, Links(*ends), max_depth=2)
     assert np.allclose(paths.vertices_m, expected.vertices_m, equal_nan=True)
 
 
@@ -193,8 +193,8 @@ def test_the_power_cut_leaves_out_long_paths_only(way, of_link):
     sources, targets = rng.uniform(15, 45, (2, 3)), rng.uniform(5, 55, (40, 3))
     targets[7] = np.nan
     longest = power_cut.longest_m(sources, targets, 9.0) if of_link else 80.0
-    every, effort = grow_paths(surfaces, sources, targets, max_depth=2, **way)
-    some, less = grow_paths(surfaces, sources, targets, max_depth=2, longest_m=longest, **way)
+    every, effort = grow_paths(surfaces, Links(sources, targets), max_depth=2, **way)
+    some, less = grow_paths(surfaces, Links(sources, targets, longest_m=longest), max_depth=2, **way)
     limit = np.broadcast_to(longest, (2, 40))[every.tower, every.pose]
     kept = every.select((path_lengths(every, sources, targets) <= limit) | (every.depth == 0))
     for depth in (1, 2):
@@ -230,7 +230,7 @@ def test_paths_can_be_recomputed_from_their_faces():
     rng = np.random.default_rng(6)
     source = np.array([[-20.0, 0.0, 20.0]])
     targets = np.column_stack([rng.uniform(-40, 40, 30), rng.uniform(-8, 8, 30), rng.uniform(1, 30, 30)])
-    paths, effort = grow_paths(surfaces, source, targets, max_depth=2)
+    paths, effort = grow_paths(surfaces, Links(source, targets), max_depth=2)
     assert effort.estimate_s < 60.0
     rows = np.flatnonzero(paths.depth == 2)
     assert len(rows) > 10
@@ -277,9 +277,8 @@ def test_prisms_by_beams_have_the_paths_of_the_image_engine(scenes, aligned):
         spots = rng.uniform([-120, -120, 0], [120, 120, 40], (60, 3))
     site = scenes.site(buildings, ((0.0, -20.0, 10.0), (3.0, -5.0, 25.0)))
     scene, poses = Scene.of(site, scenes.link(site), scenes.poses(spots)), scenes.poses(spots)
-    settings = {"max_depth": 2, "usable": scene.usable, "excluded": scene.excluded}
-    expected = image.find_paths(scene.faces, scene.sources_m, poses.position_m, **settings)
-    found, _ = prisms.find_paths(scene.faces, scene.sources_m, poses.position_m, **settings)
+    expected = image.find_paths(scene.faces, scene.links_to(poses), max_depth=2)
+    found, _ = prisms.find_paths(scene.faces, scene.links_to(poses), max_depth=2)
     assert len(expected) > 100
     assert np.array_equal(found.faces, expected.faces)
     assert np.array_equal(found.pose, expected.pose)
@@ -319,7 +318,7 @@ def test_what_a_scene_cannot_do_is_said(scenes, tmp_path):
     scene = placed_scene(enumerate_.shipped("simple_street_canyon"))
     site = scenes.site((), ((0.0, 0.0, 20.0),), scene=scene)
     with pytest.raises(UsageError, match="max_depth 4"):
-        grow_paths(merged(scene), np.zeros((1, 3)), np.zeros((1, 3)), max_depth=4)
+        grow_paths(merged(scene), Links(np.zeros((1, 3)), np.zeros((1, 3))), max_depth=4)
     assert replay(site, scenes.link(site), scenes.poses([[5.0, 2.0, 1.5]])).paths.depth.max() == 2
 
 

@@ -6,15 +6,17 @@ from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.faces import inside_solids, site_faces
+from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.mirror import find_paths, images_of, planes_of
 from aerpaw_cmp.site.site import Building
 
 SOURCE = np.array([[0.0, 0.0, 10.0]])
 
 
-def search(site, targets, max_depth=2, **settings_):
+def search(site, targets, max_depth=2, excluded=None, **settings_):
     faces = site_faces(site)
-    return faces, find_paths(faces, SOURCE, np.atleast_2d(np.asarray(targets, float)), max_depth=max_depth, **settings_)
+    links = Links(SOURCE, np.atleast_2d(np.asarray(targets, float)), excluded=excluded)
+    return faces, find_paths(faces, links, max_depth=max_depth, **settings_)
 
 
 @pytest.mark.parametrize(("seed", "holes"), [(1, False), (2, False), (3, True), (4, True)])
@@ -90,12 +92,12 @@ def test_chunks_do_not_change_the_paths(scenes, monkeypatch):
 @settings(max_examples=40, deadline=None)
 @given(st.floats(20, 3000), st.floats(0, 2 * np.pi), st.floats(0.5, 120.0), st.floats(0.5, 40.0))
 def test_empty_field_has_line_of_sight_and_one_ground_reflection(distance, bearing, high, low):
-    from aerpaw_cmp.propagation.paths import Faces
+    from aerpaw_cmp.propagation.paths import Faces, Links
 
     ground = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), ("medium_dry_ground",), ("ground",))
     source = np.array([[0.0, 0.0, low]])
     target = np.array([[distance * np.cos(bearing), distance * np.sin(bearing), high]])
-    paths = find_paths(ground, source, target, max_depth=3)
+    paths = find_paths(ground, Links(source, target), max_depth=3)
     assert paths.faces.tolist() == [[-1, -1, -1], [0, -1, -1]]
     share = low / (low + high)
     assert paths.vertices_m[1, 0] == pytest.approx([*(share * target[0, :2]), 0.0], abs=1e-9)
@@ -105,8 +107,8 @@ def test_direction_reversal_finds_the_same_paths(scenes):
     site = scenes.site(scenes.buildings(np.random.default_rng(11), 6, spread_m=60.0))
     faces = site_faces(site)
     targets = np.random.default_rng(12).uniform([-70, -70, 15], [70, 70, 30], (40, 3))
-    there = find_paths(faces, SOURCE, targets, max_depth=2)
-    back = find_paths(faces, targets, SOURCE, max_depth=2)
+    there = find_paths(faces, Links(SOURCE, targets), max_depth=2)
+    back = find_paths(faces, Links(targets, SOURCE), max_depth=2)
     turned = {
         (t, 0, *[f for f in row[::-1] if f >= 0], *[f for f in row if f < 0])
         for t, row in zip(back.tower.tolist(), back.faces.tolist(), strict=True)
@@ -201,11 +203,11 @@ def test_faces_that_may_not_reflect_do_not_at_any_place_of_a_sequence(scenes):
     site = scenes.site([Building("a", box(40, -50, 45, 50), 30.0)])
     faces = site_faces(site)
     target = np.array([[10.0, 20.0, 15.0]])
-    whole = find_paths(faces, SOURCE, target, max_depth=2)
+    whole = find_paths(faces, Links(SOURCE, target), max_depth=2)
     wall = int(np.flatnonzero(faces.normal[:, 0] == -1.0)[0])
     assert {0, wall} in [set(row) for row in whole.faces.tolist()]  # a corner reflection
     for face in (0, wall):
         usable = np.ones((1, len(faces)), dtype=bool)
         usable[0, face] = False
-        some = find_paths(faces, SOURCE, target, max_depth=2, usable=usable)
+        some = find_paths(faces, Links(SOURCE, target, usable), max_depth=2)
         assert scenes.keys(some) == {key for key in scenes.keys(whole) if face not in key[2:]}

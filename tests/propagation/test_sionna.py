@@ -155,7 +155,7 @@ def test_h_equals_sionnas_explicit_arrays_at_short_range(sionna, scenes, lone):
     ours = replay(site, link, near)
     scene = Scene.of(site, link, near)
     theirs = sionna.own_channels(
-        scene.faces, scene.sources_m, near, link, explicit=True, samples=SAMPLES, batch=BATCH, usable=scene.usable
+        scene.faces, scene.links_to(near), near.rotation, link, sionna.Rays(samples=SAMPLES, batch=BATCH), explicit=True
     )
     size = np.abs(ours.h).max(axis=(2, 3))
     error = np.abs(theirs - ours.h).max(axis=(2, 3))[size > 0] / size[size > 0]
@@ -173,7 +173,12 @@ def test_rss_equals_sionnas_own_to_a_hundredth_of_a_decibel(sionna, scenes, lone
     ours = replay(site, link, near)
     scene = Scene.of(site, link, near)
     h = sionna.own_channels(
-        scene.faces, scene.sources_m, near, link, explicit=False, samples=SAMPLES, batch=BATCH, usable=scene.usable
+        scene.faces,
+        scene.links_to(near),
+        near.rotation,
+        link,
+        sionna.Rays(samples=SAMPLES, batch=BATCH),
+        explicit=False,
     )
     theirs = rss_dbm(mean_pair_power(h), link.transmit_power_dbm)
     both = np.isfinite(ours.rss_dbm)
@@ -198,11 +203,9 @@ def test_plane_waves_make_every_line_of_sight_rank_1(sionna, scenes):
     )
     scene = Scene.of(site, link, poses)
     exact = channel_rank(replay(site, link, poses, Search(max_depth=0)).h[:, 0], 1000)
-    ranks = {}
+    ranks, rays = {}, sionna.Rays(max_depth=0, samples=1000, batch=BATCH)
     for explicit in (False, True):
-        h = sionna.own_channels(
-            scene.faces, scene.sources_m, poses, link, explicit=explicit, max_depth=0, samples=1000, batch=BATCH
-        )
+        h = sionna.own_channels(scene.faces, scene.links_to(poses), poses.rotation, link, rays, explicit=explicit)
         ranks[explicit] = channel_rank(h[:, 0], 1000)
     assert (ranks[False] == 1).all()
     assert (exact[:10] == 2).all()
@@ -246,9 +249,10 @@ def test_cuda_and_llvm_agree(sionna, scenes, lone):
     import sys
 
     code = (
-        "import sys; from aerpaw_cmp.propagation import sionna; from pathlib import Path; import numpy as np, pickle;"
+        "import sys; from aerpaw_cmp.propagation.search import sionna; from pathlib import Path; import numpy as np, pickle;"
         "case = pickle.load(open(sys.argv[1], 'rb')); sionna.load_variant(sys.argv[2]);"
-        "p = sionna.find_paths(*case, carrier_hz=3.4e9, samples=100000, batch=25, variant=sys.argv[2]);"
+        "rays = sionna.Rays(samples=100000, batch=25, variant=sys.argv[2]);"
+        "p = sionna.find_paths(*case, rays, carrier_hz=3.4e9);"
         "np.savetxt(sys.argv[3], np.column_stack([p.pose, p.tower, p.faces]), fmt='%d')"
     )
     import pickle
@@ -259,7 +263,7 @@ def test_cuda_and_llvm_agree(sionna, scenes, lone):
     scene = Scene.of(site, scenes.link(site), poses)
     with tempfile.TemporaryDirectory() as folder:
         entry = Path(folder) / "case"
-        entry.write_bytes(pickle.dumps((scene.faces, scene.sources_m, poses.position_m)))
+        entry.write_bytes(pickle.dumps((scene.faces, scene.links_to(poses))))
         found = []
         for variant in ("cuda", "llvm"):
             out = Path(folder) / variant
@@ -295,8 +299,8 @@ def test_coefficients_of_links_without_a_path(sionna, scenes):
     probe, _ = field_audit._probe(link)
     scene = Scene.of(site, link, poses)
     found = sionna.own_coefficients(
-        scene.faces, scene.sources_m, poses, probe, (np.eye(3)[None], poses.rotation),
-        usable=scene.usable, excluded=scene.excluded, samples=1000, batch=BATCH,
+        scene.faces, scene.links_to(poses), probe, (np.eye(3)[None], poses.rotation),
+        sionna.Rays(samples=1000, batch=BATCH),
     )  # fmt: skip
     assert (len(found.paths), found.gain.shape) == (0, (0, 2, 2))
 

@@ -7,6 +7,7 @@ import shapely
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.propagation.faces import inside_solids, site_faces
+from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search.mirror import find_paths
 from aerpaw_cmp.propagation.search.occlusion import Occlusion, convex_pieces
@@ -23,7 +24,7 @@ def paths_of(scenes, buildings, source, targets, max_depth=2):
     site = scenes.site(buildings)
     faces, targets = site_faces(site), np.atleast_2d(np.asarray(targets, float))
     excluded = inside_solids(site, targets)[None]
-    return faces, find_paths(faces, np.array([source], float), targets, max_depth=max_depth, excluded=excluded)
+    return faces, find_paths(faces, Links(np.array([source], float), targets, excluded=excluded), max_depth=max_depth)
 
 
 def cut(buildings, scenes, start, end):

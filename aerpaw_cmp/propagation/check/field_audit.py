@@ -383,7 +383,7 @@ def against_sionna(
     FieldAudit
         Counts and largest errors over the paths that both have.
     """
-    from ..search.sionna import own_coefficients
+    from ..search.sionna import Rays, own_coefficients
 
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
     scene = Scene.of(site, link, few)
@@ -393,9 +393,8 @@ def against_sionna(
         few.rotation @ np.array(expected.link.uav.mount),
     )
     theirs = own_coefficients(
-        scene.faces, scene.sources_m, few, probe, turns, usable=scene.usable, excluded=scene.excluded,
-        max_depth=search.max_depth, samples=int(search.samples), batch=search.batch, surfaces=scene.surfaces,
-    )  # fmt: skip
+        scene.faces, scene.links_to(few), probe, turns, Rays(**search.rays), surfaces=scene.surfaces
+    )
     place = np.full(int(max(len(poses), 1)), -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
     rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~replay.paths.off_crown)
@@ -465,7 +464,7 @@ EXPLICIT_SAMPLES = 50_000
 
 def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
     """H with each pair's own paths against Sionna's explicit arrays at short range."""
-    from ..search.sionna import own_channels
+    from ..search.sionna import Rays, own_channels
 
     arrays = list(link.tower_arrays.values())
     names = {pattern.name for array in (*arrays, link.uav_array) for pattern in array.patterns}
@@ -479,11 +478,10 @@ def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
         return FieldAudit()
     some = Poses(few.position_m[near], few.rotation[near])
     scene = Scene.of(site, link, some)
+    rays = Rays(max_depth=max_depth, samples=EXPLICIT_SAMPLES, batch=EXPLICIT_POSES)
     theirs = own_channels(
-        scene.faces, scene.sources_m, some, link,
-        explicit=True, max_depth=max_depth, samples=EXPLICIT_SAMPLES, batch=EXPLICIT_POSES, usable=scene.usable,
-        surfaces=scene.surfaces,
-    )  # fmt: skip
+        scene.faces, scene.links_to(some), some.rotation, link, rays, explicit=True, surfaces=scene.surfaces
+    )
     ours = replay_pairs(site, link, some, Search(max_depth=max_depth)).h  # without foliage
     size = np.abs(ours).max(axis=(2, 3))
     error = np.sort(np.abs(theirs - ours).max(axis=(2, 3))[size > 0] / size[size > 0])

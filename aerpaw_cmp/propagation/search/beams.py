@@ -21,7 +21,7 @@ from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..compiled import in_threads, thread_count
 from ..numba_options import kernel
-from ..paths import PathSet
+from ..paths import Links, PathSet
 from ..surfaces import Surfaces
 from .boxtree import box_missed, box_outside, box_tree, within_planes
 from .effort import Effort, Estimate, OnEstimate
@@ -79,15 +79,11 @@ class _Rules(NamedTuple):
 
 def grow_paths(
     surfaces: Surfaces,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
+    links: Links,
     *,
     max_depth: int = 2,
-    usable: BoolArray | None = None,
-    excluded: BoolArray | None = None,
     beams: bool = True,
     shadows: bool = True,
-    longest_m: float | FloatArray = np.inf,
     threads: int | None = None,
     progress: Progress | None = None,
     on_estimate: OnEstimate | None = None,
@@ -98,21 +94,14 @@ def grow_paths(
     Parameters
     ----------
     surfaces : Surfaces
-    sources_m : (towers, 3)
-    targets_m : (poses, 3)
-        NaN positions have no path.
+    links : Links
+        Faces over which no path is as short as ``longest_m`` are not followed.
     max_depth : int
         0 to 3.
-    usable : (towers, faces) bool, optional
-        Faces that may reflect for each tower. All faces hide.
-    excluded : (towers, poses) bool, optional
-        Links without any path.
     beams : bool
         False follows every sequence of faces: the same paths, for tests.
     shadows : bool
         False follows first faces that one convex face hides wholly, too.
-    longest_m : float or (towers, poses)
-        Leave out paths longer than this [m]: the power cut. Faces over which no path is short enough are not followed.
     threads : int, optional
         Default: the cores that this process may use.
     progress : callable, optional
@@ -132,43 +121,21 @@ def grow_paths(
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
     started = time.perf_counter()
+    towers = len(links.sources_m)
     pieces: list[PathSet] = []
     effort = Effort()
-    margin = SOLID_MARGIN if solids else 0.0
-    rules = _Rules(
-        depth=max_depth,
-        clearance=2.0 * surfaces.merge_m,
-        end=END_M,
-        margin=margin,
-        side=SIDE_M,
-        beams=beams,
-        shadows=shadows,
-    )
-    longest = np.broadcast_to(np.asarray(longest_m, dtype=np.float64), (len(sources_m), len(targets_m)))
-    for tower, source in enumerate(sources_m):
-        poses = _searched(source, targets_m, None if excluded is None else excluded[tower])
-        if not len(poses):
-            continue
-        front_only = np.full(len(surfaces), solids)
-        mirrors = _mirrors(surfaces, None if usable is None else usable[tower], front_only)
-        one = _Search(
-            mirrors=mirrors,
-            surfaces=surfaces,
-            source=source,
-            targets=targets_m[poses],
-            longest=longest[tower, poses],
-            rules=rules,
-        )
+    rules = _rules(surfaces, max_depth, solids=solids, beams=beams, shadows=shadows)
+    for tower, poses, one in _searches(surfaces, links, rules):
         pieces.append(_pad(one.direct(), poses, tower, max_depth))
         if max_depth:
             first, hidden = one.first_faces()
 
             def share(done: float, tower: int = tower) -> None:
                 if progress:
-                    progress((tower + done) / len(sources_m))
+                    progress((tower + done) / towers)
 
             if on_estimate:
-                on_estimate(one.estimate(first, thread_count(threads)).times(len(sources_m) - tower))
+                on_estimate(one.estimate(first, thread_count(threads)).times(towers - tower))
                 on_estimate = None
             parts, spent = one.run(first, thread_count(threads), share)
             pieces += [_pad(part, poses, tower, max_depth) for part in parts]
@@ -179,7 +146,7 @@ def grow_paths(
                 estimate_s=effort.estimate_s + spent.estimate_s,
             )
         if progress:
-            progress((tower + 1) / len(sources_m))
+            progress((tower + 1) / towers)
     paths = merge(pieces, max_depth, None)
     paths = paths if solids else without_coincident(paths, surfaces)
     return paths, Effort(
@@ -199,55 +166,52 @@ def _searched(source: FloatArray, targets_m: FloatArray, excluded: BoolArray | N
 
 
 def estimate(
-    surfaces: Surfaces,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
-    *,
-    max_depth: int = 2,
-    usable: BoolArray | None = None,
-    excluded: BoolArray | None = None,
-    longest_m: float | FloatArray = np.inf,
-    threads: int | None = None,
-    solids: bool = False,
+    surfaces: Surfaces, links: Links, *, max_depth: int = 2, threads: int | None = None, solids: bool = False
 ) -> Estimate | None:
     """What :func:`grow_paths` would take, from the first 64 faces of the first source; None where nothing is searched.
 
-    Parameters are those of :func:`grow_paths`.
-
     Parameters
     ----------
-    surfaces : Surfaces
-    sources_m, targets_m : (towers, 3), (poses, 3)
-    max_depth : int
-    usable : (towers, faces) bool, optional
-    excluded : (towers, poses) bool, optional
-    longest_m : float or (towers, poses)
-    threads : int, optional
-    solids : bool
+    surfaces, links, max_depth, threads, solids
+        As for :func:`grow_paths`.
 
     Returns
     -------
     Estimate or None
     """
-    rules = _Rules(
-        max_depth, 2.0 * surfaces.merge_m, END_M, SOLID_MARGIN if solids else 0.0, SIDE_M, beams=True, shadows=True
-    )
-    longest = np.broadcast_to(np.asarray(longest_m, dtype=np.float64), (len(sources_m), len(targets_m)))
-    for tower, source in enumerate(sources_m):
-        poses = _searched(source, targets_m, None if excluded is None else excluded[tower])
-        if not len(poses) or not max_depth:
-            continue
-        mirrors = _mirrors(surfaces, None if usable is None else usable[tower], np.full(len(surfaces), solids))
-        one = _Search(
-            mirrors=mirrors,
-            surfaces=surfaces,
-            source=source,
-            targets=targets_m[poses],
-            longest=longest[tower, poses],
-            rules=rules,
-        )
-        return one.estimate(one.first_faces()[0], thread_count(threads)).times(len(sources_m) - tower)
+    if not max_depth:
+        return None
+    for tower, _, one in _searches(surfaces, links, _rules(surfaces, max_depth, solids=solids)):
+        return one.estimate(one.first_faces()[0], thread_count(threads)).times(len(links.sources_m) - tower)
     return None
+
+
+def _rules(surfaces: Surfaces, max_depth: int, *, solids: bool, beams: bool = True, shadows: bool = True) -> _Rules:
+    margin = SOLID_MARGIN if solids else 0.0
+    return _Rules(
+        depth=max_depth, clearance=2.0 * surfaces.merge_m, end=END_M, margin=margin, side=SIDE_M, beams=beams,
+        shadows=shadows,
+    )  # fmt: skip
+
+
+def _searches(surfaces: Surfaces, links: Links, rules: _Rules) -> Iterator[tuple[int, IntArray, _Search]]:
+    """Tower, poses and search of every tower that has a pose to be searched for."""
+    shape = len(links.sources_m), len(links.targets_m)
+    longest = np.broadcast_to(np.asarray(links.longest_m, dtype=np.float64), shape)
+    for tower, source in enumerate(links.sources_m):
+        poses = _searched(source, links.targets_m, None if links.excluded is None else links.excluded[tower])
+        if len(poses):
+            usable = None if links.usable is None else links.usable[tower]
+            mirrors = _mirrors(surfaces, usable, np.full(len(surfaces), rules.margin > 0.0))
+            one = _Search(
+                mirrors=mirrors,
+                surfaces=surfaces,
+                source=source,
+                targets=links.targets_m[poses],
+                longest=longest[tower, poses],
+                rules=rules,
+            )
+            yield tower, poses, one
 
 
 def _mirrors(surfaces: Surfaces, usable: BoolArray | None, front_only: BoolArray | None = None) -> _Mirrors:

@@ -23,7 +23,7 @@ import numpy as np
 from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..faces import corners, inside
-from ..paths import Faces, PathSet
+from ..paths import Faces, Links, PathSet
 from .occlusion import Occlusion
 
 RELATIVE_TOLERANCE = 1e-12
@@ -49,12 +49,9 @@ Progress = Callable[[float], None]
 
 def find_paths(
     faces: Faces,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
+    links: Links,
     *,
     max_depth: int = 2,
-    usable: BoolArray | None = None,
-    excluded: BoolArray | None = None,
     budget: int = SEQUENCE_BUDGET,
     extent_m: FloatArray | None = None,
     progress: Progress | None = None,
@@ -65,15 +62,9 @@ def find_paths(
     ----------
     faces : Faces
         Closed solids and ground planes.
-    sources_m : (towers, 3)
-    targets_m : (poses, 3)
-        NaN positions have no path.
+    links : Links
     max_depth : int
         0 to 3.
-    usable : (towers, faces) bool, optional
-        Faces that may reflect for each tower (default: all). All faces hide.
-    excluded : (towers, poses) bool, optional
-        Links without any path, e.g. poses inside buildings.
     budget : int
         Largest number of sequences followed per tower.
     extent_m : (points, 3), optional
@@ -93,13 +84,14 @@ def find_paths(
     """
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
+    sources_m, targets_m, usable = links.sources_m, links.targets_m, links.usable
     known = targets_m[np.isfinite(targets_m).all(axis=1)] if extent_m is None else extent_m
     tolerance_m = scene_tolerance_m(faces, sources_m, known)
     hiding = Occlusion(faces, tolerance_m)
     box = _Bounds.of(faces, float(max(1.0, *(np.abs(p).max(initial=0.0) for p in (known, sources_m)))))
     # without a second reflection nobody asks
     facing = _facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)
-    alive = _alive(sources_m, targets_m, excluded)
+    alive = _alive(sources_m, targets_m, links.excluded)
     of_any = np.asarray(alive.any(axis=0))
     shared = _Ends.of(faces, targets_m, of_any, tolerance_m)
 
@@ -113,9 +105,9 @@ def find_paths(
 
     pieces: list[PathSet] = []
     for tower, source in enumerate(sources_m):
-        links = np.flatnonzero(alive[tower])
+        poses = np.flatnonzero(alive[tower])
         for level in sequences(tower):
-            pieces.append(_paths_of_level(faces, level, source, targets_m, links, tower, max_depth, hiding))
+            pieces.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
         if progress:
             progress((tower + 1) / len(sources_m))
     return merge(pieces, max_depth, faces)

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...common.units import BoolArray, FloatArray
+from ...common.units import FloatArray
 from ..faces import corners, triangles
-from ..paths import Faces, PathSet
+from ..paths import Faces, Links, PathSet
 from ..surfaces import Surfaces
 from .beams import Progress, grow_paths
 from .boxtree import box_tree
@@ -29,15 +29,11 @@ OVERLAP_M = 1e-3
 
 def find_paths(
     faces: Faces,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
+    links: Links,
     *,
     max_depth: int = 2,
-    usable: BoolArray | None = None,
-    excluded: BoolArray | None = None,
     extent_m: FloatArray | None = None,
     threads: int | None = None,
-    longest_m: float | FloatArray = np.inf,
     progress: Progress | None = None,
     on_estimate: OnEstimate | None = None,
 ) -> tuple[PathSet, Effort]:
@@ -47,19 +43,13 @@ def find_paths(
     ----------
     faces : Faces
         Closed solids and ground planes.
-    sources_m : (towers, 3)
-    targets_m : (poses, 3)
-        NaN positions have no path.
+    links : Links
     max_depth : int
         0 to 3.
-    usable : (towers, faces) bool, optional
-    excluded : (towers, poses) bool, optional
     extent_m : (points, 3), optional
         Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
     threads : int, optional
         Default: the cores that this process may use.
-    longest_m : float or (towers, poses)
-        Longer paths may be left out [m].
     progress : callable, optional
     on_estimate : callable, optional
         Told before the search what it will take.
@@ -70,20 +60,12 @@ def find_paths(
         Sorted by pose, tower, depth, faces.
     Effort
     """
+    sources_m, targets_m = links.sources_m, links.targets_m
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m if extent_m is None else extent_m)
     paths, effort = grow_paths(
-        solid_surfaces(faces, sources_m, targets_m),
-        sources_m,
-        targets_m,
-        max_depth=max_depth,
-        usable=usable,
-        excluded=excluded,
-        longest_m=longest_m,
-        threads=threads,
-        progress=progress,
-        on_estimate=on_estimate,
-        solids=True,
-    )
+        solid_surfaces(faces, sources_m, targets_m), links,
+        max_depth=max_depth, threads=threads, progress=progress, on_estimate=on_estimate, solids=True,
+    )  # fmt: skip
     hiding = Occlusion(faces, tolerance_m)
     pieces = []
     for depth in range(max_depth + 1):

@@ -31,9 +31,9 @@ from ...common.errors import CheckError, UsageError
 from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from ...machine.llvm import let_sionna_load, prepare_llvm
 from ...site.materials import material
-from ..arrays import Array, Link, Poses
+from ..arrays import Array, Link
 from ..faces import inside, triangles
-from ..paths import Faces, PathSet, path_lengths
+from ..paths import Faces, Links, PathSet, path_lengths
 from ..surfaces import Surfaces
 from .interactions import DIFFRACTED, REFLECTED, OtherPaths, OtherSearch
 from .mirror import MINIMUM_LENGTH_M, Progress, images_of, merge, planes_of, scene_tolerance_m, trace_back
@@ -432,95 +432,80 @@ class _Finder:
         }
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rays:
+    """How Sionna searches.
+
+    Parameters
+    ----------
+    max_depth : int
+        Most interactions of a path, 0 to 3.
+    samples : int
+        Rays per tower and batch.
+    batch : int
+        Poses per call, at most 100; bounds the memory.
+    variant : {"cuda", "llvm"}, optional
+    """
+
+    max_depth: int = 2
+    samples: int = 1_000_000
+    batch: int = 50
+    variant: str | None = None
+
+
 def find_paths(
     faces: Faces,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
+    links: Links,
+    rays: Rays,
     *,
     carrier_hz: float,
-    max_depth: int = 2,
-    samples: int = 1_000_000,
-    batch: int = 50,
-    usable: BoolArray | None = None,
-    excluded: BoolArray | None = None,
     surfaces: Surfaces | None = None,
-    variant: str | None = None,
     progress: Progress | None = None,
 ) -> PathSet:
     """Paths that Sionna's PathSolver finds, refined in float64.
 
     Parameters
     ----------
-    faces, sources_m, targets_m, max_depth, usable, excluded, progress
-        As in :func:`aerpaw_cmp.propagation.search.mirror.find_paths`.
+    faces : Faces
+    links : Links
+    rays : Rays
     carrier_hz : float
         Sionna shoots by reflection power, so materials matter to what it finds.
-    samples : int
-        Rays per tower and batch.
-    batch : int
-        Poses per call, at most 100; bounds the memory.
     surfaces : Surfaces, optional
         What the faces are made of, where they are open surfaces.
-    variant : {"cuda", "llvm"}, optional
+    progress : callable, optional
 
     Returns
     -------
     PathSet
+        Sorted by pose, tower, depth, faces.
     """
+    sources_m, targets_m = links.sources_m, links.targets_m
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
 
     def take(_: Any, raw: dict[str, Any], built: _Scene, poses: IntArray, towers: IntArray) -> PathSet:
-        pose, tower, sequence = _sequences(raw, built.face_of, poses, towers, max_depth)
+        pose, tower, sequence = _sequences(raw, built.face_of, poses, towers, rays.max_depth)
         return _refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m, surfaces)
 
-    pieces = list(
-        _in_batches(
-            take,
-            faces,
-            sources_m,
-            targets_m,
-            carrier_hz=carrier_hz,
-            max_depth=max_depth,
-            samples=samples,
-            batch=batch,
-            usable=usable,
-            excluded=excluded,
-            surfaces=surfaces,
-            variant=variant,
-            progress=progress,
-        )
-    )
-    paths = merge(pieces, max_depth, faces if surfaces is None else None)
+    pieces = list(_in_batches(take, faces, links, rays, carrier_hz=carrier_hz, surfaces=surfaces, progress=progress))
+    paths = merge(pieces, rays.max_depth, faces if surfaces is None else None)
     if surfaces is not None:
         from .beams import without_coincident
 
         paths = without_coincident(paths, surfaces)
-    return paths if excluded is None else paths.select(~excluded[paths.tower, paths.pose])
+    return paths if links.excluded is None else paths.select(~links.excluded[paths.tower, paths.pose])
 
 
 def find_others(
-    faces: Faces,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
-    *,
-    carrier_hz: float,
-    search: OtherSearch,
-    max_depth: int = 2,
-    samples: int = 1_000_000,
-    batch: int = 50,
-    usable: BoolArray | None = None,
-    excluded: BoolArray | None = None,
-    surfaces: Surfaces | None = None,
-    variant: str | None = None,
-    progress: Progress | None = None,
+    faces: Faces, links: Links, rays: Rays, other: OtherSearch, *, carrier_hz: float, surfaces: Surfaces | None = None
 ) -> Iterator[OtherPaths]:
     """Paths with an interaction that is no reflection, as Sionna has them: float32, nothing refined.
 
     Parameters
     ----------
-    faces, sources_m, targets_m, carrier_hz, max_depth, samples, batch, usable, excluded, surfaces, variant, progress
+    faces, links, rays, carrier_hz, surfaces
         As in :func:`find_paths`; ``max_depth`` counts every interaction.
-    search : OtherSearch
+    other : OtherSearch
         Interactions besides the reflections, and the scattering coefficient.
 
     Yields
@@ -528,76 +513,49 @@ def find_others(
     OtherPaths
         Of each batch.
     """
-    flags = {
-        "diffraction": search.diffraction,
-        "refraction": search.refraction,
-        "diffuse_reflection": search.scattering,
-    }
-    if search.diffraction:
-        flags["diffraction_lit_region"] = False  # where the direct path is there, phases would decide
 
     def take(traced: Any, raw: dict[str, Any], built: _Scene, poses: IntArray, towers: IntArray) -> OtherPaths:
         part = _others(traced, raw, built.face_of, poses, towers)
-        return part if excluded is None else part.select(~excluded[part.tower, part.pose])
+        return part if links.excluded is None else part.select(~links.excluded[part.tower, part.pose])
 
-    yield from _in_batches(
-        take,
-        faces,
-        sources_m,
-        targets_m,
-        carrier_hz=carrier_hz,
-        max_depth=max_depth,
-        samples=samples,
-        batch=batch,
-        usable=usable,
-        excluded=excluded,
-        surfaces=surfaces,
-        variant=variant,
-        progress=progress,
-        flags=flags,
-        wedges=search.diffraction,
-        scattering=search.scattering_coefficient if search.scattering else 0.0,
-    )
+    yield from _in_batches(take, faces, links, rays, carrier_hz=carrier_hz, surfaces=surfaces, other=other)
 
 
 def _in_batches(
     take: Callable[[Any, dict[str, Any], _Scene, IntArray, IntArray], Taken],
     faces: Faces,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
+    links: Links,
+    rays: Rays,
     *,
     carrier_hz: float,
-    max_depth: int,
-    samples: int,
-    batch: int,
-    usable: BoolArray | None,
-    excluded: BoolArray | None,
     surfaces: Surfaces | None,
-    variant: str | None,
-    progress: Progress | None,
-    flags: dict[str, bool] | None = None,
-    wedges: bool = False,
-    scattering: float = 0.0,
+    progress: Progress | None = None,
+    other: OtherSearch = OtherSearch(),  # noqa: B008 - frozen
 ) -> Iterator[Taken]:
     """What ``take(paths of Sionna, arrays, scene, poses, towers)`` makes of each batch.
 
     Sionna's own objects hold memory of the device: they are let go before the next batch.
     """
+    sources_m, targets_m, batch = links.sources_m, links.targets_m, rays.batch
     if not 1 <= batch <= LARGEST_BATCH:
         raise UsageError(f"batch {batch}", expected=f"1 to {LARGEST_BATCH} poses per call")
-    load_variant(variant)
+    load_variant(rays.variant)
     alive = np.isfinite(targets_m).all(axis=1)
-    groups = list(_groups(faces, sources_m, usable))
+    groups = list(_groups(faces, sources_m, links.usable))
     for number, (towers, chosen) in enumerate(groups):
-        poses = np.flatnonzero(alive if excluded is None else alive & ~excluded[towers].all(axis=0))
+        poses = np.flatnonzero(alive if links.excluded is None else alive & ~links.excluded[towers].all(axis=0))
         if not len(poses):
             continue
         reach = 4.0 * float(max(np.abs(targets_m[poses]).max(), np.abs(sources_m).max(), 100.0))
-        built = _build(faces, chosen, reach, carrier_hz, surfaces=surfaces, wedges=wedges, scattering=scattering)
-        with _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch, flags=flags) as finder:
+        scattering = other.scattering_coefficient if other.scattering else 0.0
+        built = _build(
+            faces, chosen, reach, carrier_hz, surfaces=surfaces, wedges=other.diffraction, scattering=scattering
+        )
+        ends = _Ends.points(sources_m[towers])
+        with _Finder(built, ends, np.zeros((1, 3)), batch, flags=_flags(other)) as finder:
             for start in range(0, len(poses), batch):
                 some = poses[start : start + batch]
-                traced, raw = finder.searched(targets_m[some], max_depth, samples)
+                traced, raw = finder.searched(targets_m[some], rays.max_depth, rays.samples)
                 _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
                 part = take(traced, raw, built, some, towers)
                 del traced, raw
@@ -605,6 +563,17 @@ def _in_batches(
                 if progress:
                     progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
         del built
+
+
+def _flags(other: OtherSearch) -> dict[str, bool]:
+    """Switches of PathSolver for interactions besides reflections."""
+    flags = {
+        "diffraction": other.diffraction,
+        "refraction": other.refraction,
+        "diffuse_reflection": other.scattering,
+    }
+    # where the direct path is there, phases would decide
+    return flags | ({"diffraction_lit_region": False} if other.diffraction else {})
 
 
 def _others(
@@ -658,16 +627,11 @@ class Coefficients:
 
 def own_coefficients(
     faces: Faces,
-    sources_m: FloatArray,
-    poses: Poses,
+    links: Links,
     probe: Link,
     turns: tuple[FloatArray, FloatArray],
+    rays: Rays,
     *,
-    usable: BoolArray,
-    excluded: BoolArray,
-    max_depth: int = 2,
-    samples: int = 1_000_000,
-    batch: int = 50,
     surfaces: Surfaces | None = None,
 ) -> Coefficients:
     """Sionna's complex coefficient of each path, for the audit of the field.
@@ -677,9 +641,8 @@ def own_coefficients(
 
     Parameters
     ----------
-    faces, sources_m, usable, excluded, max_depth, samples, batch, surfaces
+    faces, links, rays, surfaces
         As in :func:`find_paths`.
-    poses : Poses
     probe : Link
         Two elements of one pattern in each array's centre.
     turns : ((towers, 3, 3), (poses, 3, 3))
@@ -689,31 +652,33 @@ def own_coefficients(
     -------
     Coefficients
     """
-    load_variant()
+    load_variant(rays.variant)
+    sources_m, targets_m, batch = links.sources_m, links.targets_m, rays.batch
     arrays = list(probe.tower_arrays.values())
-    reach = 4.0 * float(max(np.abs(poses.position_m).max(), np.abs(sources_m).max(), 100.0))
+    reach = 4.0 * float(max(np.abs(targets_m).max(), np.abs(sources_m).max(), 100.0))
     pieces: list[PathSet] = []
     gains: list[ComplexArray] = []
-    for sharing, chosen in _groups(faces, sources_m, usable):
+    for sharing, chosen in _groups(faces, sources_m, links.usable):
         for name in dict.fromkeys(arrays[t].patterns[0].name for t in sharing):
             towers = np.array([t for t in sharing if arrays[t].patterns[0].name == name])
             built = _build(faces, chosen, reach, probe.carrier_hz, own_table=True, surfaces=surfaces)
             ends = _Ends(sources_m[towers], turns[0][towers], np.zeros((1, 3)))
             patterns = (name, probe.uav_array.patterns[0].name)
             with _Finder(built, ends, np.zeros((1, 3)), batch, patterns=patterns) as finder:
-                for start in range(0, len(poses), batch):
-                    some = np.arange(start, min(start + batch, len(poses)))
-                    target = _Ends(poses.position_m[some], turns[1][some], np.zeros((1, 3)))
-                    part, gain = _raw_paths(finder, built, target, some, towers, max_depth, samples)
+                for start in range(0, len(targets_m), batch):
+                    some = np.arange(start, min(start + batch, len(targets_m)))
+                    target = _Ends(targets_m[some], turns[1][some], np.zeros((1, 3)))
+                    part, gain = _raw_paths(finder, built, target, some, towers, rays)
                     weights = _slants(probe.uav_array), np.stack([_slants(array) for array in arrays])[part.tower]
                     gains.append(np.einsum("pab,au,pbv->puv", gain, weights[0], weights[1]))
                     pieces.append(part)
             del built
-    paths = PathSet.one_after_another(pieces) if pieces else PathSet.empty(max_depth)
+    paths = PathSet.one_after_another(pieces) if pieces else PathSet.empty(rays.max_depth)
     gain = np.concatenate(gains) if gains else np.zeros((0, 2, 2), dtype=np.complex128)
-    kept = ~excluded[paths.tower, paths.pose]
-    paths, gain = paths.select(kept), gain[kept]
-    length = path_lengths(paths, sources_m, poses.position_m)
+    if links.excluded is not None:
+        kept = ~links.excluded[paths.tower, paths.pose]
+        paths, gain = paths.select(kept), gain[kept]
+    length = path_lengths(paths, sources_m, targets_m)
     cycles = length / wavelength_m(probe.carrier_hz)
     return Coefficients(paths, gain * np.exp(-2j * np.pi * (cycles - np.round(cycles)))[:, None, None], length)
 
@@ -724,10 +689,10 @@ def _slants(array: Array) -> FloatArray:
 
 
 def _raw_paths(
-    finder: _Finder, built: _Scene, target: _Ends, poses: IntArray, towers: IntArray, max_depth: int, samples: int
+    finder: _Finder, built: _Scene, target: _Ends, poses: IntArray, towers: IntArray, rays: Rays
 ) -> tuple[PathSet, ComplexArray]:
     """Paths of one batch made of reflections only, and their gains (paths, V and H, V and H)."""
-    traced = finder.trace(target, max_depth, samples)
+    traced = finder.trace(target, rays.max_depth, rays.samples)
     real, imaginary = (np.asarray(part.numpy()) for part in traced.a)
     raw: dict[str, Any] = {
         "valid": traced.valid.numpy()[: len(poses)],
@@ -736,12 +701,12 @@ def _raw_paths(
         "primitive": traced.primitives.numpy()[:, : len(poses)],
     }
     receiver, tower, path = np.nonzero(raw["valid"])
-    steps = min(max_depth, len(raw["kind"]))
+    steps = min(rays.max_depth, len(raw["kind"]))
     kinds = raw["kind"][:, receiver, tower, path]
     good = np.flatnonzero(((kinds == 0) | (kinds == 1)).all(axis=0))
     receiver, tower, path = receiver[good], tower[good], path[good]
-    pose, source, sequence = _sequences(raw, built.face_of, poses, towers, max_depth)
-    points = np.full((len(pose), max_depth, 3), np.nan)
+    pose, source, sequence = _sequences(raw, built.face_of, poses, towers, rays.max_depth)
+    points = np.full((len(pose), rays.max_depth, 3), np.nan)
     points[:, :steps] = np.moveaxis(traced.vertices.numpy()[:steps, receiver, tower, path], 0, 1)
     points[sequence < 0] = np.nan
     gain = (real + 1j * imaginary)[receiver, :, tower, :, path].astype(np.complex128)
@@ -750,24 +715,22 @@ def _raw_paths(
 
 def own_channels(
     faces: Faces,
-    sources_m: FloatArray,
-    poses: Poses,
+    links: Links,
+    rotation: FloatArray,
     link: Link,
+    rays: Rays,
     *,
     explicit: bool,
-    max_depth: int = 2,
-    samples: int = 1_000_000,
-    batch: int = 50,
-    usable: BoolArray | None = None,
     surfaces: Surfaces | None = None,
 ) -> ComplexArray:
     """Channel matrices as Sionna itself gives them, for comparison only: float32 phases.
 
     Parameters
     ----------
-    faces, sources_m, max_depth, samples, batch, usable, surfaces
-        As in :func:`find_paths`.
-    poses : Poses
+    faces, links, rays, surfaces
+        As in :func:`find_paths`; links without a path are searched as well.
+    rotation : (poses, 3, 3)
+        Device to site, of the UAV at each pose.
     link : Link
         Isotropic elements; all towers with the same element positions and slants.
     explicit : bool
@@ -777,24 +740,23 @@ def own_channels(
     -------
     (poses, towers, n_rx, n_tx) complex
     """
-    load_variant()
+    load_variant(rays.variant)
+    sources_m, targets_m, batch = links.sources_m, links.targets_m, rays.batch
     arrays = list(link.tower_arrays.values())
     for array in (*arrays, link.uav_array):
         if any(pattern.name != "iso" for pattern in array.patterns):
             raise UsageError("a pattern that is not isotropic", expected="isotropic elements in Sionna's own arrays")
-    h = np.zeros((len(poses), len(arrays), len(link.uav_array), len(arrays[0])), dtype=np.complex128)
-    reach = 4.0 * float(max(np.abs(poses.position_m).max(), np.abs(sources_m).max(), 100.0))
-    for towers, chosen in _groups(faces, sources_m, usable):
+    h = np.zeros((len(targets_m), len(arrays), len(link.uav_array), len(arrays[0])), dtype=np.complex128)
+    reach = 4.0 * float(max(np.abs(targets_m).max(), np.abs(sources_m).max(), 100.0))
+    for towers, chosen in _groups(faces, sources_m, links.usable):
         mounts = np.stack([arrays[t].mount for t in towers])
         sources = _Ends(sources_m[towers], mounts, arrays[0].positions_m)
         built = _build(faces, chosen, reach, link.carrier_hz, surfaces=surfaces)
         with _Finder(built, sources, link.uav_array.positions_m, batch, synthetic=not explicit) as finder:
-            for start in range(0, len(poses), batch):
+            for start in range(0, len(targets_m), batch):
                 rows = slice(start, start + batch)
-                targets = _Ends(
-                    poses.position_m[rows], poses.rotation[rows] @ link.uav_array.mount, link.uav_array.positions_m
-                )
-                a, _ = finder.trace(targets, max_depth, samples).cir(normalize_delays=False, out_type="numpy")
+                targets = _Ends(targets_m[rows], rotation[rows] @ link.uav_array.mount, link.uav_array.positions_m)
+                a, _ = finder.trace(targets, rays.max_depth, rays.samples).cir(normalize_delays=False, out_type="numpy")
                 mixed = _slanted(a[: len(targets.centres_m), ..., 0].sum(axis=-1), link.uav_array, arrays[0])
                 h[rows, towers] = np.moveaxis(mixed, 2, 1)
         del built

@@ -144,6 +144,9 @@ SPREAD_PARTS = {
 }
 
 
+_HATCHED = "Hatched spans marked Z have no path in the simulation and are not scored. "
+
+
 def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
     stem = f"{safe_name(panel.tower)}_{safe_name(panel.channel)}"
     section = f"rss/{panel.tower}/{panel.channel}"
@@ -155,11 +158,7 @@ def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
             title=f"{panel.name}: RSS over time",
             caption="Top: the measurement after its offset, the ray tracing, and the baselines, each baseline moved to "
             "its own best fit. "
-            + (
-                "Hatched spans marked Z have no path in the simulation and are not scored. "
-                if panel.simulated_out_of_coverage.any()
-                else ""
-            )
+            + _HATCHED * bool(panel.simulated_out_of_coverage.any())
             + "Bottom: residual; dashed lines are plus and minus one RMSE."
             + _band_words(panel)
             + (

@@ -291,7 +291,8 @@ def _read_rows(path: Path) -> _Rows:
         if frequency := _FREQUENCY.match(line):
             scale = {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9}[frequency.group(2).upper()]
             rows.frequency_hz = float(frequency.group(1)) * scale
-        elif line.lower().lstrip().startswith("phi"):
+            continue
+        if line.lower().lstrip().startswith("phi"):
             _check_header(line, path, number)
             started = True
         elif started and line.strip():
@@ -559,16 +560,15 @@ def _check_angles(elevation: FloatArray, azimuth: FloatArray, path: Path) -> Non
     ):
         if len(found) >= 3 and np.abs(found - wanted).max() <= 0.05:  # false for NaN too
             continue
-        cause = "angles are missing"
-        if len(found) >= 3 and 0 < np.abs(found).max() < 7:
-            cause = "radians instead of degrees"
-        elif len(set(found.tolist())) < len(found):
-            cause = "a direction stands twice, such as 0 and 360 deg"
-        elif len(found) >= 3 and np.abs(found - 90 - wanted).max() <= 0.05:
-            cause = "zenith angles in place of elevation"
+        causes = (
+            (len(found) >= 3 and 0 < np.abs(found).max() < 7, "radians instead of degrees"),
+            (len(set(found.tolist())) < len(found), "a direction stands twice, such as 0 and 360 deg"),
+            (len(found) >= 3 and np.abs(found - 90 - wanted).max() <= 0.05, "zenith angles in place of elevation"),
+            (True, "angles are missing"),
+        )
         raise InputError(
             f"{what} runs from {found.min(initial=np.inf):g} to {found.max(initial=-np.inf):g} in {len(found)} values",
             expected=f"{wanted[0]:g} to {wanted[-1]:g} deg, equally spaced" if len(found) >= 3 else "a whole sphere",
-            cause=cause,
+            cause=next(cause for holds, cause in causes if holds),
             path=path,
         )

@@ -16,6 +16,8 @@ from typing import Any, get_args
 
 import numpy as np
 import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
@@ -432,11 +434,12 @@ def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape
         for j in sorted(int(k) for k in tree.query(shape.area) if k > i and int(k) not in gone):
             other = shapes[j]
             ratio = shape.area.area / max(other.area.area, 1e-9)
-            if 0.98 < ratio < 1.02 and shape.area.intersection(other.area).area > 0.98 * shape.area.area:
-                gone.add(j)
-                actions.append(f"{other.source}: left out, it repeats {shape.source}")
-                if other.stated and not shape.stated:
-                    shape.height_m, shape.stated = other.height_m, True
+            if not (0.98 < ratio < 1.02 and shape.area.intersection(other.area).area > 0.98 * shape.area.area):
+                continue
+            gone.add(j)
+            actions.append(f"{other.source}: left out, it repeats {shape.source}")
+            if other.stated and not shape.stated:
+                shape.height_m, shape.stated = other.height_m, True
     return [shape for i, shape in enumerate(shapes) if i not in gone]
 
 
@@ -444,22 +447,13 @@ def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
     """Sets of shapes whose areas overlap, directly or by way of others."""
     if not shapes:
         return []
-    tree = shapely.STRtree([shape.area for shape in shapes])
-    first, second = tree.query([shape.area for shape in shapes], predicate="intersects")
-    home = list(range(len(shapes)))
-
-    def root(i: int) -> int:
-        while home[i] != i:
-            home[i] = home[home[i]]
-            i = home[i]
-        return i
-
-    for i, j in zip(first.tolist(), second.tolist(), strict=True):
-        if i < j and shapes[i].area.intersection(shapes[j].area).area > 0.01:
-            home[root(j)] = root(i)
+    areas = np.array([shape.area for shape in shapes], dtype=object)
+    first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
+    overlap = shapely.area(shapely.intersection(areas[first], areas[second])) > 0.01
+    pairs = coo_array((overlap[overlap], (first[overlap], second[overlap])), shape=(len(shapes), len(shapes)))
     groups: dict[int, list[_Shape]] = {}
-    for i, shape in enumerate(shapes):
-        groups.setdefault(root(i), []).append(shape)
+    for group, shape in zip(connected_components(pairs, directed=False)[1].tolist(), shapes, strict=True):
+        groups.setdefault(group, []).append(shape)
     return list(groups.values())
 
 

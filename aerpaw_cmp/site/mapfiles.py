@@ -214,27 +214,31 @@ def _words(properties: dict[str, Any]) -> dict[str, str]:
 
 
 def _geometry(geometry: dict[str, Any], outline: Outline, result: MapFile, lines: Counter[str], path: Path) -> None:
-    kind, where = geometry.get("type"), outline.source
+    kind, natural = str(geometry.get("type")), outline.tags.get("natural")
     if kind == "GeometryCollection":
         for part in geometry["geometries"]:
             _geometry(part, outline, result, lines, path)
-    elif kind in ("Polygon", "MultiPolygon"):
-        polygons = [geometry["coordinates"]] if kind == "Polygon" else geometry["coordinates"]
-        for rings in polygons:
-            outer, *holes = [[lonlat(point, where, path) for point in ring] for ring in rings] or [[]]
-            if any(ring and ring[0] != ring[-1] for ring in (outer, *holes)):
-                outline.broken.append("a ring is not closed; its ends were joined by a straight line")
-            outline.parts.append((outer, holes))
-    elif kind in ("Point", "MultiPoint") and outline.tags.get("natural") == "tree":
-        points = [geometry["coordinates"]] if kind == "Point" else geometry["coordinates"]
-        result.trees += [TreeLine(where, outline.tags, (lonlat(point, where, path),)) for point in points]
-    elif kind in ("LineString", "MultiLineString") and outline.tags.get("natural") == "tree_row":
-        rows = [geometry["coordinates"]] if kind == "LineString" else geometry["coordinates"]
-        result.trees += [TreeLine(where, outline.tags, tuple(lonlat(p, where, path) for p in row)) for row in rows]
-    elif kind in _GEOMETRIES:
-        lines[str(kind)] += 1
+        return
+    if kind not in _GEOMETRIES:
+        raise InputError(f"it is not as it should be: a geometry of type {geometry.get('type')!r}", path=path)
+    several = geometry["coordinates"] if kind.startswith("Multi") else [geometry["coordinates"]]
+    single = kind.removeprefix("Multi")
+    if single == "Polygon":
+        for rings in several:
+            _polygon(rings, outline, path)
+    elif (single, natural) in (("Point", "tree"), ("LineString", "tree_row")):
+        rows = [[points] if single == "Point" else points for points in several]
+        source = outline.source
+        result.trees += [TreeLine(source, outline.tags, tuple(lonlat(p, source, path) for p in row)) for row in rows]
     else:
-        raise InputError(f"it is not as it should be: a geometry of type {kind!r}", path=path)
+        lines[kind] += 1
+
+
+def _polygon(rings: list[Any], outline: Outline, path: Path) -> None:
+    outer, *holes = [[lonlat(point, outline.source, path) for point in ring] for ring in rings] or [[]]
+    if any(ring and ring[0] != ring[-1] for ring in (outer, *holes)):
+        outline.broken.append("a ring is not closed; its ends were joined by a straight line")
+    outline.parts.append((outer, holes))
 
 
 # ---------------------------------------------------------------- XML
@@ -352,15 +356,13 @@ def _outermost(root: ElementTree.Element, names: set[str]) -> Iterator[ElementTr
 
     KML nests none of them in itself: a file that does would be walked through once per level.
     """
-    walk = [iter(root)]
+    walk = list(reversed(root))
     while walk:
-        element = next(walk[-1], None)
-        if element is None:
-            walk.pop()
-        elif _plain(element.tag) in names:
+        element = walk.pop()
+        if _plain(element.tag) in names:
             yield element
-        elif len(element):
-            walk.append(iter(element))
+        else:
+            walk += reversed(element)
 
 
 def _kml_tags(parts: list[ElementTree.Element]) -> dict[str, str]:

@@ -117,15 +117,8 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
     for number, line in enumerate(data[:end].decode("latin-1").splitlines(), 1):
         words = line.split()
         try:
-            if words[:1] == ["format"]:
-                kind = words[1]
-            elif words[:1] == ["element"]:
-                elements.append(_Element(words[1], int(words[2]), ()))
-            elif words[:1] == ["property"]:
-                last = elements[-1]
-                listed = words[1] == "list"
-                item = (words[4], _TYPES[words[3]], _TYPES[words[2]]) if listed else (words[2], _TYPES[words[1]], "")
-                elements[-1] = _Element(last.name, last.count, (*last.properties, item))
+            kind = words[1] if words[:1] == ["format"] else kind
+            _declare(words, elements)
         except (IndexError, KeyError, ValueError):
             raise InputError(
                 f"the header says '{line.strip()[:60]}'", expected="a PLY header", path=path, line=number
@@ -133,6 +126,17 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
     if kind not in ("ascii", "binary_little_endian", "binary_big_endian") or any(e.count < 0 for e in elements):
         raise InputError(f"a PLY of format '{kind}'", expected="ascii or binary", path=path)
     return kind, elements, start
+
+
+def _declare(words: list[str], elements: list[_Element]) -> None:
+    """An element of the header, or a property of its last one; IndexError, KeyError, ValueError where it is neither."""
+    if words[:1] == ["element"]:
+        elements.append(_Element(words[1], int(words[2]), ()))
+    elif words[:1] == ["property"]:
+        last = elements[-1]
+        listed = words[1] == "list"
+        item = (words[4], _TYPES[words[3]], _TYPES[words[2]]) if listed else (words[2], _TYPES[words[1]], "")
+        elements[-1] = _Element(last.name, last.count, (*last.properties, item))
 
 
 def _cut_off(element: _Element, path: Path) -> InputError:
@@ -268,6 +272,14 @@ def fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[In
 # ---------------------------------------------------------------- OBJ
 
 
+def _corners(words: list[str], vertices: int) -> list[int]:
+    """Vertices of a face, counted from 1, or back from the last where negative; ValueError where it is none."""
+    numbers = [int(word.split("/")[0]) for word in words]
+    if len(numbers) < 3:
+        raise ValueError
+    return [number - 1 if number > 0 else vertices + number for number in numbers]
+
+
 def read_obj(data: bytes, path: Path) -> RawMesh:
     """Vertices and faces of a Wavefront OBJ file; its normals, textures and materials are not read."""
     vertices: list[list[float]] = []
@@ -277,12 +289,8 @@ def read_obj(data: bytes, path: Path) -> RawMesh:
         try:
             if words[:1] == ["v"]:
                 vertices.append([float(words[1]), float(words[2]), float(words[3])])
-            elif words[:1] == ["f"]:
-                corners = [int(word.split("/")[0]) for word in words[1:]]
-                # counted from 1; negative: back from the last
-                corners = [c - 1 if c > 0 else len(vertices) + c for c in corners]
-                if len(corners) < 3:
-                    raise ValueError
+            if words[:1] == ["f"]:
+                corners = _corners(words[1:], len(vertices))
                 faces.setdefault(len(corners), []).append(corners)
         except (ValueError, IndexError):
             raise InputError(f"'{line.strip()[:60]}'", expected="an OBJ mesh", path=path, line=number) from None

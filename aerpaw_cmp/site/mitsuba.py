@@ -164,12 +164,11 @@ def _substitute(root: ElementTree.Element, defaults: Mapping[str, str], path: Pa
     """Values of the ``$name`` parameters, which ``default`` gives."""
     for item in root.iter():
         for key, value in item.attrib.items():
+            for name in sorted(defaults, key=len, reverse=True) if "$" in value else ():
+                value = value.replace(f"${name}", defaults[name])
             if "$" in value:
-                for name in sorted(defaults, key=len, reverse=True):
-                    value = value.replace(f"${name}", defaults[name])
-                if "$" in value:
-                    raise InputError(f"the parameter '{value}' has no default", path=path)
-                item.attrib[key] = value
+                raise InputError(f"the parameter '{value}' has no default", path=path)
+            item.attrib[key] = value
 
 
 # ---------------------------------------------------------------- materials
@@ -366,30 +365,42 @@ def _to_world(shape: ElementTree.Element, path: Path) -> FloatArray:
 
 
 def _step(item: ElementTree.Element, path: Path) -> FloatArray:
+    """Homogeneous matrix (4, 4) of one step."""
     matrix = np.eye(4)
     if item.tag == "matrix":
-        values = _numbers(item.get("value", ""), None, path)
-        if len(values) not in (9, 16):
-            raise InputError(f"a matrix of {len(values)} numbers", expected="9 or 16", path=path)
-        side = 3 if len(values) == 9 else 4
-        matrix[:side, :side] = np.reshape(values, (side, side))
-        if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
-            raise InputError("a matrix that is a perspective", expected="0 0 0 1 as its last row", path=path)
-    elif item.tag == "translate":
+        return _matrix(item, path)
+    if item.tag == "translate":
         matrix[:3, 3] = _vector(item, 0.0, path)
     elif item.tag == "scale":
         matrix[:3, :3] = np.diag(_vector(item, 1.0, path))
     elif item.tag == "rotate":
-        axis = np.array(_vector(item, 0.0, path))
-        angle = math.radians(_numbers(item.get("angle", ""), 1, path)[0])
-        if not np.linalg.norm(axis) > 0.0:
-            raise InputError("a rotation without an axis", expected='<rotate x="1" angle="90"/>', path=path)
-        x, y, z = axis / np.linalg.norm(axis)
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        matrix[:3, :3] += math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+        matrix[:3, :3] = _rotation(item, path)
     else:
         raise InputError(f"the transform '{item.tag}'", expected="matrix, translate, scale or rotate", path=path)
     return matrix
+
+
+def _matrix(item: ElementTree.Element, path: Path) -> FloatArray:
+    values = _numbers(item.get("value", ""), None, path)
+    if len(values) not in (9, 16):
+        raise InputError(f"a matrix of {len(values)} numbers", expected="9 or 16", path=path)
+    side = 3 if len(values) == 9 else 4
+    matrix = np.eye(4)
+    matrix[:side, :side] = np.reshape(values, (side, side))
+    if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise InputError("a matrix that is a perspective", expected="0 0 0 1 as its last row", path=path)
+    return matrix
+
+
+def _rotation(item: ElementTree.Element, path: Path) -> FloatArray:
+    """Rotation (3, 3) about an axis, by Rodrigues' formula."""
+    axis = np.array(_vector(item, 0.0, path))
+    angle = math.radians(_numbers(item.get("angle", ""), 1, path)[0])
+    if not np.linalg.norm(axis) > 0.0:
+        raise InputError("a rotation without an axis", expected='<rotate x="1" angle="90"/>', path=path)
+    x, y, z = axis / np.linalg.norm(axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
 
 
 def _vector(item: ElementTree.Element, default: float, path: Path) -> list[float]:

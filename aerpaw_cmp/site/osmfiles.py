@@ -216,21 +216,20 @@ def _join_rings(lines: list[list[Position]], outline: Outline) -> list[list[Posi
     rings, open_ = [], [list(line) for line in lines if len(line) > 1]
     while open_:
         ring = open_.pop()
-        grown = True
-        while ring[0] != ring[-1] and grown:
-            grown = False
-            for index, piece in enumerate(open_):
-                if ring[-1] in (piece[0], piece[-1]):
-                    ring += (piece if ring[-1] == piece[0] else piece[::-1])[1:]
-                elif ring[0] in (piece[0], piece[-1]):
-                    ring = (piece if ring[0] == piece[-1] else piece[::-1])[:-1] + ring
-                else:
-                    continue
-                del open_[index]
-                grown = True
-                break
+        while ring[0] != ring[-1] and (index := _next_piece(ring, open_)) is not None:
+            piece = open_.pop(index)
+            if ring[-1] in (piece[0], piece[-1]):
+                ring += (piece if ring[-1] == piece[0] else piece[::-1])[1:]
+            else:
+                ring = (piece if ring[0] == piece[-1] else piece[::-1])[:-1] + ring
         if ring[0] != ring[-1]:
             outline.broken.append("a ring is not closed; its ends were joined by a straight line")
             ring.append(ring[0])
         rings.append(ring)
     return rings
+
+
+def _next_piece(ring: list[Position], pieces: list[list[Position]]) -> int | None:
+    """Number of the first piece that begins or ends where the ring does."""
+    ends = {ring[0], ring[-1]}
+    return next((i for i, piece in enumerate(pieces) if ends & {piece[0], piece[-1]}), None)

@@ -102,12 +102,13 @@ def positive_metres(tags: Mapping[str, str], keys: tuple[str, ...], notes: list[
         lengths = [value for value in parts if value is not None]
         if len(lengths) < len(parts):
             notes.append(f"the {key} '{written}' is not a length")
-        elif max(lengths) <= 0:
+            continue
+        if max(lengths) <= 0:
             notes.append(f"the {key} '{written}' is not above 0, as where nobody knows it")
-        else:
-            if len(lengths) > 1 or written.startswith("~"):
-                notes.append(f"the {key} '{written}' is taken as {max(lengths):g} m")
-            return max(lengths)
+            continue
+        if len(lengths) > 1 or written.startswith("~"):
+            notes.append(f"the {key} '{written}' is taken as {max(lengths):g} m")
+        return max(lengths)
     return None
 
 

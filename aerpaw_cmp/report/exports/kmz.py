@@ -7,6 +7,7 @@ thinned, the extremes of every stretch kept, and the description says so.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,13 +65,13 @@ def _shown(export: Export) -> Iterator[_Shown]:
     for kind, scales in scales_of(export).items():
         points = next(one for one in export.sets if one.kind == kind)
         columns = {c.name: c for c in points.columns}
-        for flight, tower, channel, rows in points.links():
+        for (flight, tower, channel, rows), (name, scale) in itertools.product(points.links(), scales.items()):
+            if name.startswith("simulated_rank") and rows[name].isna().all():  # a K of other links
+                continue
             link = f"{tower} {channel}".strip()
             whose = f"{flight}: {link}" if len(export.lines) > 1 else link
-            for name, scale in scales.items():
-                if not (name.startswith("simulated_rank") and rows[name].isna().all()):  # a K of other links
-                    what = _LEVELS.get(name, columns[name].meaning)
-                    yield _Shown(name=f"{whose}, {what}", column=columns[name], scale=scale, rows=rows)
+            what = _LEVELS.get(name, columns[name].meaning)
+            yield _Shown(name=f"{whose}, {what}", column=columns[name], scale=scale, rows=rows)
 
 
 def _styles(scale: Scale) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.units import BoolArray, FloatArray, IntArray
-from .direction_gain import GainFit, GainModel, LinkSamples, Term, fit_gain
+from .direction_gain import GainFit, GainModel, LinkSamples, Pairs, Term, fit_gain, shared_knots
 from .gain_choice import Choice, choose_and_fit
 from .ladder import log_distance_level_db
 from .mount import GainOf, MountFit, fit_mounts
@@ -68,6 +68,8 @@ class Recipe:
         ``(yaw, pitch, roll)`` [deg] to a mount (3, 3).
     mount, tilt : bool
         Fit the azimuth, and pitch and roll, of antennas with a pattern.
+    pairs : mapping of str to (k, 6), optional
+        Knots of the term over both directions that serve all fits; they hold directions alone, no level.
     """
 
     model: GainModel
@@ -75,6 +77,11 @@ class Recipe:
     patterns: Mapping[str, GainOf] = field(default_factory=dict)
     mount: bool = True
     tilt: bool = False
+    pairs: Pairs | None = None
+
+    def sharing(self, series: Sequence[LinkSamples]) -> Recipe:
+        """The recipe with knots that serve every fit to some of the series."""
+        return dataclasses.replace(self, pairs=shared_knots(series, self.model))
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,9 +159,9 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, choice: Choice | None =
         return bare
     left = [dataclasses.replace(s, residual_db=s.residual_db - bare.mean(s)) for s in series]
     if choice is None:
-        choice, fit = choose_and_fit(left, recipe.model)
+        choice, fit = choose_and_fit(left, recipe.model, pairs=recipe.pairs)
     else:
-        fit = fit_gain(left, choice.model)
+        fit = fit_gain(left, choice.model, recipe.pairs)
     antennas = dict.fromkeys(s.antenna for s in series)
     fading = {name: fading_of([s for s in series if s.antenna == name], choice.model.bin_s) for name in antennas}
     return Learned(recipe, choice, mounts, fit, fading)

@@ -1,10 +1,11 @@
 """Gain over direction at both ends of a link, learned from the residuals of several flights.
 
-``residual = offset + g_uav(direction in the body) + g_tower(direction at the mast) [+ place] + own + noise``
+``residual = offset + g_uav(body) + g_tower(mast) + g_pair(body, mast) [+ place] + own + noise``
 
 ``offset`` is free per flight, tower and channel. ``own`` is a nuisance of each flight and channel, correlated over
-place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes on the sphere
-(:mod:`.sphere`); a place field, if asked for, is one over positions and stays apart from the antennas.
+place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes over directions
+(:mod:`.sphere`): of the tower in the body, of the UAV at the mast, and of both together per channel (what the gain at
+one end does not explain without the other). A place field, if asked for, is one over positions and stays apart.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import dataclasses
 import hashlib
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -23,7 +24,7 @@ from ..common.errors import InputError, UsageError
 from ..common.units import BoolArray, FloatArray, IntArray
 from .sphere import gaussian_features
 
-Frame = Literal["body", "mast", "world", "place"]
+Frame = Literal["body", "mast", "pair", "world", "place"]
 Sharing = Literal["all", "antenna"]
 
 OFFSET_SD = 100.0
@@ -108,9 +109,9 @@ class Term:
 
     Parameters
     ----------
-    frame : {"body", "mast", "world", "place"}
-        Its argument: direction of the tower in the body, of the UAV at the mast, of the tower in the world's axes
-        at the UAV (a control: no antenna is fixed there), or the position.
+    frame : {"body", "mast", "pair", "world", "place"}
+        Its argument: direction of the tower in the body, of the UAV at the mast, both of these, the direction of the
+        tower in the world's axes at the UAV (a control: no antenna is fixed there), or the position.
     per : {"all", "antenna"}
         One function for all, or one per tower and channel.
     length : float
@@ -125,8 +126,15 @@ class Term:
     sd_db: float
 
 
-UAV_TERMS = (Term("body", "all", 0.35, 2.5), Term("body", "all", 0.9, 2.0), Term("body", "antenna", 0.35, 0.8))
+UAV_TERMS = (
+    Term("body", "all", 0.2, 1.5),
+    Term("body", "all", 0.45, 2.0),
+    Term("body", "all", 0.9, 2.0),
+    Term("body", "antenna", 0.35, 0.8),
+)
 TOWER_TERMS = (Term("mast", "antenna", 0.2, 3.0), Term("mast", "antenna", 0.7, 2.0))
+PAIR_TERMS = (Term("pair", "antenna", 0.35, 1.5),)
+ANTENNA_TERMS = UAV_TERMS + TOWER_TERMS + PAIR_TERMS
 PLACE_TERM = Term("place", "antenna", 30.0, 2.0)
 
 
@@ -146,7 +154,7 @@ class GainModel:
         Samples are averaged over this time [s].
     """
 
-    terms: tuple[Term, ...] = UAV_TERMS + TOWER_TERMS
+    terms: tuple[Term, ...] = ANTENNA_TERMS
     own_sd_db: float = 2.0
     own_length_m: float = 20.0
     noise_sd_db: float = 1.5
@@ -171,7 +179,7 @@ class _Block:
     antenna: str | None
     start: int
     stop: int
-    knots_m: FloatArray | None = None
+    knots: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +196,9 @@ class _System:
 
 
 def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
-    """What a term of this frame is a function of (n, 3)."""
+    """What a term of this frame is a function of: (n, 3), or (n, 6) of both directions."""
+    if frame == "pair":
+        return np.concatenate([samples.at_uav, samples.at_tower], axis=1)
     if frame == "body":
         return samples.at_uav
     if frame == "mast":
@@ -202,38 +212,84 @@ def _knots(points_m: FloatArray, spacing_m: float) -> FloatArray:
     return points_m[np.sort(first)]
 
 
+UNEXPLAINED = 1e-3
+"""Largest share of the variance of a term over both directions that its knots leave at the bins of the fit."""
+
+
+MOST_KNOTS = 400
+"""Of one antenna; flights with every heading at every place would take thousands for a term of 1.5 dB."""
+
+
+def pair_knots(points: FloatArray, length: float, share: float = UNEXPLAINED, most: int = MOST_KNOTS) -> FloatArray:
+    """Those of some points (n, 6) that determine a Gaussian process at all of them: (knots, 6).
+
+    Parameters
+    ----------
+    points : (n, 6)
+        Directions at both ends.
+    length : float
+        Of the kernel [chord].
+    share : float
+        Share of the variance that may be left at any point.
+    most : int
+        Largest number of knots; where they do not suffice, more than the share is left.
+
+    Returns
+    -------
+    (knots, 6)
+        In the order in which they were taken.
+
+    Notes
+    -----
+    Pivoted Cholesky decomposition of the kernel: the point of largest variance left is taken next (Harbrecht, Peters
+    and Schneider, Appl. Numer. Math. 62 (2012), doi:10.1016/j.apnum.2011.10.001).
+    """
+    left, rows, taken = np.ones(len(points)), np.zeros((0, len(points))), list[int]()
+    while len(points) and left.max() > share and len(taken) < most:
+        at = int(left.argmax())
+        row = kernel(points[at : at + 1], points, length)[0] - rows[:, at] @ rows
+        rows = np.concatenate([rows, row[None] / math.sqrt(left[at])])
+        left = np.maximum(left - rows[-1] ** 2, 0.0)
+        left[at] = 0.0
+        taken.append(at)
+    return points[taken]
+
+
 def _features(block: _Block, argument: FloatArray, *, keep: bool = False) -> FloatArray:
     """Unit-variance features (n, columns of the block); ``keep`` those that the next fit asks for again."""
-    if block.knots_m is None:
+    if block.knots is None:
         return (_direction_features if keep else gaussian_features)(argument, block.term.length)
     from scipy.linalg import solve_triangular
 
-    lower = _knot_factor(block.knots_m, block.term.length)
-    return np.asarray(solve_triangular(lower, kernel(block.knots_m, argument, block.term.length), lower=True).T)
+    lower = _knot_factor(block.knots, block.term.length)
+    return np.asarray(solve_triangular(lower, kernel(block.knots, argument, block.term.length), lower=True).T)
 
+
+NUGGET = 1e-6
+"""Share of the variance that keeps the kernel between knots positive definite."""
 
 _kept_knots: OrderedDict[bytes, FloatArray] = OrderedDict()
 
 
 def _knot_factor(knots: FloatArray, length: float) -> FloatArray:
-    """Cholesky factor of the kernel between the knots of a place field; that of the last two fields is kept."""
+    """Cholesky factor of the kernel between the knots of a term; those of the last eight terms are kept."""
     key = repr(length).encode() + knots.tobytes()
     if key not in _kept_knots:
-        _kept_knots[key] = factor_of(kernel(knots, knots, length) + 1e-6 * np.eye(len(knots)))
-        while len(_kept_knots) > 2:
+        _kept_knots[key] = factor_of(kernel(knots, knots, length) + NUGGET * np.eye(len(knots)))
+        while len(_kept_knots) > 8:
             _kept_knots.popitem(last=False)
     return _kept_knots[key]
 
 
 def _block_values(block: _Block, argument: FloatArray, weights: FloatArray) -> FloatArray:
-    """:func:`_features` times weights (n,); of a place field the kernel at the knots is enough."""
-    if block.knots_m is None:
+    """:func:`_features` times weights (n,); of a term with knots the kernel is enough."""
+    if block.knots is None:
         return np.asarray(_features(block, argument, keep=True) @ weights)
     from scipy.linalg import solve_triangular
 
-    lower = _knot_factor(block.knots_m, block.term.length)
+    lower = _knot_factor(block.knots, block.term.length)
     at_knots = solve_triangular(lower, weights, lower=True, trans="T")
-    return np.asarray(kernel(argument, block.knots_m, block.term.length) @ at_knots)
+    return np.asarray(kernel(argument, block.knots, block.term.length) @ at_knots)
 
 
 FEATURES_MIB = 320
@@ -263,11 +319,11 @@ _kept_means: OrderedDict[bytes, FloatArray] = OrderedDict()
 
 def _mean_features(block: _Block, argument: FloatArray) -> FloatArray:
     """Mean of :func:`_features` over the samples (columns of the block,); of directions it is kept."""
-    if block.knots_m is not None:
+    if block.knots is not None:
         from scipy.linalg import solve_triangular
 
-        at_knots = kernel(block.knots_m, argument, block.term.length).mean(axis=1)
-        return np.asarray(solve_triangular(_knot_factor(block.knots_m, block.term.length), at_knots, lower=True))
+        at_knots = kernel(block.knots, argument, block.term.length).mean(axis=1)
+        return np.asarray(solve_triangular(_knot_factor(block.knots, block.term.length), at_knots, lower=True))
     digest = hashlib.blake2b(repr((block.term.length, argument.shape)).encode())
     digest.update(np.ascontiguousarray(argument).tobytes())
     key = digest.digest()
@@ -280,13 +336,33 @@ def _mean_features(block: _Block, argument: FloatArray) -> FloatArray:
 
 
 def kernel(one: FloatArray, other: FloatArray, length: float) -> FloatArray:
-    """Gaussian kernel of unit variance between points (n, 3) and (m, 3): (n, m)."""
+    """Gaussian kernel of unit variance between points (n, 3 or 6) and (m, 3 or 6): (n, m)."""
     from scipy.spatial.distance import cdist
 
     return np.asarray(np.exp(-cdist(one, other, "sqeuclidean") / (2.0 * length**2)))
 
 
-def _layout(model: GainModel, binned: Sequence[LinkSamples]) -> tuple[_Block, ...]:
+Pairs = Mapping[str, FloatArray]
+"""Knots (k, 6) of each antenna's term over both directions that serve several fits."""
+
+
+def _pair_knots_of(own: Sequence[LinkSamples], length: float, pairs: Pairs) -> FloatArray:
+    """Knots given for an antenna, or those of its bins."""
+    given = pairs.get(own[0].antenna)
+    return pair_knots(np.concatenate([argument_of(s, "pair") for s in own]), length) if given is None else given
+
+
+def shared_knots(series: Sequence[LinkSamples], model: GainModel) -> dict[str, FloatArray]:
+    """Knots per antenna that suit fits of any of the series: equations of one fit are then those of the next."""
+    out: dict[str, FloatArray] = {}
+    for term in (t for t in model.terms if t.frame == "pair"):
+        for antenna in dict.fromkeys(s.antenna for s in series):
+            own = binned_series([s for s in series if s.antenna == antenna], model.bin_s)
+            out[antenna] = _pair_knots_of(own, term.length, {})
+    return out
+
+
+def _layout(model: GainModel, binned: Sequence[LinkSamples], pairs: Pairs) -> tuple[_Block, ...]:
     """Columns of every term."""
     antennas: list[str | None] = list(dict.fromkeys(s.antenna for s in binned))
     blocks: list[_Block] = []
@@ -297,6 +373,8 @@ def _layout(model: GainModel, binned: Sequence[LinkSamples]) -> tuple[_Block, ..
             knots = None
             if term.frame == "place":
                 knots = _knots(np.concatenate([s.position_m for s in own]), 0.7 * term.length)
+            elif term.frame == "pair":
+                knots = _pair_knots_of(own, term.length, pairs)
             width = len(knots) if knots is not None else gaussian_features(np.eye(3)[:1], term.length).shape[1]
             blocks.append(_Block(term, antenna, start, start + width, knots))
             start += width
@@ -371,7 +449,7 @@ def _key(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> bytes
         digest.update(np.ascontiguousarray(getattr(samples, name)).tobytes())
     for block in own:
         digest.update(repr((block.term.frame, block.term.length)).encode())
-        digest.update(b"" if block.knots_m is None else np.ascontiguousarray(block.knots_m).tobytes())
+        digest.update(b"" if block.knots is None else np.ascontiguousarray(block.knots).tobytes())
     return digest.digest()
 
 
@@ -395,7 +473,7 @@ def _made_equations(model: GainModel, own: Sequence[_Block], samples: LinkSample
     made: dict[Any, FloatArray] = {}  # a length that two terms share is made once
     parts = []
     for block in own:
-        same = (block.term.frame, block.term.length, None if block.knots_m is None else block.start)
+        same = (block.term.frame, block.term.length, None if block.knots is None else block.start)
         if same not in made:
             made[same] = _features(block, argument_of(samples, block.term.frame))
         parts.append(made[same])
@@ -621,8 +699,10 @@ class GainFit:
             If no flight of the fit had this tower and channel.
         """
         gain, sd = np.full(len(samples), np.nan), np.full(len(samples), np.nan)
-        for rows, design in self._designs(samples, frames):
-            gain[rows], sd[rows] = self._moments(design)
+        blocks, good = self._chosen(samples, frames), self._known_rows(samples)
+        for start in range(0, len(good), 2000):
+            rows = good[start : start + 2000]
+            gain[rows], sd[rows] = self._moments(samples.antenna, blocks, samples.part(rows))
         return gain, sd
 
     def mean(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> FloatArray:
@@ -657,58 +737,49 @@ class GainFit:
             raise UsageError(
                 f"tower and channel {samples.antenna!r} were not fitted", expected="one of " + ", ".join(self.antennas)
             )
-        chosen = set(frames) if frames is not None else {"body", "mast", "world", "place"}
-        return [b for b in self._blocks if b.term.frame in chosen and b.antenna in (None, samples.antenna)]
+        own = [b for b in self._blocks if b.antenna in (None, samples.antenna)]
+        return own if frames is None else [b for b in own if b.term.frame in set(frames)]
 
     @staticmethod
     def _known_rows(samples: LinkSamples) -> IntArray:
         finite = np.isfinite(np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1))
         return np.flatnonzero(finite.all(axis=1))
 
-    def _designs(self, samples: LinkSamples, frames: Iterable[Frame] | None) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Rows that have every direction, some thousand at a time, and their features about the centre."""
-        blocks, good = self._chosen(samples, frames), self._known_rows(samples)
-        for start in range(0, len(good), 2000):
-            rows = good[start : start + 2000]
-            yield rows, self._about_centre(samples.part(rows), blocks)
-
     def gain(self, frame: Frame, antenna: str, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gain at one end over directions (n, 3): posterior mean and standard deviation (n,) [dB].
+        """Gain at one end over directions (n, 3), or of the pair of ends (n, 6): posterior mean and SD (n,) [dB].
 
         Zero is the mean over the bins of the flights: the level itself is in the offsets.
         """
         direction = np.asarray(direction, dtype=np.float64)
-        one = np.zeros((len(direction), len(self._weights)))
-        for block in self._blocks:
-            if block.term.frame == frame and block.antenna in (None, antenna):
-                centre = self._centre[antenna][block.start : block.stop]
-                one[:, block.start : block.stop] = _features(block, direction) - centre
-        return self._moments(one)
+        blocks = [b for b in self._blocks if b.term.frame == frame and b.antenna in (None, antenna)]
+        return self._moments(antenna, blocks, direction)
 
     def seen(self, frame: Frame, antenna: str) -> FloatArray:
-        """Directions (m, 3) of the bins that the fit had at one end; the UAV's of all antennas together."""
+        """Directions (m, 3) of the bins of the fit at one end, the UAV's of all antennas together; (m, 6) of pairs."""
         if frame == "body":
             return np.concatenate([self._seen[f"body.{a}"] for a in self.antennas])
-        return self._seen[f"mast.{antenna}"]
+        return self._seen[f"{frame}.{antenna}"]
 
-    def _about_centre(self, samples: LinkSamples, blocks: Sequence[_Block]) -> FloatArray:
-        design = np.zeros((len(samples), len(self._weights)))
-        for block in blocks:
-            values = _features(block, argument_of(samples, block.term.frame))
-            design[:, block.start : block.stop] = values - self._centre[samples.antenna][block.start : block.stop]
-        return design
-
-    def _moments(self, design: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _moments(
+        self, antenna: str, blocks: Sequence[_Block], at: LinkSamples | FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Sum of some terms along samples, or at arguments of their one frame: mean and standard deviation (n,)."""
         from scipy.linalg import solve_triangular
 
-        used = np.flatnonzero(design.any(axis=0))
-        if not len(used):
-            return np.zeros(len(design)), np.zeros(len(design))
+        design, beyond = np.zeros((len(at), len(self._weights))), np.zeros(len(at))
+        for block in blocks:
+            columns = slice(block.start, block.stop)
+            features = _features(block, argument_of(at, block.term.frame) if isinstance(at, LinkSamples) else at)
+            design[:, columns] = features - self._centre[antenna][columns]
+            if block.knots is not None:  # what the knots say nothing about is as the prior has it
+                beyond += self._scale[block.start] ** 2 * np.maximum(1.0 - (features**2).sum(axis=1), 0.0)
+        if not blocks:
+            return np.zeros(len(at)), beyond
         spread = solve_triangular(self._lower, (design * self._scale).T, lower=True)
-        return design @ self._weights, np.sqrt((spread**2).sum(axis=0))
+        return design @ self._weights, np.sqrt((spread**2).sum(axis=0) + beyond)
 
 
-def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> GainFit:
+def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None, pairs: Pairs | None = None) -> GainFit:
     """Learn the gain over direction.
 
     Parameters
@@ -717,6 +788,12 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
         Of all flights.
     model : GainModel, optional
         Terms and their strength; see :func:`.gain_choice.choose_and_fit`.
+    pairs : mapping of str to (k, 6), optional
+        Knots of :func:`shared_knots`; without, those of these series.
+
+    Returns
+    -------
+    GainFit
 
     Raises
     ------
@@ -729,11 +806,12 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     -----
     ``w ~ N(0, I)``, ``y = offset + A S w + own + noise``: with the series' own covariance ``C`` the posterior precision
     is ``I + S A' C^-1 A S`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, eq. 2.11). The solution
-    is exact but for the harmonics left out (:func:`.sphere.gaussian_spectrum`) and the average over ``bin_s``.
+    is exact but for the harmonics left out (:func:`.sphere.gaussian_spectrum`) and the share of the variance over both
+    directions that :func:`pair_knots` leaves (0.1 % each, where they suffice), and the average over ``bin_s``.
     """
     model = model or GainModel()
     binned = binned_series(series, model.bin_s)
-    blocks = _layout(model, binned)
+    blocks = _layout(model, binned, pairs or {})
     system, centre = _summed(model, binned, blocks)
     scale, noise = _scale(blocks, model), model.noise_sd_db
     weights, lower, evidence, misfit = _posterior(system, scale / noise, _apart(blocks))
@@ -769,6 +847,7 @@ def _seen(binned: Sequence[LinkSamples]) -> dict[str, FloatArray]:
         own = [s for s in binned if s.antenna == antenna]
         directions[f"body.{antenna}"] = np.concatenate([s.at_uav for s in own])
         directions[f"mast.{antenna}"] = np.concatenate([s.at_tower for s in own])
+        directions[f"pair.{antenna}"] = np.concatenate([argument_of(s, "pair") for s in own])
     return directions
 
 
@@ -804,7 +883,7 @@ def column_forms(
 
     kept = [s for s in series if len(s.binned(model.bin_s))]
     binned = binned_series(kept, model.bin_s)
-    blocks = _layout(model, binned)
+    blocks = _layout(model, binned, {})
     scale = _scale(blocks, model)
     form, cross = np.zeros((width, width)), np.zeros((len(scale), width))
     gram = np.zeros((len(scale), len(scale)))

@@ -19,6 +19,7 @@ from .direction_gain import (
     GainFit,
     GainModel,
     LinkSamples,
+    Pairs,
     Term,
     argument_of,
     binned_series,
@@ -61,7 +62,10 @@ class Choice:
 
 
 def choose_and_fit(
-    series: Sequence[LinkSamples], model: GainModel | None = None, spreads: Sequence[float] = SPREADS
+    series: Sequence[LinkSamples],
+    model: GainModel | None = None,
+    spreads: Sequence[float] = SPREADS,
+    pairs: Pairs | None = None,
 ) -> tuple[Choice, GainFit]:
     """Balance of the ends, length of the nuisance, strength of nuisance and noise, and the common scale of all.
 
@@ -78,6 +82,8 @@ def choose_and_fit(
         Where to start; the lengths of its gains are kept.
     spreads : sequence of float
         Factors to choose from.
+    pairs : mapping of str to (k, 6), optional
+        Knots of :func:`.direction_gain.shared_knots`.
 
     Returns
     -------
@@ -110,7 +116,7 @@ def choose_and_fit(
     balanced = _balanced(model, *chosen)
     errors = best.left_out(rows, coarse.noise_sd_db, spreads)
     spread = min(errors, key=lambda f: errors[f]) if errors else 1.0
-    fit = fit_gain(series, _with_spread(balanced, spread))
+    fit = fit_gain(series, _with_spread(balanced, spread), pairs)
     scaled = fit.scaled()
     return Choice(scaled.model, spread, errors, fit.common_scale, evidence), scaled
 

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from ..propagation.search.effort import Estimate
 from ..site.site import Site
 from .clock import Along, ClockChannel, ClockEstimate, judge_clock
 from .data import FlightData, RssSeries, Times, rank_positions
+from .learned_gain import LearnedGain, learned_gain
 from .lock import LOCK_FLOOR_DB
 from .losses import path_loss, reflecting_crowns
 from .settings import RtSettings
@@ -53,6 +54,13 @@ class Replayed:
     clock: Clock | None = None
     tower_m: FloatArray | None = None
     """Place (poses, 3) of a tower that moves [m]; None of one that stands."""
+    learned: LearnedGain | None = None
+    """Of RSS: what learned antennas add to the level, and their error bars."""
+
+    def level_dbm(self, kind: Literal["coherent", "power"]) -> FloatArray:
+        """Level (poses,) of the paths, with what learned antennas add towards both ends at once [dBm]."""
+        level = (self.replay.rss_power_dbm if kind == "power" else self.replay.rss_dbm)[:, 0]
+        return level if self.learned is None else level + self.learned.pair_db
 
     def source_m(self, site: Site) -> FloatArray:
         """Centre of the tower's array [m]: (1, 3), or (poses, 3) where it moves."""
@@ -135,7 +143,7 @@ def replay_rss(
         progress(f"replay RSS {tower} {channels}: {len(joined)} poses")
         towers_m = None if tower not in data.nodes else np.concatenate(places)
         whole = replay_poses(data.site, rt, link, joined, towers_m=towers_m, progress=progress)
-        start = 0
+        fixed_m, start = data.site.towers[tower].position_m[None, :], 0
         for index, here, track, part, place in zip(members, valid, tracks, poses, places, strict=True):
             stop = start + len(part)
             out[index] = Replayed(
@@ -146,6 +154,7 @@ def replay_rss(
                 track=track,
                 clock=shifts[index],
                 tower_m=None if towers_m is None else place,
+                learned=learned_gain(link, part, fixed_m if towers_m is None else place),
             )
             start = stop
     return [out[i] for i in range(len(data.rss))]

@@ -22,6 +22,7 @@ from ..common.yamlfile import load_yaml
 from ..compare import calibration
 from ..compare.calibration import Learned, Observed, Recipe, Score
 from ..compare.direction_gain import (
+    ANTENNA_TERMS,
     PLACE_TERM,
     TOWER_TERMS,
     UAV_TERMS,
@@ -30,6 +31,7 @@ from ..compare.direction_gain import (
     Term,
     column_forms,
 )
+from ..compare.learning_curve import CurvePoint, learning_curve, words_of_curve
 from ..compare.mount import GainOf
 from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
@@ -116,6 +118,7 @@ class Calibration:
     scores: Mapping[str, tuple[Score, ...]]
     controls: Mapping[str, tuple[Score, ...]]
     ground: GroundFit | None
+    curve: tuple[CurvePoint, ...]
     warnings: tuple[str, ...]
     words: tuple[str, ...]
     rank: Any = field(default=None)
@@ -191,6 +194,8 @@ def calibrate(
             scores, controls = score_on(workers, path, logs_root, recipe)
         else:
             scores, controls = score_all(observed, recipe, stages)
+    with stages("curve"):
+        curve = learning_curve(observed, recipe)
     warnings += mount_warnings(learned)
     if score:
         with stages("score"):
@@ -205,8 +210,9 @@ def calibrate(
         scores=scores,
         controls=controls,
         ground=ground,
+        curve=curve,
         warnings=tuple(warnings),
-        words=tuple(words_of(scores, controls, ground)),
+        words=(*words_of(scores, controls, ground), *words_of_curve(curve)),
     )
 
 
@@ -345,7 +351,7 @@ def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
 def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
     """Terms and patterns as calibration.yaml asks."""
     terms: dict[str, tuple[Term, ...]] = {
-        "both": UAV_TERMS + TOWER_TERMS, "uav": UAV_TERMS, "tower": TOWER_TERMS, "none": ()
+        "both": ANTENNA_TERMS, "uav": UAV_TERMS, "tower": TOWER_TERMS, "none": ()
     }  # fmt: skip
     patterns: dict[str, GainOf] = {}
     if settings.patterns.uav is not None:
@@ -360,7 +366,7 @@ def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: P
         patterns=patterns,
         mount=settings.fit.mount != "none",
         tilt=settings.fit.mount == "tilt",
-    )
+    ).sharing([o.samples for o in observed])
 
 
 def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
@@ -457,9 +463,10 @@ def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple
 def _controls(observed: Sequence[Observed], recipe: Recipe) -> dict[str, Callable[[], tuple[Score, ...]]]:
     """What computes each control."""
     bare = dataclasses.replace(recipe, patterns={})
+    turned = dataclasses.replace(bare, pairs=None)  # their directions are others
     out: dict[str, Callable[[], tuple[Score, ...]]] = {
-        "world frame at the UAV": lambda: calibration.flight_left_out(calibration.world_frame(observed), bare),
-        "heading turned the wrong way": lambda: calibration.flight_left_out(calibration.wrong_way(observed), bare),
+        "world frame at the UAV": lambda: calibration.flight_left_out(calibration.world_frame(observed), turned),
+        "heading turned the wrong way": lambda: calibration.flight_left_out(calibration.wrong_way(observed), turned),
         "body frame, no patterns": lambda: calibration.flight_left_out(observed, bare),
         "UAV end only": lambda: calibration.flight_left_out(observed, calibration.only_terms(bare, UAV_TERMS)),
         "tower end only": lambda: calibration.flight_left_out(observed, calibration.only_terms(bare, TOWER_TERMS)),

@@ -16,6 +16,8 @@ from ..common.provenance import KEY, union
 from ..common.units import FloatArray, IntArray
 from ..common.versions import versions
 from ..compare.calibration import Learned, mean_rmse
+from ..compare.direction_gain import LinkSamples, pair_knots
+from ..compare.learning_curve import with_one_more
 from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.training import flight_logs
 from ..logs.records import has_wall_clock
@@ -24,12 +26,16 @@ from ..report.calibration_html import write_calibration
 from ..report.export import write_file
 from ..report.names import safe_name
 from ..site.learned import Entry, Errors, LearnedReceiver, LearnedSeries
+from ..site.pair_gain import PairGain
 from ..site.sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid, sphere_netcdf, unit_mean_gain
 from .calibrate import Calibration, CalibrationFile
 from .calibrate_rank import RankCalibration
 
 MARK = "# aerpaw-cmp calibrate"
 """First words of calibrated.yaml, by which an own earlier output is known."""
+
+PAIR_SHARE = 0.01
+"""Share of the variance over both directions that the stored directions leave."""
 
 
 def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
@@ -86,7 +92,8 @@ def antenna_files(
     out: dict[str, str | bytes] = {}
     for (antenna, end), one in maps.items():
         stem = safe_name(f"{antenna}.{end}")
-        out[f"{stem}.csv"] = sphere_csv(one.gain_dbi, one.sd_db, (*notes, calibration.learned.spread(antenna).text()))
+        more = (calibration.learned.spread(antenna).text(), *pair_notes(calibration, antenna, end))
+        out[f"{stem}.csv"] = sphere_csv(one.gain_dbi, one.sd_db, (*notes, *more))
         pattern = SpherePattern(stem, one.gain_dbi, one.sd_db)
         out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz)
         said = {
@@ -102,6 +109,32 @@ def antenna_files(
         if sphere is not None:
             out[f"{stem}.nc"] = sphere
     return out
+
+
+def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
+    """What the tower's file says about the gain towards both ends at once; nothing where none was learned."""
+    fit = calibration.learned.fit
+    term = next((t for t in fit.model.terms if t.frame == "pair"), None) if fit else None
+    if fit is None or term is None or end == "uav":
+        return ()
+    at = pair_knots(fit.seen("pair", antenna), term.length, PAIR_SHARE)
+    samples = LinkSamples(
+        flight="",
+        tower=antenna.partition(".")[0],
+        channel=antenna.partition(".")[2],
+        time_s=np.arange(float(len(at))),
+        position_m=np.zeros((len(at), 3)),
+        at_uav=at[:, :3],
+        at_tower=at[:, 3:],
+        residual_db=np.full(len(at), np.nan),
+    )
+    return PairGain(
+        directions=at,
+        gain_db=fit.gain("pair", antenna, at)[0],
+        sd_db=fit.predict(samples, ("body", "mast", "pair"))[1],
+        length=term.length,
+        prior_sd_db=term.sd_db,
+    ).notes()
 
 
 def settings_text(calibration: Calibration, folder_name: str) -> str:
@@ -190,6 +223,8 @@ def record_of(
             "model": dataclasses.asdict(model),
         },
         ground=ground,
+        curve=[dataclasses.asdict(point) for point in calibration.curve],
+        one_more_rmse_db=with_one_more(calibration.curve),
         antennas=tuple(maps.values()),
         place=None if calibration.place is None else _place(calibration, calibration.place),
         rank=calibration.rank,
@@ -253,6 +288,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
                 f"aerpaw-cmp calibrate: {name}, {antenna} {end}",
                 f"{KEY}: {' '.join(calibration.trained_on)}",
                 calibration.learned.spread(antenna).text(),
+                *pair_notes(calibration, antenna, end),
             )
             tables[files[end]] = sphere_csv(one.gain_dbi, one.sd_db, notes, decimals=2).encode()
         own = [o.samples for o in calibration.observed if o.samples.antenna == antenna]

@@ -153,7 +153,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
     other = rss_alternatives(data.site, data.settings.rt, replayed, settings.field)
     alternatives = {name: at_samples(series, replayed, level, settings) for name, level in other.items()}
-    stated = stated_spread(data.site, series.tower, replayed, settings.window_s)
+    stated = stated_spread(replayed, settings.window_s)
     quantities = {**geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
     residual_by = rss.residual_tables(score.residual_db, quantities)
     curve_offset_db, curve_rmse_db = offsets.offset_curve(
@@ -275,8 +275,8 @@ def _averaged(
 ) -> dict[str, dict[str, Fit]]:
     """Both sides averaged alike, over windows of time and stretches of path, per simulation."""
     simulations = {
-        "coherent": replayed.spread(replayed.replay.rss_dbm[:, 0]),
-        "power_sum": replayed.spread(replayed.replay.rss_power_dbm[:, 0]),
+        "coherent": replayed.spread(replayed.level_dbm("coherent")),
+        "power_sum": replayed.spread(replayed.level_dbm("power")),
     }
     over_time = rss.averaged_fits(
         series.time, levels.measured_db, simulations, windows_s=AVERAGING_WINDOWS_S, step_db=settings.step_db,

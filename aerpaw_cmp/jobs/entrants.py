@@ -13,7 +13,7 @@ from ..common.units import BoolArray, FloatArray
 from ..compare import calibration
 from ..compare.calibration import Observed, Recipe
 from ..compare.correction import BIN_S, Base, Predictor, choose, fixed_base
-from ..compare.direction_gain import TOWER_TERMS, UAV_TERMS, GainModel, LinkSamples
+from ..compare.direction_gain import GainModel, LinkSamples
 from ..compare.forecast import constant_forecast
 from ..compare.spread import fading_of
 from ..flight.data import FlightData
@@ -140,7 +140,7 @@ def learned_base(train: Sequence[LinkSamples]) -> Predictor:
     """Antennas learned on these samples, as a base of a correction; each fit is made once."""
     key = tuple(hash(s.residual_db.tobytes()) for s in train)
     if key not in _FITS:
-        recipe = Recipe(model=GainModel(terms=UAV_TERMS + TOWER_TERMS, bin_s=BIN_S), rotation=rotation)
+        recipe = Recipe(model=GainModel(bin_s=BIN_S), rotation=rotation)
         _FITS[key] = calibration.learn(train, recipe)
     return _FITS[key].predict
 

@@ -22,6 +22,7 @@ from ..common.yamlfile import parse_yaml
 from ..compare.ladder import Ladder, Rung, climb
 from ..compare.result import BASELINE_TITLE
 from ..flight.data import FlightData, RssSeries
+from ..flight.learned_gain import pair_db
 from ..flight.losses import path_loss
 from ..flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
 from ..flight.settings import FlightFile, RssSettings
@@ -282,14 +283,15 @@ class _Climber:
         paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
         wanted = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
         loss = path_loss(self._data.site, wanted, link.carrier_hz)
+        pair = pair_db(link, poses, self._sources(series))
         if model.diffraction:
             search = Search(max_depth=traced.paths.faces.shape[1], diffraction="edges")
             bent = replay(self._data.site, link, poses, search, Field(loss), Run(cache_dir=""))
             level = bent.rss_power_dbm if model.ground == "power sum" else bent.rss_dbm
-            return level[:, 0], series.step * bent.seconds
+            return level[:, 0] + pair, series.step * bent.seconds
         fields = fields_from(self._sources(series), traced.faces, paths, link, poses, loss)
         power = fields.power if model.ground == "power sum" else mean_pair_power(fields.h)
-        level = rss_dbm(power, link.transmit_power_dbm)[:, 0]
+        level = rss_dbm(power, link.transmit_power_dbm)[:, 0] + pair
         return level, series.step * (search_s + time.perf_counter() - begin)
 
     def _paths(self, index: int, buildings: bool) -> tuple[Replay, float]:

@@ -13,8 +13,6 @@ from ..compare.spread import NO_SPREAD, Spread, StatedSpread
 from ..flight.data import RssSeries
 from ..flight.replay import Replayed
 from ..flight.settings import RssSettings
-from ..site.site import Site
-from ..site.sphere_pattern import SpherePattern
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,10 +35,10 @@ def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> L
     posed = replayed.valid.copy()
     if settings.minimum_height_m is not None:
         posed[posed] = replayed.poses.position_m[:, 2] >= settings.minimum_height_m
-    level_dbm = replayed.replay.rss_power_dbm if settings.field == "power" else replayed.replay.rss_dbm
+    level_dbm = replayed.level_dbm("power" if settings.field == "power" else "coherent")
     return Levels(
         measured_db=np.where(posed, measured, np.nan),
-        simulated_db=at_samples(series, replayed, level_dbm[:, 0], settings),
+        simulated_db=at_samples(series, replayed, level_dbm, settings),
         posed=posed,
     )
 
@@ -68,16 +66,15 @@ def at_samples(series: RssSeries, replayed: Replayed, level_db: FloatArray, sett
     return rss.local_mean_db(series.time, level, settings.window_s) if settings.field == "local_mean" else level
 
 
-def stated_spread(site: Site, tower: str, replayed: Replayed, window_s: float = 0.0) -> StatedSpread | None:
+def stated_spread(replayed: Replayed, window_s: float = 0.0) -> StatedSpread | None:
     """Error bars of the simulated level that learned antennas state, along the direct line; None where none does.
 
-    The gains of both ends count as independent; they are learned from the same levels, so the true standard deviation
-    is rather smaller. Files of 0.3 state that of the gain alone.
+    Where only one end is learned, or files hold no gain towards both ends at once, the gains of both ends count as
+    independent; they are learned from the same levels, so the true standard deviation is rather smaller. Files of 0.3
+    state that of the gain alone.
 
     Parameters
     ----------
-    site : Site
-    tower : str
     replayed : Replayed
     window_s : float
         Time over which the measurement is averaged: as long as the mean that was learned from, it has no fading.
@@ -86,20 +83,10 @@ def stated_spread(site: Site, tower: str, replayed: Replayed, window_s: float = 
     -------
     StatedSpread or None
     """
-    link, poses = replayed.link, replayed.poses
-    ray = poses.position_m - replayed.source_m(site)
-    at_uav = np.einsum("nji,nj->ni", poses.rotation, -ray)
-    square, spread, stated = np.zeros(len(ray)), NO_SPREAD, False
-    for array, direction in ((link.uav_array, at_uav), (link.tower_arrays[tower], ray)):
-        pattern = array.patterns[0]
-        if not isinstance(pattern, SpherePattern):
-            continue
-        stated, own = True, direction @ array.mount
-        theta = np.arctan2(np.hypot(own[:, 0], own[:, 1]), own[:, 2])
-        square += pattern.gain_sd_db(theta, np.arctan2(own[:, 1], own[:, 0])) ** 2
-        spread = Spread.from_text(pattern.notes) or spread
-    if not stated:
+    gain = replayed.learned
+    if gain is None:
         return None
+    spread = next((s for s in map(Spread.from_text, gain.notes) if s is not None), NO_SPREAD)
     if window_s >= spread.bin_s:
         spread = dataclasses.replace(spread, fading_sd_db=0.0)
-    return StatedSpread(gain_sd_db=replayed.spread(np.sqrt(square)), spread=spread)
+    return StatedSpread(gain_sd_db=replayed.spread(gain.sd_db), spread=spread)

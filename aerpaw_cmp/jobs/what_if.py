@@ -14,6 +14,7 @@ from ..compare.offset import expected_offset_db, read_reference_powers, referenc
 from ..compare.rank import rank_from_singular_values, singular_values
 from ..compare.result import FoliageLoss, FoliageRankChange
 from ..flight.data import RssSeries
+from ..flight.learned_gain import pair_db
 from ..flight.losses import path_loss
 from ..flight.replay import Replayed, attitude_rotation, fields_from
 from ..flight.settings import PortSettings, ReferencePowers, RtSettings
@@ -95,10 +96,11 @@ def rss_alternatives(site: Site, rt: RtSettings, replayed: Replayed, field: RssF
                 changed[name] = (link, Poses(replayed.poses.position_m, np.ascontiguousarray(rotation)))
     levels = {
         name: level_dbm(other, evaluate(site, replayed, loss, link=other, poses=poses), field)
+        + pair_db(other, poses, replayed.source_m(site))
         for name, (other, poses) in changed.items()
     }
     for name, fields in foliage_alternatives(site, rt, replayed).items():
-        levels[name] = level_dbm(link, fields, field)
+        levels[name] = level_dbm(link, fields, field) + pair_db(link, replayed.poses, replayed.source_m(site))
     return levels
 
 

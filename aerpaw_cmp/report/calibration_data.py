@@ -46,6 +46,10 @@ class CalibrationData:
     mounts: Mapping[str, Mapping[str, Any]]
     strengths: Mapping[str, Any]
     ground: Mapping[str, Any] | None
+    curve: Sequence[Mapping[str, Any]]
+    """Error by number of flights that were learned from, fewest first; none with fewer than three flights."""
+    one_more_rmse_db: float
+    """To expect with one flight more, extrapolated [dB]; NaN without a curve."""
     antennas: Sequence[AntennaMap]
     place: Mapping[str, FloatArray] | None = None
     rank: Mapping[str, Any] | None = None

@@ -45,6 +45,7 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
             "mounts": data.mounts,
             "strengths": data.strengths,
             "ground": data.ground,
+            "learning_curve": {"points": list(data.curve), "one_more_rmse_db": data.one_more_rmse_db},
             "antennas": [
                 {"name": a.name, "share_of_sphere_seen": share_seen(a), "n_bins": len(a.seen)} for a in data.antennas
             ],
@@ -118,6 +119,27 @@ def draw_scores(data: CalibrationData) -> Figure:
     return fig
 
 
+def draw_curve(data: CalibrationData) -> Figure:
+    """Error on flights left out against the number of flights learned from, and what one more would bring."""
+    fig = canvas.figure((7.0, 3.8))
+    ax = fig.subplots()
+    flights = [p["flights"] for p in data.curve]
+    for key, label, colour in (
+        ("rmse_db", "as logged", canvas.SIMULATED),
+        ("rmse_4s_db", "4 s means", canvas.MEASURED),
+    ):
+        ax.plot(flights, [p[key] for p in data.curve], "o-", color=colour, label=label)
+    ax.plot(
+        [flights[-1], flights[-1] + 1], [data.curve[-1]["rmse_db"], data.one_more_rmse_db], "o--", fillstyle="none",
+        color=canvas.SIMULATED, label="one flight more (extrapolated)",
+    )  # fmt: skip
+    ax.set_xticks([*flights, flights[-1] + 1])
+    ax.set_xlabel("flights learned from")
+    ax.set_ylabel("RMSE on a flight left out [dB]")
+    ax.legend()
+    return fig
+
+
 def draw_place(place: Mapping[str, Any], name: str) -> Figure:
     """The field over places that the fit with one has, along the flights."""
     fig = canvas.figure((7.0, 6.0))
@@ -147,6 +169,20 @@ def figure_specs(data: CalibrationData) -> list[FigureSpec]:
                 caption="Mean RMSE after one offset per flight and channel. Nothing is scored where it was learned.",
                 alt="Bars of RMSE for every left-out split and control",
                 draw=partial(draw_scores, data),
+                page=True,
+            )
+        )
+    if len(data.curve) > 1:
+        out.append(
+            FigureSpec(
+                name="learning_curve",
+                section="scores",
+                title="What another flight would bring",
+                caption=f"Mean RMSE over {data.curve[0]['series']} series, each predicted by subsets of the other "
+                "flights. The last point is extrapolated: the squared error as a constant and a part that falls with "
+                "the number of flights.",
+                alt="RMSE on flights left out against the number of flights learned from",
+                draw=partial(draw_curve, data),
                 page=True,
             )
         )

@@ -20,7 +20,8 @@ from ..common.files import LARGEST_TABLE, read_bounded, write_whole
 from ..common.yamlfile import dump_yaml, load_yaml
 
 INDEX = "learned.yaml"
-FORMAT: Literal["aerpaw-cmp learned 1"] = "aerpaw-cmp learned 1"
+FORMAT: Literal["aerpaw-cmp learned 2"] = "aerpaw-cmp learned 2"
+"""Since 2 the comments of a tower's table may hold the gain towards both ends at once (:mod:`.pair_gain`)."""
 
 BAND = 0.02
 """Share by which a carrier may differ from the one that an antenna was learned at."""
@@ -105,7 +106,7 @@ class Entry(_Record):
 class Learned(_Record):
     """All that a site remembers, by name."""
 
-    format: Literal["aerpaw-cmp learned 1"] = FORMAT
+    format: Literal["aerpaw-cmp learned 1", "aerpaw-cmp learned 2"] = FORMAT
     entries: dict[Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")], Entry] = {}
 
 

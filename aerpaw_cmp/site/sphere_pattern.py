@@ -15,6 +15,7 @@ from ..common.provenance import trained_on
 from ..common.units import FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern
 from .learned import read_table
+from .pair_gain import PairGain
 
 COLUMNS = ("azimuth_deg", "elevation_deg", "gain_dbi", "gain_sd_db")
 
@@ -32,7 +33,7 @@ class SpherePattern(MeasuredPattern):
     trained_on : tuple of str
         SHA-256 of their logs: on those it must not be scored.
     notes : str
-        Comments of the file.
+        Comments of the file; of a tower's antenna they may hold ``pair``, the gain towards both ends at once.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class SpherePattern(MeasuredPattern):
         self.learned_from = learned_from
         self.trained_on = trained_on
         self.notes = notes
+        self.pair = PairGain.from_notes(notes)
         self._sd_db = np.asarray(sd_db, dtype=np.float64)
 
     def gain_sd_db(self, theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:

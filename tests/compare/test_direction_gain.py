@@ -16,6 +16,8 @@ from aerpaw_cmp.compare.direction_gain import (
     LinkSamples,
     Term,
     fit_gain,
+    pair_knots,
+    shared_knots,
 )
 from aerpaw_cmp.compare.gain_choice import choose_and_fit
 from aerpaw_cmp.compare.mount import fit_mounts
@@ -108,6 +110,71 @@ def test_fit_equals_the_exact_gaussian_process(own_sd, noise_sd):
         exact = kernel(test.at_uav, test.at_tower, np.full(len(test), i), body, mast, series) @ weights
         found = fit.predict(test)[0]
         assert np.abs((found - found.mean()) - (exact - exact.mean())).max() < 0.05
+
+
+PAIR = Term("pair", "antenna", 0.5, 2.0)
+
+
+def test_gain_towards_both_ends_equals_the_exact_gaussian_process():
+    """Mean and standard deviation of one antenna against the dense solution, on and off the flown pairs."""
+    train = [TRAIN[0].part(np.arange(0, 500, 3)), TRAIN[2].part(np.arange(0, 500, 3))]
+    model = dataclasses.replace(MODEL, terms=(*TERMS, PAIR), bin_s=1.0)
+    fit = fit_gain(train, model)
+    test = dataclasses.replace(TEST[0].part(np.arange(0, 500, 7)), at_uav=TEST[0].at_uav[::7] * [-1.0, 1.0, 1.0])
+
+    def kernel(one, other):
+        body, mast = (cdist(getattr(one, k), getattr(other, k), "sqeuclidean") for k in ("at_uav", "at_tower"))
+        pair = PAIR.sd_db**2 * np.exp(-(body + mast) / 0.5)
+        return 2.5**2 * np.exp(-body / 0.5) + 3.0**2 * np.exp(-mast / 0.32) + pair
+
+    blocks = [[kernel(one, other) for other in train] for one in train]
+    whole = np.block(blocks)
+    start = 0
+    for s in train:
+        at = slice(start, start + len(s))
+        whole[at, at] += np.exp(-cdist(s.position_m, s.position_m) / 20.0) + 1e4 + np.eye(len(s))
+        start += len(s)
+    y = np.concatenate([s.residual_db - s.residual_db.mean() for s in train])
+    # predictions are about the mean over the training bins
+    seen = np.concatenate([kernel(test, s) for s in train], axis=1)
+    inside = np.block(blocks)
+    centred = seen - inside.mean(axis=0)
+    exact = centred @ np.linalg.solve(whole, y)
+    variance = np.diag(kernel(test, test)) - 2.0 * seen.mean(axis=1) + inside.mean()
+    variance = variance - np.einsum("ij,ij->i", centred, np.linalg.solve(whole, centred.T).T)
+    gain, sd = fit.predict(test)
+    assert np.abs(gain - exact).max() < 0.08
+    assert np.abs(sd - np.sqrt(variance)).max() < 0.05
+    assert np.ptp(sd) > 1.0  # some pairs are known and some are not
+
+
+def test_knots_leave_no_more_than_their_share():
+    at = np.concatenate([TRAIN[0].at_uav, TRAIN[0].at_tower], axis=1)
+    for share in (0.1, 1e-3):
+        knots = pair_knots(at, 0.35, share)
+        k = np.exp(-cdist(at, knots, "sqeuclidean") / (2 * 0.35**2))
+        left = 1.0 - np.einsum("ij,ij->i", k, np.linalg.solve(pair_kernel(knots), k.T).T)
+        assert left.max() < share + 1e-6
+        assert len(knots) < 0.7 * len(at)
+    assert len(pair_knots(at, 0.35, 1e-3, most=20)) == 20
+
+
+def pair_kernel(knots):
+    return np.exp(-cdist(knots, knots, "sqeuclidean") / (2 * 0.35**2)) + 1e-9 * np.eye(len(knots))
+
+
+def test_planted_interaction_is_learned_and_shared_knots_change_little():
+    wave = lambda s: 3.0 * np.sin(4.0 * s.at_uav[:, 0] + 3.0 * s.at_tower[:, 1])  # noqa: E731
+    train, test = (
+        [dataclasses.replace(s, residual_db=s.residual_db + wave(s)) for s in part] for part in (TRAIN, TEST)
+    )
+    model = dataclasses.replace(MODEL, terms=(*TERMS, PAIR))
+    fit, without = fit_gain(train, model), fit_gain(train, MODEL)
+    for s in test:
+        assert rmse(s.residual_db - fit.mean(s)) < 0.95 * rmse(s.residual_db - without.mean(s))
+    shared = fit_gain(train[:4], model, shared_knots(train, model))
+    some = test[0].part(np.arange(0, 500, 11))
+    np.testing.assert_allclose(shared.predict(some), fit_gain(train[:4], model).predict(some), rtol=0, atol=0.1)
 
 
 def test_planted_gains_lie_within_their_own_sd_where_flights_have_looked():

@@ -66,6 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert main(["simulate", str(path)]) == 0
         write(path, settings(name, {"model": "iso"}))
     write(place / "calibration.yaml", {"calibration": "planted", "flights": ["first.yaml", "second.yaml"]})
+    write(place / "aside_calibration.yaml", {"calibration": "aside", "flights": ["aside.yaml"]})
     return place
 
 
@@ -148,6 +149,22 @@ def test_a_flight_kept_aside_replays_with_the_learned_antennas(folder: Path, met
     scored = known.dropna(subset=["residual_db"])
     half = (scored["simulated_high_dbm"] - scored["simulated_low_dbm"]) / 2
     assert bars["inside_90"] == pytest.approx(np.mean(scored["residual_db"].abs() < half), abs=0.01)
+
+
+def test_a_report_has_the_level_of_the_fit_itself(folder: Path, metrics: dict) -> None:
+    """Antenna files, the gain towards both ends in their comments, and the replay against the fit along the flight."""
+    del metrics
+    report = pd.read_csv(folder / "report_learned" / "rss.csv")
+    found = calibrate(folder / "calibration.yaml")
+    (aside,) = observe(read_flights(load_calibration(folder / "aside_calibration.yaml"), folder, None)[0])[0]
+    gain, sd = found.learned.predict(aside.samples)
+    level = report.dropna(subset=["residual_db"])
+    assert len(level) == len(gain) > 100
+    difference = level["simulated_dbm"].to_numpy() - (gain + aside.free_space_db)
+    assert difference.std() < 0.15
+    pair = found.learned.fit.mean(aside.samples, ("pair",))
+    assert (difference - pair).std() > difference.std()
+    assert np.median(np.abs(level["gain_sd_db"].to_numpy() / sd - 1.0)) < 0.1
 
 
 def refusal(folder: Path, capsys: pytest.CaptureFixture[str], content: dict, code: int = 2) -> str:

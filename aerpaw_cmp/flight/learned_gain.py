@@ -1,0 +1,78 @@
+"""What learned antennas say about a link besides the patterns that the replay takes: both ends at once, error bars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.units import FloatArray
+from ..propagation.arrays import Array, Link, Poses
+from ..site.sphere_pattern import SpherePattern
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearnedGain:
+    """Along the direct line, at the poses of a replay.
+
+    Parameters
+    ----------
+    pair_db : (poses,)
+        Gain towards both ends at once, to be added to the level [dB]; zero where the files hold none.
+    sd_db : (poses,)
+        Standard deviation of all learned gain together [dB].
+    notes : tuple of str
+        Comments of the files, the tower's last.
+    """
+
+    pair_db: FloatArray
+    sd_db: FloatArray
+    notes: tuple[str, ...]
+
+
+def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain | None:
+    """The learned gain of a link to one tower; None where neither end is learned.
+
+    Parameters
+    ----------
+    link : Link
+        With one tower.
+    poses : Poses
+    source_m : (1, 3) or (poses, 3)
+        Centre of the tower's array [m].
+
+    Returns
+    -------
+    LearnedGain or None
+    """
+    ray = poses.position_m - source_m
+    ray = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
+    (tower_array,) = link.tower_arrays.values()
+    towards = {"uav": np.einsum("nji,nj->ni", poses.rotation, -ray), "tower": ray}
+    ends: dict[str, tuple[SpherePattern, FloatArray]] = {}
+    for end, array in (("uav", link.uav_array), ("tower", tower_array)):
+        pattern = array.patterns[0]
+        if isinstance(pattern, SpherePattern):
+            ends[end] = pattern, _own(array, towards[end])
+    if not ends:
+        return None
+    square = np.zeros(len(ray))
+    for pattern, own in ends.values():
+        theta = np.arctan2(np.hypot(own[:, 0], own[:, 1]), own[:, 2])
+        square += pattern.gain_sd_db(theta, np.arctan2(own[:, 1], own[:, 0])) ** 2
+    pair_db, sd_db = np.zeros(len(ray)), np.sqrt(square)
+    if len(ends) == 2:
+        (uav, at_uav), (tower, at_tower) = ends["uav"], ends["tower"]
+        if tower.pair is not None and uav.trained_on == tower.trained_on:  # of one and the same calibration
+            pair_db, sd_db = tower.pair.at(np.concatenate([at_uav, at_tower], axis=1), sd_db)
+    return LearnedGain(pair_db=pair_db, sd_db=sd_db, notes=tuple(p.notes for p, _ in reversed(ends.values())))
+
+
+def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | float:
+    """Gain (poses,) towards both ends at once, to be added to the level [dB]; 0 where none is learned."""
+    gain = learned_gain(link, poses, source_m)
+    return 0.0 if gain is None else gain.pair_db
+
+
+def _own(array: Array, direction: FloatArray) -> FloatArray:
+    return np.asarray(direction @ array.mount)

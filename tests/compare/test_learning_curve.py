@@ -1,0 +1,63 @@
+"""Learning curve: errors by explicit fits, same targets at every size, and the law of one more flight."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.calibration import Observed, Recipe, learn
+from aerpaw_cmp.compare.direction_gain import GainModel, Term
+from aerpaw_cmp.compare.learning_curve import CurvePoint, learning_curve, with_one_more, words_of_curve
+from tests.compare.test_gain_choice import campaign
+
+RECIPE = Recipe(GainModel((Term("body", "all", 0.5, 2.5), Term("mast", "antenna", 0.4, 3.0))), lambda *_: np.eye(3))
+
+
+def observed(flights: int) -> list[Observed]:
+    return [Observed(s, np.zeros(len(s)), np.zeros(len(s))) for s in campaign(6, flights=flights, n=120)]
+
+
+def test_points_are_means_of_explicit_fits_over_all_subsets():
+    series = observed(4)
+    points = learning_curve(series, RECIPE)
+    assert [p.flights for p in points] == [1, 2, 3]
+    assert [p.fits for p in points] == [4, 6, 4]
+    assert {p.series for p in points} == {8}
+    names = [f"f{k}" for k in range(4)]
+    for point in points:
+        errors = []
+        for one in series:
+            others = [n for n in names if n != one.samples.flight]
+            each = []
+            for subset in itertools.combinations(others, point.flights):
+                learned = learn([o.samples for o in series if o.samples.flight in subset], RECIPE)
+                each.append((one.samples.residual_db - learned.mean(one.samples)).std())
+            errors.append(np.mean(each))
+        assert point.rmse_db == pytest.approx(np.mean(errors), rel=1e-6)
+    assert points[0].rmse_db > points[2].rmse_db + 0.2
+
+
+def test_many_flights_take_few_fits_and_every_flight_is_predicted():
+    points = learning_curve(observed(9), RECIPE)
+    assert points[0].flights == 1
+    assert points[-1].flights == 8
+    assert max(p.fits for p in points) <= 6
+    assert min(p.series for p in points) >= 10
+
+
+def test_one_more_flight_follows_what_averages_out():
+    points = [
+        CurvePoint(flights=n, rmse_db=(9 + 4 / n) ** 0.5, rmse_4s_db=(4 + 4 / n) ** 0.5, fits=1, series=2)
+        for n in (1, 2, 3)
+    ]
+    assert with_one_more(points) == pytest.approx((9 + 4 / 4) ** 0.5)
+    assert with_one_more(points, "rmse_4s_db") == pytest.approx((4 + 4 / 4) ** 0.5)
+    assert "0.05 dB (3.16 dB" in words_of_curve(points)[0]
+    flat = [CurvePoint(flights=n, rmse_db=3.0 + 0.1 * n, rmse_4s_db=3.0, fits=1, series=2) for n in (1, 2)]
+    assert with_one_more(flat) == pytest.approx(3.2)  # a curve that rises promises nothing
+    assert np.isnan(with_one_more(points[:1]))
+    assert words_of_curve(points[:1]) == []
+
+
+def test_two_flights_have_no_curve():
+    assert learning_curve(observed(2), RECIPE) == ()

@@ -22,6 +22,7 @@ from .shown import number, print_files, print_json, print_plan, say, table
         "aerpaw-cmp report flight.yaml --figures all --style paper",
         "aerpaw-cmp report flight.yaml --export geopackage,kmz",
         "aerpaw-cmp report flight.yaml --with calibrated.yaml",
+        "aerpaw-cmp report flight.yaml --against prediction",
         "aerpaw-cmp report flight.yaml --strict --json --quiet",
     ],
 )
@@ -47,6 +48,10 @@ def report(
     learned: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("--with", metavar="CALIBRATED", help="Antennas, ground and receiver of this calibrated.yaml."),
+    ] = None,
+    against: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--against", metavar="PREDICTION", help="Score what 'predict' said of this flight (its folder)."),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
@@ -79,6 +84,7 @@ def report(
         audit=audit,
         recommend=recommend,
         learned=learned,
+        against=against,
         force=force,
         export=export or (),
         figures=figures,
@@ -206,6 +212,8 @@ def _print_report_summary(outcome: Any) -> None:
             )
     if rows:
         table(["tower", "K", "agreement", "total variation", "n"], rows, "Rank, measured against replayed")
+    if "against" in outcome.metrics:
+        print(outcome.metrics["against"]["sentence"])
     warnings = [one_line(text) for text in outcome.metrics["warnings"]]
     for text in warnings[:_WARNINGS]:
         say.warn(f"warning: {text}")

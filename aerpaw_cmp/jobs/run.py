@@ -182,6 +182,7 @@ def run_report(
     audit: str | None = None,
     recommend: Path | None = None,
     learned: Path | str | None = None,
+    against: Path | str | None = None,
     force: bool = False,
     figures: str = "page",
     style: str = "screen",
@@ -205,6 +206,8 @@ def run_report(
         Where to write it.
     learned : Path, optional
         calibrated.yaml whose antennas, ground and receiver take the place of those of the flight file.
+    against : Path, optional
+        Output folder of ``predict``: what it said of this flight is scored.
     force : bool
         Replace what this tool did not write.
     figures : {"page", "none", "svg", "png", "pdf", "all"}
@@ -231,6 +234,7 @@ def run_report(
     from ..report.export import metrics as metrics_of
     from ..report.exports.formats import chosen_formats
     from ..report.write import FIGURES, STYLES, write_report
+    from .against import score_against
     from .flight_run import run_flight
     from .ladder import recommended_text
     from .later_audit import refuse_changed, with_later_audit
@@ -255,11 +259,16 @@ def run_report(
         stages = Stages(progress)
         with stages("read"):
             data = load_data(settings, flight.parent, logs_root)
+            before = None if against is None else score_against(data, Path(against))
         replays = replay_flight(data, stages)
         flight_run = run_flight(data, stages, replays=replays, ladder=True)
         record = report_record(flight_run, other_inputs(settings, flight, logs_root, learned))
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         asked |= {} if learned is None else {"learned": os.path.relpath(learned, folder)}
+        if before is not None:
+            asked["against"] = os.path.relpath(Path(against or ""), folder)
+            extra = {**record.extra_metrics, "against": before.metrics()}
+            record = replace(record, against=before, extra_metrics=extra)
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
         if same_inputs is not None:
             refuse_changed(same_inputs, record.inputs)
@@ -366,7 +375,10 @@ def run_audit(
         force=force,
         same_inputs=earlier.inputs,
         progress=progress,
-        **{key: earlier.folder / value if key == "learned" else value for key, value in earlier.asked.items()},
+        **{
+            key: earlier.folder / value if key in ("learned", "against") else value
+            for key, value in earlier.asked.items()
+        },
     )
 
 

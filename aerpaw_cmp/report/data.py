@@ -23,6 +23,7 @@ from ..compare.serving import ServingComparison
 from ..compare.statistics import PairedDifference
 from ..logs.records import RejectedLine
 from ..site.site import Site
+from .against import Against
 
 Interval = tuple[float, float]
 
@@ -462,3 +463,5 @@ class ReportData:
     paths: tuple[PosePaths, ...] = ()
     serving: ServingComparison | None = None
     audit_command: str = ""
+    against: Against | None = None
+    """What was predicted before the flight, where a prediction is named."""

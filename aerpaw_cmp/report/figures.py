@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .against_figures import against_specs
 from .canvas import POINTS_PER_CLOUD, FigureSpec, count
 from .data import GEOMETRY, ChannelPair, RankPanel, ReportData, RssPanel, Track
 from .names import safe_name
@@ -62,6 +63,8 @@ def figure_specs(data: ReportData) -> list[FigureSpec]:
     for rank in data.rank:
         if len(rank.time):
             result += _rank_specs(data, rank)
+    if data.against is not None:
+        result += against_specs(data.against)
     return _with_own_names(result)
 
 

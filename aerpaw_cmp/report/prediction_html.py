@@ -188,7 +188,7 @@ def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
     axes = fig.subplots(1, 2, sharex=True, sharey=True)
     east, north = part["east_m"].to_numpy(), part["north_m"].to_numpy()
     for ax, column, label, colours in (
-        (axes[0], "level_db", "level", "viridis"),
+        (axes[0], "level_db", "level [dB]", "viridis"),
         (axes[1], "sd_db", "standard deviation [dB]", "magma"),
     ):
         values = part[column].to_numpy()

@@ -10,7 +10,11 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.flight.data import load_data
+from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs import predict as job
+from aerpaw_cmp.jobs.against import score_against
+from aerpaw_cmp.jobs.calibrate import observe
 from aerpaw_cmp.jobs.predict_run import page_of
 from aerpaw_cmp.jobs.where import Asked, find_targets
 from aerpaw_cmp.report.prediction_html import write_prediction
@@ -108,6 +112,54 @@ def test_files_agree_with_each_other(tmp_path, prediction):
     pytest.importorskip("netCDF4")
     with xarray.open_dataset(tmp_path / "prediction.nc") as book:
         np.testing.assert_allclose(book["level_db"].to_numpy().ravel(), levels["level_db"], atol=1e-3)
+
+
+@pytest.fixture
+def said(small, tmp_path):
+    """A prediction that is 2 dB above each level of LW1 USRP1 and states 3 dB, at the very poses of the flight."""
+    data = load_data(load_flight(small / "a.yaml"), small)
+    one = next(o for o in observe([data])[0] if o.samples.antenna == "LW1.USRP1")
+    level = one.samples.residual_db + one.free_space_db + 2.0
+    place = dict(zip(("east_m", "north_m", "height_m"), one.samples.position_m.T, strict=True))
+    frame = pd.DataFrame({**place, "yaw_deg": one.heading_deg, "tower": "LW1", "channel": "USRP1", "level_db": level,
+                          "sd_db": 3.0, "q05_db": level - 4.935, "q95_db": level + 4.935})  # fmt: skip
+    frame.to_csv(tmp_path / "prediction.csv", index=False)
+    (tmp_path / "metrics.json").write_text(json.dumps({"trained_on": ["0" * 64], "sentence": "s", "flights": ["x"]}))
+    return data, tmp_path
+
+
+def test_a_flown_route_is_scored_by_what_was_said(said):
+    against = score_against(*said)
+    (scores,) = against.scores.values()
+    # the flight waits at its waypoints: there a sample is scored by a neighbour's level
+    assert scores["bias_db"] == pytest.approx(-2.0, abs=0.3)
+    assert scores["n"] == len(against.series[0].time_s)
+    assert scores["share_near"] == 1.0
+    error = against.series[0].measured_db - against.series[0].level_db
+    assert scores["rmse_db"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert scores["coverage_90"] == np.mean(np.abs(error) <= 4.935)
+    assert against.metrics()["sentence"].startswith("Predicted before this flight: RMSE")
+
+
+def test_a_prediction_that_learned_from_the_flight_is_refused(said):
+    data, folder = said
+    about = json.loads((folder / "metrics.json").read_text())
+    for digest in (f.sha256 for f in data.files if f.path.endswith("LW1/USRP1_power_log.txt")):
+        (folder / "metrics.json").write_text(json.dumps({**about, "trained_on": [digest]}))
+        with pytest.raises(UsageError, match="this flight's own log"):
+            score_against(data, folder)
+
+
+def test_a_prediction_of_another_place_is_no_score(said):
+    data, folder = said
+    table = pd.read_csv(folder / "prediction.csv")
+    table["north_m"] += 5000.0
+    table.to_csv(folder / "prediction.csv", index=False)
+    with pytest.raises(UsageError, match="within 30 m"):
+        score_against(data, folder)
+    (folder / "metrics.json").write_text("{}")
+    with pytest.raises(InputError, match="no prediction"):
+        score_against(data, folder)
 
 
 def test_a_grid_has_its_heights_one_after_the_other():

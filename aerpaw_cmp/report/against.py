@@ -1,0 +1,66 @@
+"""What was predicted before a flight, beside what it measured: record and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..common.units import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgainstSeries:
+    """Samples (n,) of one tower and channel that were predicted; levels in the unit of the log [dB]."""
+
+    tower: str
+    channel: str
+    time_s: FloatArray
+    measured_db: FloatArray
+    level_db: FloatArray
+    sd_db: FloatArray
+    low_db: FloatArray
+    high_db: FloatArray
+    share_near: float
+
+    def coverage(self, share: float) -> float:
+        """Share of samples inside the interval that is to hold so many."""
+        from scipy.special import ndtri
+
+        half = float(ndtri(0.5 + 0.5 * share)) * self.sd_db
+        return float(np.mean(np.abs(self.measured_db - self.level_db) <= half))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Against:
+    """A prediction and the flight that followed; ``scores`` by ``tower channel``."""
+
+    folder: str
+    sentence: str
+    generated: str
+    flights: tuple[str, ...]
+    series: tuple[AgainstSeries, ...]
+    scores: Mapping[str, Mapping[str, float]]
+
+    @property
+    def words(self) -> str:
+        """What the flight says of the prediction."""
+        rows = list(self.scores.values())
+        mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+        return (
+            f"Predicted before this flight: RMSE {mean['rmse_db']:.1f} dB as predicted "
+            f"({mean['rmse_4s_db']:.1f} dB over 4 s), {mean['own_offset_rmse_db']:.1f} dB after the flight's own "
+            f"offset. The 90 % intervals hold {100 * mean['coverage_90']:.0f} % of the samples."
+        )
+
+    def metrics(self) -> dict[str, Any]:
+        """``against`` of metrics.json."""
+        return {
+            "prediction": self.folder,
+            "generated": self.generated,
+            "flights": list(self.flights),
+            "sentence": self.words,
+            "scores": {name: dict(row) for name, row in self.scores.items()},
+        }

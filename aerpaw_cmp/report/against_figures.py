@@ -1,0 +1,74 @@
+"""Figures of a prediction beside the flight that followed: levels with intervals, reliability, sharpness."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from . import canvas
+from .against import Against, AgainstSeries
+from .canvas import FigureSpec
+from .names import safe_name
+
+SHARES = np.arange(0.1, 1.0, 0.1)
+"""Of the reliability plot."""
+
+
+def against_specs(against: Against) -> list[FigureSpec]:
+    """Levels over time with their intervals, then reliability and sharpness."""
+    out = []
+    for s in against.series:
+        out.append(
+            FigureSpec(
+                name=f"against_{safe_name(s.tower)}_{safe_name(s.channel)}",
+                page=True,
+                section="against",
+                title=f"{s.tower} {s.channel}: predicted before this flight",
+                caption="Band: 90 % interval of one sample as it was predicted. Nothing of this flight was used.",
+                alt=f"Measured level of {s.tower} {s.channel} over time beside its prediction",
+                draw=partial(_over_time, s),
+            )
+        )
+    out.append(
+        FigureSpec(
+            name="against_reliability",
+            page=True,
+            section="against",
+            title="Reliability and sharpness",
+            caption="Left: share of samples inside intervals of a nominal share; on the diagonal intervals hold what "
+            "they say. Right: standard deviations that were given; smaller is sharper.",
+            alt="Observed against nominal coverage, and a histogram of standard deviations",
+            draw=partial(_reliability, against),
+        )
+    )
+    return out
+
+
+def _over_time(s: AgainstSeries) -> Figure:
+    fig = canvas.figure((9.2, 3.4))
+    ax = fig.subplots()
+    ax.fill_between(s.time_s, s.low_db, s.high_db, color=canvas.SIMULATED, alpha=0.22, linewidth=0, label="90 %")
+    ax.plot(s.time_s, s.measured_db, ".", markersize=2, color=canvas.MEASURED, label="measured", rasterized=True)
+    ax.plot(s.time_s, s.level_db, color=canvas.SIMULATED, linewidth=1.2, label="predicted")
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel("level [dB]")
+    canvas.legend_below(ax, 3)
+    return fig
+
+
+def _reliability(against: Against) -> Figure:
+    fig = canvas.figure((9.2, 3.6))
+    left, right = fig.subplots(1, 2)
+    left.plot([0, 100], [0, 100], color="0.6", linewidth=1)
+    for s in against.series:
+        name = f"{s.tower} {s.channel}"
+        left.plot(100 * SHARES, [100 * s.coverage(share) for share in SHARES], "o-", markersize=3, label=name)
+        right.hist(s.sd_db, bins=30, histtype="step", label=name)
+    left.set_xlabel("nominal [%]")
+    left.set_ylabel("observed [%]")
+    left.legend(fontsize=8)
+    right.set_xlabel("standard deviation of one sample [dB]")
+    right.set_ylabel("samples")
+    return fig

@@ -137,6 +137,7 @@ def site_show(
         "aerpaw-cmp map site.yaml --spacing 15 --dry-run",
         "aerpaw-cmp map site.yaml -o reports/map --spacing 20 --rank-altitude 30 --rank-altitude 70",
         "aerpaw-cmp map lake_wheeler --flight flight.yaml --foliage none --no-study --json",
+        "aerpaw-cmp map lake_wheeler --with flight1.yaml --with flight2.yaml",
     ],
 )
 def map_(
@@ -177,6 +178,10 @@ def map_(
         Optional[Path],  # noqa: UP045
         typer.Option(help="flight.yaml whose track trains the test 'along a flight'."),
     ] = None,
+    flights: Annotated[
+        Optional[list[Path]],  # noqa: UP045
+        typer.Option("--with", metavar="FLIGHT", help="flight.yaml that corrects the levels; repeatable."),
+    ] = None,
     logs_root: LogsRoot = None,
     threshold_dbm: Annotated[
         Optional[float],  # noqa: UP045
@@ -215,6 +220,7 @@ def map_(
         out=out,
         quick=quick,
         flight=flight,
+        flights=flights or (),
         logs_root=logs_root,
         workers=workers,
         scheduler=scheduler,

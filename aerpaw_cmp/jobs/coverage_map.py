@@ -61,6 +61,7 @@ from ..propagation.search.crowns import Crowns
 from ..report import maps_data as page
 from ..site.site import Site
 from ..site.siteyaml import load_site
+from .corrected_map import CorrectedMaps
 from .what_if import p833_note
 from .workers import Lost, Workers
 
@@ -342,6 +343,7 @@ class MapOutcome:
     paths_off_crowns: int = 0
     trajectory_m: FloatArray | None = None
     trajectory_name: str = ""
+    corrected: CorrectedMaps | None = None
 
     @property
     def shown(self) -> MapResult:
@@ -473,7 +475,7 @@ def maps_record(
     -------
     MapsData
     """
-    s, result = outcome.settings, outcome.shown
+    s, result, flown = outcome.settings, outcome.shown, outcome.corrected
     rss = tuple(one for mode, maps in outcome.ordered() for one in _rss_maps(maps, mode))
     rank = tuple(one for mode, maps in outcome.ordered() for one in _rank_maps(maps, mode))
     return page.MapsData(
@@ -485,10 +487,12 @@ def maps_record(
         north_m=result.grid.north_m,
         borders_m=tuple(border.line_m for border in result.borders),
         rss=rss,
+        corrected=() if flown is None else tuple(flown.rss_maps(result.grid)),
+        flown_m=() if flown is None else flown.flown_m,
         rank=rank,
         rank_by_tower=tuple(one for mode, maps in outcome.ordered() for one in _tower_rank_maps(maps, mode)),
         layers=tuple(_further_layers(outcome)),
-        further=tuple(_linked_layers(outcome)),
+        further=(*(() if flown is None else flown.page_layers(result.grid)), *_linked_layers(outcome)),
         correlation=tuple(_correlation_panels(outcome)),
         errors=tuple(_errors(outcome)),
         learning=tuple(_learning(outcome)),
@@ -668,6 +672,9 @@ def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
 
 
 def _warnings(outcome: MapOutcome) -> Iterator[str]:
+    if outcome.corrected is not None:
+        yield f"Corrected by flights: {outcome.corrected.sentence}"
+        yield from outcome.corrected.warnings
     for key in ("zero", "missing"):
         if key in outcome.studies and (study := outcome.studies[key]).fit.degenerate:
             yield f"Correlation fit (Z {key}): {study.fit.message}"
@@ -771,7 +778,8 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
         The files written.
     """
     site, grid = outcome.site, outcome.shown.grid
-    joint, every = _all_layers(outcome, towers_too=False), _all_layers(outcome, towers_too=True)
+    flown = [] if outcome.corrected is None else outcome.corrected.layers()
+    joint, every = (_all_layers(outcome, towers_too=too) + flown for too in (False, True))
     names = {layer.name for layer in joint}
     every = [layer for layer in every if layer.name in names or not layer.name.startswith(RATIOS)]
     shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
@@ -795,7 +803,7 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
     )
     maps = dict(outcome.ordered())
     writers: tuple[Callable[[], Path], ...] = (
-        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, about),
+        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, about, flown),
         lambda: export.write_geotiff(folder / "maps.tif", all_joint),
     )
     for write in writers:

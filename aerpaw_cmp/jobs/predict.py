@@ -329,15 +329,21 @@ def _over_headings(
 ) -> tuple[FloatArray, FloatArray]:
     """Level and standard deviation of 4 s means (m,); all headings count alike where none is known."""
     position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
-    free, unknown = source.free_space_db(position), ~np.isfinite(yaw)
-    turns = np.arange(HEADINGS) * (360.0 / HEADINGS) if unknown.any() else np.zeros(1)
+    free = source.free_space_db(position)
     means, variances = [], []
-    for turn in turns:
-        gain, _, sd = correction.predict(source.samples(position, np.where(unknown, turn, yaw)))
+    for turn in _turns(yaw):
+        heading = np.where(np.isfinite(yaw), yaw, turn)
+        gain, _, sd = correction.predict(source.samples(position, heading))
         means.append(gain)
         variances.append(sd**2)
     level = np.mean(means, axis=0)
     return free + level, np.sqrt(np.mean(variances, axis=0) + np.var(means, axis=0))
+
+
+def _turns(yaw_deg: FloatArray) -> FloatArray:
+    """Headings that count alike where one is not known [deg]."""
+    count = 1 if np.isfinite(yaw_deg).all() else HEADINGS
+    return np.asarray(np.arange(count) * (360.0 / HEADINGS))
 
 
 def _outside(targets: Targets, flown: Sequence[LinkSamples]) -> BoolArray:
@@ -398,7 +404,7 @@ def _ranks(targets: Targets, known: Sequence[FlightData], site: Site) -> list[pd
             for tower, one in read_receiver(path).items():
                 receivers.setdefault(tower, (one, known[0]))
     out = []
-    rows = np.flatnonzero(targets.known & np.isfinite(targets.yaw_deg))
+    rows = np.flatnonzero(targets.known)
     for tower, (receiver, data) in receivers.items():
         if tower not in site.towers or not len(rows):
             continue
@@ -406,16 +412,20 @@ def _ranks(targets: Targets, known: Sequence[FlightData], site: Site) -> list[pd
         link = data.settings.link.rank.build([tower], data.folder)
         if {len(link.uav_array), len(link.tower_arrays[tower])} != {4}:
             continue
-        samples = RankSamples(
-            flight="",
-            tower=tower,
-            tower_m=np.asarray(site.towers[tower].position_m),
-            poses=Poses(position, body_rotation(np.zeros(len(yaw)), np.zeros(len(yaw)), yaw)),
-            rank=np.full(len(rows), np.nan),
-            link=link,
-            time_s=targets.time_s[rows],
-        )
-        p, _ = receiver.forecast(samples)
+        each = []
+        for turn in _turns(yaw):
+            heading = np.where(np.isfinite(yaw), yaw, turn)
+            samples = RankSamples(
+                flight="",
+                tower=tower,
+                tower_m=np.asarray(site.towers[tower].position_m),
+                poses=Poses(position, body_rotation(0.0 * heading, 0.0 * heading, heading)),
+                rank=np.full(len(rows), np.nan),
+                link=link,
+                time_s=targets.time_s[rows] if targets.kind == "route" else 1e4 * np.arange(float(len(rows))),
+            )
+            each.append(receiver.forecast(samples)[0])
+        p = np.mean(each, axis=0)
         frame: pd.DataFrame = pd.DataFrame(
             {
                 "point": rows,

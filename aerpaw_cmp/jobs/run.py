@@ -584,8 +584,8 @@ class MapsOutcome:
 
 def run_map(
     site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None,
-    logs_root: Path | None = None, workers: int = 1, scheduler: str | None = None, force: bool = False,
-    progress: Progress = silent, **options: Any,
+    flights: Sequence[Path] = (), logs_root: Path | None = None, workers: int = 1, scheduler: str | None = None,
+    force: bool = False, progress: Progress = silent, **options: Any,
 ) -> MapsOutcome:  # fmt: skip
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -599,6 +599,8 @@ def run_map(
         A coarse map; what ``options`` state still counts.
     flight : Path, optional
         flight.yaml whose track trains the test "along a flight".
+    flights : sequence of Path
+        Flight files that correct the levels (:mod:`.predict`).
     logs_root : Path, optional
         Folder against which its logs resolve.
     workers, scheduler
@@ -630,12 +632,17 @@ def run_map(
     place = load_site(site)
     name = Path(site).stem
     folder = out or _map_folder(site)
-    inputs = [Path(site), *([] if flight is None else [flight])]
+    inputs = [Path(site), *([] if flight is None else [flight]), *flights]
     stages = Stages(progress)
     with OutputFolder(folder, job="map", inputs=inputs, force=force) as output:
         file = [Path(site).absolute()] if Path(site).is_file() else []
         with open_workers(workers, scheduler, paths=file, progress=progress) as crew:
             outcome = mapping.make_maps(place, settings, stages, workers=crew, name=str(file[0] if file else site))
+        if flights:
+            from .corrected_map import corrected_maps
+
+            heights = settings.rss_altitudes_m
+            outcome.corrected = corrected_maps(site, settings.spacing_m, heights, flights, logs_root, stages)
         if settings.study:
             if flight is not None:
                 outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)

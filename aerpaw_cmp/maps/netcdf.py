@@ -18,6 +18,7 @@ import numpy as np
 from ..common.cf import DB, DBM, dataset, netcdf_bytes, site_crs
 from ..common.geodesy import SiteFrame
 from ..common.units import AnyArray, FloatArray
+from .grid import Layer
 from .job import HIGHEST_RANK, RATIO_LIMIT_DB, MapResult
 
 _PLANE = ("y", "x")
@@ -25,7 +26,13 @@ _LABELS = "foliage_mode latitude longitude"
 _Variable = tuple[tuple[str, ...], AnyArray, dict[str, Any]]
 
 
-def write_netcdf(path: str | Path, maps: Mapping[str, MapResult], frame: SiteFrame, about: Mapping[str, str]) -> Path:
+def write_netcdf(
+    path: str | Path,
+    maps: Mapping[str, MapResult],
+    frame: SiteFrame,
+    about: Mapping[str, str],
+    further: Sequence[Layer] = (),
+) -> Path:
     """The file of :func:`maps_dataset`, which has the parameters; replaced where it exists.
 
     Parameters
@@ -34,6 +41,7 @@ def write_netcdf(path: str | Path, maps: Mapping[str, MapResult], frame: SiteFra
     maps : mapping of str to MapResult
     frame : SiteFrame
     about : mapping of str to str
+    further : sequence of Layer
 
     Returns
     -------
@@ -46,11 +54,13 @@ def write_netcdf(path: str | Path, maps: Mapping[str, MapResult], frame: SiteFra
         If xarray or netCDF4 is not installed.
     """
     target = Path(path)
-    target.write_bytes(netcdf_bytes(maps_dataset(maps, frame, about)))
+    target.write_bytes(netcdf_bytes(maps_dataset(maps, frame, about, further)))
     return target
 
 
-def maps_dataset(maps: Mapping[str, MapResult], frame: SiteFrame, about: Mapping[str, str]) -> Any:
+def maps_dataset(
+    maps: Mapping[str, MapResult], frame: SiteFrame, about: Mapping[str, str], further: Sequence[Layer] = ()
+) -> Any:
     """Maps as an ``xarray.Dataset`` with dimensions foliage, tower, k, height, y, x.
 
     Parameters
@@ -61,6 +71,8 @@ def maps_dataset(maps: Mapping[str, MapResult], frame: SiteFrame, about: Mapping
         From local metres to latitude and longitude.
     about : mapping of str to str
         Attributes of the file (:func:`~aerpaw_cmp.common.cf.file_attributes`).
+    further : sequence of Layer
+        Further variables over y and x, by their names.
 
     Returns
     -------
@@ -69,6 +81,15 @@ def maps_dataset(maps: Mapping[str, MapResult], frame: SiteFrame, about: Mapping
     first = next(iter(maps.values()))
     variables = {**_places(first, frame), **_levels(maps), **_ranks(maps)}
     variables["foliage_mode"] = _text("foliage", maps, "how trees act")
+    for layer in further:
+        plane = first.grid.raster(np.asarray(layer.values))
+        if layer.classes:
+            codes = tuple(f"rank_{c}" if c.isdigit() else c for c in layer.classes)
+            variables[layer.name] = _PLANE, plane.astype(np.int8), _codes(codes, layer.title)
+        else:
+            unit = {"dBm": DBM, "dB": DB}.get(layer.unit, layer.unit)
+            said = {"long_name": layer.title, "units": unit, "comment": f"unit: {layer.unit}", "grid_mapping": "crs"}
+            variables[layer.name] = _PLANE, plane.astype(np.float32), {**said, "coordinates": "latitude longitude"}
     return dataset(variables, about)
 
 

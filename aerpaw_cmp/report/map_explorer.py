@@ -153,6 +153,7 @@ def _packed(data: MapsData, layers: Sequence[MapLayer], stride: int) -> dict[str
         "degrees": geographic(data.site.frame, data.east_m, data.north_m),
         "site": plan_of(data.site),
         "borders": [listed(line) for line in data.borders_m],
+        "flown": [listed(np.round(line, 1)) for line in data.flown_m],
         "joint": JOINT,
         "quantities": quantities,
         "ramps": {"level": ramp("viridis"), "difference": ramp("RdBu_r")},

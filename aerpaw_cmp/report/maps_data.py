@@ -148,6 +148,10 @@ class MapsData:
         Lines between the areas of two towers (Voronoi), east and north [m].
     rank : tuple of RankMap
         The nearest tower serving; ``rank_by_tower`` each alone, for the linked map.
+    corrected : tuple of RssMap
+        Of each link, raw and corrected by flights (``antennas``): for figures; the linked map has them in ``further``.
+    flown_m : tuple of (n, 2)
+        Tracks of those flights, east and north [m].
     further : tuple of MapLayer
         Layers of the linked map that have no static figure.
     metrics : mapping
@@ -162,6 +166,8 @@ class MapsData:
     north_m: FloatArray
     borders_m: tuple[FloatArray, ...] = ()
     rss: tuple[RssMap, ...] = ()
+    corrected: tuple[RssMap, ...] = ()
+    flown_m: tuple[FloatArray, ...] = ()
     rank: tuple[RankMap, ...] = ()
     rank_by_tower: tuple[RankMap, ...] = ()
     layers: tuple[Layer, ...] = ()

@@ -331,13 +331,14 @@ def level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
 def figure_specs(data: MapsData) -> list[FigureSpec]:
     """Every figure that the data allow, in reading order."""
     result: list[FigureSpec] = []
-    limits = level_limits(data.rss)
+    levels = (*data.rss, *data.corrected)
+    limits = level_limits(levels)
     for (antennas, foliage, height), maps in grouped(
-        data.rss, lambda one: (one.antennas, one.foliage, one.altitude_m)
+        levels, lambda one: (one.antennas, one.foliage, one.altitude_m)
     ).items():
         words = f"{antennas}{f', foliage {foliage}' if foliage else ''}, {height:g} m"
         result.append(_rss_spec(data, maps, limits, words))
-    for (antennas, foliage), maps in grouped(data.rss, lambda one: (one.antennas, one.foliage)).items():
+    for (antennas, foliage), maps in grouped(levels, lambda one: (one.antennas, one.foliage)).items():
         words = f"{antennas}{f', foliage {foliage}' if foliage else ''}"
         result.append(
             FigureSpec(

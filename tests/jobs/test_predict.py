@@ -1,5 +1,6 @@
 """``predict``: what is said where, on the sample flight whose levels and offsets are planted."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -12,11 +13,14 @@ import pytest
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs import corrected_map
 from aerpaw_cmp.jobs import predict as job
 from aerpaw_cmp.jobs.against import score_against
 from aerpaw_cmp.jobs.calibrate import observe
 from aerpaw_cmp.jobs.predict_run import page_of
 from aerpaw_cmp.jobs.where import Asked, find_targets
+from aerpaw_cmp.propagation.arrays import Link, single_element
+from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.prediction_html import write_prediction
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -178,3 +182,22 @@ def test_a_planned_flight_faces_its_course():
     step = np.diff(targets.position_m[leg][:, :2], axis=0)[0]
     assert targets.yaw_deg[leg][0] == pytest.approx(np.degrees(np.arctan2(step[0], step[1])) % 360.0, abs=1e-6)
     assert east.min() < -375
+
+
+def test_corrected_levels_are_brought_to_the_raw_replay_by_the_planted_offset(prediction):
+    targets = dataclasses.replace(prediction.targets, heights_m=(45.0,))
+    said = dataclasses.replace(prediction, targets=targets)
+    (one,) = corrected_map._levels(said, prediction.sources["LW1.USRP1"], len(targets))
+    level = rows_of(prediction, "LW1", "USRP1")["level_db"].to_numpy()
+    np.testing.assert_allclose((one.corrected_dbm - level)[[0, 2, 3]], 12.3, atol=0.7)
+    raw = trace("lake_wheeler", Link(3.3e9, {"LW1": single_element()}, single_element()), [[-300.0, 150.0, 45.0]])
+    assert one.raw_dbm[0] == pytest.approx(raw.rss_dbm[0, 0], abs=1e-6)
+    maps = corrected_map.CorrectedMaps(levels=(one,), ranks={}, flown_m=(), sentence="", warnings=())
+    assert [layer.name for layer in maps.layers()] == [
+        f"rss_{kind}_h045m_LW1_USRP1" for kind in ("raw", "corrected", "sd")
+    ]
+
+
+def rows_of(prediction, tower, channel):
+    table = prediction.table
+    return table[(table["tower"] == tower) & (table["channel"] == channel)]

@@ -9,7 +9,7 @@ from aerpaw_cmp.common.cf import file_attributes
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.maps import netcdf
-from aerpaw_cmp.maps.grid import Grid, serving_tower, voronoi_borders
+from aerpaw_cmp.maps.grid import Grid, Layer, class_names, serving_tower, voronoi_borders
 from aerpaw_cmp.maps.job import MapResult
 
 FRAME = SiteFrame(35.7275, -78.6960)
@@ -56,7 +56,9 @@ def write(path):
         version="0.2.0",
         comment="A gap has no path.",
     )
-    return netcdf.write_netcdf(path, MAPS, FRAME, about)
+    level = Layer("rss_sd_h030m_LW1", np.arange(len(GRID)) / 4.0, "dB", "Standard deviation")
+    rank = Layer("rank_learned_h030m_LW1", np.arange(len(GRID)) % 5, "1", "Rank", class_names(4))
+    return netcdf.write_netcdf(path, MAPS, FRAME, about, [level, rank])
 
 
 def check(path):
@@ -151,3 +153,11 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "netCDF4", None)
     with pytest.raises(UsageError, match=r"aerpaw-cmp\[geo\]"):
         write(tmp_path / "m.nc")
+
+
+def test_further_layers_are_variables_in_index_order(path):
+    xarray = pytest.importorskip("xarray")
+    with xarray.open_dataset(write(path)) as book:
+        assert np.array_equal(book["rss_sd_h030m_LW1"].to_numpy().ravel(), np.arange(len(GRID)) / 4.0)
+        assert book["rss_sd_h030m_LW1"].attrs["grid_mapping"] == "crs"
+        assert np.array_equal(book["rank_learned_h030m_LW1"].to_numpy().ravel(), np.arange(len(GRID)) % 5)

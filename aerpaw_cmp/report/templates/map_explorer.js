@@ -123,6 +123,7 @@
     for (const faces of data.site.buildings) for (const face of faces) { path(face, true); pen.fillStyle = "#fff"; pen.strokeStyle = "#000"; pen.lineWidth = 0.8; pen.fill("evenodd"); pen.stroke(); }
     const tower = chosen("Tower", state.a);
     if (!tower || tower === data.joint) for (const line of data.borders) { path(line); pen.strokeStyle = "#fff"; pen.lineWidth = 2.4; pen.stroke(); pen.strokeStyle = "#000"; pen.lineWidth = 1.1; pen.setLineDash([6, 3]); pen.stroke(); pen.setLineDash([]); }
+    if (data.flown.length && at("flown").checked) for (const line of data.flown) { path(line); pen.strokeStyle = "#fff"; pen.lineWidth = 2.6; pen.stroke(); pen.strokeStyle = "#7a1fa2"; pen.lineWidth = 1.2; pen.stroke(); }
     if (state.line) { path(state.line); pen.strokeStyle = "#fff"; pen.lineWidth = 4.5; pen.stroke(); pen.strokeStyle = "#c1121f"; pen.lineWidth = 2.2; pen.stroke(); }
     for (const t of data.site.towers) {
       const x = project.x(t.at[0]), y = project.y(t.at[1]), own = !tower || tower === data.joint || tower === t.name;
@@ -340,6 +341,7 @@
   at("quantity").addEventListener("change", e => { setQuantity(+e.target.value); if (state.difference) setDifference(true); everything(); });
   at("scale").addEventListener("change", e => { state.scale = e.target.value; everything(); });
   at("difference").addEventListener("change", e => { setDifference(e.target.checked); everything(); });
+  at("flown-choice").hidden = !data.flown.length; at("flown").addEventListener("change", everything);
   at("swap").addEventListener("click", () => { [state.a, state.b] = [state.b, state.a]; controls(); everything(); });
   at("view-all").addEventListener("click", () => { Object.assign(state, { zoom: 1, east: 0, north: 0 }); later(drawMap); });
   at("clear-line").addEventListener("click", () => line(null));

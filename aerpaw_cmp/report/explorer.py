@@ -1,4 +1,4 @@
-"""The data of the linked views: what the page's script draws, as typed arrays in base64.
+"""The data of the linked views: what the page's script draws, as one block of packed arrays.
 
 Every number of the page's script comes from here; it computes only what a span or a switch changes (offset, RMSE,
 correlation and histograms of the chosen samples), by the same formulas as :mod:`aerpaw_cmp.compare`.
@@ -6,7 +6,6 @@ correlation and histograms of the chosen samples), by the same formulas as :mod:
 
 from __future__ import annotations
 
-import base64
 import itertools
 import json
 from collections.abc import Mapping, Sequence
@@ -14,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..common.units import BoolArray, FloatArray, IntArray
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site
 from .canvas import seconds_since, spread_out, start_of
 from .data import GEOMETRY, PosePaths, RankPanel, ReportData, RssPanel, tower_way
 from .names import k_key
+from .packed import PackedArrays
 from .shapes import listed, outline, walls
 from .words import pretty
 
@@ -29,29 +29,6 @@ POINTS = 50_000
 
 TREES = 1500
 TRACK_POINTS = 4000
-
-
-class Arrays:
-    """Arrays of the page, each stored once.
-
-    Attributes
-    ----------
-    stored : list of dict
-        ``{"type": "f4" or "f8", "data": base64}``, little endian.
-    """
-
-    def __init__(self) -> None:
-        self.stored: list[dict[str, str]] = []
-        self._known: dict[tuple[str, bytes], int] = {}
-
-    def add(self, values: AnyArray, kind: str = "f4") -> int:
-        """Number under which the values stand; equal arrays share one."""
-        raw = np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()
-        key = (kind, raw)
-        if key not in self._known:
-            self._known[key] = len(self.stored)
-            self.stored.append({"type": kind, "data": base64.b64encode(raw).decode("ascii")})
-        return self._known[key]
 
 
 def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
@@ -96,7 +73,7 @@ def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
     limit : int
         Samples of all series together.
     """
-    start, arrays = start_of(data), Arrays()
+    start, arrays = start_of(data), PackedArrays()
     total = sum(len(p.time) for p in data.rss) + sum(len(p.time) for p in data.rank)
 
     def share(n: int) -> int:
@@ -112,7 +89,7 @@ def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
         "track": _track(data, start, arrays),
         "site": scene(data.site),
         "paths": [_paths(p, start) for p in data.paths],
-        "arrays": arrays.stored,
+        "packed": arrays.content(),
     }
 
 
@@ -121,14 +98,14 @@ def as_json(content: Mapping[str, Any]) -> str:
     return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def _place(panel: RssPanel | RankPanel, pick: IntArray, arrays: Arrays) -> dict[str, int]:
+def _place(panel: RssPanel | RankPanel, pick: IntArray, arrays: PackedArrays) -> dict[str, int]:
     """Places of the UAV, and those of a tower that moves."""
     names = {"east": panel.east_m, "north": panel.north_m, "up": panel.up_m}
     names |= {f"tower_{axis}": values for axis, values in tower_way(panel).items()}
     return {name: arrays.add(values[pick]) for name, values in names.items() if values is not None}
 
 
-def _rss(panel: RssPanel, start: np.datetime64, arrays: Arrays, limit: int) -> dict[str, Any]:
+def _rss(panel: RssPanel, start: np.datetime64, arrays: PackedArrays, limit: int) -> dict[str, Any]:
     residual = panel.residual_db
     pick = keep_extremes([panel.measured_db, residual], limit) if len(panel.time) else np.arange(0)
     models = [{"name": "ray tracing", "offset": _number(panel.offset_db), "rmse": _number(panel.rmse_db),
@@ -155,7 +132,7 @@ def _rss(panel: RssPanel, start: np.datetime64, arrays: Arrays, limit: int) -> d
     }
 
 
-def _source(panel: RssPanel, pick: IntArray, arrays: Arrays) -> dict[str, Any]:
+def _source(panel: RssPanel, pick: IntArray, arrays: PackedArrays) -> dict[str, Any]:
     """Where each sample stands in the logs: the files, and per sample its file and line."""
     assert panel.source is not None
     return {
@@ -165,7 +142,7 @@ def _source(panel: RssPanel, pick: IntArray, arrays: Arrays) -> dict[str, Any]:
     }
 
 
-def _rank(panel: RankPanel, start: np.datetime64, arrays: Arrays, limit: int) -> dict[str, Any]:
+def _rank(panel: RankPanel, start: np.datetime64, arrays: PackedArrays, limit: int) -> dict[str, Any]:
     pick = keep_extremes([panel.measured], limit) if len(panel.time) else np.arange(0)
     return {
         "tower": panel.tower,
@@ -189,7 +166,7 @@ def _best(panel: RankPanel) -> int:
     return int(np.argmin(distance)) if distance else 0
 
 
-def _track(data: ReportData, start: np.datetime64, arrays: Arrays) -> dict[str, int] | None:
+def _track(data: ReportData, start: np.datetime64, arrays: PackedArrays) -> dict[str, int] | None:
     track = data.track
     if track is None or not len(track.time):
         return None

@@ -34,7 +34,7 @@ class PackedArrays:
         self._known: dict[tuple[str, bytes], int] = {}
         self._size = 0
 
-    def add(self, values: AnyArray, kind: str) -> int:
+    def add(self, values: AnyArray, kind: str = "f4") -> int:
         """Number under which the values stand, little endian; equal arrays share one."""
         raw = np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()
         key = (kind, raw)

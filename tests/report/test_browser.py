@@ -16,6 +16,7 @@ from tests.report.browsing import (
     extents,
     frame,
     needs_browser,
+    open_page,
     reload_page,
     serious_findings,
     set_scheme,
@@ -37,7 +38,7 @@ def page(small_report, tmp_path_factory):
 @pytest.fixture(scope="module")
 def driver(page):
     found = start("--window-size=1440,1200")
-    found.get(page.as_uri())
+    open_page(found, page, "window.explorer")
     yield found
     found.quit()
 
@@ -217,16 +218,15 @@ def test_a_broken_formula_would_be_seen(driver, small_report):
     assert wrong > right + 0.01
 
 
-def test_only_rank(small_report, tmp_path, driver):
+def test_only_rank(small_report, tmp_path, driver, page):
     bare = dataclasses.replace(small_report, rss=(), pairs=())
     path = write.write_report(bare, tmp_path, drawn="none").files[0]
-    here = driver.current_url
-    driver.get(path.as_uri())
+    open_page(driver, path, "window.explorer")
     try:
         assert driver.execute_script("return explorer.rankStatistics().n") == np.isfinite(bare.rank[0].measured).sum()
         assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
     finally:
-        driver.get(here)
+        open_page(driver, page, "window.explorer")
 
 
 @pytest.mark.parametrize("width", [1440, 390])

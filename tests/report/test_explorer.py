@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
+import zlib
 
 import numpy as np
 import pytest
@@ -16,8 +17,9 @@ from aerpaw_cmp.report.data import Source
 
 
 def array(content, number):
-    stored = content["arrays"][number]
-    return np.frombuffer(base64.b64decode(stored["data"]), dtype="<" + stored["type"])
+    kind, offset, length = content["packed"]["arrays"][number]
+    block = zlib.decompress(base64.b64decode(content["packed"]["data"]))
+    return np.frombuffer(block, dtype=f"<{kind}", count=length, offset=offset)
 
 
 def test_arrays_come_back_as_they_were(report_data):
@@ -38,7 +40,7 @@ def test_equal_arrays_are_stored_once(report_data):
     panel = report_data.rss[0]
     twice = dataclasses.replace(report_data, rss=(panel, dataclasses.replace(panel, channel="copy")))
     alone = dataclasses.replace(report_data, rss=(panel,))
-    assert len(explorer.payload(twice)["arrays"]) == len(explorer.payload(alone)["arrays"])
+    assert len(explorer.payload(twice)["packed"]["arrays"]) == len(explorer.payload(alone)["packed"]["arrays"])
 
 
 def test_a_sample_names_its_log_and_line(report_data):

@@ -182,7 +182,7 @@
     if (!(x1 > x0)) { x0 -= withDates ? 864e5 : 1; x1 += withDates ? 864e5 : 1; }
     const pad = Math.max(0.5, (y1 - y0) * 0.06);
     const date = v => new Date(v).toISOString().slice(0, x1 - x0 < 3 * 864e5 ? 16 : 10).replace("T", " ");
-    const marks = withDates ? Array.from({ length: Math.max(2, Math.floor(w / 150)) }, (_, k, n = Math.max(2, Math.floor(w / 150))) => x0 + (x1 - x0) * (k + 0.5) / n) : undefined;
+    const marks = withDates ? common.clockTicks(x0 / 1000, x1 / 1000, Math.max(2, Math.floor(w / 150)), 0).map(t => t * 1000) : undefined;
     const g = axes(pen, w, h, { low: x0 - (x1 - x0) * 0.02, high: x1 + (x1 - x0) * 0.02, label: withDates ? "Date (UTC)" : "Flight number", marks, words: withDates ? date : undefined }, { low: y0 - pad, high: y1 + pad, label: "Offset [dB]" });
     for (const [x, y, f, l] of points) { const X = g.X(x), Y = g.Y(y); spots.drift.push([X, Y, f]); pen.globalAlpha = 0.7; pen.fillStyle = hues[l % hues.length]; pen.beginPath(); pen.arc(X, Y, 2.4, 0, 7); pen.fill(); }
     pen.globalAlpha = 1;
@@ -225,11 +225,11 @@
     let [[a, b], [s, n]] = [ext(c.e).map(v => (v + 0.5) * m), ext(c.n).map(v => (v + 0.5) * m)];
     const wide = Math.max(b - a, n - s) / 2, near = (data.site ? data.site.towers : []).map(t => t.at).filter(t => t[0] > a - wide && t[0] < b + wide && t[1] > s - wide && t[1] < n + wide);
     for (const t of near) { a = Math.min(a, t[0]); b = Math.max(b, t[0]); s = Math.min(s, t[1]); n = Math.max(n, t[1]); }
-    const scale = Math.min((w - 60) / (b - a + 3 * m), (h - 40) / (n - s + 3 * m)), mx = (a + b) / 2, my = (s + n) / 2;
-    project = { x: e => 46 + (w - 52) / 2 + (e - mx) * scale, y: v => 6 + (h - 36) / 2 - (v - my) * scale, east: x => mx + (x - 46 - (w - 52) / 2) / scale, north: y => my - (y - 6 - (h - 36) / 2) / scale, scale };
+    project = common.plan([46, 6, w - 6, h - 30], [a - 1.5 * m, b + 1.5 * m, s - 1.5 * m, n + 1.5 * m]);
+    const scale = project.scale;
     pen.save(); pen.beginPath(); pen.rect(46, 6, w - 52, h - 36); pen.clip();
     if (data.site) {
-      const path = f => { pen.beginPath(); f.forEach((p, i) => i ? pen.lineTo(project.x(p[0]), project.y(p[1])) : pen.moveTo(project.x(p[0]), project.y(p[1]))); pen.closePath(); };
+      const path = f => common.path(pen, f, project, true);
       for (const f of data.site.forests) { path(f); pen.fillStyle = css("--forest"); pen.fill(); }
       for (const faces of data.site.buildings) for (const f of faces) { path(f); pen.fillStyle = css("--building"); pen.fill("evenodd"); }
     }
@@ -239,26 +239,16 @@
     }
     const track = state.flight === null ? null : trackOf(state.flight);
     if (track) for (const [colour, wide] of [["#000", 4], ["#F0C000", 2]]) { pen.beginPath(); track[0].forEach((e, i) => i ? pen.lineTo(project.x(e), project.y(track[1][i])) : pen.moveTo(project.x(e), project.y(track[1][i]))); pen.strokeStyle = colour; pen.lineWidth = wide; pen.stroke(); }
-    for (const t of data.site ? data.site.towers : []) {
-      const x = project.x(t.at[0]), y = project.y(t.at[1]);
-      pen.beginPath(); pen.moveTo(x, y - 8); pen.lineTo(x - 7, y + 5); pen.lineTo(x + 7, y + 5); pen.closePath(); pen.fillStyle = "#C1121F"; pen.strokeStyle = "#fff"; pen.lineWidth = 1.2; pen.fill(); pen.stroke();
-    }
+    for (const t of data.site ? data.site.towers : []) common.tower(pen, project.x(t.at[0]), project.y(t.at[1]));
     labels = common.names(pen, [46, 6, w - 6, h - 30], (data.site ? data.site.towers : []).map(t => ({ text: t.name, at: [project.x(t.at[0]), project.y(t.at[1])], colour: css("--accent"), halo: css("--paper") })));
     if (place !== null && c.e[place] !== undefined) { pen.strokeStyle = "#000"; pen.lineWidth = 2; pen.strokeRect(project.x(c.e[place] * m), project.y((c.n[place] + 1) * m), m * scale, m * scale); }
     pen.restore();
-    pen.fillStyle = css("--ink"); pen.font = "12px system-ui, sans-serif"; pen.textAlign = "center";
-    for (const e of ticks(project.east(50), project.east(w - 12), Math.floor(w / 110))) pen.fillText(number(e, 0), project.x(e), h - 17);
-    pen.fillText("East [m]", w / 2, h - 3); pen.textAlign = "right";
-    for (const v of ticks(project.north(h - 34), project.north(12), 5)) pen.fillText(number(v, 0), 42, project.y(v) + 4);
-    pen.textAlign = "center"; pen.save(); pen.translate(10, h / 2); pen.rotate(-Math.PI / 2); pen.fillText("North [m]", 0, 0); pen.restore();
-    pen.textAlign = "left";
+    common.planAxes(pen, project, w, h);
   }
   function drawLegend() {
-    const [pen, w] = frame(at("legend")), left = 46, right = w - 40;
-    for (let i = 0; i <= right - left; i++) { pen.fillStyle = `rgb(${diverging(i / (right - left))})`; pen.fillRect(left + i, 4, 1.5, 12); }
-    pen.fillStyle = css("--ink"); pen.textAlign = "center";
-    for (const v of ticks(-data.reach, data.reach, 5)) pen.fillText(number(v, Number.isInteger(v) ? 0 : 1), left + (v + data.reach) / (2 * data.reach) * (right - left), 30);
-    pen.fillText("Mean residual [dB]", (left + right) / 2, 46); pen.textAlign = "left";
+    const [pen, w] = frame(at("legend")), ends = [46, w - 40];
+    common.colourBar(pen, diverging, [-data.reach, data.reach], ends, 4);
+    pen.fillText("Mean residual [dB]", (ends[0] + ends[1]) / 2, 48); pen.textAlign = "left";
   }
   function describePlace() {
     const found = places(), c = found && cellsOf(found);

@@ -71,7 +71,8 @@ const common = (() => {
   }
   // instants at round times of day between two, all in seconds; "begun" is the time of day of zero
   function clockTicks(low, high, most, begun) {
-    const step = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600].find(s => (high - low) / s <= most) ?? 86400, out = [];
+    const day = 86400, steps = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, day, 2 * day, 7 * day, 30 * day, 90 * day, 365 * day];
+    const step = steps.find(s => (high - low) / s <= most) ?? 3650 * day, out = [];
     for (let v = Math.ceil((low + begun) / step - 1e-9) * step; v <= high + begun; v += step) out.push(v - begun);
     return high - low < 1.5 ? ticks(low, high, most) : out;
   }
@@ -93,6 +94,35 @@ const common = (() => {
     pen.save(); pen.translate(12, (top + bottom) / 2); pen.rotate(-Math.PI / 2); pen.fillText(y.label, 0, 0); pen.restore();
     pen.textAlign = "left";
     return { X, Y, left, right, top, bottom };
+  }
+
+  // a plan: scales that show [west, east, south, north] in an area [left, top, right, bottom], zoomed and moved
+  function plan(area, [west, east, south, north], zoom = 1, moved = [0, 0]) {
+    const [left, top, right, bottom] = area, scale = zoom * Math.min((right - left) / (east - west), (bottom - top) / (north - south));
+    const mx = (west + east) / 2 + moved[0], my = (south + north) / 2 + moved[1], ox = (left + right) / 2, oy = (top + bottom) / 2;
+    return { area, scale, x: e => ox + (e - mx) * scale, y: n => oy - (n - my) * scale, east: x => mx + (x - ox) / scale, north: y => my - (y - oy) / scale };
+  }
+  function planAxes(pen, { area: [left, top, right, bottom], x, y, east, north }, w, h) {
+    pen.fillStyle = css("--ink"); pen.font = FONT; pen.textAlign = "center";
+    for (const e of ticks(east(left), east(right), Math.floor(w / 110))) pen.fillText(number(e, 0), x(e), h - 18);
+    pen.fillText("East [m]", w / 2, h - 3); pen.textAlign = "right";
+    for (const n of ticks(north(bottom), north(top), 6)) pen.fillText(number(n, 0), 42, y(n) + 4);
+    pen.textAlign = "center"; pen.save(); pen.translate(10, h / 2); pen.rotate(-Math.PI / 2); pen.fillText("North [m]", 0, 0); pen.restore(); pen.textAlign = "left";
+  }
+  function path(pen, points, project, close) {
+    pen.beginPath(); points.forEach((p, i) => i ? pen.lineTo(project.x(p[0]), project.y(p[1])) : pen.moveTo(project.x(p[0]), project.y(p[1]))); if (close) pen.closePath();
+  }
+  function tower(pen, x, y, alpha = 1) {
+    pen.beginPath(); pen.moveTo(x, y - 8); pen.lineTo(x - 7, y + 5); pen.lineTo(x + 7, y + 5); pen.closePath();
+    pen.globalAlpha = alpha; pen.fillStyle = "#C1121F"; pen.strokeStyle = "#fff"; pen.lineWidth = 1.2; pen.fill(); pen.stroke(); pen.globalAlpha = 1;
+  }
+  // a bar of colours with numbers below it
+  function colourBar(pen, of, [low, high], [left, right], top) {
+    for (let i = 0; i <= right - left; i++) { pen.fillStyle = `rgb(${of(i / (right - left))})`; pen.fillRect(left + i, top, 1.5, 14); }
+    pen.strokeStyle = css("--soft"); pen.strokeRect(left, top, right - left, 14);
+    const marks = ticks(low, high, Math.max(2, Math.floor((right - left) / 70))), d = digits(marks);
+    pen.fillStyle = css("--ink"); pen.textAlign = "center";
+    for (const v of marks) { const x = left + (v - low) / (high - low) * (right - left); pen.fillText(number(v, d), x, top + 28); pen.fillRect(x, top + 14, 1, 3); }
   }
 
   // a colour ramp given as one string of six-digit colours
@@ -141,5 +171,5 @@ const common = (() => {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => later(job));
   }
 
-  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, whenResized, digits, clockTicks, clockText };
+  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar };
 })();

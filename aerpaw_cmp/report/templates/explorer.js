@@ -1,17 +1,12 @@
 "use strict";
 // The linked views: one pose, one span and one choice of series, shown by a map and by charts over time.
 // Numbers of a span follow the formulas of aerpaw_cmp.compare: offset on the grid, RMSE about it, Pearson correlation.
-(() => {
+(async () => {
   const data = JSON.parse(document.getElementById("explorer-data").textContent);
   const root = document.getElementById("explorer");
-  const { at, css, number, cells, fill, ticks, later, shade } = common;
+  const { at, css, number, cells, fill, axes, later, shade } = common;
 
-  const arrays = data.arrays.map(a => {
-    const raw = atob(a.data), bytes = new Uint8Array(raw.length);
-    for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
-    return a.type === "f8" ? new Float64Array(bytes.buffer) : new Float32Array(bytes.buffer);
-  });
-  const get = i => i === undefined || i === null ? null : arrays[i];
+  const arrays = await common.unpack(data.packed), get = i => i === undefined || i === null ? null : arrays[i];
 
   const state = { series: 0, model: 0, k: 0, span: null, pose: null, colour: "residual", against: 0, turn: 0, tilt: Math.PI / 2, zoom: 1, east: 0, north: 0 };
   const rss = () => data.rss[state.series] || null;
@@ -381,28 +376,19 @@
 
   // --- residual against a quantity, and histograms ----------------------------------------------------------------------
 
-  function frame(id) {
-    const found = common.frame(at(id));
-    found[0].font = "11px system-ui, sans-serif";
-    return found;
-  }
-
   function drawScatter() {
     const s = rss();
     at("scatter-figure").hidden = !s || !s.geometry.length;
     if (!s || !s.geometry.length) return;
-    const [p, w, h] = frame("scatter"), g = s.geometry[state.against] || s.geometry[0], x = get(g.values), y = residuals(), time = get(s.time);
+    const [p, w, h] = common.frame(at("scatter")), kind = s.geometry[state.against] || s.geometry[0], x = get(kind.values), y = residuals(), time = get(s.time);
     const chosen = [];
     for (let i = 0; i < x.length; i++) if (Number.isFinite(x[i]) && Number.isFinite(y[i]) && (!state.span || (time[i] >= state.span[0] && time[i] <= state.span[1]))) chosen.push([x[i], y[i]]);
     if (!chosen.length) return;
     let low = Infinity, high = -Infinity, reach = 5;
     for (const [a, b] of chosen) { low = Math.min(low, a); high = Math.max(high, a); reach = Math.max(reach, Math.abs(b)); }
     reach = Math.min(reach, 30); if (high - low < 1e-6) high = low + 1;
-    const X = v => 44 + (v - low) / (high - low) * (w - 56), Y = v => 8 + (reach - Math.max(-reach, Math.min(reach, v))) / (2 * reach) * (h - 42);
-    p.strokeStyle = css("--line"); p.fillStyle = css("--ink"); p.lineWidth = 1;
-    for (const t of ticks(low, high)) { p.beginPath(); p.moveTo(X(t), 8); p.lineTo(X(t), h - 34); p.stroke(); p.textAlign = "center"; p.fillText(String(Math.round(t * 100) / 100), X(t), h - 20); }
-    for (const t of ticks(-reach, reach)) { p.beginPath(); p.moveTo(44, Y(t)); p.lineTo(w - 12, Y(t)); p.stroke(); p.textAlign = "right"; p.fillText(number(t, 0), 40, Y(t) + 4); }
-    p.textAlign = "center"; p.fillText(g.name, (44 + w - 12) / 2, h - 5);
+    const g = axes(p, w, h, { low, high, label: kind.name }, { low: -reach, high: reach, label: "Residual [dB]" });
+    const X = g.X, Y = v => g.Y(Math.max(-reach, Math.min(reach, v)));
     p.fillStyle = css("--measured"); p.globalAlpha = 0.5;
     for (const [a, b] of chosen) p.fillRect(X(a) - 1.2, Y(b) - 1.2, 2.4, 2.4);
     p.globalAlpha = 1;
@@ -420,25 +406,18 @@
   }
 
   function drawHistogram() {
-    const s = rss(), r = rank(), [p, w, h] = frame("histogram");
+    const s = rss(), r = rank(), [p, w, h] = common.frame(at("histogram"));
+    const bar = (g, low, high, v, colour) => { p.fillStyle = css(colour); p.fillRect(g.X(low), g.Y(v), g.X(high) - g.X(low) - 1, g.bottom - g.Y(v)); };
     if (s) {
       const found = statistics(), rest = residuals(), counts = new Array(30).fill(0);
-      if (found.used) for (const i of found.used) counts[Math.min(29, Math.max(0, Math.floor((rest[i] + 15) / 1)))]++;
-      const most = Math.max(1, ...counts), wide = (w - 30) / 30;
-      counts.forEach((c, i) => { p.fillStyle = css("--measured"); p.fillRect(15 + i * wide, h - 34 - c / most * (h - 46), wide - 1, c / most * (h - 46)); });
-      p.fillStyle = css("--ink"); p.textAlign = "center";
-      for (const v of [-15, -10, -5, 0, 5, 10, 15]) p.fillText(number(v, 0), 15 + (v + 15) * wide, h - 20);
-      p.fillText("Residual [dB] (outer bins include outliers)", w / 2, h - 5);
+      for (const i of found.used || []) counts[Math.min(29, Math.max(0, Math.floor(rest[i] + 15)))]++;
+      const g = axes(p, w, h, { low: -15, high: 15, label: "Residual [dB] (outer bins include outliers)" }, { low: 0, high: Math.max(1, ...counts), label: "Samples" });
+      counts.forEach((c, i) => bar(g, i - 15, i - 14, c, "--measured"));
     } else if (r) {
-      const found = rankStatistics(), names = ["none", "1", "2", "3", "4"], wide = (w - 40) / 5;
-      const share = list => { const t = list.reduce((a, b) => a + b, 0) || 1; return list.map(v => v / t); };
+      const found = rankStatistics(), share = list => { const t = list.reduce((a, b) => a + b, 0) || 1; return list.map(v => 100 * v / t); };
       const m = share(found.shares.measured), q = share(found.shares.simulated);
-      names.forEach((name, i) => {
-        p.fillStyle = css("--measured"); p.fillRect(20 + i * wide + 4, h - 34 - m[i] * (h - 46), wide / 2 - 6, m[i] * (h - 46));
-        p.fillStyle = css("--ink"); p.fillRect(20 + i * wide + wide / 2, h - 34 - q[i] * (h - 46), wide / 2 - 6, q[i] * (h - 46));
-        p.textAlign = "center"; p.fillText(name, 20 + (i + .5) * wide, h - 20);
-      });
-      p.fillStyle = css("--ink"); p.fillText("Rank: measured (light), simulated (dark)", w / 2, h - 5);
+      const g = axes(p, w, h, { low: -0.5, high: 4.5, label: "Rank: measured (light), simulated (dark)", marks: [0, 1, 2, 3, 4], words: v => v ? String(v) : "none" }, { low: 0, high: Math.max(1, ...m, ...q), label: "Share [%]" });
+      m.forEach((v, i) => { bar(g, i - 0.4, i, v, "--measured"); bar(g, i, i + 0.4, q[i], "--ink"); });
     }
   }
 
@@ -527,4 +506,7 @@
   controls();
   everything();
   window.explorer = { times: () => charts.map(c => c.chart.axes[0]._values), state, statistics, rankStatistics, choose, span, series: i => Array.from(get(i)), labels: () => labels, keyTop: () => canvas.clientHeight - KEY, data };
-})();
+})().catch(error => { // an old browser without the means: the static figures stay
+  document.documentElement.classList.remove("live");
+  console.error(error);
+});

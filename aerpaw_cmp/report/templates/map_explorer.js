@@ -1,7 +1,7 @@
 "use strict";
 // The linked map: one layer or the difference of two, what stands at the pointer, a profile, the numbers of the layer.
 (async () => {
-  const { at, css, number, cells, fill, frame, axes, ramp, quantile, later, whenResized, digits, ticks } = common;
+  const { at, css, number, cells, fill, frame, axes, ramp, quantile, later, whenResized } = common;
   const data = JSON.parse(at("explorer-data").textContent), arrays = await common.unpack(data.packed);
   const east = arrays[data.east], north = arrays[data.north], columns = east.length, rows = north.length;
   const ramps = { level: ramp(data.ramps.level), difference: ramp(data.ramps.difference) };
@@ -96,12 +96,6 @@
     pen.putImageData(pixels, 0, 0);
   }
 
-  function fit(w, h) {
-    const scale = state.zoom * Math.min((w - 62) / (edges[1] - edges[0]), (h - 40) / (edges[3] - edges[2]));
-    const mx = (edges[0] + edges[1]) / 2 + state.east, my = (edges[2] + edges[3]) / 2 + state.north, ox = 46 + (w - 62) / 2, oy = 8 + (h - 40) / 2;
-    project = { x: e => ox + (e - mx) * scale, y: n => oy - (n - my) * scale, east: x => mx + (x - ox) / scale, north: y => my - (y - oy) / scale, scale };
-  }
-
   function hatch(pen) {
     const tile = document.createElement("canvas"), p = tile.getContext("2d");
     tile.width = tile.height = 8; p.strokeStyle = css("--soft"); p.globalAlpha = 0.6; p.lineWidth = 1;
@@ -112,13 +106,13 @@
   function drawMap() {
     if (!image) draw();
     const [pen, w, h] = frame(canvas);
-    fit(w, h);
+    project = common.plan([46, 8, w - 16, h - 32], edges, state.zoom, [state.east, state.north]);
     const x0 = project.x(edges[0]), x1 = project.x(edges[1]), y0 = project.y(edges[3]), y1 = project.y(edges[2]);
     pen.save(); pen.beginPath(); pen.rect(46, 8, w - 62, h - 40); pen.clip();
     pen.fillStyle = css("--band"); pen.fillRect(x0, y0, x1 - x0, y1 - y0);
     pen.fillStyle = hatch(pen); pen.fillRect(x0, y0, x1 - x0, y1 - y0);
     pen.imageSmoothingEnabled = false; pen.drawImage(image, x0, y0, x1 - x0, y1 - y0);
-    const path = (points, close) => { pen.beginPath(); points.forEach((p, i) => i ? pen.lineTo(project.x(p[0]), project.y(p[1])) : pen.moveTo(project.x(p[0]), project.y(p[1]))); if (close) pen.closePath(); };
+    const path = (points, close) => common.path(pen, points, project, close);
     for (const f of data.site.forests) { path(f, true); pen.strokeStyle = "#fff"; pen.lineWidth = 2.2; pen.stroke(); pen.strokeStyle = "#2F5D28"; pen.lineWidth = 1.1; pen.setLineDash([4, 2]); pen.stroke(); pen.setLineDash([]); }
     for (const faces of data.site.buildings) for (const face of faces) { path(face, true); pen.fillStyle = "#fff"; pen.strokeStyle = "#000"; pen.lineWidth = 0.8; pen.fill("evenodd"); pen.stroke(); }
     const tower = chosen("Tower", state.a);
@@ -126,10 +120,8 @@
     if (data.flown.length && at("flown").checked) for (const line of data.flown) { path(line); pen.strokeStyle = "#fff"; pen.lineWidth = 2.6; pen.stroke(); pen.strokeStyle = "#7a1fa2"; pen.lineWidth = 1.2; pen.stroke(); }
     if (state.line) { path(state.line); pen.strokeStyle = "#fff"; pen.lineWidth = 4.5; pen.stroke(); pen.strokeStyle = "#c1121f"; pen.lineWidth = 2.2; pen.stroke(); }
     for (const t of data.site.towers) {
-      const x = project.x(t.at[0]), y = project.y(t.at[1]), own = !tower || tower === data.joint || tower === t.name;
-      pen.beginPath(); pen.moveTo(x, y - 8); pen.lineTo(x - 7, y + 5); pen.lineTo(x + 7, y + 5); pen.closePath();
-      pen.globalAlpha = own ? 1 : 0.35; pen.fillStyle = "#C1121F"; pen.strokeStyle = "#fff"; pen.lineWidth = 1.2; pen.fill(); pen.stroke();
-      pen.globalAlpha = 1;
+      const own = !tower || tower === data.joint || tower === t.name;
+      common.tower(pen, project.x(t.at[0]), project.y(t.at[1]), own ? 1 : 0.35);
     }
     labels = common.names(pen, [46, 8, w - 16, h - 32], data.site.towers.map(t => ({ text: t.name, at: [project.x(t.at[0]), project.y(t.at[1])], colour: "#8f0f18", halo: "#fff", alpha: !tower || tower === data.joint || tower === t.name ? 1 : 0.35 })));
     if (state.cell) {
@@ -137,11 +129,7 @@
       pen.strokeStyle = "#000"; pen.lineWidth = 3; pen.strokeRect(x, y, wide, high); pen.strokeStyle = "#F0C000"; pen.lineWidth = 1.6; pen.strokeRect(x, y, wide, high);
     }
     pen.restore();
-    pen.fillStyle = css("--ink"); pen.font = "12px system-ui, sans-serif"; pen.textAlign = "center";
-    for (const e of ticks(project.east(46), project.east(w - 16), Math.floor(w / 110))) pen.fillText(number(e, 0), project.x(e), h - 18);
-    pen.fillText("East [m]", w / 2, h - 3); pen.textAlign = "right";
-    for (const n of ticks(project.north(h - 32), project.north(8), 6)) pen.fillText(number(n, 0), 42, project.y(n) + 4);
-    pen.textAlign = "center"; pen.save(); pen.translate(10, h / 2); pen.rotate(-Math.PI / 2); pen.fillText("North [m]", 0, 0); pen.restore(); pen.textAlign = "left";
+    common.planAxes(pen, project, w, h);
   }
 
   function drawLegend() {
@@ -163,13 +151,8 @@
       });
       return;
     }
-    const left = 46, right = w - 40, of = ramped();
-    for (let i = 0; i <= right - left; i++) { const c = of(i / (right - left)); pen.fillStyle = `rgb(${c})`; pen.fillRect(left + i, 26, 1.5, 14); }
-    pen.strokeStyle = css("--soft"); pen.strokeRect(left, 26, right - left, 14);
-    const marks = ticks(ends[0], ends[1], Math.max(2, Math.floor((right - left) / 70))), d = digits(marks);
-    pen.fillStyle = css("--ink"); pen.textAlign = "center";
-    for (const v of marks) { const X = left + (v - ends[0]) / (ends[1] - ends[0]) * (right - left); pen.fillText(number(v, d), X, 54); pen.fillRect(X, 40, 1, 3); }
-    pen.textAlign = "right"; pen.fillText(`${name}${said ? ` [${said}]` : ""}`, right, 17); pen.textAlign = "left";
+    common.colourBar(pen, ramped(), ends, [46, w - 40], 26);
+    pen.textAlign = "right"; pen.fillText(`${name}${said ? ` [${said}]` : ""}`, w - 40, 17); pen.textAlign = "left";
   }
 
   // --- words and numbers --------------------------------------------------------------------------------------------

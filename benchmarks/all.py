@@ -79,6 +79,7 @@ SMALLEST: dict[str, list[str]] = {
     "kriging_field": ["--quick"],
     "long_flight": ["--hours", "0.3", "--shares", "1"],
     "mutation": ["record", "{folder}/map.json", "--tests", "tests/compare/test_offset.py"],
+    "outside_faults": ["--only", "take-off ground not added to the track", "--no-tests"],
     "output_faults": ["--kills", "5"],
     "pages": ["--only", "long", "--repeats", "1"],
     "performance": ["--docs", "{folder}/performance.md"],

@@ -991,17 +991,25 @@ def _kappa_interval(first: FloatArray, second: FloatArray, kappa: float) -> Inte
         return NO_INTERVAL
     influence, _, (low, high) = _pair_statistics((a == b).astype(np.float64), _indicators(a), _indicators(b))[1]
     known = autocorrelation(influence)
-    if not known.enough:
+    if not known.enough or not _explored(a, b):
         return NO_INTERVAL
     reach = known.half_width * float(np.sqrt(block_variance(influence - influence.mean(), known.block_length)))
     return max(low, kappa - reach), min(high, kappa + reach)
+
+
+def _explored(a: IntArray, b: IntArray) -> bool:
+    """Whether both sequences are long enough to have met the ranks that their process has.
+
+    Agreement forgets sooner than the ranks do, but a rank that a short flight never met is in no resample of it.
+    """
+    return all(autocorrelation(ranks).enough or not np.ptp(ranks) for ranks in (a, b))
 
 
 def _pair_intervals(
     a: IntArray, b: IntArray, values: tuple[float, float, float, float], replicates: int, seed: int
 ) -> list[Interval]:
     """Intervals of agreement, kappa, total variation and Wasserstein from one bootstrap of the pairs."""
-    if len(a) < 2:
+    if len(a) < 2 or not _explored(a, b):
         return [NO_INTERVAL] * 4
     equal, first, second = (a == b).astype(np.float64), _indicators(a), _indicators(b)
     columns = np.column_stack([equal, first, second])

@@ -155,3 +155,26 @@ def test_baselines_of_a_part_take_their_offset_from_outside_it_too(split: str) -
         assert found.free_space_rmse_db == pytest.approx(error.std(), abs=1e-9)
         assert found.constant_rmse_db == pytest.approx(constant.std(), abs=1e-9)
         assert found.free_space_rmse_db > o.samples.residual_db.std()  # the flight's own offset flatters
+
+
+def test_a_line_over_distance_is_the_one_that_least_squares_finds_outside() -> None:
+    """Slope and level of samples outside alone; whatever free space is relative to; 0 to STEEPEST."""
+    rng = np.random.default_rng(12)
+    one = observed("a", seed=4)
+    outside = np.arange(len(one.samples)) < 120
+    free = rng.uniform(-80.0, -60.0, len(outside))
+    for true_slope, expected in ((1.4, 1.4), (-2.0, 0.0), (9.0, calibration.STEEPEST)):
+        measured = 7.0 + true_slope * free
+        for shift_db in (0.0, 100.0):
+            samples = dataclasses.replace(one.samples, residual_db=measured - free - shift_db)
+            shown = dataclasses.replace(one, samples=samples, free_space_db=free + shift_db)
+            simple = calibration.Simple.unknown(len(free))
+            simple.predict(shown, ~outside, outside)
+            level = measured[outside].mean()
+            wanted = level + expected * (free[~outside] - free[outside].mean())
+            assert simple.line_db[~outside] == pytest.approx(wanted)
+            assert simple.constant_db[~outside] == pytest.approx(level)
+            assert simple.free_db[~outside] + shown.free_space_db[~outside] == pytest.approx(
+                free[~outside] + (measured - free)[outside].mean()
+            )
+            assert np.isnan(simple.line_db[outside]).all()

@@ -377,3 +377,19 @@ def test_outliers_are_far_outside_the_flights_own_levels():
     assert np.flatnonzero(outliers(level)).tolist() == [500]
     assert not outliers(rng.normal(-50.0, 0.1, 100)).any()
     assert not outliers([NAN, NAN]).any()
+
+
+@pytest.mark.parametrize(("level", "spans"), [(1.35, 0), (1.65, 2)])
+def test_a_span_is_large_from_one_and_a_half_times_the_rms_error(level, spans):
+    """Two plateaus whose height over the RMS of all is planted, no noise."""
+    time = np.arange(0.0, 400.0)
+    residual = np.zeros(400)
+    residual[50:100], residual[250:300] = 1.0, -1.0
+    rms = 1.0 / level  # of the whole: the rest makes it so
+    rest = np.sqrt((400 * rms**2 - 100) / 300)
+    quiet = residual == 0
+    residual[quiet] = rest * np.where(np.arange(quiet.sum()) % 2, 1.0, -1.0)
+    found = error_spans(time, residual, window_s=10.0)
+    assert len(found) == spans
+    assert sorted(round(span.mean_db, 1) for span in found) == ([-1.0, 1.0] if spans else [])
+    assert len(error_spans(time, residual, window_s=10.0, threshold_db=0.9)) == 2

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -53,3 +55,29 @@ def test_a_file_says_its_spread_and_one_of_another_kind_none() -> None:
     assert Spread.from_text(f"# a note\n# {spread.text()}\n") == spread
     for text in ("", "# spread: own_sd_db 2", "# spread: own_sd_db two noise_sd_db 1", spread.text()):
         assert Spread.from_text(text) is None
+
+
+def test_fading_does_not_depend_on_the_zero_of_the_clock() -> None:
+    """Bins begin with the first sample, whatever its time is called."""
+    random = np.random.default_rng(8)
+    one = samples(random.normal(0.0, 3.0, 800) + np.repeat(random.normal(0.0, 8.0, 100), 8))
+    one = dataclasses.replace(
+        one, time_s=np.arange(800) / 8.0
+    )  # exact in binary: no sample changes its bin by rounding
+    expected = fading_of([one], 1.0)
+    for shift_s in (0.375, 17.5, 1024.25):
+        assert fading_of([dataclasses.replace(one, time_s=one.time_s + shift_s)], 1.0) == pytest.approx(expected)
+
+
+def test_heavy_tails_widen_only_as_far_as_the_expansion_holds() -> None:
+    """Between an excess kurtosis of 0 and 2 the 95 % interval grows steadily; beyond 2 no more."""
+    none = np.zeros(1)
+
+    def width(kurtosis: float) -> float:
+        spread = Spread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=4.0, fading_kurtosis=kurtosis, bin_s=4.0)
+        return float(spread.half_width_db(none, 0.95)[0])
+
+    assert width(0.0) == pytest.approx(4.0 * 1.95996, rel=1e-4)
+    assert width(0.0) < width(1.0) < width(1.99) < width(2.0)
+    assert width(2.0) == width(3.0) == width(50.0)
+    assert width(-2.0) == width(-9.0) < width(0.0)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.stats import norm
 
+from aerpaw_cmp.compare import statistics
 from aerpaw_cmp.compare.statistics import (
     Autocorrelation,
     autocorrelation,
@@ -133,6 +135,26 @@ def test_interval_of_independent_samples_is_that_of_the_textbook():
     offset, rmse = np.median(ends, axis=0)
     assert offset == pytest.approx(2 * 1.96 * 3 / np.sqrt(n), rel=0.2)
     assert rmse == pytest.approx(2 * 1.96 * 3 / np.sqrt(2 * n), rel=0.2)
+
+
+def test_ends_are_those_of_the_central_95_percent_of_the_draws(monkeypatch):
+    """Of unit-normal draws every interval reaches 1.96 to either side: 90 % would reach 1.64."""
+    normal = norm.ppf((np.arange(20_000) + 0.5) / 20_000)
+    monkeypatch.setattr(statistics, "mean_draws", lambda *_: normal)
+    ramp = np.arange(30.0) - 14.5
+    monkeypatch.setattr(statistics, "power_draws", lambda *_: (ramp.std() + normal) ** 2)
+    monkeypatch.setattr(statistics, "_power_pairs", lambda *_: ((5.0 + normal) ** 2, np.full(len(normal), 9.0)))
+    white = Autocorrelation(n=10_000, block_length=1, n_effective=10_000.0, variance_factor=1.0)
+    found = {
+        "mean": (statistics.mean_interval(ramp), 0.0),
+        "spread": (statistics.spread_interval(ramp), ramp.std()),
+        "pair": (paired_difference(ramp, 2 * ramp).difference_ci95_db, 2.0),
+        "resampled": (interval(0.0, normal, white), 0.0),
+    }
+    for name, (ends, middle) in found.items():
+        assert ends == pytest.approx((middle - 1.96, middle + 1.96), abs=0.01), name
+    low, high = share_interval(0.5, 0.01, white)
+    assert high - low == pytest.approx(2 * 1.96 * 0.01, rel=0.01)
 
 
 def test_a_significant_difference_of_a_flight_of_few_correlation_times_is_found():

@@ -147,3 +147,21 @@ def test_no_origin_for_another_track_or_a_hover() -> None:
     still = flown.assign(latitude_deg=35.73, longitude_deg=-78.7, altitude_m=30.0)
     hover = still.assign(time=np.datetime64(0, "ns") + np.arange(len(still)) * np.timedelta64(1, "s"))
     assert origin_of(stream_of(hover), stream_of(still)) is None, "every origin fits a hover"
+
+
+@pytest.mark.parametrize("north", [True, False])
+def test_places_are_told_apart_along_either_axis(north: bool) -> None:
+    """Tracks that share time are one flight near by and two apart, whether north or east of each other."""
+    from aerpaw_cmp.flight import grouping
+
+    span = (np.datetime64("2025-03-02T15:00:00"), np.datetime64("2025-03-02T15:05:00"))
+
+    def flight(away: float) -> grouping.Flight:
+        place = (35.73 + away * north, -78.7 + away * (not north))
+        return grouping.Flight(files=[], span=span, place=place)
+
+    apart = grouping.APART_DEG
+    assert grouping._meet(flight(0.0), span, (35.73, -78.7))
+    assert grouping._meet(flight(0.9 * apart), span, (35.73, -78.7))
+    for away in (1.1 * apart, -1.1 * apart):
+        assert not grouping._meet(flight(away), span, (35.73, -78.7))

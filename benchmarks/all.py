@@ -65,6 +65,7 @@ SMALLEST: dict[str, list[str]] = {
     "all": ["--only", "kriging", "--no-history"],
     "clock_power": ["sample_logs/UAV", "--quiet"],
     "coverage_of_intervals": ["--flights", "20", "--replicates", "100"],
+    "drafted_reports": ["sample_logs/UAV"],
     "drafts": ["sample_logs"],
     "estimate": [],
     "exports": ["--samples", "20000"],

@@ -54,7 +54,10 @@ class LadderRow:
     seconds : float
         For the whole flight, the same in each of its rows.
     recommended : bool
-        The simplest model within one standard error of the best, over all series of the flight.
+        The simplest model within one standard error of the best, over all series of the flight; the best on other
+        flights, where its calibration knows that.
+    elsewhere_db : (float, float), optional
+        RMSE of the recommended model and of free space on flights left out [dB], where these chose it.
     """
 
     model: str
@@ -66,6 +69,7 @@ class LadderRow:
     n: int
     seconds: float
     recommended: bool
+    elsewhere_db: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +86,8 @@ class Ladder:
     best: int | None
     best_replay: int | None
     recommended: int | None
+    elsewhere_db: tuple[float, float] | None = None
+    """RMSE of the recommended model and of free space on other flights, where these chose it [dB]."""
 
 
 def stretches_of(samples: int, blocks: int = BLOCKS) -> IntArray:
@@ -216,6 +222,7 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[Ladd
                 n=int(np.isfinite(error).sum()),
                 seconds=rung.seconds,
                 recommended=index == ladder.recommended,
+                elsewhere_db=ladder.elsewhere_db if index == ladder.recommended else None,
             )
         )
     return rows

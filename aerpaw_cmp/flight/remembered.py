@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from ..site.learned import Entry, Learned
+import numpy as np
+
+from ..common.errors import InputError, UsageError
+from ..site.learned import Entry, Errors, Learned, find_named, read_learned
+from .data import FlightData, RssSeries
+from .settings import FlightFile, with_learned
 
 SeriesKey = tuple[str, str, str]
 """Tower, channel (``rank`` of rank) and reader of a series of the draft."""
@@ -63,6 +69,39 @@ def propose(known: Learned, site: str, series: Sequence[SeriesKey]) -> Proposal:
         receiver=f"{site}/{receivers[0][0]}" if receivers else None,
         receiver_about=receivers[0][1].about() if receivers else "",
     )
+
+
+def offered(data: FlightData) -> FlightFile | None:
+    """The settings of a flight with the antennas that its site remembers; None where nothing fits its towers.
+
+    Airframes alone are not offered: what an airframe is worth without its tower antenna was not measured.
+    """
+    site = data.settings.site.file
+    series = [(s.tower, s.channel, data.files[int(number)].result.reader)
+              for s in data.rss for number in np.unique(s.log)]  # fmt: skip
+    try:
+        known = propose(read_learned(_beside(site, data.folder)), str(Path(site).with_suffix("")), series)
+    except (InputError, UsageError):
+        return None
+    if len(known.antennas) < 2:
+        return None
+    settings = with_learned(data.settings.model_copy(update={"antennas": dict(known.antennas)}), data.folder)
+    return settings if settings.link != data.settings.link else None
+
+
+def _beside(site: str, folder: Path) -> str | Path:
+    return folder / site if (folder / site).is_file() else site
+
+
+def errors_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> Errors | None:
+    """Errors on flights left out of the learned antennas of a tower and channel; None where no such are used."""
+    name = antennas.get(f"{series.tower}.{series.channel}")
+    if name is None or "uav" not in antennas:
+        return None
+    try:
+        return find_named(name, folder).entry.errors
+    except (InputError, UsageError):
+        return None
 
 
 def _fits(entry: Entry, series: Sequence[SeriesKey]) -> tuple[int, int]:

@@ -43,6 +43,7 @@ from ..compare.spread import StatedSpread, inside_shares
 from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.lock import LOCK_FLOOR_DB
 from ..flight.losses import direct_foliage_m
+from ..flight.remembered import errors_elsewhere
 from ..flight.replay import FlightReplay, Replayed
 from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..flight.training import learned_here
@@ -205,10 +206,18 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             explained_by={name: table.explained for name, table in residual_by.items()},
             simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
             error_bars=None if stated is None else _error_bars(stated, None if trained else score.residual_db),
+            elsewhere=_elsewhere(data, series),
             trained_on=trained or None,
         ),
         stated=stated,
     )
+
+
+def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
+    """Error to expect on another flight, where the antennas of the site say it."""
+    errors = errors_elsewhere(data.settings.antennas, series, data.folder)
+    names = ("rmse_db", "free_space_rmse_db", "rmse_4s_db")
+    return None if errors is None else {name: getattr(errors, name) for name in names}
 
 
 def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[str, float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ from ..compare.result import BASELINE_TITLE
 from ..flight.data import FlightData, RssSeries
 from ..flight.learned_gain import pair_db
 from ..flight.losses import path_loss
+from ..flight.remembered import errors_elsewhere, offered
 from ..flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
 from ..flight.settings import FlightFile, RssSettings
 from ..flight.training import learned_here
@@ -118,6 +119,8 @@ class FlightLadder:
     ladder: Ladder
     models: tuple[Model | None, ...]
     names: tuple[tuple[str, str], ...]
+    offered: Mapping[str, str] = field(default_factory=dict)
+    """Names of learned antennas that the site offers and the flight file does not use."""
 
     @property
     def recommended(self) -> Model | None:
@@ -162,6 +165,10 @@ class _Climber:
         self._data, self._series = data, series
         self._measured = [s.levels.measured_db[s.rows] for s in series]
         self._traced: dict[tuple[int, bool], tuple[Replay, float]] = {}
+        patterns = [p for s in series for a in _arrays(s.replayed.link) for p in a.patterns]
+        self._offer = offered(data) if all(p.name == "iso" for p in patterns) else None
+        own = [s.replayed.link for s in series]
+        self._links = own if self._offer is None else [_link_of(self._offer, data, s) for s in data.rss]
 
     def climb(self) -> FlightLadder:
         """All stages."""
@@ -179,7 +186,31 @@ class _Climber:
         models.append(None)
         rungs.append(self._as_set())
         names = tuple((s.tower, s.channel) for s in self._data.rss)
-        return FlightLadder(ladder=self._scored(rungs), models=tuple(models), names=names)
+        found = FlightLadder(
+            ladder=self._scored(rungs),
+            models=tuple(models),
+            names=names,
+            offered={} if self._offer is None else self._offer.antennas,
+        )
+        return self._by_flights_left_out(found)
+
+    def _by_flights_left_out(self, climbed: FlightLadder) -> FlightLadder:
+        """The learned model, as it was calibrated, where flights left out say that it beats free space."""
+        antennas = (self._offer or self._data.settings).antennas
+        errors = [errors_elsewhere(antennas, series, self._data.folder) for series in self._data.rss]
+        known = [one for one in errors if one is not None]
+        if len(known) < len(errors) or not known:
+            return climbed
+        learned, free = (
+            _root_mean_square([getattr(e, key) for e in known]) for key in ("rmse_db", "free_space_rmse_db")
+        )
+        for attitude in ("logged", "level"):
+            model = Model(antennas="learned", attitude=attitude)
+            at = climbed.models.index(model) if model in climbed.models else None
+            if at is not None and np.isfinite(climbed.ladder.rmse_db[at]) and learned < free:
+                ladder = dataclasses.replace(climbed.ladder, recommended=at, elsewhere_db=(learned, free))
+                return dataclasses.replace(climbed, ladder=ladder)
+        return climbed
 
     def _scored(self, rungs: Sequence[Rung]) -> Ladder:
         return climb(
@@ -192,7 +223,7 @@ class _Climber:
     # the stages: what may be added to the best model so far
 
     def _antennas(self, _best: Model) -> list[Model]:
-        patterns = [p for s in self._series for a in _arrays(s.replayed.link) for p in a.patterns]
+        patterns = [p for link in self._links for a in _arrays(link) for p in a.patterns]
         models = [Model()]
         if all(p.name == "iso" for p in patterns):
             return models
@@ -245,7 +276,7 @@ class _Climber:
     def _as_set(self) -> Rung:
         levels = tuple(s.levels.simulated_db[s.rows] for s in self._series)
         seconds = self._of_flight([s.replayed.replay.seconds for s in self._series])
-        if self._learned_here:
+        if self._learned_here and self._offer is None:
             nothing = tuple(np.full(len(level), np.nan) for level in levels)
             return Rung(model=AS_SET + LEARNED_HERE, level_db=nothing, seconds=seconds)
         return Rung(model=AS_SET, level_db=levels, seconds=seconds)
@@ -261,8 +292,8 @@ class _Climber:
     @cached_property
     def _learned_here(self) -> bool:
         """Whether antennas or settings of the flight file were learned from a log of this very flight."""
-        pairs = zip(self._data.rss, self._series, strict=True)
-        return any(learned_here(self._data, series, s.replayed.link) for series, s in pairs)
+        pairs = zip(self._data.rss, self._links, strict=True)
+        return any(learned_here(self._data, series, link) for series, link in pairs)
 
     def _rung(self, model: Model) -> Rung:
         learned = model.antennas in ("learned", "installed") or model.ground == "rough"
@@ -279,7 +310,7 @@ class _Climber:
         series, rt = self._series[index], self._data.settings.rt
         traced, search_s = self._paths(index, model.buildings)
         begin = time.perf_counter()
-        poses, link = self._poses(series, model.attitude), _link(series.replayed.link, model.antennas)
+        poses, link = self._poses(series, model.attitude), _link(self._links[index], model.antennas)
         paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
         wanted = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
         loss = path_loss(self._data.site, wanted, link.carrier_hz)
@@ -319,6 +350,16 @@ class _Climber:
         return Poses(whole.position_m[series.picked], np.ascontiguousarray(turn[series.picked]))
 
 
+def _root_mean_square(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _link_of(settings: FlightFile, data: FlightData, series: RssSeries) -> Link:
+    """The link of a series as other settings have it."""
+    link = settings.link.channels.get(series.channel, settings.link.rss)
+    return link.build([series.tower], data.folder)
+
+
 def _arrays(link: Link) -> list[Any]:
     return [*link.tower_arrays.values(), link.uav_array]
 
@@ -337,7 +378,9 @@ def _link(link: Link, antennas: Antennas) -> Link:
     )
 
 
-def recommended_settings(settings: Mapping[str, Any], model: Model | None) -> dict[str, Any]:
+def recommended_settings(
+    settings: Mapping[str, Any], model: Model | None, offered: Mapping[str, str] | None = None
+) -> dict[str, Any]:
     """flight.yaml as nested mappings with the settings of a model; None leaves it as it is.
 
     Parameters
@@ -346,11 +389,19 @@ def recommended_settings(settings: Mapping[str, Any], model: Model | None) -> di
         The keys that the flight file states.
     model : Model or None
         See :attr:`FlightLadder.recommended`.
+    offered : mapping of str to str, optional
+        Learned antennas of the site by name, which a learned model takes.
+
+    Returns
+    -------
+    dict
     """
     result = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
     result.pop("antennas", None)  # the names of learned antennas: link holds their files by now
     if model is None:
         return result
+    if offered and model.antennas == "learned":
+        result["antennas"] = dict(offered)
     changes = model.settings(int(result.get("rt", {}).get("max_depth", 2)))
     for section, change in changes.items():
         result[section] = {**result.get(section, {}), **change}
@@ -405,10 +456,13 @@ def recommended_text(settings: FlightFile, ladder: FlightLadder | None, name: st
             expected="RSS with known poses, replayed by the image engine (rt.engine: image)",
         )
     stated = settings.model_dump(mode="json", exclude_unset=True)
-    changed = recommended_settings(stated, ladder.recommended)
+    changed = recommended_settings(stated, ladder.recommended, ladder.offered)
     chosen = ladder.ladder.rungs[ladder.ladder.recommended].model
     rmse = ladder.ladder.rmse_db[ladder.ladder.recommended]
     head = f"# {name} with the model that its ladder recommends: {chosen} ({rmse:.2f} dB on held-out segments).\n"
+    if ladder.ladder.elsewhere_db is not None:
+        learned, free = ladder.ladder.elsewhere_db
+        head += f"# On flights left out of its antennas: {learned:.2f} dB, free space {free:.2f} dB.\n"
     text = head + yaml.safe_dump(changed, sort_keys=False, allow_unicode=True, width=120)
     parse_yaml(text, FlightFile)  # a flight file that its own reader refuses is a fault of ours
     return text

@@ -19,6 +19,7 @@ from .words import (
     Judged,
     audit_paths,
     count,
+    expected_sentence,
     first_sentence,
     local_error,
     pretty,
@@ -48,10 +49,12 @@ def verdict(data: ReportData) -> tuple[str, ...]:
     found = judged(scored)
     first = first_sentence(found) if found is not None else _rank_sentence(data.rank)
     if learned := _training(data):
+        learned = " ".join(part for part in (learned, expected_sentence(data.rss)) if part)
         return learned, " ".join(part for part in (_baseline_sentence(data.rss), first, trust(data)) if part)
     if not first:
         most = max([panel.n for panel in data.rss], default=0)
         return (NOTHING_COMPARED if not most else TOO_FEW_COMPARED.format(n=most), trust(data))
+    first = " ".join(part for part in (first, expected_sentence(scored)) if part)
     return first, " ".join(part for part in (_fails(scored), trust(data)) if part)
 
 

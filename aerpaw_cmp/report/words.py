@@ -121,6 +121,18 @@ def first_sentence(facts: Judged) -> str:
     return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{beside}. {said}"
 
 
+def expected_sentence(panels: Sequence[RssPanel]) -> str:
+    """The error to expect on another flight; nothing unless every scored channel has it from flights left out."""
+    known = [panel.extra.get("elsewhere") for panel in panels]
+    if not known or not all(known):
+        return ""
+    learned, free = (
+        math.sqrt(sum(one[name] ** 2 for one in known if one) / len(known))
+        for name in ("rmse_db", "free_space_rmse_db")
+    )
+    return f"Expect {learned:.1f} dB on another flight (free space {free:.1f} dB)."
+
+
 def local_error(panel: RssPanel, span: ErrorSpan) -> str:
     """Where a channel is missed most, and the likely causes, those of the measurement first."""
     causes = []
@@ -255,9 +267,10 @@ AS_SET = "as set in flight.yaml"
 def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
     """Cross-validated errors of this replay, of the baselines and of the recommended model."""
     rows = [row for row in ladder if math.isfinite(row.rmse_heldout_db)]
-    chosen = next((row.model for row in rows if row.recommended), None)
-    if chosen is None:
+    best = next((row for row in rows if row.recommended), None)
+    if best is None:
         return ""
+    chosen = best.model
     error = {row.model: _pooled([r for r in rows if r.model == row.model]) for row in rows}
     beside = [f"{name} {error[name]:.1f} dB" for name in (AS_SET, *BASELINE_TITLE.values()) if name in error]
     least = min(error, key=lambda name: error[name])
@@ -265,6 +278,8 @@ def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
     if least in (BASELINE_TITLE["log_distance"], BASELINE_TITLE["constant"]):
         text += f" The {least}, which replays nothing, has the smallest error of all models."
     how = "the simplest replay within one standard error of the best replay"
+    if best.elsewhere_db is not None:
+        how = "the best on other flights ({:.1f} dB, free space {:.1f} dB)".format(*best.elsewhere_db)
     if chosen == AS_SET:
         return f"{text} The settings of this flight file are {how}."
     return (

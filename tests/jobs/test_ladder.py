@@ -16,6 +16,7 @@ from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.jobs.ladder import Model, _Climber, recommended_settings
+from aerpaw_cmp.site.learned import Entry, Errors, LearnedSeries, folder_of, remember
 from aerpaw_cmp.site.sphere_pattern import sphere_csv
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -115,6 +116,64 @@ def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> N
         assert all(("not scored" in name) != scored for name in learned)
         assert np.isfinite(rows["free space"].rmse_heldout_db)
         assert recommended_settings(stated, Model(antennas="learned"))["link"] == stated["link"]
+
+
+def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64) -> Path:
+    """The planted flight at a site whose memory has antennas for its tower and channel; its own file names none."""
+    site = folder / "mine.yaml"
+    site.write_bytes(Path(str(folder_of("lake_wheeler"))).with_suffix(".yaml").read_bytes())
+    rows, columns = np.mgrid[0:19, 0:24]
+    table = 2.0 * np.cos(np.radians(15.0 * columns)) + 0.1 * rows
+    sphere = sphere_csv(table, np.ones(table.shape), (f"aerpaw-cmp calibrate: some, trained_on sha256 {trained_on}",))
+    series = LearnedSeries(
+        tower="LW1",
+        channel="A",
+        reader="generic_csv",
+        carrier_hz=3.3e9,
+        tower_file="t.csv.gz",
+        uav_file="u.csv.gz",
+        sd_db=1.0,
+    )
+    errors = Errors(series=2, rmse_db=learned_db, rmse_4s_db=2.0, free_space_rmse_db=5.0, inside_90=0.9)
+    entry = Entry(
+        command="made here",
+        made="2026-11-23",
+        flights=["a", "b"],
+        flown=[],
+        trained_on=[trained_on],
+        series=[series],
+        errors=errors,
+    )
+    remember(site, "some", entry, {"t.csv.gz": sphere.encode(), "u.csv.gz": sphere.encode()})
+    path = flight(folder)
+    path.write_text(path.read_text().replace("file: lake_wheeler", "file: mine.yaml"), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(("learned_db", "chosen"), [(3.5, True), (5.5, False)])
+def test_an_isotropic_flight_is_offered_what_its_site_remembers(
+    learned_db: float, chosen: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Free space wins on this flight; on other flights the learned antennas do, or they do not."""
+    path = remembering(tmp_path, learned_db)
+    metrics = report(path, capsys, "--recommend", str(tmp_path / "best.yaml"))
+    rungs = {row["model"]: row for row in metrics["ladder"]}
+    assert {"learned sphere", "learned sphere + heading"} <= set(rungs)
+    assert rungs["learned sphere + heading"]["recommended"] == chosen
+    assert rungs["free space"]["rmse_heldout_db"] < rungs["learned sphere + heading"]["rmse_heldout_db"]
+    best = load_flight(tmp_path / "best.yaml")
+    assert bool(best.antennas) == chosen
+    text = (tmp_path / "best.yaml").read_text()
+    assert ("On flights left out of its antennas: 3.50 dB, free space 5.00 dB" in text) == chosen
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert ("best on other flights (3.5 dB, free space 5.0 dB)" in page) == chosen
+    assert main(["report", str(tmp_path / "best.yaml"), "-o", str(tmp_path / "again"), "--json"]) == 0
+    first = json.loads(capsys.readouterr().out)["rss"]["LW1"]["A"]
+    assert first.get("elsewhere") == (
+        {"rmse_db": 3.5, "free_space_rmse_db": 5.0, "rmse_4s_db": 2.0} if chosen else None
+    )
+    page = (tmp_path / "again" / "report.html").read_text(encoding="utf-8")
+    assert ("Expect 3.5 dB on another flight (free space 5.0 dB)." in page) == chosen
 
 
 def test_recommended_file_must_stand_beside_its_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -48,7 +48,7 @@ from ..maps.job import (
     map_job,
 )
 from ..maps.netcdf import write_netcdf
-from ..maps.study import HeldOutStudy, Study, held_out_study, rank_fields, rank_study
+from ..maps.study import HeldOutStudy, Study, held_out_study, interpolation_study, rank_fields
 from ..maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ..propagation.arrays import Link, Poses, linear_array, single_element
 from ..propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
@@ -402,9 +402,10 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
         )
     local: dict[str, Any] = {"neighbours": s.neighbours, "radius_m": s.reach_m, "seed": s.seed}
     with stages("leave one out"):
-        outcome.studies["missing"] = rank_study(result, **local)
-        outcome.studies["zero"] = rank_study(result, out_of_coverage="zero", **local)
-        outcome.studies["random"] = rank_study(result, out_of_coverage="zero", selection="random", **local)
+        zeros, towers = rank_fields(result, "zero")[1], result.towers_m
+        outcome.studies["missing"] = interpolation_study(result.grid, rank, towers, **local)
+        outcome.studies["zero"] = interpolation_study(result.grid, zeros, towers, **local)
+        outcome.studies["random"] = interpolation_study(result.grid, zeros, towers, selection="random", **local)
     with stages("correlation"):
         points, width = result.grid.points_m, s.spacing_m
         outcome.correlations = {

@@ -38,6 +38,8 @@ from .variogram import (
     vertical_correlation,
 )
 
+LOWEST_M = 30.0
+
 
 @dataclass(frozen=True, slots=True)
 class Study:
@@ -66,54 +68,18 @@ class Study:
 
 
 def rank_fields(
-    result: MapResult, lowest_altitude_m: float = 30.0, out_of_coverage: Literal["missing", "zero"] = "missing"
+    result: MapResult, out_of_coverage: Literal["missing", "zero"] = "missing"
 ) -> tuple[tuple[float, ...], FloatArray]:
-    """Altitudes and joint ranks (n, altitudes, K) to interpolate; the paper leaves 3 m out.
+    """Altitudes and joint ranks (n, altitudes, K) to interpolate, from 30 m on: the paper leaves 3 m out.
 
     ``out_of_coverage``: a rank of 0 becomes NaN (no sample), or stays the number 0.
 
     Source: arXiv 2502.10324 eq. 7; arXiv 2502.10324 eq. 8.
     """
-    rows = [i for i, height in enumerate(result.rank_altitudes_m) if height >= lowest_altitude_m]
+    rows = [i for i, height in enumerate(result.rank_altitudes_m) if height >= LOWEST_M]
     rank = np.moveaxis(result.ranks()[rows], -1, 0).astype(np.float64)
     heights = tuple(result.rank_altitudes_m[i] for i in rows)
     return heights, without_coverage_as_nan(rank) if out_of_coverage == "missing" else rank
-
-
-def rank_study(
-    result: MapResult,
-    *,
-    lowest_altitude_m: float = 30.0,
-    out_of_coverage: Literal["missing", "zero"] = "missing",
-    neighbours: int = 20,
-    radius_m: float = 150.0,
-    selection: Literal["nearest", "random"] = "nearest",
-    seed: int = 0,
-) -> Study:
-    """:func:`interpolation_study` of the joint rank maps; see :func:`rank_fields`.
-
-    Parameters
-    ----------
-    result : MapResult
-    lowest_altitude_m : float
-        Maps below it are left out.
-    out_of_coverage : {"missing", "zero"}
-        A position without a channel as no sample, or as rank 0.
-    neighbours, radius_m : int, float
-        M and r0 of the interpolators.
-    selection : {"nearest", "random"}
-        Which M samples within r0 count.
-    seed : int
-        Of the random selection.
-
-    Returns
-    -------
-    Study
-    """
-    _, rank = rank_fields(result, lowest_altitude_m, out_of_coverage)
-    return interpolation_study(
-        result.grid, rank, result.towers_m, neighbours=neighbours, radius_m=radius_m, selection=selection, seed=seed
-    )
 
 
 def interpolation_study(

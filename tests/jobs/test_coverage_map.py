@@ -224,7 +224,7 @@ def made(tmp_path_factory):
 
 def test_the_command_prints_one_object_that_is_the_metrics(made):
     folder, printed = made
-    assert printed == json.loads((folder / "metrics.json").read_text())
+    assert printed == {"schema": 1, **json.loads((folder / "metrics.json").read_text())}
     assert printed["grid"] == {"columns": 6, "rows": 11, "positions": 66}
     assert {(m["antennas"], m["foliage"]) for m in printed["coverage"]} == {
         (a, f) for a in ("SISO", "MIMO") for f in ("none", "opaque")
@@ -273,7 +273,7 @@ def test_the_page_shows_every_figure_of_the_paper_rows(made):
     assert named
     assert named <= stems
     for name in named:
-        assert f'id="{name}"' in html
+        assert f'id="figure-{name}"' in html
     assert "illustrative" in html
     what = {row["what"] for row in printed["paper"]}
     assert {"out of coverage at 3 m", "c1 of the bi-exponential model"} <= what

@@ -20,7 +20,6 @@ from aerpaw_cmp.maps.study import (
     held_out_study,
     interpolation_study,
     rank_fields,
-    rank_study,
 )
 
 GRID = Grid.over_area((-300.0, 300.0, -300.0, 300.0))
@@ -168,8 +167,8 @@ def test_layer_names_take_any_altitude_k_and_tower():
 
 
 def test_rank_study_runs_the_papers_comparison(result):
-    study = rank_study(result)
     heights, rank = rank_fields(result)
+    study = interpolation_study(GRID, rank, result.towers_m)
     assert heights == (30.0, 40.0, 50.0)
     assert rank.shape == (len(GRID), 3, 2)
     assert set(study.scores) == {"Kriging", "makima", "spline", "nearest", "inverse distance", "serving-tower mean"}
@@ -182,7 +181,7 @@ def test_rank_study_runs_the_papers_comparison(result):
     out = (result.ranks()[1:] == 0).sum(axis=-1)
     np.testing.assert_array_equal(study.scores["Kriging"].n + study.scores["Kriging"].unpredicted, len(GRID) - out)
     assert study.scores["Kriging"].mae.mean() < study.scores["serving-tower mean"].mae.mean()
-    zeros = rank_study(result, out_of_coverage="zero")
+    zeros = interpolation_study(GRID, rank_fields(result, "zero")[1], result.towers_m)
     assert (zeros.scores["Kriging"].n == len(GRID)).all()
 
 
@@ -191,7 +190,8 @@ def test_rank_study_of_a_flat_map_says_so():
         one = np.ones((len(position_m), len(names)))
         return Evaluation(-one, -one, np.stack([one, 0 * one, 0 * one, 0 * one], axis=-1))
 
-    study = rank_study(map_job(GRID, TOWERS, flat, rss_altitudes_m=(), rank_altitudes_m=(30, 40)))
+    made = map_job(GRID, TOWERS, flat, rss_altitudes_m=(), rank_altitudes_m=(30, 40))
+    study = interpolation_study(GRID, rank_fields(made)[1], made.towers_m)
     assert study.fit.degenerate
     assert "stands in" in study.fit.message
     assert (study.scores["Kriging"].mae == 0).all()
@@ -225,7 +225,7 @@ def test_rss_is_studied_like_rank(result):
 
 def test_honest_study_is_harder_than_leave_one_out(result):
     heights, rank = rank_fields(result)
-    study = rank_study(result)
+    study = interpolation_study(GRID, rank, result.towers_m)
     flight = np.column_stack([np.linspace(-300, 300, 400), 50 * np.sin(np.linspace(0, 9, 400))])
     found = held_out_study(
         GRID, heights, rank, study.fit, trajectory_m=flight, block_m=200.0, learning_sizes=(20, 100, 9999)

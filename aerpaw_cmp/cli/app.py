@@ -54,11 +54,9 @@ LogsRoot = Annotated[
 Workers = Annotated[int, typer.Option(min=1, help="Workers of this machine that share the tasks.")]
 Scheduler = Annotated[
     Optional[str],  # noqa: UP045
-    typer.Option("--scheduler", "--cluster", help="Address of a Dask scheduler, in place of workers here."),
+    typer.Option("--scheduler", "--cluster", help="Address of a Dask scheduler, instead of local workers."),
 ]
-DryRun = Annotated[
-    bool, typer.Option("--dry-run", help="Only say what would run and about how long; nothing is written.")
-]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print stages and time estimate; write nothing.")]
 Quiet = Annotated[
     bool,
     typer.Option("-q", "--quiet", help="Results, warnings and failures only."),

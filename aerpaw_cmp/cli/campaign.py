@@ -27,7 +27,7 @@ def campaign(
         list[str],
         typer.Argument(
             metavar="[status|resume] CAMPAIGN",
-            help="campaign.yaml; with 'status', what is kept and what is to do; with 'resume', that and then the rest.",
+            help="campaign.yaml; 'status' lists finished and open tasks; 'resume' lists them and runs the open tasks.",
         ),
     ],
     out: Annotated[
@@ -39,11 +39,11 @@ def campaign(
     scheduler: Scheduler = None,
     keep: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Folder or URL of the outcomes of tasks; a rerun computes only what is missing there."),
+        typer.Option(help="Folder or URL for task outcomes; a rerun computes missing outcomes only."),
     ] = None,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Keep no outcomes and take none.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Ignore stored outcomes and store none.")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Tell what is kept, what would be computed and how long; compute nothing.")
+        bool, typer.Option("--dry-run", help="List finished tasks, open tasks and the time estimate; compute nothing.")
     ] = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")

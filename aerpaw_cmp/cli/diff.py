@@ -29,8 +29,10 @@ def diff(
             "-o", "--out", metavar="DIR", help="Folder for diff.html and diff.json  [default: none is written]"
         ),
     ] = None,
-    tolerance: Annotated[float, typer.Option(help="Differences up to so many dB count as none.")] = 0.01,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when numbers differ by more.")] = False,
+    tolerance: Annotated[float, typer.Option(help="Largest difference that counts as equal [dB].")] = 0.01,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Exit code 1 when a number differs by more than the tolerance.")
+    ] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> int:

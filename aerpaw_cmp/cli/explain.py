@@ -22,14 +22,16 @@ from .shown import number, print_json, say, table
 def explain(
     flight: Annotated[Path, typer.Argument(help="flight.yaml")],
     time: Annotated[str, typer.Option(help="Seconds after the first sample, or ISO 8601 (time_utc of rss.csv).")],
-    tower: Annotated[str, typer.Option(help="Whose link.")],
+    tower: Annotated[str, typer.Option(help="Tower of the link.")],
     channel: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Of the RSS logs, or 'rank'; default: the tower's first log."),
+        typer.Option(help="Channel of the RSS logs, or 'rank'  [default: first log of the tower]"),
     ] = None,
     engine: Annotated[
         Optional[Literal["image", "sionna", "both"]],  # noqa: UP045
-        typer.Option(help="Whose paths, in place of rt.engine; both: also what either lacks, and why."),
+        typer.Option(
+            help="Path search; both: also paths that one search misses, with the reason  [default: rt.engine]"
+        ),
     ] = None,
     logs_root: LogsRoot = None,
     as_json: Json = False,

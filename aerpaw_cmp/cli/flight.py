@@ -35,19 +35,19 @@ def report(
     logs_root: LogsRoot = None,
     engine: Annotated[
         Optional[Literal["image", "sionna"]],  # noqa: UP045
-        typer.Option(help="In place of rt.engine."),
+        typer.Option(help="Path search  [default: rt.engine]"),
     ] = None,
     audit: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Number of audited links, 'full', 'none', or 'later' (the command audit fills it in)."),
+        typer.Option(help="Number of audited links, 'full', 'none', or 'later' ('aerpaw-cmp audit' adds it)."),
     ] = None,
     recommend: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option("--recommend", help="Write the flight file with the settings of the model that the scene needs."),
+        typer.Option("--recommend", help="Write a flight.yaml with the recommended model."),
     ] = None,
     learned: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option("--with", metavar="CALIBRATED", help="Antennas, ground and receiver of this calibrated.yaml."),
+        typer.Option("--with", metavar="CALIBRATED", help="calibrated.yaml with antennas, ground and receiver."),
     ] = None,
     against: Annotated[
         Optional[Path],  # noqa: UP045
@@ -56,11 +56,11 @@ def report(
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
         Literal["page", "none", "svg", "png", "pdf", "all"],
-        typer.Option(help="What is drawn: what the page shows, nothing, or every figure in one format or in all."),
+        typer.Option(help="Figures to draw: those of the page, none, or all in one format or in every format."),
     ] = "page",
     style: Annotated[
         Literal["screen", "paper"],
-        typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded)."),
+        typer.Option(help="Figure style: screen, or paper (IEEE width, fonts embedded)."),
     ] = "screen",
     export: Export = None,
     dry_run: DryRun = False,
@@ -249,11 +249,13 @@ def calibrate(
     logs_root: LogsRoot = None,
     into_site: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option("--into-site", metavar="SITE", help="Let this site remember it: drafts then use it by name."),
+        typer.Option(
+            "--into-site", metavar="SITE", help="Site that stores the learned antennas; drafts then use them by name."
+        ),
     ] = None,
     score: Annotated[
         Optional[list[Path]],  # noqa: UP045
-        typer.Option(help="Also score this flight.yaml with all that was learned; may be repeated."),
+        typer.Option(help="flight.yaml to score with the learned settings; repeatable."),
     ] = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,
@@ -337,7 +339,7 @@ def simulate(
 )
 def sample(
     out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="DIR", help="Folder that gets flight.yaml and the logs.")
+        Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for flight.yaml and the logs.")
     ] = Path("sample"),
     force: Force = False,
     as_json: Json = False,

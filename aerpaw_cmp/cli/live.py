@@ -44,7 +44,7 @@ class WebCommand(TyperCommand):
 def tap(
     port: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Argument(help="Serial port, or several; without it the first AT port of a Quectel."),
+        typer.Argument(help="Serial port, or several  [default: the first AT port of a Quectel modem]"),
     ] = None,
     out: Annotated[
         Path,
@@ -58,23 +58,23 @@ def tap(
     ] = False,
     ri_hz: Annotated[float, typer.Option(help="Rate of the rank indicator.")] = 2.0,
     other_hz: Annotated[float, typer.Option(help="Rate of each other query.")] = 1.0,
-    no_csi_alarm: Annotated[Optional[float], typer.Option(help="Bell when no CSI came for so many seconds.")] = None,  # noqa: UP045
-    no_csi_exit: Annotated[bool, typer.Option("--no-csi-exit", help="End with exit code 1 on that alarm.")] = False,
-    sync_s: Annotated[float, typer.Option(help="Longest time between a record and its sync to disk.")] = 1.0,
-    duration: Annotated[Optional[float], typer.Option(help="End by itself after so many seconds.")] = None,  # noqa: UP045
-    wait: Annotated[float, typer.Option(help="Wait so many seconds for the port to appear.")] = 0.0,
+    no_csi_alarm: Annotated[Optional[float], typer.Option(help="Seconds without CSI until the bell rings.")] = None,  # noqa: UP045
+    no_csi_exit: Annotated[bool, typer.Option("--no-csi-exit", help="Exit with code 1 on that alarm.")] = False,
+    sync_s: Annotated[float, typer.Option(help="Longest time between a record and its sync to disk [s].")] = 1.0,
+    duration: Annotated[Optional[float], typer.Option(help="Stop after this many seconds.")] = None,  # noqa: UP045
+    wait: Annotated[float, typer.Option(help="Seconds to wait for the port.")] = 0.0,
     web: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(help=f"Also show the flight as a page, at HOST:PORT [default: {WEB}]; 0.0.0.0 asks for a token."),
     ] = None,
     play: Annotated[
         Optional[list[Path]],  # noqa: UP045
-        typer.Option(help="Show an earlier log as that page and tap nothing; repeat it for several modems."),
+        typer.Option(help="Earlier log to show on the page; nothing is tapped; repeatable."),
     ] = None,
     speed: Annotated[float, typer.Option(help="Seconds of the log per second, with --play.")] = 1.0,
     export: Annotated[
         Optional[Literal["csv"]],  # noqa: UP045
-        typer.Option(help="Write the log below OUT as a table and end."),
+        typer.Option(help="Write the log below OUT as a table and stop."),
     ] = None,
     flight: Annotated[Path | None, typer.Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
     telemetry: Annotated[Path | None, typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,
@@ -178,17 +178,19 @@ def _needs_posix(command: str) -> None:
     ],
 )
 def modem_sim(
-    link: Annotated[Optional[Path], typer.Option(help="Symbolic link to the port, kept right.")] = None,  # noqa: UP045
+    link: Annotated[Path | None, typer.Option(help="Symbolic link to the port, updated when the port changes.")] = None,
     source: Annotated[
-        Path | None, typer.Option(help="What to play: a transcript, a tap log, or any log with ranks.")
+        Path | None, typer.Option(help="Log to play: a transcript, a tap log, or any log with ranks.")
     ] = None,
     kind: Annotated[
-        Literal["modem", "gps", "diag", "silent", "rubbish"], typer.Option(help="What the port behaves like.")
+        Literal["modem", "gps", "diag", "silent", "rubbish"], typer.Option(help="Device to imitate.")
     ] = "modem",
     flight: Annotated[
         Path | None, typer.Option(help="flight.yaml: fly it again from now on, with its ranks; needs --telemetry.")
     ] = None,
-    telemetry: Annotated[Path | None, typer.Option(help="New file for the telemetry of --flight, which grows.")] = None,
+    telemetry: Annotated[
+        Path | None, typer.Option(help="New telemetry file for --flight; it grows during the flight.")
+    ] = None,
     fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045
     as_json: Json = False,
 ) -> int:

@@ -30,20 +30,22 @@ def ingest(
     draft: Annotated[Optional[Path], typer.Option(help="Also write a first flight.yaml that names these logs.")] = None,  # noqa: UP045
     site: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Site of the draft, whose memory of antennas it uses.  [default: lake_wheeler]"),
+        typer.Option(help="Site of the draft; its learned antennas are used  [default: lake_wheeler]"),
     ] = None,
-    reader: Annotated[Optional[str], typer.Option(help="Reader of all files, in place of sniffing.")] = None,  # noqa: UP045
-    timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
-    time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
+    reader: Annotated[Optional[str], typer.Option(help="Reader for all files  [default: detected by content]")] = None,  # noqa: UP045
+    timezone: Annotated[
+        str | None, typer.Option(help="IANA time zone of clocks without a zone, such as America/New_York.")
+    ] = None,
+    time_origin: Annotated[str | None, typer.Option(help="Start time (ISO 8601) of logs with relative times.")] = None,
     ri_base: Annotated[
         Optional[Literal["zero", "one"]],  # noqa: UP045
-        typer.Option(help="What the source prints for rank 1."),
+        typer.Option(help="Number that the log prints for rank 1."),
     ] = None,
     columns: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option("--map", metavar="COLUMN=QUANTITY", help="What a column of a CSV holds: time, rss_db, rank, ..."),
+        typer.Option("--map", metavar="COLUMN=QUANTITY", help="Content of a CSV column: time, rss_db, rank, ..."),
     ] = None,
-    unit: Annotated[Optional[str], typer.Option(help="Unit of levels where the file does not fix it.")] = None,  # noqa: UP045
+    unit: Annotated[Optional[str], typer.Option(help="Unit of levels, if the file does not state it.")] = None,  # noqa: UP045
     force: Force = False,
     as_json: Json = False,
 ) -> None:

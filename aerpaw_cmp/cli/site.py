@@ -26,7 +26,7 @@ def site_import(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The site.yaml to write.")],
     base: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Site whose towers and settings are kept. Default: lake_wheeler; none for a scene."),
+        typer.Option(help="Site that gives towers and settings  [default: lake_wheeler; none for a scene]"),
     ] = None,
     origin: Annotated[
         Optional[str],  # noqa: UP045
@@ -34,17 +34,19 @@ def site_import(
     ] = None,
     tower: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option(help="Scene: name=east,north,height [m] of an antenna; may be repeated."),
+        typer.Option(help="Scene: name=east,north,height [m] of an antenna; repeatable."),
     ] = None,
     material: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option(help="Scene: id=concrete for a material that says nothing about radio; may be repeated."),
+        typer.Option(help="Scene: id=concrete, for a material without radio properties; repeatable."),
     ] = None,
-    turn: Annotated[float, typer.Option(help="Scene: degrees counter-clockwise that x lies from east.")] = 0.0,
-    merge_m: Annotated[float, typer.Option(help="Scene: corners of a face lie this near to one plane [m].")] = 1e-3,
+    turn: Annotated[float, typer.Option(help="Scene: angle of the x axis, counter-clockwise from east [deg].")] = 0.0,
+    merge_m: Annotated[
+        float, typer.Option(help="Scene: largest distance of a face's corners from its plane [m].")
+    ] = 1e-3,
     untagged: Annotated[
         Optional[Literal["building", "forest", "geofence"]],  # noqa: UP045
-        typer.Option(help="What areas without a tag are."),
+        typer.Option(help="Kind of the areas without a tag."),
     ] = None,
     force: Force = False,
     as_json: Json = False,
@@ -84,7 +86,7 @@ def site_import(
 def site_export(
     site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")],
     out: Annotated[Path, typer.Option("-o", "--out", "--sionna", metavar="DIR", help="Output folder.")],
-    trees: Annotated[bool, typer.Option("--trees/--no-trees", help="Crowns and trunks, too.")] = True,
+    trees: Annotated[bool, typer.Option("--trees/--no-trees", help="Also export crowns and trunks.")] = True,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -106,7 +108,9 @@ def site_export(
     ],
 )
 def site_show(
-    site: Annotated[Optional[str], typer.Argument(help="site.yaml or packaged site; else the flight's.")] = None,  # noqa: UP045
+    site: Annotated[
+        str | None, typer.Argument(help="site.yaml or packaged site  [default: that of --flight, else lake_wheeler]")
+    ] = None,
     out: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/site-<site>]"),
@@ -149,34 +153,36 @@ def map_(
     quick: Annotated[bool, typer.Option("--quick", help="A coarse map in seconds: 120 m, three heights.")] = False,
     foliage: Annotated[
         Optional[list[str]],  # noqa: UP045
-        typer.Option(help="none, attenuating, opaque or all; may be repeated. Default: all."),
+        typer.Option(help="none, attenuating, opaque or all; repeatable  [default: all]"),
     ] = None,
     crown_reflections: Annotated[
-        bool, typer.Option("--crown-reflections/--no-crown-reflections", help="Opaque crowns reflect, too.")
+        bool, typer.Option("--crown-reflections/--no-crown-reflections", help="Opaque crowns also reflect.")
     ] = True,
-    spacing: Annotated[Optional[float], typer.Option(help="Between positions [m]. Default: 30.")] = None,  # noqa: UP045
+    spacing: Annotated[Optional[float], typer.Option(help="Distance between positions [m]  [default: 30]")] = None,  # noqa: UP045
     rss_altitude: Annotated[
         Optional[list[float]],  # noqa: UP045
-        typer.Option(help="Height of RSS maps [m]; may be repeated. Default: 30, 70, 110."),
+        typer.Option(help="Height of RSS maps [m]; repeatable  [default: 30, 70, 110]"),
     ] = None,
     rank_altitude: Annotated[
         Optional[list[float]],  # noqa: UP045
-        typer.Option(help="Height of rank maps [m]; may be repeated. Default: 3 and 30 to 110 by 10."),
+        typer.Option(help="Height of rank maps [m]; repeatable  [default: 3 and 30 to 110 by 10]"),
     ] = None,
     k: Annotated[
         Optional[list[float]],  # noqa: UP045
-        typer.Option("-k", "--k", help="Singular-value ratio; may be repeated. Default: 10, 100, 1000."),
+        typer.Option("-k", "--k", help="Singular-value ratio K; repeatable  [default: 10, 100, 1000]"),
     ] = None,
-    carrier_ghz: Annotated[Optional[float], typer.Option(help="Default: 3.4.")] = None,  # noqa: UP045
+    carrier_ghz: Annotated[Optional[float], typer.Option(help="Carrier frequency [GHz]  [default: 3.4]")] = None,  # noqa: UP045
     engine: Annotated[
         Optional[Literal["image", "sionna"]],  # noqa: UP045
-        typer.Option(help="Default: image."),
+        typer.Option(help="Path search  [default: image]"),
     ] = None,
-    max_depth: Annotated[Optional[int], typer.Option(min=0, max=3, help="Reflections. Default: 2.")] = None,  # noqa: UP045
-    samples: Annotated[Optional[int], typer.Option(min=1, help="Rays per tower, sionna only. Default: 1e6.")] = None,  # noqa: UP045
+    max_depth: Annotated[
+        int | None, typer.Option(min=0, max=3, help="Largest number of reflections  [default: 2]")
+    ] = None,
+    samples: Annotated[Optional[int], typer.Option(min=1, help="Rays per tower (sionna only)  [default: 1e6]")] = None,  # noqa: UP045
     flight: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="flight.yaml whose track trains the test 'along a flight'."),
+        typer.Option(help="flight.yaml whose track is the training set of the test 'along a flight'."),
     ] = None,
     flights: Annotated[
         Optional[list[Path]],  # noqa: UP045
@@ -185,9 +191,11 @@ def map_(
     logs_root: LogsRoot = None,
     threshold_dbm: Annotated[
         Optional[float],  # noqa: UP045
-        typer.Option(help="A level below it is out of coverage. Default: only no path is."),
+        typer.Option(help="Lowest level in coverage [dBm]  [default: any path is coverage]"),
     ] = None,
-    study: Annotated[bool, typer.Option("--study/--no-study", help="Correlation and interpolation, too.")] = True,
+    study: Annotated[
+        bool, typer.Option("--study/--no-study", help="Also spatial correlation and interpolation.")
+    ] = True,
     workers: Workers = 1,
     scheduler: Scheduler = None,
     dry_run: DryRun = False,

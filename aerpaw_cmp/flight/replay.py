@@ -488,7 +488,7 @@ def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
         raise UsageError(
             f"rt.relevance_db with towers.{name}, which moves",
             expected="a tower that stands still, or no rt.relevance_db",
-            cause="which buildings matter is told for one place of the tower",
+            cause="the relevance of a building depends on the place of the tower",
         )
     if rt.power_cut_db is not None:
         raise UsageError(

@@ -145,7 +145,7 @@ def _logs(data: FlightData, account: _Account) -> list[Log | None]:
         if content is None:
             account.leave(f"{settings.path} (packed, larger than 32 MiB, or read in pieces)")
         elif zone is None or settings.clock == "local_as_utc" or settings.time_origin or settings.columns:
-            account.leave(f"{settings.path} (its times or columns are told by the flight file)")
+            account.leave(f"{settings.path} (the flight file states its times or columns)")
         else:
             try:
                 log = read_log(content, zone)

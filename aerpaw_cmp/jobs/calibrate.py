@@ -578,9 +578,9 @@ def words_of(
         gain = free - here
         share = (base - left) / gain if gain > 0 else 0.0
         out.append(
-            f"Towards sectors of directions that the other flights never saw, with offsets from outside the sector, it "
-            f"leaves {left:.2f} dB and free space {base:.2f} dB: {100 * min(max(share, 0.0), 1.0):.0f} % of the gain "
-            "over free space carries over to new directions."
+            "Towards sectors of directions that no training flight has seen, with offsets from outside the sector: "
+            f"RMSE {left:.2f} dB, free space {base:.2f} dB. {100 * min(max(share, 0.0), 1.0):.0f} % of the gain over "
+            "free space carries over to new directions."
         )
     body, world, wrong = (
         mean(controls.get(name, ())) for name in
@@ -590,7 +590,7 @@ def words_of(
         kind = (
             "at least partly antenna"
             if body < min(world, wrong) - 0.05
-            else ("not told apart from the place: the headings are too much alike")
+            else "not separable from the place: the headings are too similar"
         )
         out.append(
             f"Without patterns, the UAV's gain in the body frame leaves {body:.2f} dB, in the world frame {world:.2f} "

@@ -313,7 +313,7 @@ def fit_rank(flights: Sequence[FlightData], settings: RankFitSettings) -> RankCa
             )
         if receivers[tower].tied > 1:
             warnings.append(
-                f"rank at {tower}: {receivers[tower].tied} geometries cannot be told apart, among them "
+                f"rank at {tower}: {receivers[tower].tied} geometries give the same score, among them "
                 + "; ".join(g.in_words() for g in receivers[tower].geometries[:3])
             )
     return RankCalibration(

@@ -26,7 +26,7 @@ SPLIT_TITLE = {
     "altitude_left_out": "and its cruising height",
     "heading_left_out": "and an eighth of the compass of headings",
     "sector_left_out": "and a sector of 60 degrees at the tower",
-    "route_left_out": "a stretch of the flight's own route left out",
+    "route_left_out": "a segment of the flight's own route",
     "other_flights": "flights that had no part (--score)",
 }
 

@@ -281,7 +281,9 @@ def _ranked_words(data: CampaignData) -> list[str]:
     named = ", ".join(like[:FEW_SETTINGS]) + (
         f" and {len(like) - FEW_SETTINGS} more" if len(like) > FEW_SETTINGS else ""
     )
-    return [first + (f"not shown to be worse: {named}." if like else "every other setting is shown to be worse.")]
+    return [
+        first + (f"the difference is not significant for {named}." if like else "every other setting is worse (95 %).")
+    ]
 
 
 def warnings(data: CampaignData) -> list[str]:

@@ -182,7 +182,7 @@ def _level_verdict(diff: ReportDiff) -> str:
     text = f"RSS over all links: RMSE {pooled.other_rmse_db:.2f} dB in the first, {pooled.rmse_db:.2f} dB in the second"
     text += {
         "better": f", better by {abs(pooled.difference_db):.2f} dB {_bounds(pooled.difference_ci95_db, 2)}",
-        "worse": f", WORSE by {abs(pooled.difference_db):.2f} dB {_bounds(pooled.difference_ci95_db, 2)}",
+        "worse": f", worse by {abs(pooled.difference_db):.2f} dB {_bounds(pooled.difference_ci95_db, 2)}",
         "no difference shown": f"; {pooled.difference_db:+.2f} dB {_bounds(pooled.difference_ci95_db, 2)} shows no "
         "difference of the models",
         "none given": f"; {pooled.difference_db:+.2f} dB, too few independent samples for an interval",

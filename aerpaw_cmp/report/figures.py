@@ -100,7 +100,7 @@ def _overview_spec(data: ReportData) -> list[FigureSpec]:
 def _track_specs(data: ReportData, track: Track) -> list[FigureSpec]:
     there = [word for word, some in (("buildings", data.site.buildings), ("forests", data.site.forests)) if some]
     invented = (
-        f" {' and '.join(there).capitalize()} are illustrative: they were invented to show the method."
+        f" {' and '.join(there).capitalize()} are illustrative: they do not exist and show the method."
         if data.site.illustrative and there
         else ""
     )
@@ -110,7 +110,7 @@ def _track_specs(data: ReportData, track: Track) -> list[FigureSpec]:
             page=True,
             section="flight",
             title="Where the UAV flew",
-            caption=f"Left: the whole site with its towers. Right: the flight, coloured by height.{invented}",
+            caption=f"Left: the site with its towers. Right: the flight, coloured by height.{invented}",
             alt=f"Plan of {data.site.name} with {len(data.site.towers)} towers and the flown line.",
             draw=lambda: trajectory(data, track),
         ),

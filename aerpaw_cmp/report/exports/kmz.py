@@ -53,7 +53,7 @@ def write_kmz(export: Export, folder: Path) -> list[Path]:
     words = [*export.remarks, "Lines stand at their height above the ground below."]
     if max((len(one.rows) for one in shown), default=0) > budget:
         words.append(
-            f"Thinned to about {budget} points per line, with the extremes of every stretch kept; all samples stand in "
+            f"Thinned to about {budget} points per line, with minimum and maximum of every segment; all samples are in "
             "rss.csv and rank.csv."
         )
     path, text = folder / "samples.kmz", "".join([*map(_styles, scales.values()), *body])

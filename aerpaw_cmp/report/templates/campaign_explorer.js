@@ -315,7 +315,7 @@
       at(name).closest("label").hidden = values.length < 3;
     }
     fill(at("measure"), data.held_out ? ["held out: offset of the other flights", "offset of the flight's own samples"] : ["offset of the flight's own samples"], state.measure === "held" ? 0 : data.held_out ? 1 : 0);
-    at("said").textContent = (data.held_out ? "" : "No other flight has these towers and channels: errors are with an offset of the flight's own samples. ") + `Errors and offsets are kept in this page in steps of ${data.step} dB; campaign.csv holds them in full.` + (data.left_out ? ` Left out of this page for its size: ${data.left_out}.` : "");
+    at("said").textContent = (data.held_out ? "" : "No second flight has these towers and channels: each error uses the offset of the flight's own samples. ") + `This page holds errors and offsets in steps of ${data.step} dB; campaign.csv holds all digits.` + (data.left_out ? ` Left out of this page for its size: ${data.left_out}.` : "");
   }
   const filters = () => { for (const tr of document.querySelectorAll("#failures-table tbody tr")) tr.hidden = !["every setting", data.settings[state.setting]].includes(tr.dataset.setting) && tr.dataset.setting !== undefined && at("failures-filter").checked; };
   for (const [id, change] of [["setting", v => { state.setting = +v; }], ["measure", v => { state.measure = data.held_out && +v === 0 ? "held" : "own"; }]]) at(id).addEventListener("change", e => { change(e.target.value); controls(); everything(); });

@@ -424,11 +424,8 @@ def _models_at(model: type[pydantic.BaseModel], location: Location) -> list[type
     """Models that may stand at a location; parts that name no field are indices, keys or union members."""
     here: list[type[pydantic.BaseModel]] = [model]
     for part in location:
-        inside: list[type[pydantic.BaseModel]] = []
-        for candidate in here:
-            for name, info in candidate.model_fields.items():
-                if part in (name, info.alias):
-                    inside += _models_in(info.annotation)
+        fields = [field for candidate in here for field in candidate.model_fields.items()]
+        inside = [model for name, info in fields if part in (name, info.alias) for model in _models_in(info.annotation)]
         named = [candidate for candidate in here if candidate.__name__ == part]
         here = inside or named or here
     return here

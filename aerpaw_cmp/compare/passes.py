@@ -164,25 +164,25 @@ class PassTable:
         names = list(self._flights)
         chosen = set(names if first_flights is None else first_flights)
         rule = radius_m, heading_within_deg
-        for i, first in enumerate(names):
-            for second in names[i + 1 :] if first in chosen else ():
-                known: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
-                shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
-                partners: dict[str, list[tuple[int, _Prepared]]] = {}
-                for number, entry in self._flights[second]:
-                    partners.setdefault(entry.one.link, []).append((number, entry))
-                for number, here in self._flights[first]:
-                    for other, there in partners.get(here.one.link, ()):
-                        yield _pair(
-                            first=number,
-                            here=here,
-                            second=other,
-                            there=there,
-                            places=self._places,
-                            known=known,
-                            shared=shared,
-                            rule=rule,
-                        )
+        couples = ((first, second) for i, first in enumerate(names) if first in chosen for second in names[i + 1 :])
+        for first, second in couples:
+            known: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
+            shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
+            partners: dict[str, list[tuple[int, _Prepared]]] = {}
+            for number, entry in self._flights[second]:
+                partners.setdefault(entry.one.link, []).append((number, entry))
+            for number, here in self._flights[first]:
+                for other, there in partners.get(here.one.link, ()):
+                    yield _pair(
+                        first=number,
+                        here=here,
+                        second=other,
+                        there=there,
+                        places=self._places,
+                        known=known,
+                        shared=shared,
+                        rule=rule,
+                    )
 
 
 def _prepare(one: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:

@@ -331,11 +331,11 @@ def _check_names(
                 expected="flights of the campaign: " + ", ".join(known),
                 cause=f"did you mean {near!r}?" if near else None,
             )
+    first = {key: values[0] for key, values in campaign.held_out.fit.items() if key != K_KEY}
     for path, flight in files.values():
-        for key, values in campaign.held_out.fit.items():
+        for key, value in first.items():
             try:
-                if key != K_KEY:
-                    overridden(flight, {key: values[0]})
+                overridden(flight, {key: value})
             except UsageError as error:
                 raise UsageError(
                     f"held_out.fit for {path}: {error.found}", expected=error.expected, cause=error.cause

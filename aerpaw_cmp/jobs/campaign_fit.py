@@ -76,15 +76,21 @@ def search(loss: Callable[[Point], float], grids: Mapping[str, Sequence[Any]]) -
         method = "every combination"
     else:
         for share in (0.25, 0.5, 0.75):
-            point = {name: values[int(share * (len(values) - 1))] for name, values in grids.items()}
-            for _ in range(SWEEPS):
-                before = dict(point)
-                for name, values in grids.items():
-                    point[name] = min(values, key=lambda value: tried({**point, name: value}))
-                if point == before:
-                    break
+            _by_key(tried, grids, {name: values[int(share * (len(values) - 1))] for name, values in grids.items()})
         method = "one parameter after the other, three starts"
     return Search(tuple(sorted(known.values(), key=lambda row: row[1])), method)
+
+
+def _by_key(
+    tried: Callable[[dict[str, Any]], float], grids: Mapping[str, Sequence[Any]], point: dict[str, Any]
+) -> None:
+    """Try the values of one key after the other, the others held, until a round changes nothing."""
+    for _ in range(SWEEPS):
+        before = dict(point)
+        for name, values in grids.items():
+            point[name] = min(values, key=lambda value: tried({**point, name: value}))
+        if point == before:
+            return
 
 
 def fitted_folds(

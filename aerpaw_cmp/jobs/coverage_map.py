@@ -648,14 +648,14 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
     if held_out.trajectory is not None:
         name = f"trained along {outcome.trajectory_name}"
         tables[name] = {"Kriging": held_out.trajectory, **outcome.peers["flight"]}
+    fields = list(itertools.product(enumerate(heights), enumerate(outcome.shown.ks)))
     for evaluation, scores in tables.items():
         for method, score in scores.items():
-            for row, height in enumerate(heights):
-                for column, k in enumerate(outcome.shown.ks):
-                    yield page.MapError(
-                        evaluation=evaluation, method=method, k=k, altitude_m=height,
-                        mae=float(score.mae[row, column]), n=int(score.n[row, column]),
-                    )  # fmt: skip
+            for (row, height), (column, k) in fields:
+                yield page.MapError(
+                    evaluation=evaluation, method=method, k=k, altitude_m=height,
+                    mae=float(score.mae[row, column]), n=int(score.n[row, column]),
+                )  # fmt: skip
 
 
 def _local(scores: Mapping[str, Score]) -> dict[str, Score]:

@@ -306,10 +306,9 @@ def code_digest() -> str:
     for name in ("aerpaw_cmp", "aerpaw_parsers"):
         with contextlib.suppress(ImportError):
             root = Path(str(import_module(name).__file__)).parent
-            for path in sorted(root.rglob("*.py")):
-                module = path.relative_to(root).as_posix()
-                if name != "aerpaw_cmp" or shapes_numbers(module):
-                    digest.update(module.encode() + b"\0" + path.read_bytes())
+            modules = sorted(path.relative_to(root).as_posix() for path in root.rglob("*.py"))
+            for module in filter(shapes_numbers if name == "aerpaw_cmp" else None, modules):
+                digest.update(module.encode() + b"\0" + (root / module).read_bytes())
     for name in ("numpy", "scipy", "sionna-rt"):
         with contextlib.suppress(metadata.PackageNotFoundError):
             digest.update(f"{name} {metadata.version(name)}".encode())

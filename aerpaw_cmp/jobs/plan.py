@@ -29,25 +29,25 @@ from ..site.siteyaml import load_site
 
 MEASURED = {
     "imports": 2.5,
-    "clocks, per receiver": 0.95,
-    "compare, per RSS sample": 0.08e-3,
-    "compare, per rank sample": 0.2e-3,
-    "ladder, replays of the RSS": 2.5,
-    "audit": 9.0,
-    "audit, per link": 0.02,
+    "clocks, per receiver": 0.5,
+    "compare, per RSS sample": 0.06e-3,
+    "compare, per rank sample": 0.15e-3,
+    "ladder, replays of the RSS": 8.0,
+    "audit": 1.3,
+    "audit, per tower and array": 0.65,
     "page": 0.6,
-    "figures": 2.0,
-    "figures, per channel": 0.61,
+    "figures": 1.0,
+    "figures, per channel": 0.3,
     "study, per position": 5.8e-3,
     "export, per layer and position": 0.02e-3,
     "map pages": 4.0,
 }
 """CPU seconds, measured on the sample flight and the packaged site by ``benchmarks/estimate.py``."""
 
-PROBE_S = 0.024
+PROBE_S = 0.006
 """CPU seconds of :func:`probe` on that machine."""
 
-MEASURED_ON = "2026-11-21, one core of an AMD EPYC, Python 3.11"
+MEASURED_ON = "2026-11-23, one core of an AMD EPYC, Python 3.11"
 TRIED_POSES = (32, 160)
 """Of the two replays that a time is extrapolated from."""
 
@@ -183,7 +183,7 @@ def report_plan(
     stages.append(PlannedStage(name="compare", work=f"{n_rss} RSS and {n_rank} rank samples", seconds=seconds))
     if rt.audit_links > 0 and settings.report.audit == "now":
         links = min(rt.audit_links, n_rss + n_rank)
-        seconds = cost["audit"] + links * cost["audit, per link"]
+        seconds = cost["audit"] + len(rss + rank) * cost["audit, per tower and array"]
         stages.append(PlannedStage(name="audit", work=f"{links} links by the other engine", seconds=seconds))
     if n_rss and rt.engine == "image":
         known_s = [stage.seconds for stage in rss if stage.seconds is not None]

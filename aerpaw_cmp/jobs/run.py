@@ -411,13 +411,13 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
     """Checks that the report states and that did not hold."""
+    links = {f"{tower} {name}": m for tower, channels in metrics["rss"].items() for name, m in channels.items()}
     failed = []
-    for tower, channels in metrics["rss"].items():
-        for channel, m in channels.items():
-            if m["n"] == 0:
-                failed.append(f"{tower} {channel}: no sample could be compared")
-            elif m["at_search_edge"]:
-                failed.append(f"{tower} {channel}: the best offset lies at the edge of the searched span")
+    for link, m in links.items():
+        if m["n"] == 0:
+            failed.append(f"{link}: no sample could be compared")
+        elif m["at_search_edge"]:
+            failed.append(f"{link}: the best offset lies at the edge of the searched span")
     if metrics.get("audit_command"):
         failed.append(f"audit pending; run `{metrics['audit_command']}`")
     audit = (metrics.get("rt") or {}).get("audit") or {}

@@ -6,8 +6,6 @@ A process of its own, since killed workers leave open sockets to the collector, 
 from __future__ import annotations
 
 import json
-import os
-import signal
 import socket
 import sys
 import tempfile
@@ -20,10 +18,11 @@ from typing import Any
 import dask
 import distributed
 from distributed.security import Security
+from worker_tasks import collected, dies  # beside this script
 
 from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.jobs import workers
-from aerpaw_cmp.jobs.workers import Lost, check_workers, open_workers
+from aerpaw_cmp.jobs.workers import check_workers, open_workers
 
 SECURITY = Security.temporary()
 # as a user's configuration names them, there by files
@@ -46,27 +45,6 @@ def square(number: int) -> int:
 def slow(number: int) -> int:
     time.sleep(0.05)
     return number * number
-
-
-def dies(item: tuple[int, str]) -> int:
-    """The third ends its worker the first time, the fifth every time."""
-    number, folder = item
-    mark = Path(folder) / str(number)
-    if number == 5 or (number == 3 and not mark.exists()):
-        mark.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number * number
-
-
-def collected(crew: Any, function: Any, items: list[Any]) -> list[Any]:
-    found: dict[int, Any] = {}
-
-    def done(number: int, result: Any) -> None:
-        assert number not in found, "no task comes twice"
-        found[number] = result.message if isinstance(result, Lost) else result
-
-    crew.run(function, items, done)
-    return [found[i] for i in range(len(items))]
 
 
 def message(action: Callable[[], Any]) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -16,28 +15,8 @@ from typing import Any
 import pytest
 
 from aerpaw_cmp.jobs import workers
-from aerpaw_cmp.jobs.workers import Lost, open_workers, remove_left_folders
-
-
-def dies(item: tuple[int, str]) -> int:
-    """The third ends its worker the first time, the fifth every time."""
-    number, folder = item
-    mark = Path(folder) / str(number)
-    if number == 5 or (number == 3 and not mark.exists()):
-        mark.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number * number
-
-
-def collected(crew: Any, function: Any, items: list[Any]) -> list[Any]:
-    found: dict[int, Any] = {}
-
-    def done(number: int, result: Any) -> None:
-        assert number not in found, "no task comes twice"
-        found[number] = result.message if isinstance(result, Lost) else result
-
-    crew.run(function, items, done)
-    return [found[i] for i in range(len(items))]
+from aerpaw_cmp.jobs.workers import open_workers, remove_left_folders
+from tests.jobs.worker_tasks import collected, dies
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from __future__ import annotations
 import cmath
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -289,6 +289,15 @@ class Mirror:
         return min(s, self.length_m - s, p[2] - self.low_m, self.high_m - p[2])
 
 
+def _edges(part: shapely.Polygon) -> Iterator[tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Edges of a footprint with the building to their left: outside round its rim, inside round a hole."""
+    for hole, ring in enumerate((part.exterior, *part.interiors)):
+        points = list(ring.coords)
+        for a, b in itertools.pairwise(points if ring.is_ccw is (hole == 0) else points[::-1]):
+            if a[:2] != b[:2]:
+                yield a, b
+
+
 def mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
     """Ground of the tower, then walls and roof of each building."""
     mirrors = [Mirror((0.0, 0.0, 1.0), tower.ground_m, site.ground_material)]
@@ -298,29 +307,17 @@ def mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
         for part in shapely.get_parts(whole):
             if part.geom_type != "Polygon" or part.area <= 0:
                 continue
-            for hole, ring in enumerate((part.exterior, *part.interiors)):
-                # the building lies to the left of each edge: outside round its rim, inside round a hole
-                points = list(ring.coords)
-                for a, b in itertools.pairwise(points if ring.is_ccw is (hole == 0) else points[::-1]):
-                    length = math.hypot(b[0] - a[0], b[1] - a[1])
-                    if length == 0:
-                        continue
-                    along = ((b[0] - a[0]) / length, (b[1] - a[1]) / length)
-                    normal = (along[1], -along[0], 0.0)
-                    offset = normal[0] * a[0] + normal[1] * a[1]
-                    mirrors.append(
-                        Mirror(
-                            normal,
-                            offset,
-                            building.material,
-                            start=(a[0], a[1]),
-                            along=along,
-                            length_m=length,
-                            low_m=foot,
-                            high_m=top,
-                            solid=number,
-                        )
+            for a, b in _edges(part):
+                length = math.hypot(b[0] - a[0], b[1] - a[1])
+                along = ((b[0] - a[0]) / length, (b[1] - a[1]) / length)
+                normal = (along[1], -along[0], 0.0)
+                offset = normal[0] * a[0] + normal[1] * a[1]
+                mirrors.append(
+                    Mirror(
+                        normal, offset, building.material, start=(a[0], a[1]), along=along, length_m=length,
+                        low_m=foot, high_m=top, solid=number,
                     )
+                )  # fmt: skip
             mirrors.append(Mirror((0.0, 0.0, 1.0), top, building.material, roof=part, solid=number))
     return tuple(mirrors)
 
@@ -430,11 +427,12 @@ class Reference:
         chains: list[tuple[Mirror, ...]] = [()]
         level: list[tuple[tuple[Mirror, ...], Vector]] = [((), self.source)]
         for depth in range(1, max_depth + 1):
-            grown = []
-            for past, image in level:
-                for mirror in self.mirrors:
-                    if mirror.height(image) > (0.0 if past else -MARGIN_M) and (not past or mirror is not past[-1]):
-                        grown.append(((*past, mirror), mirror.mirrored(image)))
+            grown = [
+                ((*past, mirror), mirror.mirrored(image))
+                for past, image in level
+                for mirror in self.mirrors
+                if mirror.height(image) > (0.0 if past else -MARGIN_M) and (not past or mirror is not past[-1])
+            ]
             if len(grown) > budget:
                 return None
             chains += [s for s, _ in grown]

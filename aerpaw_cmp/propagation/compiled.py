@@ -35,13 +35,16 @@ from ..common.units import AnyArray
 ROOM = Path(__file__).parent
 SWITCH = "AERPAW_CMP_COMPILED"
 FIELD, BEAMS = "field.kernels", "search.beams"
+EDGES, EDGE_FIELD = "search.edge_kernels", "field.edge_kernels"
 SOURCES = (
     "field/dyads.py", "field/fresnel.py", "field/kernels.py",
-    "search/beams.py", "search/merging.py", "search/boxtree.py", "search/mirror.py", "compiled.py", "numba_options.py",
+    "field/wedge.py", "field/edges.py", "field/edge_kernels.py", "search/edge_kernels.py",
+    "search/beams.py", "search/merging.py", "search/boxtree.py", "search/mirror.py", "edges.py",
+    "compiled.py", "numba_options.py",
 )  # fmt: skip
 """Files of kernels, and those whose functions and constants they take in."""
 
-COMPILE_S = {FIELD: 10.0, BEAMS: 25.0}
+COMPILE_S = {FIELD: 10.0, BEAMS: 25.0, EDGES: 20.0, EDGE_FIELD: 20.0}
 """CPU seconds of the first compilation on a machine."""
 READ_S = 0.4
 """CPU seconds of NumPy from which numba's import and reading what was compiled before pay off."""
@@ -54,7 +57,12 @@ MIRRORS_S = 1.6e-7
 """CPU seconds of NumPy per link and face, sequences of two reflections."""
 
 
-_in_numpy_s = {FIELD: 0.0, BEAMS: 0.0}
+CANDIDATES_S = 1.2e-7
+"""CPU seconds of NumPy per candidate of a path over an edge."""
+EDGE_FIELD_S = 7e-6
+"""CPU seconds of NumPy per path over an edge."""
+
+_in_numpy_s = dict.fromkeys(COMPILE_S, 0.0)
 """Estimated seconds of this process so far."""
 
 
@@ -119,6 +127,42 @@ def beams() -> State:
     if switch() == "never":
         return State(None, f"{SWITCH}=never")
     return load(BEAMS)
+
+
+def edges_for(candidates: int, needed: bool = False) -> ModuleType | None:
+    """Compiled search of paths over edges, or None where NumPy is quicker.
+
+    Parameters
+    ----------
+    candidates : int
+        Of edges, links and mirrors.
+    needed : bool
+        NumPy cannot do it.
+
+    Returns
+    -------
+    module or None
+
+    Raises
+    ------
+    UsageError
+        If it is needed and does not run.
+    """
+    if not needed:
+        return _worth(EDGES, candidates * CANDIDATES_S)
+    state = State(None, f"{SWITCH}=never") if switch() == "never" else load(EDGES)
+    if state.kernels is None:
+        raise UsageError(
+            f"diffraction 'all', or in a scene of triangles, but {state.reason}",
+            expected="diffraction 'edges', or numba that works: pip install 'aerpaw-cmp[fast]'",
+            cause="these paths are searched by compiled code alone",
+        )
+    return state.kernels
+
+
+def edge_field_for(paths: int) -> ModuleType | None:
+    """Compiled field of paths over edges, or None where NumPy is quicker."""
+    return _worth(EDGE_FIELD, paths * EDGE_FIELD_S)
 
 
 def _worth(name: str, numpy_s: float) -> ModuleType | None:

@@ -12,6 +12,16 @@ import numpy as np
 
 from ..common.units import AnyArray, FloatArray, IntArray
 from .paths import Faces, PathSet
+from .surfaces import Surfaces
+
+NEAREST_M = 0.01
+"""An end nearer than this to an edge has no path over it: there is no far field."""
+
+BEND_RAD = np.radians(2.0)
+"""Faces of triangles that meet at less than this make no edge: they are facets of a bowed surface."""
+
+WELD_M = 1e-4
+"""Corners of triangles nearer than this are one [m]."""
 
 SHARPEST = 1e-6
 """Exterior angles nearer than this to 180 degrees [rad] are a plane."""
@@ -88,10 +98,97 @@ class Edges:
             face=pairs,
         )
 
-    def coordinates(self, points_m: FloatArray, edge: IntArray) -> FloatArray:
-        """Points (n, points, 3) in the frames of edges (n,): along, in face 0 away from the edge, out of face 0."""
-        frame = np.stack([self.along[edge], self.face_axis[edge], self.normal[edge]], axis=1)
-        return np.asarray(np.einsum("nij,npj->npi", frame, points_m - self.start_m[edge][:, None]))
+    @classmethod
+    def of_surfaces(cls, surfaces: Surfaces) -> Edges:
+        """Edges of a scene of triangles: where faces meet at an angle, and borders that no other face touches.
+
+        The air is taken to be on the side of the larger angle: in an inner corner, which diffracts nothing that
+        reaches it, that is the inside of the building. Which way a triangle is turned does not matter.
+
+        Parameters
+        ----------
+        surfaces : Surfaces
+
+        Returns
+        -------
+        Edges
+            One per side of triangles; a border has the exterior angle 2 and one face twice. The outer border of level
+            ground is none.
+        """
+        corners, face = surfaces.corners_m, surfaces.face
+        _, corner = np.unique(np.round(corners.reshape(-1, 3) / WELD_M).astype(np.int64), axis=0, return_inverse=True)
+        corner = corner.reshape(-1, 3)
+        ends = np.sort(np.stack([corner, np.roll(corner, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
+        sides = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 3)
+        opposite = np.roll(corners, -2, axis=1).reshape(-1, 3)
+        swap = corner.reshape(-1) != ends[:, 0]
+        sides[swap] = sides[swap][:, ::-1]
+        _, edge = np.unique(ends, axis=0, return_inverse=True)
+        owner = np.repeat(face, 3)
+        edge = edge.reshape(-1)
+        along = sides[:, 1] - sides[:, 0]
+        size = np.linalg.norm(along, axis=1)
+        good = (ends[:, 0] != ends[:, 1]) & (size > NEAREST_M)
+        along = along / np.where(good, size, 1.0)[:, None]
+        inward = opposite - sides[:, 0]
+        inward = inward - (inward * along).sum(axis=1)[:, None] * along
+        width = np.linalg.norm(inward, axis=1)
+        good &= width > 1e-9
+        inward = inward / np.where(good, width, 1.0)[:, None]
+        order = np.flatnonzero(good)[np.argsort(edge[good], kind="stable")]
+        level = np.abs(surfaces.faces.normal[owner, 2]) > 0.99
+        outer = np.array([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])[:, :2]
+        rim = (np.abs(sides[:, None, :, :2] - outer[None, :, None]) < WELD_M).all(axis=2).any(axis=(1, 2)) & level
+        runs = np.split(order, np.flatnonzero(np.diff(edge[order])) + 1) if len(order) else []
+        rows = [
+            row
+            for run in runs
+            if not (len(run) == 1 and rim[run[0]]) and (row := _widest(run, along[run[0]], inward, owner)) is not None
+        ]
+        first = np.array([row[0] for row in rows], dtype=np.int64)
+        last = np.array([row[1] for row in rows], dtype=np.int64)
+        angle = np.array([row[2] for row in rows])
+        axis = inward[first]
+        # out of face 0, into the air: across the edge, turned by a quarter from the axis towards the widest gap
+        out = np.cross(along[first], axis)
+        axis_n = np.where((angle < 2.0 * np.pi)[:, None], inward[last], axis)
+        return cls(
+            start_m=sides[first, 0],
+            end_m=sides[first, 1],
+            along=along[first],
+            face_axis=axis,
+            normal=out,
+            normal_n=np.cross(axis_n, along[first]),
+            exterior=angle / np.pi,
+            face=np.stack([owner[first], owner[last]], axis=1),
+        )
+
+    def pairs(self) -> tuple[IntArray, IntArray]:
+        """Pairs (pairs, 2) of edges of one plane face, and which of their faces (0 or 1) that is."""
+        face, side = self.face.reshape(-1), np.tile([0, 1], len(self))
+        edge = np.repeat(np.arange(len(self)), 2)
+        order = np.argsort(face, kind="stable")
+        made: list[IntArray] = [np.zeros((0, 4), np.int64)]
+        for run in np.split(order, np.flatnonzero(np.diff(face[order])) + 1) if len(order) else []:
+            first, second = (part.reshape(-1) for part in np.meshgrid(run, run, indexing="ij"))
+            apart = edge[first] != edge[second]
+            made.append(np.column_stack([edge[first], edge[second], side[first], side[second]])[apart])
+        rows = np.concatenate(made)
+        return rows[:, :2], rows[:, 2:]
+
+
+def _widest(run: IntArray, along: FloatArray, inward: FloatArray, owner: IntArray) -> tuple[int, int, float] | None:
+    """Sides of triangles on both ends of the widest gap round an edge, and its angle; None where no air bends there."""
+    axis = inward[run[0]]
+    across = np.cross(along, axis)
+    angle = np.mod(np.arctan2(inward[run] @ across, inward[run] @ axis), 2.0 * np.pi)
+    order = np.argsort(angle, kind="stable")
+    gap = np.diff(angle[order], append=angle[order[0]] + 2.0 * np.pi)
+    widest = int(np.argmax(gap))
+    first, last = run[order[widest]], run[order[(widest + 1) % len(run)]]
+    if gap[widest] < np.pi + BEND_RAD or (len(run) > 1 and owner[first] == owner[last]):
+        return None
+    return int(first), int(last), float(gap[widest])
 
 
 def _of_solid(faces: Faces, solid: int, ground_m: float) -> list[tuple[FloatArray, FloatArray, tuple[int, int]]]:
@@ -131,25 +228,42 @@ def _corner(faces: Faces, wall: int, end: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class EdgePaths:
-    """Paths over one edge, sorted by pose and tower.
+    """Paths over one or two edges, sorted by pose and tower.
 
     Parameters
     ----------
-    pose, tower, edge : (paths,) int
+    pose, tower : (paths,) int
+    edge : (paths, 2) int
+        The second is -1 over one edge.
+    shared : (paths, 2) int
+        Which face of each of two edges the path runs along between them: 0, or 1 for face n.
     ground : (paths, 2) int
-        Faces that reflect before and after the edge, the ground as a rule; -1 where none does.
-    vertices_m : (paths, 3, 3)
-        Reflection, edge, reflection point for array centres; NaN where unused.
+        Faces that reflect before and after the edges, the ground as a rule; -1 where none does.
+    vertices_m : (paths, 4, 3)
+        Reflection, edge, edge, reflection point for array centres; NaN where unused.
     """
 
     pose: IntArray
     tower: IntArray
     edge: IntArray
+    shared: IntArray
     ground: IntArray
     vertices_m: FloatArray
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    @classmethod
+    def of(cls, index: IntArray, vertices_m: FloatArray) -> EdgePaths:
+        """Paths of rows (paths, 8): pose, tower, edges, shared faces, mirrors."""
+        return cls(
+            pose=index[:, 0],
+            tower=index[:, 1],
+            edge=index[:, 2:4],
+            shared=index[:, 4:6],
+            ground=index[:, 6:8],
+            vertices_m=vertices_m,
+        )
 
     def as_path_set(self) -> PathSet:
         """The same polylines without faces: what terrain and foliage ask for."""
@@ -159,6 +273,6 @@ class EdgePaths:
         nothing = np.full(self.vertices_m.shape[:2], -1, dtype=np.int64)
         return PathSet(self.pose, self.tower, used.sum(axis=1), nothing, vertices)
 
-    def select(self, rows: AnyArray) -> EdgePaths:
-        """The paths of a mask or of indices."""
+    def select(self, rows: AnyArray | slice) -> EdgePaths:
+        """The paths of a mask, of indices or of a run."""
         return EdgePaths(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})

@@ -197,7 +197,7 @@ def replay(
     notes += cache.warnings if cache else []
     notes += _checked_cut(site, scene, link, poses, search, field, cache)
     scene, paths, stopped = passed(site, scene, poses, paths, search)
-    bent, unmodelled = _bent(site, scene, link, poses, search, field)
+    bent, unmodelled = _bent(site, scene, link, poses, search, field, run)
     result, idle = _evaluated(scene, link, poses, paths, search, field, run, bent)
     notes += [*stopped, *unmodelled]
     if searches:
@@ -307,24 +307,39 @@ class _Bent:
 
 
 def _bent(
-    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field
+    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, run: Run
 ) -> tuple[_Bent | None, list[str]]:
     """What diffraction adds, and what of it is not modelled."""
     if search.diffraction == "none":
         return None, []
-    if scene.surfaces is not None:
-        return None, ["diffraction: edges of a scene of triangles are not searched"]
-    edges = Edges.of(scene.faces, float(scene.faces.offset_m[scene.faces.solid < 0].max(initial=0.0)))
+    edges = edges_of(scene)
     paths = find_edge_paths(
-        scene.faces, edges, scene.sources_m, poses.position_m, scene.usable, scene.excluded, search.diffraction == "all"
+        edges,
+        scene.faces,
+        (scene.sources_m, poses.position_m),
+        scene.usable,
+        scene.excluded,
+        surfaces=scene.surfaces,
+        every=search.diffraction == "all",
+        threads=run.threads,
     )
-    bends = paths.as_path_set()
-    clear = _clear_of_terrain(site, scene, poses, bends)
-    loss_db = field.loss_db(bends, scene.sources_m, poses.position_m)
-    clear &= True if loss_db is None else np.isfinite(loss_db)
-    paths, loss_db = paths.select(clear), None if loss_db is None else loss_db[clear]
-    h, power = edge_channels(paths, edges, scene.faces, scene.sources_m, poses, link, loss_db)
-    return _Bent(paths, h, power), ["diffraction over two edges, and with more than one reflection on a side"]
+    loss_db = None
+    if site.dem is not None or field.loss is not None:
+        bends = paths.as_path_set()
+        clear = _clear_of_terrain(site, scene, poses, bends)
+        loss_db = field.loss_db(bends, scene.sources_m, poses.position_m)
+        clear &= True if loss_db is None else np.isfinite(loss_db)
+        paths, loss_db = paths.select(clear), None if loss_db is None else loss_db[clear]
+    h, power = edge_channels(paths, edges, scene.faces, scene.sources_m, poses, link, loss_db, threads=run.threads)
+    missing = "three edges" if search.diffraction == "all" else "two edges, after a reflection off a wall,"
+    return _Bent(paths, h, power), [f"diffraction over {missing} and with more than one reflection on a side"]
+
+
+def edges_of(scene: Scene) -> Edges:
+    """Edges of the buildings or triangles of a scene."""
+    if scene.surfaces is not None:
+        return Edges.of_surfaces(scene.surfaces)
+    return Edges.of(scene.faces, float(scene.faces.offset_m[scene.faces.solid < 0].max(initial=0.0)))
 
 
 def _evaluated(

@@ -149,7 +149,7 @@ def test_no_pose_is_shared_by_two_threads(monkeypatch, case):
     pose = case[3].pose
     for chunk in (1, 7, 64, 10_000):
         monkeypatch.setattr(field_sum, "PATHS_PER_PART", chunk)
-        parts = field_sum._parts(pose)
+        parts = field_sum.parts_between_poses(pose)
         assert [part.start for part in parts] == [0, *(part.stop for part in parts[:-1])]
         assert parts[-1].stop == len(pose)
         assert all(pose[part.stop - 1] != pose[part.stop] for part in parts[:-1])

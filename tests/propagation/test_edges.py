@@ -16,13 +16,15 @@ from shapely.geometry import LineString, box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.bench import random_scene
-from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.arrays import Array, Link, Poses, single_element
 from aerpaw_cmp.propagation.edges import Edges
-from aerpaw_cmp.propagation.faces import site_faces
+from aerpaw_cmp.propagation.faces import site_faces, triangles
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.site.materials import face_material
+from aerpaw_cmp.site.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building, Site, Tower
 
 HZ = 3.4e9
@@ -173,9 +175,12 @@ def field_over(edge, q, s, t, below_s, below_t) -> complex:
     both = cotangent_term(less, 1, n, kl) + cotangent_term(less, -1, n, kl)
     faces = cotangent_term(more, 1, n, kl) + cotangent_term(more, -1, n, kl)
     half = (math.pi - less) / 2
-    te, tm = coefficients(abs(math.sin(half)) * sin_b, "concrete")
-    slope = math.hypot(cos_b, math.cos(half) * sin_b)
-    c, a = math.cos(half) / slope, cos_b * math.sin(half) / slope
+    flat = math.sin(angles[0] / n) * math.sin(angles[1] / n)  # 0 along a face, and as on a mirror where one reflects
+    flat *= math.sin(half) / abs(math.sin(half / n) * math.sin((math.pi + less) / (2 * n)))
+    flat = min(max(flat, -1.0), 1.0)
+    te, tm = coefficients(abs(flat) * sin_b, "concrete")
+    slope = math.hypot(cos_b * flat, math.cos(half))
+    c, a = math.cos(half) / slope, cos_b * flat / slope
     face = np.array([[te * c * c - tm * a * a, (te + tm) * c * a], [-(te + tm) * c * a, tm * c * c - te * a * a]])
     matrix = both * np.eye(2) + faces * face
     matrix = -cmath.exp(-0.25j * math.pi) / (2 * n * math.sqrt(2 * math.pi * K) * sin_b) * matrix
@@ -242,8 +247,33 @@ def test_a_link_turned_round_is_the_same() -> None:
     tower, uav = (0.0, 0.0, 10.0), (70.0, 4.0, 2.0)
     there = trace(place(BARN, tower=tower), LINK, poses(uav), diffraction="all")
     back = trace(place(BARN, tower=uav), LINK, poses(tower), diffraction="all")
-    assert len(there.edge_paths or ()) == len(back.edge_paths or ()) == 2
-    assert there.h[0, 0, 0, 0] == pytest.approx(back.h[0, 0, 0, 0], rel=1e-10)
+    assert len(there.edge_paths or ()) == len(back.edge_paths or ()) == 11  # two over one edge, nine over two
+    assert there.h[0, 0, 0, 0] == pytest.approx(back.h[0, 0, 0, 0], rel=1e-7)
+
+
+@pytest.mark.parametrize("uav", [(70.0, 4.0, 2.0), (66.0, 41.0, 3.0)])
+def test_a_link_over_two_edges_turned_round_is_the_same(uav: tuple[float, float, float]) -> None:
+    """Vertical and slanted elements, edges that are parallel and edges that are not."""
+    tower = (0.0, 0.0, 5.0)
+    array = Array(np.zeros((2, 3)), np.array([0.0, np.pi / 3]))
+    link = Link(HZ, {"T": array}, array)
+    both = "edges", "all"
+    there = [trace(place(BARN, tower=tower), link, poses(uav), diffraction=d).h[0, 0] for d in both]
+    back = [trace(place(BARN, tower=uav), link, poses(tower), diffraction=d).h[0, 0].T for d in both]
+    over_two, turned = there[1] - there[0], back[1] - back[0]
+    assert np.abs(over_two).max() > 1e-11
+    assert np.abs(over_two - turned).max() < 1e-4 * np.abs(over_two).max()
+
+
+@pytest.mark.parametrize("height", [5.0, 7.9, 8.3])
+def test_level_over_two_edges_is_continuous(height: float) -> None:
+    """Through the plane of the roof behind the barn, and through the shadow boundary of a tower above it."""
+    pytest.importorskip("numba")
+    for at in (8.0, *((8.3 - 0.3 * 70.0 / 40.0,) if height == 8.3 else ())):
+        heights = at + np.array([-1e-3, -1e-5, 0.0, 1e-5, 1e-3])
+        site = place(BARN, tower=(0.0, 0.0, height))
+        level = trace(site, LINK, poses(*((70.0, 3.0, z) for z in heights)), diffraction="all").rss_dbm[:, 0]
+        assert np.ptp(level) < 0.1
 
 
 def test_silent_places_are_reached() -> None:
@@ -303,7 +333,8 @@ def test_ends_on_an_edge_are_no_numbers_that_are_none() -> None:
     corner, rim = (40.0, -15.0, 4.0), (46.0, 25.0, 8.0)
     result = trace(place(BARN, tower=(40.0, 3.0, 8.0)), LINK, poses(corner, rim, (70.0, 0.0, 2.0)), diffraction="all")
     assert np.isfinite(result.h).all()
-    assert result.has_path[2, 0]
+    above = trace(place(BARN, tower=(40.0, 3.0, 8.2)), LINK, poses((70.0, 0.0, 2.0)), diffraction="all")
+    assert above.has_path[0, 0]
 
 
 def test_what_is_not_modelled_is_said_or_refused() -> None:
@@ -321,3 +352,53 @@ def test_without_buildings_nothing_changes() -> None:
     where = poses((70.0, 3.0, 2.0))
     first, second = trace(site, LINK, where), trace(site, LINK, where, diffraction="all")
     assert np.array_equal(first.h, second.h)
+
+
+# --- compiled code and scenes of triangles ---------------------------------------------------------------------------
+
+
+def test_compiled_search_and_field_are_those_of_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("numba")
+    site, link, flown = random_scene(60, buildings=6, towers=2)
+    flown.position_m[::2, 2] = 3.0
+    found = {}
+    for mode in ("never", "always"):
+        monkeypatch.setenv("AERPAW_CMP_COMPILED", mode)
+        found[mode] = replay(site, link, flown, Search(diffraction="edges"))
+    ours, plain = (_rows(found[mode].edge_paths) for mode in ("always", "never"))
+    assert len(plain) > 1000
+    assert ours == plain
+    assert np.abs(found["always"].h - found["never"].h).max() < 1e-11 * np.abs(found["never"].h).max()
+
+
+def _rows(paths) -> set[tuple[int, ...]]:
+    columns = np.column_stack([paths.pose, paths.tower, paths.edge, paths.ground])
+    return set(map(tuple, columns.tolist()))
+
+
+def test_a_box_of_triangles_diffracts_as_a_prism() -> None:
+    pytest.importorskip("numba")
+    prism = place(BARN)
+    faces = site_faces(prism)
+    vertices, triangle, owner = triangles(faces, 500.0)
+    materials = tuple(faces.material[i] for i in range(len(faces)))
+    scene = TriangleScene(vertices, triangle, owner, tuple(map(str, range(len(faces)))), materials)
+    mesh = replace(place(), scene=scene)
+    where = poses((70.0, 3.0, 2.0), (30.0, 60.0, 1.0), (60.0, -40.0, 9.0), (46.0, 40.0, 3.0))
+    for mode in ("edges", "all"):
+        one, two = (trace(site, LINK, where, diffraction=mode) for site in (prism, mesh))
+        assert len(one.edge_paths or ()) == len(two.edge_paths or ()) > 8
+        assert np.abs(one.h - two.h).max() < 1e-6 * np.abs(one.h).max()
+
+
+def test_the_border_of_a_sheet_is_a_half_plane() -> None:
+    pytest.importorskip("numba")
+    sheet = np.array([[30.0, -40, 0], [30, 40, 0], [30, 40, 6], [30, -40, 6]])
+    scene = TriangleScene(sheet, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, np.int64), ("sheet",), ("metal",))
+    edges = Edges.of_surfaces(merged(scene))
+    assert np.allclose(edges.exterior, 2.0)
+    assert sorted(edges.length_m.tolist()) == pytest.approx([6.0, 6.0, 80.0, 80.0])
+    result = trace(replace(place(), scene=scene), LINK, poses((60.0, 1.0, 2.0)), max_depth=0, diffraction="edges")
+    assert result.edge_paths is not None
+    at = result.edge_paths.vertices_m[:, 1]
+    assert ((at[:, 2] == 6.0) & (np.abs(at[:, 1]) < 39.0)).sum() == 1

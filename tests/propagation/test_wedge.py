@@ -7,31 +7,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.special import jv
+from scipy.special import jv, wofz
 
 from aerpaw_cmp.common.units import ComplexArray, FloatArray
-from aerpaw_cmp.propagation.field.fresnel import reflection_coefficients
-from aerpaw_cmp.propagation.field.wedge import wedge_matrix
+from aerpaw_cmp.propagation.field.wedge import face_coefficients, transition, wedge
 
 WAVELENGTH = 299792458.0 / 3.4e9
 K = 2.0 * np.pi / WAVELENGTH
-CONCRETE = 5.24 - 0.3j
 EDGE, ALONG, NORMAL = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.0, 1, 0])
 
 
-def conductor(cosine: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    return np.full(np.shape(cosine), -1 + 0j), np.full(np.shape(cosine), 1 + 0j)
+CONDUCTOR = (0.0, -1e30, np.inf)
+CONCRETE = (5.24, -0.3, np.inf)
 
 
-def concrete(cosine: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    return reflection_coefficients(
-        cosine, np.full(np.shape(cosine), CONCRETE), np.full(np.shape(cosine), np.inf), WAVELENGTH
-    )
+def matrix(*values: float, face=CONDUCTOR) -> ComplexArray:
+    bb, bp, pp = wedge(*(np.array(v) for v in values), face, face)
+    return np.array([[bb, bp], [-bp, pp]])
 
 
-def matrix(*values: float, face=conductor) -> ComplexArray:
-    phi_in, phi_out, cos_beta, exterior, distance = (np.array([v]) for v in values)
-    return wedge_matrix(phi_in, phi_out, cos_beta, exterior, distance, face, face)[0]
+def test_transition_function() -> None:
+    root = np.concatenate([np.linspace(0.0, 8.0, 4001), np.logspace(0.5, 5.0, 2000)])
+    re, im = transition(root)
+    exact = np.sqrt(np.pi) * np.exp(0.25j * np.pi) * wofz(np.exp(0.75j * np.pi) * root)
+    assert np.abs((re + 1j * im) / exact - 1.0).max() < 1e-8
 
 
 def test_exact_half_plane() -> None:
@@ -82,7 +81,7 @@ def test_series_of_a_wedge(exterior: float, sign: float) -> None:
 
 
 def diffracted(
-    source: FloatArray, target: FloatArray, wave: FloatArray, exterior: float = 1.5, face=concrete
+    source: FloatArray, target: FloatArray, wave: FloatArray, exterior: float = 1.5, face=CONCRETE
 ) -> ComplexArray:
     """Field vector at ``target`` of a point source that radiates ``wave`` less its part along the ray."""
 
@@ -122,7 +121,7 @@ def seen(source: FloatArray, target: FloatArray, wave: FloatArray, turn: float) 
         across = np.cross(before, NORMAL)
         across /= np.linalg.norm(across)
         field = wave - (wave @ before) * before
-        te, tm = concrete(np.array(abs(before @ NORMAL)))
+        te, tm = face_coefficients(np.array(abs(before @ NORMAL)), *CONCRETE)
         upright = np.cross(across, before)
         reflected = te * (across @ field) * across - tm * (upright @ field) * (upright * mirror)
         total = total + reflected * np.exp(-1j * K * length) / length
@@ -160,4 +159,4 @@ def test_no_wedge_is_no_edge() -> None:
 
 def test_on_a_boundary_nothing_is_undefined() -> None:
     for after in (np.pi - 0.7, np.pi + 0.7, 0.7, 0.0, 1.5 * np.pi):
-        assert np.isfinite(matrix(0.7, after, 0.0, 1.5, 300.0, face=concrete)).all()
+        assert np.isfinite(matrix(0.7, after, 0.0, 1.5, 300.0, face=CONCRETE)).all()

@@ -1,26 +1,97 @@
-"""Complex amplitudes of paths over an edge, for every pair of elements.
+"""Complex amplitudes of paths over edges, for every pair of elements.
 
-As with reflections a bent leg is straight in the space of the mirrored end. The length is that of each pair of
-elements. Directions, patterns and the diffraction matrix are those of the array centres, as the paths are: the field
-stays continuous where a direct or reflected path of the centres ends.
+As with reflections a bent leg is straight in the space of the mirrored end, and over an edge a path is straight once
+both legs are turned into one plane: places of elements in that plane give the length of each pair. Directions, patterns
+and the diffraction matrix are those of the array centres, as the paths are: the field stays continuous where a direct
+or reflected path of the centres ends. Small jobs run in NumPy, large ones in
+:mod:`aerpaw_cmp.propagation.field.edge_kernels`, by the same laws.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...common.units import ComplexArray, FloatArray, IntArray, wavelength_m
-from ..arrays import Array, Link, Poses
+from ...common.units import ComplexArray, FloatArray, IntArray, amplitude_from_db, wavelength_m
+from ...propagation import compiled
+from ..arrays import Link, Poses
 from ..edges import EdgePaths, Edges
 from ..paths import Faces
 from . import dyads
-from .fresnel import FaceMaterials, reflection_coefficients
-from .sum import radiated
-from .wedge import Fresnel, wedge_matrix
+from .dyads import Number, Rotation, Vector
+from .fresnel import FaceMaterials
+from .geometry import parts_of, pattern_fields, plain, rows_of
+from .sum import parts_between_poses
+from .wedge import along_face, at_face, face_coefficients, wedge
 
 PATHS_PER_CHUNK = 4096
+
+STEP_RAD = 1e-6
+"""Step of the derivative of a diffraction matrix at a face: a shadow boundary within it would be taken for a slope."""
+
+
+class Tables(NamedTuple):
+    """Edges, faces and ends as the laws take them; the last entry of the faces' tables stands for no face."""
+
+    start: FloatArray
+    along: FloatArray
+    inward: FloatArray
+    out: FloatArray
+    exterior: FloatArray
+    face: IntArray
+    normal: FloatArray
+    offset: FloatArray
+    material: FloatArray
+    source: FloatArray
+    tower_axes: FloatArray
+    place: FloatArray
+    axes: FloatArray
+    tower_m: FloatArray
+    tower_slant: FloatArray
+    uav_m: FloatArray
+    uav_slant: FloatArray
+    wave_number: float
+
+    @classmethod
+    def of(cls, edges: Edges, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link) -> Tables:
+        """Tables of a replay.
+
+        Parameters
+        ----------
+        edges : Edges
+        faces : Faces
+        sources_m : (towers, 3)
+        poses : Poses
+        link : Link
+
+        Returns
+        -------
+        Tables
+        """
+        wavelength = wavelength_m(link.carrier_hz)
+        arrays, uav = list(link.tower_arrays.values()), link.uav_array
+        slants = [np.stack([np.cos(a.slant_rad), np.sin(a.slant_rad)]) for a in (*arrays, uav)]
+        return cls(
+            start=edges.start_m,
+            along=edges.along,
+            inward=np.stack([edges.face_axis, np.cross(edges.along, edges.normal_n)], axis=1),
+            out=edges.normal,
+            exterior=edges.exterior,
+            face=edges.face,
+            normal=np.vstack([faces.normal, np.zeros(3)]),
+            offset=np.append(faces.offset_m, 0.0),
+            material=FaceMaterials.of(faces, link.carrier_hz).table(wavelength),
+            source=sources_m,
+            tower_axes=np.stack([array.mount.T for array in arrays]),
+            place=poses.position_m,
+            axes=np.einsum("nij,jk->nki", poses.rotation, uav.mount),
+            tower_m=np.stack([array.positions_m.T for array in arrays]),
+            tower_slant=np.stack(slants[:-1]),
+            uav_m=uav.positions_m.T,
+            uav_slant=slants[-1],
+            wave_number=2.0 * np.pi / wavelength,
+        )
 
 
 def edge_channels(
@@ -31,12 +102,15 @@ def edge_channels(
     poses: Poses,
     link: Link,
     loss_db: FloatArray | None = None,
+    *,
+    threads: int | None = None,
 ) -> tuple[ComplexArray, FloatArray]:
     """What paths over edges add to the channel matrices.
 
     Parameters
     ----------
     paths : EdgePaths
+        Sorted by pose and tower.
     edges : Edges
     faces : Faces
         Of the scene.
@@ -46,6 +120,8 @@ def edge_channels(
     link : Link
     loss_db : (paths,), optional
         Further loss of each path, such as foliage.
+    threads : int, optional
+        Of compiled code.
 
     Returns
     -------
@@ -53,37 +129,37 @@ def edge_channels(
     power : (poses, towers)
         Sum over paths of the mean of ``|h|^2`` over element pairs.
     """
-    arrays = list(link.tower_arrays.values())
-    ports, uavs = len(arrays[0]), len(link.uav_array)
-    h = np.zeros((len(poses) * len(arrays), uavs, ports), dtype=np.complex128)
-    power = np.zeros(len(poses) * len(arrays))
-    for tower in range(len(arrays)):
-        mine = np.flatnonzero(paths.tower == tower)
-        for start in range(0, len(mine), PATHS_PER_CHUNK):
-            rows = mine[start : start + PATHS_PER_CHUNK]
-            some = amplitudes(paths.select(rows), edges, faces, sources_m, poses, link)
-            if loss_db is not None:
-                some *= 10.0 ** (-loss_db[rows] / 20.0)[:, None, None]
-            key = paths.pose[rows] * len(arrays) + tower
-            np.add.at(h, key, some)
-            np.add.at(power, key, (np.abs(some) ** 2).mean(axis=(1, 2)))
+    tables = Tables.of(edges, faces, sources_m, poses, link)
+    shape = (len(poses), len(sources_m))
+    uavs, ports = tables.uav_m.shape[1], tables.tower_m.shape[2]
+    h = np.zeros((shape[0] * shape[1], uavs, ports), dtype=np.complex128)
+    power = np.zeros(len(h))
+    lost = np.ones(len(paths)) if loss_db is None else amplitude_from_db(-loss_db)
+    kernels = compiled.edge_field_for(len(paths))
+
+    def run(part: slice) -> None:
+        some = paths.select(part)
+        if kernels is not None:
+            kernels.add(tables, some, pattern_ends(some, tables, link), lost[part], h, power)
+            return
+        amplitude = amplitudes(some, tables, link) * lost[part, None, None]
+        key = some.pose * shape[1] + some.tower
+        first = np.flatnonzero(np.diff(key, prepend=-1))
+        h[key[first]] = np.add.reduceat(amplitude, first, axis=0)
+        power[key[first]] = np.add.reduceat((np.abs(amplitude) ** 2).mean(axis=(1, 2)), first)
+
+    compiled.in_threads(run, parts_between_poses(paths.pose, PATHS_PER_CHUNK), 1 if kernels is None else threads)
     matrices = h.swapaxes(1, 2) if link.uav_transmits else h
-    shape = (len(poses), len(arrays))
     return np.ascontiguousarray(matrices).reshape(*shape, *matrices.shape[1:]), power.reshape(shape)
 
 
-def amplitudes(
-    paths: EdgePaths, edges: Edges, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link
-) -> ComplexArray:
-    """Complex amplitudes (paths, uav elements, tower elements) of paths of one tower.
+def amplitudes(paths: EdgePaths, tables: Tables, link: Link) -> ComplexArray:
+    """Complex amplitudes (paths, uav elements, tower elements) of paths.
 
     Parameters
     ----------
     paths : EdgePaths
-    edges : Edges
-    faces : Faces
-    sources_m : (towers, 3)
-    poses : Poses
+    tables : Tables
     link : Link
 
     Returns
@@ -93,97 +169,320 @@ def amplitudes(
     Notes
     -----
     ``g_u . M_2 D M_1 . g_t  lambda / (4 pi) / sqrt(k s s' (s + s')) e^{-j k (s + s')}`` with s' and s the lengths
-    before and after the edge, D the diffraction matrix times the square root of k, and M the dyads of the ground.
+    before and after the edge, D the diffraction matrix times the square root of k, and M the dyads of mirrors.
     """
-    array = list(link.tower_arrays.values())[paths.tower[0]]
-    wavelength = wavelength_m(link.carrier_hz)
-    k, tables = 2.0 * np.pi / wavelength, FaceMaterials.of(faces, link.carrier_hz)
-    mount = np.broadcast_to(array.mount, (len(paths), 3, 3))
-    here = _end(paths, 0, edges, faces, sources_m[paths.tower], mount, array)
-    turn = poses.rotation[paths.pose] @ link.uav_array.mount
-    there = _end(paths, 1, edges, faces, poses.position_m[paths.pose], turn, link.uav_array)
-    point, edge = paths.vertices_m[:, 1], edges.along[paths.edge]
-    before, after = _unit(point - here.centre_m), _unit(there.centre_m - point)
-    sent = _off_ground(radiated(array, here.turn, before.T), before, here, tables, wavelength)
-    caught = _off_ground(radiated(link.uav_array, there.turn, -after.T), after, there, tables, wavelength)
-    near, far, rise = here.radius[:, 0], there.radius[:, 0], there.along[:, 0] - here.along[:, 0]
-    total = np.hypot(near + far, rise)
+    out = np.empty((len(paths), tables.uav_m.shape[1], tables.tower_m.shape[2]), dtype=np.complex128)
+    fields = pattern_ends(paths, tables, link)
+    for two in (False, True):
+        rows = np.flatnonzero((paths.edge[:, 1] >= 0) == two)
+        if len(rows):
+            out[rows] = _alike(paths.select(rows), tables, [None if f is None else f[rows] for f in fields], two)
+    return out
+
+
+def _alike(paths: EdgePaths, t: Tables, fields: list[FloatArray | None], two: bool) -> ComplexArray:
+    """Amplitudes of paths that all cross one edge, or all two."""
+    first, last = paths.edge[:, 0], paths.edge[:, 1 if two else 0]
+    here, there = (_end(paths, t, side) for side in (0, 1))
+    edge_1, edge_2 = (_edge(t, e) for e in (first, last))
+    if two:
+        before, after, cosines, joined, turn = over_two(
+            here[0], there[0], edge_1, edge_2, parts_of(paths.vertices_m[:, 1]), parts_of(paths.vertices_m[:, 2]),
+            paths.shared[:, 0, None], paths.shared[:, 1, None], t.wave_number,
+        )  # fmt: skip
+    else:
+        before, after, cosines, joined, turn = over_one(here[0], there[0], edge_1, t.wave_number)
+    parts = []
+    for side, (end, edge, way) in enumerate(((here, edge_1, before), (there, edge_2, after))):
+        te, tm = mirror_coefficients(way, end[2], parts_of(t.material[paths.ground[:, side]]))
+        mirror = end[2], (paths.ground[:, side] >= 0)[:, None], te, tm
+        given = (1.0, 0.0, 0.0, 0.0) if fields[side] is None else tuple(fields[side].swapaxes(0, 1))  # type: ignore[union-attr]
+        units = end_parts(end[1], (way, 1.0 - 2.0 * side), mirror, edge[1], cosines[side])
+        parts.append(element_parts(units, given, (end[4][..., 0, :], end[4][..., 1, :])))
+    u_s, v_s = _in_edge(here, edge_1)
+    along, radius = _in_edge(there, edge_2)
+    u_t, v_t = turn[0] + turn[1] * along + turn[2] * radius, turn[3] + turn[4] * along + turn[5] * radius
+    total = np.hypot(u_t[:, :, None] - u_s[:, None, :], v_t[:, :, None] + v_s[:, None, :])
+    cycles = total * (t.wave_number / (2.0 * np.pi))
+    carrier = np.exp(-2j * np.pi * (cycles - np.round(cycles))) / np.sqrt(total)
+    (b_in, p_in), (b_out, p_out) = parts
+    b_mid, p_mid = joined[0] * b_in + joined[1] * p_in, joined[2] * b_in + joined[3] * p_in
+    return np.asarray((b_out[:, :, None] * b_mid[:, None, :] + p_out[:, :, None] * p_mid[:, None, :]) * carrier)
+
+
+def _end(paths: EdgePaths, t: Tables, side: int) -> tuple[Vector, Rotation, Vector, FloatArray, FloatArray]:
+    """An end of paths in the space where its leg is straight: centre, axes, normal of its mirror; elements, slants."""
+    face = paths.ground[:, side]
+    index = (paths.tower, paths.pose)[side]
+    normal = parts_of(t.normal[face])
+    centre = mirrored(parts_of((t.source, t.place)[side][index]), normal, t.offset[face, None])
+    axes = rows_of((t.tower_axes, t.axes)[side][index])
+    turned = tuple(mirrored(axis, normal, 0.0) for axis in axes)
+    if side:
+        return centre, turned, normal, t.uav_m[None], t.uav_slant[None]  # type: ignore[return-value]
+    return centre, turned, normal, t.tower_m[paths.tower], t.tower_slant[paths.tower]  # type: ignore[return-value]
+
+
+def _edge(t: Tables, edge: IntArray) -> Any:
+    """Edges (paths,) as the laws take them: start, direction, both faces' axes, normal of face 0, angle, materials."""
+    materials = tuple(parts_of(t.material[t.face[edge, side]]) for side in (0, 1))
+    return (
+        parts_of(t.start[edge]), parts_of(t.along[edge]), parts_of(t.inward[edge, 0]), parts_of(t.inward[edge, 1]),
+        parts_of(t.out[edge]), t.exterior[edge, None], *materials,
+    )  # fmt: skip
+
+
+def _in_edge(end: Any, edge: Any) -> tuple[FloatArray, FloatArray]:
+    return element_place(end[0], end[1], tuple(end[3][..., axis, :] for axis in range(3)), edge)  # type: ignore[return-value]
+
+
+def pattern_ends(paths: EdgePaths, t: Tables, link: Link) -> list[FloatArray | None]:
+    """Pattern fields (paths, 4, elements) of both ends along the paths of the centres; None for 1 along theta.
+
+    Parameters
+    ----------
+    paths : EdgePaths
+    t : Tables
+    link : Link
+
+    Returns
+    -------
+    list of (paths, 4, elements) or None
+        Of towers and UAV.
+    """
+    arrays, uav = list(link.tower_arrays.values()), link.uav_array
+    fields: list[FloatArray | None] = [None, None]
+    last = np.where(np.isfinite(paths.vertices_m[:, 2, :1]), paths.vertices_m[:, 2], paths.vertices_m[:, 1])
+    for side, corner in enumerate((paths.vertices_m[:, 1], last)):
+        if all(plain(array.patterns) for array in ((uav,) if side else arrays)):
+            continue
+        centre, axes, *_ = _end(paths, t, side)
+        way = unit(centre, parts_of(corner))
+        made = np.empty((len(paths), 4, len(uav if side else arrays[0])))
+        for tower, array in enumerate((uav,) if side else arrays):
+            rows = slice(None) if side else np.flatnonzero(paths.tower == tower)
+            turned = tuple(tuple(part[rows] for part in axis) for axis in axes)
+            spread = tuple(np.repeat(part[rows], len(array), axis=1) for part in way)
+            made[rows] = pattern_fields(array, np.arange(len(array)), turned, spread)  # type: ignore[arg-type]
+        fields[side] = made
+    return fields
+
+
+# ------------------------------------------------------------------------------- laws, of numbers or of arrays
+
+
+def dot(a: Vector, b: Vector) -> Number:
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def unit(start: Vector, end: Vector) -> Vector:
+    """Unit vector from one point to another."""
+    x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+    scale = 1.0 / np.sqrt(x * x + y * y + z * z)
+    return x * scale, y * scale, z * scale
+
+
+def mirrored(point: Vector, normal: Vector, offset: Number) -> Vector:
+    """A point mirrored in a plane, or with offset 0 a vector; as it is where the normal is zero."""
+    twice = 2.0 * (dot(point, normal) - offset)
+    return point[0] - twice * normal[0], point[1] - twice * normal[1], point[2] - twice * normal[2]
+
+
+def round_edge(point: Vector, edge: Any) -> Vector:
+    """Coordinates of a point round an edge: along it, in face 0 away from it, out of face 0."""
+    x = point[0] - edge[0][0], point[1] - edge[0][1], point[2] - edge[0][2]
+    return dot(x, edge[1]), dot(x, edge[2]), dot(x, edge[4])
+
+
+def element_place(centre: Vector, axes: Rotation, element: Vector, edge: Any) -> tuple[Number, Number]:
+    """Place of an element along an edge and its distance from it [m].
+
+    Parameters
+    ----------
+    centre, axes : Vector, Rotation
+        Of the array, where its leg is straight.
+    element : Vector
+        In the array [m].
+    edge : tuple
+
+    Returns
+    -------
+    along, radius : Number
+    """
+    x, y, z = dyads.turned_back(axes, element)
+    along, down, out = round_edge((centre[0] + x, centre[1] + y, centre[2] + z), edge)
+    return along, np.sqrt(down * down + out * out)
+
+
+def angle_round(place: Vector) -> Number:
+    """Angle of a point round an edge from face 0 [rad]."""
+    angle = np.arctan2(place[2], place[1])
+    return dyads.select(angle < 0.0, angle + 2.0 * np.pi, angle)
+
+
+def mirror_coefficients(way: Vector, normal: Vector, material: Vector) -> tuple[Any, Any]:
+    """TE and TM coefficients of the mirror of a leg."""
+    return face_coefficients(dyads.incidence(way, normal), material[0], material[1], material[2])
+
+
+def end_parts(axes: Rotation, way: Any, mirror: Any, along: Vector, cosine: Number) -> Any:
+    """Unit fields along theta and phi of a device over its leg, in the edge-fixed basis times the sine with the edge.
+
+    Parameters
+    ----------
+    axes : Rotation
+        Device axes in the space where the leg is straight.
+    way : (Vector, Number)
+        Direction of the wave, and 1 at the source, -1 at the target, which radiates against it.
+    mirror : tuple
+        Normal of the leg's mirror, whether there is one, and its coefficients TE and TM.
+    along : Vector
+        Direction of the edge.
+    cosine : Number
+        Of the angle between ray and edge.
+
+    Returns
+    -------
+    theta_beta, theta_phi, phi_beta, phi_phi : complex
+    """
+    (x, y, z), sign = way
+    toward = sign * x, sign * y, sign * z
+    flat = along[0] - cosine * x, along[1] - cosine * y, along[2] - cosine * z
+    cross = along[1] * z - along[2] * y, along[2] * x - along[0] * z, along[0] * y - along[1] * x
+    theta = after_mirror(dyads.field_vector(axes, toward, 1.0, 0.0), way[0], mirror)
+    phi = after_mirror(dyads.field_vector(axes, toward, 0.0, 1.0), way[0], mirror)
+    return (
+        dot(theta[0], flat) + 1j * dot(theta[1], flat), dot(theta[0], cross) + 1j * dot(theta[1], cross),
+        dot(phi[0], flat) + 1j * dot(phi[1], flat), dot(phi[0], cross) + 1j * dot(phi[1], cross),
+    )  # fmt: skip
+
+
+def after_mirror(wave: Vector, way: Vector, mirror: Any) -> tuple[Vector, Vector]:
+    """Real and imaginary part of a real field vector after the mirror of its leg, or as it is."""
+    normal, bounced, te, tm = mirror
+    re, im = dyads.reflected(wave, (0.0, 0.0, 0.0), way, normal, te.real, te.imag, tm.real, tm.imag)
+    x, y, z = wave
+    return (
+        (dyads.select(bounced, re[0], x), dyads.select(bounced, re[1], y), dyads.select(bounced, re[2], z)),
+        (dyads.select(bounced, im[0], 0.0), dyads.select(bounced, im[1], 0.0), dyads.select(bounced, im[2], 0.0)),
+    )
+
+
+def element_parts(parts: Any, field: Any, slant: Any) -> tuple[Any, Any]:
+    """Field of an element in the edge-fixed basis from those of unit fields, its pattern and its slant."""
+    e_theta, e_phi = dyads.slant_rotation(field[0] + 1j * field[1], field[2] + 1j * field[3], slant[0], slant[1])
+    return e_theta * parts[0] + e_phi * parts[2], e_theta * parts[1] + e_phi * parts[3]
+
+
+def over_one(source: Vector, target: Vector, edge: Any, wave_number: float) -> Any:
+    """A path over one edge between array centres.
+
+    Parameters
+    ----------
+    source, target : Vector
+        Mirrored where their leg is bent.
+    edge : tuple
+        Start, direction, axes of faces 0 and n, normal of face 0, exterior angle, materials of faces 0 and n.
+    wave_number : float
+
+    Returns
+    -------
+    before, after : Vector
+        Directions of the legs.
+    cosines : (Number, Number)
+        Of the angles between legs and edges.
+    joined : tuple of 4 complex
+        Matrix over (after, before) and (beta, phi) with spreading, but for one over the root of the length.
+    turn : tuple of 6 Number
+        Place of a target element where the path is straight: ``turn[0] + turn[1] along + turn[2] radius`` and so on.
+    """
+    here, there = round_edge(source, edge), round_edge(target, edge)
+    near, far = np.sqrt(here[1] ** 2 + here[2] ** 2), np.sqrt(there[1] ** 2 + there[2] ** 2)
+    rise = there[0] - here[0]
+    total = np.sqrt((near + far) ** 2 + rise * rise)
     sine, cosine = (near + far) / total, rise / total
-    matrix = wedge_matrix(
-        here.angle, there.angle, cosine, edges.exterior[paths.edge], k * near * far / total,
-        *(_fresnel(tables, face, wavelength) for face in edges.face[paths.edge].T),
-    )  # fmt: skip
-    into, out = (np.stack([edge - cosine[:, None] * way, np.cross(edge, way)], axis=1) for way in (before, after))
-    joined = np.einsum("iru,rai,rab,rbj,jrt->rut", caught, out, matrix, into, sent, optimize=True)
-    # into and out lack a factor 1 / sine each; the legs are near / sine and far / sine long
-    spread = 1.0 / (2.0 * k * sine * np.sqrt(k * near * far))
-    length = np.hypot(
-        there.radius[:, 1:, None] + here.radius[:, None, 1:], there.along[:, 1:, None] - here.along[:, None, 1:]
+    bb, bp, pp = wedge(
+        angle_round(here), angle_round(there), cosine, edge[5], wave_number * near * far / total, edge[6], edge[7]
     )
-    cycles = length / wavelength
-    carrier = np.exp(-2j * np.pi * (cycles - np.round(cycles)))
-    return np.asarray(joined * spread[:, None, None] / np.sqrt(length) * carrier)
+    at, start, along = here[0] + rise * near / (near + far), edge[0], edge[1]
+    point = start[0] + at * along[0], start[1] + at * along[1], start[2] + at * along[2]
+    # lambda / (4 pi) = 1 / 2k; the legs are near / sine and far / sine long, both bases lack a factor 1 / sine
+    spread = 1.0 / (2.0 * wave_number * sine * np.sqrt(wave_number * near * far))
+    joined = bb * spread, bp * spread, -bp * spread, pp * spread
+    return unit(source, point), unit(point, target), (cosine, cosine), joined, (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class _End:
-    """One end of paths in the space where its leg is straight, and its place round the edge.
+def over_two(
+    source: Vector, target: Vector, edge_1: Any, edge_2: Any, point_1: Vector, point_2: Vector, shared_1: Number,
+    shared_2: Number, wave_number: float,
+) -> Any:  # fmt: skip
+    """A path over two edges of one plane face, along that face between them; as :func:`over_one`.
 
-    ``radius, along`` (paths, 1 + elements) are of the centre, then of each element [m], ``angle`` (paths,) of the
-    centre; ``normal`` (paths, 3) of the ground is zero where none reflects.
+    Sources: Luebbers, IEEE Trans. Antennas Propag. 37 (1989) 206, doi 10.1109/8.18707 (slope term); Andersen, IEEE
+    Trans. Antennas Propag. 45 (1997) 654, doi 10.1109/8.564091 (edges in a row).
+
+    Parameters
+    ----------
+    source, target : Vector
+    edge_1, edge_2 : tuple
+    point_1, point_2 : Vector
+        Where the path meets the edges.
+    shared_1, shared_2 : Number
+        Which face of each edge the two share: 0, or 1 for face n.
+    wave_number : float
+
+    Returns
+    -------
+    before, after, cosines, joined, turn
+        As of :func:`over_one`.
+
+    Notes
+    -----
+    ``(S_1 (1 - W) + X H_1) (S_2 (1 - W) + X H_2) / (2 j k s) / k / sqrt(s_0 s s_2 (s_0 + s + s_2))`` for each
+    polarisation, with :func:`at_face` (S and H by the height of the ray over the face) and :func:`along_face`. On a
+    perfect conductor that is half of two hard wedges, ``2 H_1 H_2``; on a face where waves cancel the slope carries on.
     """
-
-    centre_m: FloatArray
-    turn: FloatArray
-    normal: FloatArray
-    ground: IntArray
-    radius: FloatArray
-    along: FloatArray
-    angle: FloatArray
-
-
-def _end(
-    paths: EdgePaths, side: int, edges: Edges, faces: Faces, centre_m: FloatArray, turn: FloatArray, array: Array
-) -> _End:
-    """Source (side 0) or target (1) of paths, mirrored in the ground where that reflects its leg."""
-    ground = paths.ground[:, side]
-    normal = np.where((ground >= 0)[:, None], faces.normal[ground], 0.0)
-    height = (centre_m * normal).sum(axis=1) - np.where(ground >= 0, faces.offset_m[ground], 0.0)
-    centre_m = centre_m - 2.0 * height[:, None] * normal
-    turn = turn - 2.0 * np.einsum("ni,nj,njk->nik", normal, normal, turn)
-    places = np.concatenate(
-        [centre_m[:, None], centre_m[:, None] + array.positions_m @ turn.transpose(0, 2, 1)], axis=1
-    )
-    along, down, out = np.moveaxis(edges.coordinates(places, paths.edge), -1, 0)
-    angle = np.mod(np.arctan2(out[:, 0], down[:, 0]), 2.0 * np.pi)
-    return _End(
-        centre_m=centre_m,
-        turn=turn,
-        normal=normal,
-        ground=ground,
-        radius=np.hypot(down, out),
-        along=along,
-        angle=angle,
-    )
-
-
-def _off_ground(
-    wave: ComplexArray, toward: FloatArray, end: _End, tables: FaceMaterials, wavelength: float
-) -> ComplexArray:
-    """Field vectors (3, paths, elements) after the ground's dyad; as they are where no ground reflects."""
-    ray, normal = (v.T[:, :, None] for v in (toward, end.normal))
-    te, tm = _fresnel(tables, end.ground[:, None], wavelength)(dyads.incidence(tuple(ray), tuple(normal)))  # type: ignore[arg-type]
-    re, im = dyads.reflected(
-        tuple(wave.real), tuple(wave.imag), tuple(ray), tuple(normal), te.real, te.imag, tm.real, tm.imag  # type: ignore[arg-type]
+    way = unit(point_1, point_2)
+    gap = np.sqrt((point_2[0] - point_1[0]) ** 2 + (point_2[1] - point_1[1]) ** 2 + (point_2[2] - point_1[2]) ** 2)
+    here, there = round_edge(source, edge_1), round_edge(target, edge_2)
+    near, far = np.sqrt(here[1] ** 2 + here[2] ** 2), np.sqrt(there[1] ** 2 + there[2] ** 2)
+    cos_1, cos_2 = dot(way, edge_1[1]), dot(way, edge_2[1])
+    sin_1, sin_2 = np.sqrt(1.0 - cos_1 * cos_1), np.sqrt(1.0 - cos_2 * cos_2)
+    first, last = near / sin_1, far / sin_2
+    on_n = shared_1 > 0
+    material = (
+        dyads.select(on_n, edge_1[7][0], edge_1[6][0]), dyads.select(on_n, edge_1[7][1], edge_1[6][1]),
+        dyads.select(on_n, edge_1[7][2], edge_1[6][2]),
     )  # fmt: skip
-    after = np.stack([a + 1j * b for a, b in zip(re, im, strict=True)])
-    return np.asarray(np.where((end.ground >= 0)[:, None], after, wave))
+    hard_1, slope_1 = at_face(
+        angle_round(here), shared_1 * np.pi * edge_1[5], (1.0 - 2.0 * shared_1) * STEP_RAD, edge_1[5],
+        wave_number * first * gap * sin_1 * sin_1 / (first + gap),
+    )  # fmt: skip
+    hard_2, slope_2 = at_face(
+        angle_round(there), shared_2 * np.pi * edge_2[5], (1.0 - 2.0 * shared_2) * STEP_RAD, edge_2[5],
+        wave_number * last * gap * sin_2 * sin_2 / (last + gap),
+    )  # fmt: skip
+    # matrices lack one factor 1 / sine each, bases another, and the height of a ray over the face gains one
+    spread = 1.0 / (2.0 * wave_number**2 * (sin_1 * sin_2) ** 2 * np.sqrt(first * gap * last))
+    # the bases of both edges lie in the face and across it: they differ by a sign
+    spread = dyads.select(dot(edge_1[1], edge_2[1]) - cos_1 * cos_2 < 0.0, -spread, spread) / (2j * wave_number * gap)
+    te, tm = along_face(wave_number * gap, material)
+    slope_1, slope_2, whole = slope_1 / sin_1, slope_2 / sin_2, 4.0 * wave_number * gap
+    soft_te, soft_tm = 1.0 - np.abs(te * te) / whole, 1.0 - np.abs(tm * tm) / whole
+    beta = spread * (slope_1 * soft_te + te * hard_1) * (slope_2 * soft_te + te * hard_2)
+    phi = spread * (slope_1 * soft_tm + tm * hard_1) * (slope_2 * soft_tm + tm * hard_2)
+    joined = beta, 0.0 * beta, 0.0 * phi, phi
+    inward_1, inward_2 = into_face(edge_1, shared_1), into_face(edge_2, shared_2)
+    apart = edge_2[0][0] - edge_1[0][0], edge_2[0][1] - edge_1[0][1], edge_2[0][2] - edge_1[0][2]
+    turn = (
+        dot(apart, edge_1[1]), dot(edge_2[1], edge_1[1]), -dot(inward_2, edge_1[1]),
+        dot(apart, inward_1), dot(edge_2[1], inward_1), -dot(inward_2, inward_1),
+    )  # fmt: skip
+    return unit(source, point_1), unit(point_2, target), (cos_1, cos_2), joined, turn
 
 
-def _fresnel(tables: FaceMaterials, face: IntArray, wavelength: float) -> Fresnel:
-    eta, thickness = tables.permittivity[face], tables.thickness_m[face]
-    return lambda cosine: reflection_coefficients(cosine, eta, thickness, wavelength)
-
-
-def _unit(vector: FloatArray) -> FloatArray:
-    return np.asarray(vector / np.linalg.norm(vector, axis=1, keepdims=True))
+def into_face(edge: Any, shared: Number) -> Vector:
+    """Unit vector in face 0 (``shared`` 0) or n (1) of an edge, away from it."""
+    a, b, on_n = edge[2], edge[3], shared > 0
+    return dyads.select(on_n, b[0], a[0]), dyads.select(on_n, b[1], a[1]), dyads.select(on_n, b[2], a[2])

@@ -123,7 +123,7 @@ def channel_matrices(
         first = np.flatnonzero(np.diff(key, prepend=-1))
         h[key[first]] = np.add.reduceat(amplitude.view(np.complex128)[..., 0], first, axis=0)
 
-    compiled.in_threads(run, _parts(ordered.pose), 1 if kernels is None else threads)
+    compiled.in_threads(run, parts_between_poses(ordered.pose), 1 if kernels is None else threads)
     if order is not None:
         power[order] = power.copy()
     matrices = h.reshape(len(poses), len(arrays), uavs, ports)
@@ -265,11 +265,11 @@ def _by_link(paths: PathSet, towers: int) -> IntArray | None:
     return None if (np.diff(key) >= 0).all() else np.argsort(key, kind="stable")
 
 
-def _parts(pose: IntArray) -> list[slice]:
-    """Runs of paths between poses: threads must not share a link."""
+def parts_between_poses(pose: IntArray, most: int = PATHS_PER_PART) -> list[slice]:
+    """Runs of some ``most`` paths that end between poses (paths,): threads must not share a link."""
     edges = [0]
     while edges[-1] < len(pose):
-        stop = min(edges[-1] + PATHS_PER_PART, len(pose))
+        stop = min(edges[-1] + most, len(pose))
         if stop < len(pose):  # to the end of the pose
             stop = int(np.searchsorted(pose, pose[stop - 1], side="right"))
         edges.append(stop)

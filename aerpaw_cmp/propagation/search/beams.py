@@ -444,11 +444,11 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
             share = abs(low) / (abs(low) + abs(top))
             vertices[row, step] = images[step + 1] + share * (point - images[step + 1])
             point = vertices[row, step]
-            if _in_face(first, flat, along, across, f, point, edge):
+            if in_face(first, flat, along, across, f, point, edge):
                 continue
             moved = False
             for k in range(start[plane[f]], start[plane[f] + 1]):
-                if _in_face(first, flat, along, across, order[k], point, edge):
+                if in_face(first, flat, along, across, order[k], point, edge):
                     sequence[row, step] = order[k]
                     moved = True
                     break
@@ -704,8 +704,28 @@ def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-def]
-    """Whether a point of the plane of face ``f`` lies in one of its triangles."""
+def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-def]
+    """Whether a point of the plane of a face lies in one of its triangles.
+
+    Parameters
+    ----------
+    first : (faces + 1,) int
+        Where the triangles of each face begin.
+    flat : (triangles, 3, 2)
+        Corners in the axes of their face [m].
+    along, across : (faces, 3)
+        Axes of the faces.
+    f : int
+        The face.
+    p : (3,)
+        The point [m].
+    edge : float
+        How far outside a triangle it may lie [m].
+
+    Returns
+    -------
+    bool
+    """
     a = along[f, 0] * p[0] + along[f, 1] * p[1] + along[f, 2] * p[2]
     b = across[f, 0] * p[0] + across[f, 1] * p[1] + across[f, 2] * p[2]
     for t in range(first[f], first[f + 1]):
@@ -854,7 +874,7 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, so
                     for axis in range(3):
                         points[step, axis] = behind[axis] + share * (point[axis] - behind[axis])
                     point = points[step]
-                    if not _in_face(first, flat, along, across, g, point, EDGE_M):
+                    if not in_face(first, flat, along, across, g, point, EDGE_M):
                         good = False
                         break
                 if not good:
@@ -913,6 +933,7 @@ __all__ = [
     "Estimate",
     "estimate",
     "grow_paths",
+    "in_face",
     "reflection_points",
     "segment_cut",
     "try_out",

@@ -1,78 +1,271 @@
-"""Paths over one edge of a building.
+"""Paths over edges of buildings.
 
 A path runs from the source, or its image in the ground, to the point of the edge where both legs make the same angle
 with it (Keller's cone), and on to the target or its image in the ground. It exists when that point lies on the edge,
-both legs are free, and the point is on no other building's wall or inside one.
+both legs are free, and the point is on no other building's wall or inside one. Over two edges of one plane face it runs
+along that face between them, where it is straight once both legs are turned into the plane of the face.
+
+Small jobs over single edges run in NumPy here, all others in :mod:`aerpaw_cmp.propagation.search.edge_kernels`.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import fields
+from types import ModuleType
+from typing import Any
 
 import numpy as np
+import shapely
 
 from ...common.units import BoolArray, FloatArray, IntArray
-from ..edges import EdgePaths, Edges
+from .. import compiled
+from ..edges import NEAREST_M, EdgePaths, Edges
 from ..faces import inside
 from ..paths import Faces
+from ..surfaces import Surfaces
 from .mirror import scene_tolerance_m
 from .occlusion import Occlusion
 
 PROBE_M = 1e-3
 """How far beside an edge point the air on both of its faces is looked for."""
 
-NEAREST_M = 0.01
-"""An end nearer than this to an edge has no path over it: there is no far field."""
-
 LINKS_AT_ONCE = 200_000
 """Pairs of edge and pose that are looked at together."""
 
+POSES_PER_PART = 256
+"""Poses whose compiled search one thread takes at once."""
+
 
 def find_edge_paths(
-    faces: Faces,
     edges: Edges,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
+    faces: Faces,
+    ends: tuple[FloatArray, FloatArray],
     usable: BoolArray,
     excluded: BoolArray,
-    walls: bool = False,
+    *,
+    surfaces: Surfaces | None = None,
+    every: bool = False,
+    threads: int | None = None,
 ) -> EdgePaths:
-    """All paths over one edge, with at most one ground reflection on either side of it.
+    """Paths over edges, with at most one ground reflection on either side.
 
     Parameters
     ----------
-    faces : Faces
     edges : Edges
-    sources_m, targets_m : (towers, 3), (poses, 3)
+    faces : Faces
+    ends : (towers, 3), (poses, 3)
+        Sources and targets [m].
     usable : (towers, faces) bool
         Faces that may reflect for each tower; its ground planes are meant.
     excluded : (towers, poses) bool
         Links without any path.
-    walls : bool
-        Also with one wall or roof, before or after the edge.
+    surfaces : Surfaces, optional
+        Of a scene of triangles: its ground is the face below each end.
+    every : bool
+        Also with one wall or roof before or after the edge, and over two edges of one face.
+    threads : int, optional
+        Of compiled code.
 
     Returns
     -------
     EdgePaths
+
+    Raises
+    ------
+    UsageError
+        If compiled code is asked for that does not run.
     """
-    known = targets_m[np.isfinite(targets_m).all(axis=1)]
-    hiding = Occlusion(faces, scene_tolerance_m(faces, sources_m, known))
+    sources, targets = ends
+    candidates = len(edges) * excluded.size * (len(faces) if every else 4)
+    kernels = compiled.edges_for(candidates, needed=every or surfaces is not None) if len(edges) else None
+    if kernels is not None:
+        return _compiled(kernels, edges, faces, ends, usable, excluded, surfaces, every, threads)
+    known = targets[np.isfinite(targets).all(axis=1)]
+    hiding = Occlusion(faces, scene_tolerance_m(faces, sources, known))
     exposed = _Exposed(faces, edges, hiding)
-    solid = np.flatnonzero(faces.solid >= 0).tolist() if walls else []
-    pieces = []
-    for tower, source in enumerate(sources_m):
+    pieces = [EdgePaths.of(np.zeros((0, 8), np.int64), np.zeros((0, 4, 3)))]
+    for tower, source in enumerate(sources):
         grounds = [-1, *np.flatnonzero(usable[tower] & (faces.solid < 0)).tolist()]
-        sides = [*itertools.product(grounds, grounds), *((w, -1) for w in solid), *((-1, w) for w in solid)]
-        for mirrors in sides if len(edges) else ():
-            pieces += _over_edges(faces, edges, source, targets_m, ~excluded[tower], mirrors, hiding, exposed, tower)
-    if not pieces:
-        none = np.zeros(0, dtype=np.int64)
-        return EdgePaths(none, none, none, np.zeros((0, 2), np.int64), np.zeros((0, 3, 3)))
-    columns = {f.name: np.concatenate([getattr(p, f.name) for p in pieces]) for f in fields(EdgePaths)}
+        for mirrors in itertools.product(grounds, grounds) if len(edges) else ():
+            pieces += _over_edges(faces, edges, source, targets, ~excluded[tower], mirrors, hiding, exposed, tower)
+    return _sorted(pieces)
+
+
+def _sorted(pieces: list[EdgePaths]) -> EdgePaths:
+    """Pieces as one, by pose, tower, edges and mirrors."""
+    columns = {name: np.concatenate([getattr(p, name) for p in pieces]) for name in EdgePaths.__slots__}
     before, after = columns["ground"].T
-    order = np.lexsort((after, before, columns["edge"], columns["tower"], columns["pose"]))
+    last, first = columns["edge"].T[::-1]
+    order = np.lexsort((after, before, first, last, columns["tower"], columns["pose"]))
     return EdgePaths(**{name: column[order] for name, column in columns.items()})
+
+
+def _compiled(
+    kernels: ModuleType,
+    edges: Edges,
+    faces: Faces,
+    ends: tuple[FloatArray, FloatArray],
+    usable: BoolArray,
+    excluded: BoolArray,
+    surfaces: Surfaces | None,
+    every: bool,
+    threads: int | None,
+) -> EdgePaths:
+    sources, targets = (np.ascontiguousarray(end) for end in ends)
+    poses = np.flatnonzero(np.isfinite(targets).all(axis=1))
+    hiding = Occlusion(faces, scene_tolerance_m(faces, sources, targets[poses])) if surfaces is None else None
+    bends = _bends(kernels, edges, faces, ends, usable, surfaces, every)
+    mirrors = _mirrors(kernels, faces, surfaces)
+    solids = _solids(kernels, hiding, surfaces)
+    parts = [poses[k : k + POSES_PER_PART] for k in range(0, len(poses), POSES_PER_PART)]
+    rows = compiled.in_threads(
+        lambda part: kernels.search(bends, mirrors, solids, sources, targets, excluded, part), parts, threads
+    )
+    none = np.zeros((0, 8), np.int64), np.zeros((0, 4, 3))
+    index, vertices = (np.concatenate([n, *(row[i] for row in rows)]) for i, n in enumerate(none))
+    paths = EdgePaths.of(index, vertices)
+    if hiding is None:
+        return paths
+    return paths.select(_beyond_bounds(edges, faces, ends, hiding, paths))
+
+
+def _beyond_bounds(
+    edges: Edges, faces: Faces, ends: tuple[FloatArray, FloatArray], hiding: Occlusion, paths: EdgePaths
+) -> BoolArray:
+    """Paths (paths,) that hold by what compiled code does not ask: outlines of faces, seams and touching solids."""
+    exposed, good = _Exposed(faces, edges, hiding), np.ones(len(paths), dtype=np.bool_)
+    outlined = np.append([polygon is not None for polygon in faces.polygon], False)
+    for side, corner in ((0, 0), (1, 3)):
+        rows = np.flatnonzero(good & outlined[paths.ground[:, side]])
+        good[rows] = inside(faces, paths.ground[rows, side], paths.vertices_m[rows, corner], 0.0)
+    common = np.where(paths.edge[:, 1] >= 0, edges.face[paths.edge[:, 0], paths.shared[:, 0]], -1)
+    for row in np.flatnonzero(good & outlined[common]):
+        line = paths.vertices_m[row, 1:3]
+        flat = np.column_stack([line @ faces.along[common[row]], line @ faces.across[common[row]]])
+        good[row] = faces.polygon[common[row]].buffer(hiding.tolerance_m).covers(shapely.LineString(flat))  # type: ignore[union-attr]
+    good[good] &= exposed.at(paths.edge[good, 0], paths.vertices_m[good, 1])
+    rows = np.flatnonzero(good & (paths.edge[:, 1] >= 0))
+    good[rows] &= exposed.at(paths.edge[rows, 1], paths.vertices_m[rows, 2])
+    if any(any(pieces) for pieces in hiding.abutting):
+        rows = np.flatnonzero(good)
+        sources, targets = ends
+        for start, end in _legs(sources[paths.tower[rows]], paths.vertices_m[rows], targets[paths.pose[rows]]):
+            good[rows] &= ~hiding.segments(start, end)
+    return good
+
+
+def _bends(
+    kernels: ModuleType,
+    edges: Edges,
+    faces: Faces,
+    ends: tuple[FloatArray, FloatArray],
+    usable: BoolArray,
+    surfaces: Surfaces | None,
+    every: bool,
+) -> Any:
+    """Edges, pairs and mirrors as compiled code takes them."""
+    if surfaces is None:
+        wall = faces.solid >= 0
+        plane = usable & ~wall[None, :]
+        ground_t = np.where(plane.any(axis=1), plane.argmax(axis=1), -1)
+        ground_p = np.full(len(ends[1]), -2, dtype=np.int64)
+    else:
+        ground_t, ground_p = (_below(surfaces, points) for points in ends)
+        wall = np.ones(len(faces), dtype=np.bool_)
+        wall[[*ground_t[ground_t >= 0], *ground_p[ground_p >= 0]]] = False
+    grounds = np.unique(np.append(ground_t, ground_p))
+    options = np.arange(len(faces)) if every else grounds[grounds >= 0]
+    pair, shared = edges.pairs() if every else (np.zeros((0, 2), np.int64),) * 2
+    inward = np.stack([edges.face_axis, np.cross(edges.along, edges.normal_n)], axis=1)
+    (e, g), (side, far) = pair.T, shared.T
+    apart, in_e, in_g = edges.start_m[g] - edges.start_m[e], inward[e, side], inward[g, far]
+    turn = [(v * axis).sum(axis=1) for axis in (edges.along[e], in_e) for v in (apart, edges.along[g], -in_g)]
+    return kernels.Bends(
+        start=edges.start_m,
+        along=edges.along,
+        axis=edges.face_axis,
+        out=edges.normal,
+        out_n=edges.normal_n,
+        length=edges.length_m,
+        exterior=edges.exterior,
+        face=np.ascontiguousarray(edges.face),
+        options=np.append(-1, options),
+        ground_t=ground_t,
+        ground_p=ground_p,
+        wall=wall,
+        pair=np.ascontiguousarray(pair),
+        shared=np.ascontiguousarray(shared),
+        turn=np.column_stack(turn),
+    )
+
+
+def _mirrors(kernels: ModuleType, faces: Faces, surfaces: Surfaces | None) -> Any:
+    none = np.zeros(0, np.int64), np.zeros((0, 3, 2))
+    first, flat = none if surfaces is None else (surfaces.first, surfaces.flat_m)
+    return kernels.Mirrors(
+        normal=faces.normal,
+        offset=faces.offset_m,
+        along=faces.along,
+        across=faces.across,
+        lower=faces.lower,
+        upper=faces.upper,
+        first=first,
+        flat=flat,
+    )
+
+
+def _solids(kernels: ModuleType, hiding: Occlusion | None, surfaces: Surfaces | None) -> Any:
+    from .beams import END_M, SIDE_M  # compiled
+    from .boxtree import box_tree
+
+    rules = (1, 0.0 if surfaces is None else 2.0 * surfaces.merge_m, END_M, 0.0, SIDE_M, True, True)
+    if surfaces is not None:
+        return kernels.Solids(
+            normal=np.zeros((0, 3)),
+            offset=np.zeros(0),
+            first=np.zeros(1, np.int64),
+            tolerance=0.0,
+            lower=np.zeros((0, 3)),
+            upper=np.zeros((0, 3)),
+            corners=surfaces.corners_m,
+            tree=tuple(surfaces.tree),
+            rules=rules,
+            triangles=True,
+        )
+    assert hiding is not None
+    planes = [piece for pieces in hiding.pieces for piece in pieces]
+    solid = np.repeat(np.arange(len(hiding.pieces)), [len(pieces) for pieces in hiding.pieces])
+    return kernels.Solids(
+        normal=np.concatenate([normal for normal, _ in planes]),
+        offset=np.concatenate([offset for _, offset in planes]),
+        first=np.cumsum([0, *(len(offset) for _, offset in planes)]),
+        tolerance=hiding.tolerance_m,
+        lower=hiding.low[solid],
+        upper=hiding.high[solid],
+        corners=np.zeros((0, 3, 3)),
+        tree=tuple(box_tree(hiding.low[solid], hiding.high[solid])),
+        rules=rules,
+        triangles=False,
+    )
+
+
+def _below(surfaces: Surfaces, points_m: FloatArray) -> IntArray:
+    """Face of the first triangle below each point; -1 where there is none."""
+    corners, found = surfaces.corners_m, np.full(len(points_m), -1, dtype=np.int64)
+    side, last = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = side[:, 0] * last[:, 1] - side[:, 1] * last[:, 0]
+    rows = np.flatnonzero(np.abs(area) > 1e-9)
+    side, last, area, corner, face = side[rows], last[rows], area[rows], corners[rows, 0], surfaces.face[rows]
+    for number, point in enumerate(points_m):
+        if not np.isfinite(point).all():
+            continue
+        x, y = point[0] - corner[:, 0], point[1] - corner[:, 1]
+        u, v = (x * last[:, 1] - y * last[:, 0]) / area, (side[:, 0] * y - side[:, 1] * x) / area
+        height = corner[:, 2] + u * side[:, 2] + v * last[:, 2]
+        under = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & (height < point[2])
+        if under.any():
+            found[number] = face[np.flatnonzero(under)[height[under].argmax()]]
+    return found
 
 
 class _Exposed:
@@ -116,23 +309,20 @@ def _over_edges(
     poses = np.flatnonzero(alive & np.isfinite(targets_m).all(axis=1))
     source = _mirrored(faces, ground[0], source_m)
     ends = _mirrored(faces, ground[1], targets_m[poses])
-    here = edges.coordinates(np.broadcast_to(source, (len(edges), 1, 3)), np.arange(len(edges)))[:, 0]
-    radius = np.hypot(here[:, 1], here[:, 2])
-    lit = np.flatnonzero((radius >= NEAREST_M) & _in_air(edges, source[None], here[:, 2]))
+    at_source, near = (part[:, 0] for part in _round_edges(edges, source[None]))
+    lit = np.flatnonzero(near >= 0.0)
     pieces = []
     step = max(1, LINKS_AT_ONCE // max(1, len(lit)))
     for first in range(0, len(poses), step):
         some = ends[first : first + step]
-        there = edges.coordinates(np.broadcast_to(some, (len(lit), *some.shape)), lit).swapaxes(0, 1)
-        reach = np.hypot(there[..., 1], there[..., 2])
-        at = here[lit, 0] + (there[..., 0] - here[lit, 0]) * (radius[lit] / (radius[lit] + reach))
-        good = (at >= 0.0) & (at <= edges.length_m[lit]) & (reach >= NEAREST_M)
-        good &= _in_air(edges, some[:, None], there[..., 2], lit)
+        at_target, far = (part[lit].T for part in _round_edges(edges, some))
+        at = at_source[lit] + (at_target - at_source[lit]) * (near[lit] / (near[lit] + far))
+        good = (at >= 0.0) & (at <= edges.length_m[lit]) & (far >= 0.0)
         row, column = np.nonzero(good)
         edge, pose = lit[column], poses[first + row]
         point = edges.start_m[edge] + at[row, column][:, None] * edges.along[edge]
         bounce = [_on_ground(faces, index, end, point) for index, end in zip(ground, (source, some[row]), strict=True)]
-        vertices = np.stack([bounce[0], point, bounce[1]], axis=1)
+        vertices = np.stack([bounce[0], point, np.full_like(point, np.nan), bounce[1]], axis=1)
         good = np.ones(len(pose), np.bool_)
         for index, spot, end in zip(ground, bounce, (source_m, targets_m[pose]), strict=True):
             if index >= 0:
@@ -143,34 +333,28 @@ def _over_edges(
         good[good] &= exposed.at(edge[good], point[good])
         for leg in _legs(source_m, vertices, targets_m[pose]):
             good[good] &= ~hiding.segments(leg[0][good], leg[1][good])
-        count = int(good.sum())
-        pieces.append(
-            EdgePaths(
-                pose[good], np.full(count, tower), edge[good], np.tile(np.array(ground), (count, 1)), vertices[good]
-            )
-        )
+        rows = np.zeros((int(good.sum()), 8), dtype=np.int64)
+        rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 6:] = pose[good], tower, edge[good], -1, ground
+        pieces.append(EdgePaths.of(rows, vertices[good]))
     return pieces
 
 
 def _legs(source_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Straight pieces of the paths; where no ground point is, its leg is from the edge point to itself."""
-    before, point, after = (vertices_m[:, i] for i in range(3))
-    has_before, has_after = np.isfinite(before[:, :1]), np.isfinite(after[:, :1])
-    start = np.broadcast_to(source_m, point.shape)
-    return [
-        (np.where(has_before, before, start), point),
-        (np.where(has_before, start, point), np.where(has_before, before, point)),
-        (point, np.where(has_after, after, targets_m)),
-        (np.where(has_after, after, point), np.where(has_after, targets_m, point)),
-    ]
+    """Straight pieces of the paths; a point that is not used is the one before it."""
+    points = [np.broadcast_to(source_m, targets_m.shape)]
+    for corner in range(vertices_m.shape[1]):
+        used = np.isfinite(vertices_m[:, corner, :1])
+        points.append(np.where(used, vertices_m[:, corner], points[-1]))
+    return list(itertools.pairwise([*points, targets_m]))
 
 
-def _in_air(
-    edges: Edges, points_m: FloatArray, height_m: FloatArray, some: IntArray | slice = slice(None)
-) -> BoolArray:
-    """Points outside the wedge: before face 0 (``height_m``) or before face n."""
-    over_n = ((points_m - edges.start_m[some]) * edges.normal_n[some]).sum(axis=-1)
-    return np.asarray((height_m >= 0.0) | (over_n >= 0.0))
+def _round_edges(edges: Edges, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places (edges, points) along edges and distances from them; -1 inside the wedge or too near."""
+    axes = np.stack([edges.along, edges.face_axis, edges.normal, edges.normal_n])
+    start = (axes * edges.start_m).sum(axis=2)
+    along, down, up, up_n = axes @ points_m.T - start[..., None]
+    far = np.hypot(down, up)
+    return along, np.where((far >= NEAREST_M) & ((up >= 0.0) | (up_n >= 0.0)), far, -1.0)
 
 
 def _mirrored(faces: Faces, ground: int, points_m: FloatArray) -> FloatArray:

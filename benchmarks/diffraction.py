@@ -1,0 +1,83 @@
+"""Diffraction against reflections in one process: CPU seconds, ratio, paths; and a town of triangles.
+
+1. 5 towers x ``--poses`` poses x 12 buildings, 4 x 4 elements, depth 2: replays without and with edges in turn, on one
+   thread, ``--pairs`` times; the ratio is that of what diffraction adds to what the reflections take;
+2. with ``--town``: munich with 200 receivers, depth 2, single diffraction (Sionna RT must be installed: its scene).
+
+Run: python benchmarks/diffraction.py [--poses 10000] [--pairs 3] [--town] [--json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+
+import numpy as np
+from scenes import ends, shipped  # type: ignore[import-not-found]
+
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.jobs.bench import random_scene
+from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.options import Run, Search
+from aerpaw_cmp.propagation.replay import Replay, replay
+from aerpaw_cmp.site.mitsuba import read_scene
+from aerpaw_cmp.site.site import Site, Tower
+
+
+def timed(case: tuple[Site, Link, Poses], diffraction: str) -> tuple[Replay, float]:
+    start = time.process_time()
+    found = replay(*case, Search(diffraction=diffraction), run=Run(threads=1))
+    return found, time.process_time() - start
+
+
+def boxes(poses: int, pairs: int) -> dict[str, float]:
+    """What edges add to a replay of boxes."""
+    case = random_scene(poses, towers=5)
+    for mode in ("none", "edges"):
+        timed(case, mode)
+    rows = [(timed(case, "none"), timed(case, "edges")) for _ in range(pairs)]
+    plain, bent = (float(np.median([row[k][1] for row in rows])) for k in (0, 1))
+    return {
+        "links": poses * 5,
+        "reflections_cpu_s": plain,
+        "diffraction_cpu_s": bent - plain,
+        "ratio": float(np.median([(b - a) / a for (_, a), (_, b) in rows])),
+        "paths": len(rows[0][0][0].paths),
+        "edge_paths": len(rows[0][1][0].edge_paths or ()),
+    }
+
+
+def town(receivers: int = 200) -> dict[str, float]:
+    """Munich with single diffraction."""
+    (source,), targets = ends("munich", receivers)
+    towers = {"T": Tower("T", 48.1, 11.6, float(source[0]), float(source[1]), antenna_height_m=float(source[2]))}
+    site = Site("munich", SiteFrame(48.1, 11.6), towers, scene=read_scene(shipped("munich")))
+    link = Link(3.5e9, {"T": single_element()}, single_element())
+    poses = Poses(targets, np.broadcast_to(np.eye(3), (receivers, 3, 3)).copy())
+    few = Poses(targets[:2], poses.rotation[:2])
+    row: dict[str, float] = {"receivers": receivers}
+    for mode in ("none", "edges"):
+        timed((site, link, few), mode)  # compiles, and merges the triangles
+        found, seconds = timed((site, link, poses), mode)
+        street = targets[:, 2] < 2.0
+        row |= {f"{mode}_cpu_s": seconds, f"{mode}_silent_at_1.5_m": int((~found.has_path[street, 0]).sum())}
+    return row | {"edge_paths": len(found.edge_paths or ()), "street_receivers": int(street.sum())}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--poses", type=int, default=10_000)
+    parser.add_argument("--pairs", type=int, default=3)
+    parser.add_argument("--town", action="store_true")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    result = {"load": os.getloadavg()[0], "boxes": boxes(options.poses, options.pairs)}
+    if options.town:
+        result["munich"] = town()
+    print(json.dumps(result) if options.json else "\n".join(f"{name}: {value}" for name, value in result.items()))
+
+
+if __name__ == "__main__":
+    main()

@@ -176,6 +176,25 @@ def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:
         table(heads, rows, "Model comparison (cross-validated); * simplest replay within 1 SE of the best")
 
 
+def _print_forecasts(rank: Mapping[str, Any]) -> None:
+    """The forecast of the fitted receivers, where one was scored."""
+    rows = []
+    for tower, m in rank.items():
+        found = m.get("receiver")
+        if found and found.get("kappa") is not None:
+            low, high = found["kappa_ci95"]
+            rows.append([
+                tower, number(found["kappa"], "{:.2f}"), f"{number(low, '{:.2f}')} .. {number(high, '{:.2f}')}",
+                *(number(found[name], "{:.3f}") for name in _FORECAST), str(m["n"]),
+            ])  # fmt: skip
+    if rows:
+        heads = ["tower", "kappa", "95 %", "agreement", "commonest", "log score", "constant", "n"]
+        table(heads, rows, "Rank forecast by the fitted receiver")
+
+
+_FORECAST = ("agreement", "majority_agreement", "log_score", "constant_log_score")
+
+
 def _print_report_summary(outcome: Any) -> None:
     from ..compare.memory import FEWEST
     from ..compare.result import BASELINE_TITLE
@@ -212,6 +231,7 @@ def _print_report_summary(outcome: Any) -> None:
             )
     if rows:
         table(["tower", "K", "agreement", "total variation", "n"], rows, "Rank, measured against replayed")
+    _print_forecasts(outcome.metrics["rank"])
     if "against" in outcome.metrics:
         print(outcome.metrics["against"]["sentence"])
     warnings = [one_line(text) for text in outcome.metrics["warnings"]]

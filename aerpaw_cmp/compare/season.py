@@ -18,7 +18,7 @@ FEWEST_FLIGHTS = 3
 MANY_FLIGHTS = 20
 """From so many flights on, how alike neighbouring flights are is estimated and counted."""
 
-Verdict = Literal["first", "worse", "no difference shown", "none given"]
+Verdict = Literal["first", "worse", "not significant", "no interval"]
 
 
 def left_out_offsets(
@@ -135,8 +135,8 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
 def verdict_of(difference: MeanOfFlights) -> Verdict:
     """Whether a setting is shown to be worse than the first."""
     if not np.isfinite(difference.low):
-        return "none given"
-    return "worse" if difference.low > 0 else "no difference shown"
+        return "no interval"
+    return "worse" if difference.low > 0 else "not significant"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

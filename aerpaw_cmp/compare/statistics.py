@@ -328,7 +328,7 @@ def interval(
     Returns
     -------
     (low, high)
-        NaN ("none given") below :data:`FEWEST_INDEPENDENT` independent samples. Where resampling biases the
+        NaN ("no interval") below :data:`FEWEST_INDEPENDENT` independent samples. Where resampling biases the
         statistic (distances, RMSE), the same bias sits in the estimate and is taken off.
     """
     if not known.enough or not np.isfinite(estimate):
@@ -358,7 +358,7 @@ class ErrorIntervals:
     Parameters
     ----------
     offset_db, rmse_db, correlation : (low, high)
-        NaN ("none given") of fewer than :data:`~aerpaw_cmp.compare.memory.FEWEST` samples, or where the statistic does
+        NaN ("no interval") of fewer than :data:`~aerpaw_cmp.compare.memory.FEWEST` samples, or where the statistic does
         not exist.
     autocorrelation : Autocorrelation
         Of the residual.
@@ -458,8 +458,8 @@ class PairedDifference:
         Of ``difference_db`` [dB]: half of its central 68 % interval; NaN where none can be given.
     mean_square_difference_db2, mean_square_ci95_db2 : float, (low, high)
         Difference of the mean square errors and its interval [dB^2].
-    verdict : {"better", "worse", "no difference shown", "none given"}
-        What the interval says about the first model; "none given" where there is no interval.
+    verdict : {"better", "worse", "not significant", "no interval"}
+        What the interval says about the first model; "no interval" where there is no interval.
     """
 
     n: int
@@ -470,18 +470,18 @@ class PairedDifference:
     standard_error_db: float
     mean_square_difference_db2: float
     mean_square_ci95_db2: Interval
-    verdict: Literal["better", "worse", "no difference shown", "none given"]
+    verdict: Literal["better", "worse", "not significant", "no interval"]
 
     def in_words(self, other: str) -> str:
         """A clause for a report, such as "worse than free space by 0.6 dB [0.2, 1.0]"."""
         if not self.n:
             return f"no sample in common with {other}"
         size = f"{abs(self.difference_db):.1f} dB"
-        if self.verdict == "none given":
+        if self.verdict == "no interval":
             more = "more" if self.difference_db > 0 else "less"
             return f"{size} {more} error than {other}, too few samples for an interval"
         low, high = self.difference_ci95_db
-        if self.verdict == "no difference shown":
+        if self.verdict == "not significant":
             return f"no significant difference from {other} ({self.difference_db:+.1f} dB [{low:+.1f}, {high:+.1f}])"
         near, far = sorted((abs(low), abs(high)))
         digits = 1 if near >= 0.05 else 2
@@ -574,11 +574,11 @@ def _power_pairs(
     return size * (1.0 + tilt), size * (1.0 - tilt)
 
 
-def paired_verdict(low: float, high: float) -> Literal["better", "worse", "no difference shown", "none given"]:
+def paired_verdict(low: float, high: float) -> Literal["better", "worse", "not significant", "no interval"]:
     """The word that the interval of a difference of errors allows."""
     if not (np.isfinite(low) and np.isfinite(high)):
-        return "none given"
-    return "better" if high < 0 else "worse" if low > 0 else "no difference shown"
+        return "no interval"
+    return "better" if high < 0 else "worse" if low > 0 else "not significant"
 
 
 def share_interval(share: float, spread: float, known: Autocorrelation) -> Interval:

@@ -354,7 +354,7 @@ class SettingRank:
     n_paired : int
         Flights in that difference.
     verdict : str
-        "first", "worse", "no difference shown" or "none given".
+        "first", "worse", "not significant" or "no interval".
     """
 
     setting: str

@@ -30,7 +30,7 @@ from .exports.write import write_exports
 from .first_screen import most_telling, pooled_db
 from .html import by_section, environment, policy, script
 from .names import k_key
-from .words import Judged, first_sentence, pretty
+from .words import Judged, first_sentence, pretty, ranking_sentence
 
 FEW, MANY = 8, 200
 """Warnings that stand open, and that stand on the page at all."""
@@ -272,18 +272,10 @@ def _ranked_words(data: CampaignData) -> list[str]:
     if len(ranking) < 2 or not data.season.held_out:
         return []
     first = (
-        f"With the offset of the other flights, {ranking[0].setting} errs least ({ranking[0].mean_db:.2f} dB over "
-        f"{ranking[0].n_flights} flights); "
+        f"With the offset of the other flights, {ranking[0].setting} has the smallest error "
+        f"({ranking[0].mean_db:.2f} dB over {ranking[0].n_flights} flights). "
     )
-    if all(entry.verdict == "none given" for entry in ranking[1:]):
-        return [first + "these are too few flights to show that another setting is worse."]
-    like = [entry.setting for entry in ranking[1:] if entry.verdict != "worse"]
-    named = ", ".join(like[:FEW_SETTINGS]) + (
-        f" and {len(like) - FEW_SETTINGS} more" if len(like) > FEW_SETTINGS else ""
-    )
-    return [
-        first + (f"the difference is not significant for {named}." if like else "every other setting is worse (95 %).")
-    ]
+    return [first + ranking_sentence({entry.setting: entry.verdict for entry in ranking[1:]}, FEW_SETTINGS)]
 
 
 def warnings(data: CampaignData) -> list[str]:
@@ -347,7 +339,7 @@ def verdict(data: CampaignData) -> list[str]:
     for name in dict.fromkeys(name for row in rows for name in row.baselines):
         errors = [row.baselines.get(name, np.nan) for row in rows]
         if np.isfinite(errors).all():
-            said = [row.verdicts[name] for row in rows if row.verdicts.get(name, "none given") != "none given"]
+            said = [row.verdicts[name] for row in rows if row.verdicts.get(name, "no interval") != "no interval"]
             every.append(
                 Judged(ray_db=total, channels=len(rows), name=name, other_db=pooled_db(errors, [row.n for row in rows]),
                        judged=len(said), better=said.count("better"), worse=said.count("worse"),

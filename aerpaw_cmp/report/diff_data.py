@@ -9,7 +9,7 @@ from typing import Any
 
 from ..compare.report_difference import Changed, LevelDifference, Overlap, RankDifference
 from ..compare.statistics import PairedDifference
-from .words import count
+from .words import DIFFERENCE, count
 
 LEAST_RANK = 1e-6
 """Differences of agreement and kappa below this are rounding."""
@@ -179,19 +179,17 @@ def _level_verdict(diff: ReportDiff) -> str:
         though = f", though the replay moved by up to {moved:.2g} dB" if moved > diff.tolerance_db else ""
         return f"RSS errors agree on the common samples{though}."
     pooled = diff.pooled
-    text = f"RSS over all links: RMSE {pooled.other_rmse_db:.2f} dB in the first, {pooled.rmse_db:.2f} dB in the second"
-    text += {
-        "better": f", better by {abs(pooled.difference_db):.2f} dB {_bounds(pooled.difference_ci95_db, 2)}",
-        "worse": f", worse by {abs(pooled.difference_db):.2f} dB {_bounds(pooled.difference_ci95_db, 2)}",
-        "no difference shown": f"; {pooled.difference_db:+.2f} dB {_bounds(pooled.difference_ci95_db, 2)} shows no "
-        "difference of the models",
-        "none given": f"; {pooled.difference_db:+.2f} dB, too few independent samples for an interval",
-    }[pooled.verdict]
+    text = (
+        f"RSS over all links: RMSE {pooled.other_rmse_db:.2f} dB in the first, {pooled.rmse_db:.2f} dB in the second. "
+    )
+    text += DIFFERENCE[pooled.verdict].format(
+        difference=pooled.difference_db, interval=_bounds(pooled.difference_ci95_db, 2)
+    )
     if len(scored) > 1:
         verdicts = [(word, sum(one.rmse.verdict == word for one in scored)) for word in ("better", "worse")]
         rest = len(scored) - sum(n for _, n in verdicts)
-        text += f" (links: {verdicts[0][1]} better, {verdicts[1][1]} worse, {rest} undecided)"
-    return text + "."
+        text += f" Links: {verdicts[0][1]} better, {verdicts[1][1]} worse, {rest} not significant."
+    return text
 
 
 def _bounds(value: tuple[float, float], decimals: int) -> str:

@@ -12,7 +12,15 @@ from .against_figures import against_specs
 from .canvas import POINTS_PER_CLOUD, FigureSpec, count
 from .data import GEOMETRY, ChannelPair, RankPanel, ReportData, RssPanel, Track
 from .names import safe_name
-from .rank_figures import agreement_curve, confusion, rank_histograms, rank_maps, rank_over_time
+from .rank_figures import (
+    agreement_curve,
+    confusion,
+    forecast_of,
+    rank_forecast,
+    rank_histograms,
+    rank_maps,
+    rank_over_time,
+)
 from .rss_figures import (
     altitude,
     channel_difference,
@@ -234,7 +242,7 @@ def _rank_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
             caption=caption,
             alt=alt,
             draw=draw,
-            page=name in ("rank_histogram", "rank_time"),
+            page=name in ("rank_forecast", "rank_histogram", "rank_time"),
         )
 
     result = [
@@ -260,6 +268,17 @@ def _rank_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
             lambda: rank_over_time(data, panel),
         ),
     ]
+    if forecast_of(panel) is not None:
+        result.insert(
+            0,
+            spec(
+                "rank_forecast",
+                "rank forecast along the flight",
+                "Probability of each rank by the fitted receiver, means along the flight; the reported ranks under it.",
+                f"Stacked probabilities of rank 1 to 4 at {panel.tower} over time, and the reported ranks.",
+                lambda: rank_forecast(data, panel),
+            ),
+        )
     if any(at.confusion is not None for at in panel.simulated):
         result.append(
             spec(

@@ -116,7 +116,7 @@ def judged(panels: Sequence[RssPanel]) -> Judged | None:
     every = []
     for name, error in baseline_errors(panels).items():
         paired = [b.paired for p in panels if (b := _baseline(p, name)) is not None and b.paired is not None]
-        said = [pair.verdict for pair in paired if pair.verdict != "none given"]
+        said = [pair.verdict for pair in paired if pair.verdict != "no interval"]
         every.append(Judged(ray_db=total, channels=len(panels), name=name, other_db=error, judged=len(said),
                             better=said.count("better"), worse=said.count("worse")))  # fmt: skip
     return most_telling(every)

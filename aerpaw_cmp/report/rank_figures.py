@@ -165,6 +165,47 @@ def rank_over_time(data: ReportData, panel: RankPanel) -> Figure:
     return fig
 
 
+def forecast_of(panel: RankPanel) -> FloatArray | None:
+    """Probabilities (n, 4) of rank 1 to 4 by a fitted receiver; None without one."""
+    columns = [panel.values.get(f"probability_rank{rank}") for rank in RANKS]
+    known = [np.asarray(one, dtype=np.float64) for one in columns if one is not None]
+    return np.column_stack(known) if len(known) == len(RANKS) else None
+
+
+_FORECAST_COLUMNS = 600
+"""Means of the forecast along the flight: as many as a page can show."""
+
+
+def rank_forecast(data: ReportData, panel: RankPanel) -> Figure:
+    """Probability of each rank along the flight, the reported ranks under it."""
+    probability = forecast_of(panel)
+    assert probability is not None
+    start = start_of(data)
+    seconds = seconds_since(panel.time, start)
+    known = np.isfinite(probability).all(axis=1)
+    order = np.flatnonzero(known)[np.argsort(seconds[known], kind="stable")]
+    parts = np.array_split(order, min(_FORECAST_COLUMNS, max(len(order), 1)))
+    at = np.array([seconds[part].mean() for part in parts if len(part)])
+    mean = np.array([probability[part].mean(axis=0) for part in parts if len(part)])
+    fig = figure((9.2, 4.2))
+    upper, lower = fig.subplots(2, 1, sharex=True, height_ratios=[2.4, 1.0])
+    if len(at):
+        labels = [f"rank {rank}" for rank in RANKS]
+        upper.stackplot(at, *(100 * mean.T), colors=[rank_colour(rank) for rank in RANKS], labels=labels, linewidth=0.4,
+                        edgecolor="#222222")  # fmt: skip
+    upper.set_ylim(0, 100)
+    upper.set_ylabel("Probability [%]")
+    upper.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
+    draw_measured_rank(lower, seconds, panel)
+    draw_waypoints(upper, data, start, names=True)
+    lower.set_yticks(RANKS)
+    lower.set_ylim(0.5, 4.5)
+    lower.set_ylabel("Rank")
+    lower.legend(*first_labels(lower, 2), loc="center left", bbox_to_anchor=(1.0, 0.5))
+    time_axis(lower, start)
+    return fig
+
+
 def draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankPanel) -> None:
     """Reported ranks as ticks; those held over from an earlier report are smaller and grey."""
     held = np.zeros(len(seconds), dtype=bool) if panel.stale is None else panel.stale

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from ..common.provenance import KEY
@@ -102,6 +102,29 @@ SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
     (lambda f: f.channels > 2, "The difference is not significant on any of {channels} {unit} (95 %)."),
 )  # fmt: skip
 """What may follow the two errors, and when: the first whose condition holds. No other sentence says better or worse."""
+
+DIFFERENCE = {
+    "better": "The second is significantly better: {difference:+.2f} dB {interval} (95 %).",
+    "worse": "The second is significantly worse: {difference:+.2f} dB {interval} (95 %).",
+    "not significant": "The difference of {difference:+.2f} dB {interval} is not significant (95 %).",
+    "no interval": "The difference is {difference:+.2f} dB; too few independent samples for an interval.",
+}
+"""Sentence on two reports, by the verdict of the paired interval. No other sentence of a diff says better or worse."""
+
+RANKING: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
+    (lambda said: said == {"no interval"}, "Too few flights for an interval of the difference to another setting."),
+    (lambda said: said == {"worse"}, "Every other setting is significantly worse (95 %)."),
+    (bool, "Not significantly worse (95 %): {named}."),
+)
+"""Sentence on the ranking of settings, by what the intervals say of those behind the first."""
+
+
+def ranking_sentence(verdicts: Mapping[str, str], most: int) -> str:
+    """What the intervals say of the settings behind the first, by name; at most ``most`` are named."""
+    alike = [name for name, said in verdicts.items() if said != "worse"]
+    named = ", ".join(alike[:most]) + (f" and {len(alike) - most} more" if len(alike) > most else "")
+    return next(text for holds, text in RANKING if holds(set(verdicts.values()))).format(named=named)
+
 
 NOTHING_COMPARED = "Nothing could be compared: no sample has a measurement, a pose and a path at once."
 TOO_FEW_COMPARED = "Nothing could be compared: no channel has 20 samples with measurement, pose and path (at most {n})."

@@ -57,9 +57,9 @@ def test_few_flights_and_missing_ones():
     two = mean_of_flights([1.0, np.nan, 3.0])
     assert (two.n, two.mean) == (2, 2.0)
     assert np.isnan(two.low)
-    assert verdict_of(two) == "none given"
+    assert verdict_of(two) == "no interval"
     assert verdict_of(mean_of_flights([1.0, 1.1, 0.9, 1.0])) == "worse"
-    assert verdict_of(mean_of_flights([1.0, -1.0, 0.5, -0.5])) == "no difference shown"
+    assert verdict_of(mean_of_flights([1.0, -1.0, 0.5, -0.5])) == "not significant"
     same = mean_of_flights(np.full(30, 0.25))
     assert (same.low, same.high) == (0.25, 0.25)
 

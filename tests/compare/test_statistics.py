@@ -164,7 +164,7 @@ def test_a_significant_difference_of_a_flight_of_few_correlation_times_is_found(
     for _ in range(60):
         one, two = (shadowing(rng, 500, 25, 4.0) for _ in range(2))
         words.append(paired_difference(2 * one, two).verdict)
-    assert set(words) <= {"worse", "no difference shown"}
+    assert set(words) <= {"worse", "not significant"}
     assert words.count("worse") > 20
 
 
@@ -247,13 +247,13 @@ def test_errors_kept_out_of_a_fit_count_with_their_offset():
 
 def test_pairs_that_cannot_be_compared():
     none = paired_difference([np.nan, 1.0], [1.0, np.nan])
-    assert (none.n, none.verdict) == (0, "none given")
+    assert (none.n, none.verdict) == (0, "no interval")
     assert none.as_dict()["difference_ci95_db"] == [None, None]
     assert none.in_words("two-ray") == "no sample in common with two-ray"
     with pytest.raises(ValueError, match="one length"):
         paired_difference([1.0], [1.0, 2.0])
     same = paired_difference(np.arange(100.0), np.arange(100.0))
-    assert same.verdict == "no difference shown"
+    assert same.verdict == "not significant"
     assert same.difference_db == 0.0
 
 

@@ -51,7 +51,7 @@ def test_settings_that_share_no_flight_have_no_difference(data):
     rows = early + [r for r in data.rss if r.setting == "setting 02" and r.flight >= "flight_012"]
     ranking = rank_settings(rows, ["setting 01", "setting 02"], data.flights, "")
     assert np.isnan(ranking[1].difference_db)
-    assert ranking[1].verdict == "none given"
+    assert ranking[1].verdict == "no interval"
 
 
 def test_the_planted_drift_is_found(data):

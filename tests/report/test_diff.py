@@ -137,7 +137,7 @@ def test_noise_on_one_link_is_found_there_and_sized(noisy):
     mae = [float((r - r.mean()).abs().mean()) for r in about]
     assert (hit.mae_db.first, hit.mae_db.second, hit.mae_db.difference) == pytest.approx((*mae, mae[1] - mae[0]))
     assert {one.rmse.difference_db for one in by_link.values()} == {0.0}
-    assert ", worse by " in verdict(found)
+    assert "significantly worse: +" in verdict(found)
     assert any("was changed after the report wrote it" in text for text in found.remarks)
 
 
@@ -149,7 +149,7 @@ def test_the_other_way_round_has_the_other_sign(noisy):
         assert there.mae_db.difference == pytest.approx(-back.mae_db.difference)
     assert one.pooled.verdict == "worse"
     assert two.pooled.verdict == "better"
-    assert "better by" in verdict(two)
+    assert "significantly better: -" in verdict(two)
 
 
 def test_the_tolerance_decides_what_counts(noisy, capsys):

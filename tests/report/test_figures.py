@@ -380,3 +380,21 @@ def test_very_many_outages_are_joined_where_no_eye_parts_them():
     assert (joined[0][0], joined[-1][1]) == (spans[0][0], spans[-1][1])
     few = canvas.runs(seconds % 1000 < 5)
     assert canvas._apart(few, seconds) is few
+
+
+def test_the_forecast_of_a_receiver_is_the_first_figure_of_the_rank(report_data):
+    """Shares along the flight add up to 100 %, and a certain forecast fills its own band alone."""
+    panel = report_data.rank[0]
+    assert not any("rank_forecast" in spec.name for spec in figures.figure_specs(report_data))
+    n = len(panel.time)
+    certain = np.arange(n) < n // 2
+    said = np.where(certain[:, None], [0.0, 1.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4])
+    values = {**panel.values, **{f"probability_rank{rank + 1}": said[:, rank] for rank in range(4)}}
+    data = dataclasses.replace(report_data, rank=(dataclasses.replace(panel, values=values), *report_data.rank[1:]))
+    first = next(spec for spec in figures.figure_specs(data) if spec.section.startswith("rank/"))
+    assert first.name.startswith("rank_forecast")
+    upper = first.draw().axes[0]
+    bands = [band.get_paths()[0].vertices for band in upper.collections[:4]]
+    assert max(v[:, 1].max() for v in bands) == pytest.approx(100.0)
+    begin = [v[np.abs(v[:, 0] - v[:, 0].min()) < 1e-9, 1] for v in bands]
+    assert [np.ptp(y) for y in begin] == pytest.approx([0.0, 100.0, 0.0, 0.0])

@@ -11,7 +11,7 @@ from aerpaw_cmp.compare.field_difference import FieldAudit
 from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.report.data import ErrorSpan
 from aerpaw_cmp.report.first_screen import headlines, pooled_db, verdict
-from aerpaw_cmp.report.words import Judged, first_sentence, pretty
+from aerpaw_cmp.report.words import DIFFERENCE, Judged, first_sentence, pretty, ranking_sentence
 
 
 def test_pooled_error_is_that_of_all_samples_together():
@@ -43,7 +43,7 @@ def judged_as(data, verdicts, rmse_db=8.4, baseline_db=7.9):
             panel,
             baselines=tuple(
                 dataclasses.replace(
-                    b, paired=dataclasses.replace(pair, verdict=verdicts.get(b.name, "no difference shown"))
+                    b, paired=dataclasses.replace(pair, verdict=verdicts.get(b.name, "not significant"))
                 )
                 for b in panel.baselines
             ),
@@ -173,3 +173,22 @@ def test_sentence_and_card_of_a_rank_show_the_same_digits(report_data):
     shown = f"{100 * best.total_variation:.0f} percentage points"
     assert shown in sentence
     assert card.value == shown
+
+
+@pytest.mark.parametrize("verdicts", [
+    {"a": "worse", "b": "worse"}, {"a": "worse", "b": "not significant"}, {"a": "no interval", "b": "no interval"},
+    {"a": "no interval", "b": "worse"}, {"a": "not significant"},
+])  # fmt: skip
+def test_a_ranking_says_worse_only_where_intervals_do(verdicts):
+    said = ranking_sentence(verdicts, 3)
+    assert ("significantly worse (95 %)." in said) == (set(verdicts.values()) == {"worse"})
+    named = [name for name in verdicts if f" {name}" in said.partition(":")[2].replace(",", "")]
+    assert named == ([n for n, v in verdicts.items() if v != "worse"] if ":" in said else [])
+    assert ("Too few flights" in said) == (set(verdicts.values()) == {"no interval"})
+
+
+@pytest.mark.parametrize("word", ["better", "worse", "not significant", "no interval"])
+def test_a_difference_of_reports_says_what_its_interval_does(word):
+    said = DIFFERENCE[word].format(difference=0.31, interval="[+0.10, +0.52]")
+    assert [w for w in ("better", "worse") if w in said] == ([word] if word in ("better", "worse") else [])
+    assert "+0.31 dB" in said

@@ -22,7 +22,7 @@ import pandas as pd
 from aerpaw_cmp.logs.flight_file import write_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.logs.writers import format_quectel_csv, format_vehicle_out
+from aerpaw_cmp.logs.writers import format_vehicle_out
 
 ZONE = "America/New_York"
 SCALE_LINES = 5_000_000
@@ -75,8 +75,11 @@ def write_quectel(place: Path, lines: int) -> None:
     rng = np.random.default_rng(7)
     with place.open("wb") as file:
         for first, count in _blocks(lines):
-            times = START + (first + np.arange(count)) * np.timedelta64(10_000_000, "ns")
-            file.write(format_quectel_csv(times, rng.integers(1, 5, count), ZONE).removeprefix(b"OK\n"))
+            rows = zip(_wall(first, count, 10_000_000).tolist(), rng.integers(1, 5, count).tolist(), strict=True)
+            file.writelines(
+                b'%s,"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",27,%d,15,3\r\n' % (time[:-3], rank)
+                for time, rank in rows
+            )
 
 
 def write_nemo(place: Path, lines: int) -> None:

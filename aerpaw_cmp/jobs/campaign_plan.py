@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import AerpawCmpError
-from ..common.stages import Progress, duration, silent
+from ..common.stages import Progress, duration
 from ..report.campaign_data import Failure, FlownTrack
 from .campaign_tasks import Done, Order, Outcome, Task, carry_out, carry_out_all, fitted_to, outcome_store, task_facts
 from .workers import Lost, Workers
@@ -229,31 +229,6 @@ class Outcomes:
 
     def __len__(self) -> int:
         return len(self._found)
-
-
-def run_tasks(
-    tasks: Sequence[Task], workers: Workers, progress: Progress = silent, keep: str | None = None
-) -> list[Outcome]:
-    """All tasks in order.
-
-    Parameters
-    ----------
-    tasks : sequence of Task
-    workers : Workers
-        Who computes what is not kept.
-    progress : Progress
-        Counts and time left with every finished task.
-    keep : str, optional
-        Folder or URL of outcomes: what stands there is taken, what is computed is put there as soon as it is done.
-
-    Returns
-    -------
-    list of Outcome
-        In the order of the tasks; what goes wrong in one is its failure.
-    """
-    outcomes, orders = kept_outcomes(tasks, keep, progress)
-    compute(tasks, orders, workers, progress, outcomes)
-    return [outcomes[number] for number in range(len(tasks))]
 
 
 def kept_outcomes(tasks: Sequence[Task], keep: str | None, progress: Progress) -> tuple[Outcomes, dict[int, Order]]:

@@ -288,7 +288,7 @@ def _content(path: Path) -> str:
 
 
 _ROOMS_ASIDE = ("cli/", "live/", "maps/", "report/", "__main__.py")
-_BUT = ("report/__init__.py", "report/campaign_data.py", "report/data.py")
+_BUT = ("report/__init__.py", "report/against.py", "report/campaign_data.py", "report/data.py")
 
 
 def shapes_numbers(module: str) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.units import AnyArray, FloatArray
+from ..common.units import AnyArray
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -162,43 +162,6 @@ def _ri(values: ArrayLike) -> AnyArray:
     return np.where(np.isnan(rank), 0, rank).astype(np.int64)
 
 
-def format_quectel_csv(
-    times: ArrayLike, rank: ArrayLike, timezone: str, *, mcs: ArrayLike | None = None, cqi: ArrayLike | None = None
-) -> bytes:
-    """Rank as AERPAW's ``Basic_and_Other_Params.csv``, launched version, its first line ``OK`` included.
-
-    Parameters
-    ----------
-    times : array of datetime64, shape (n,)
-        UTC.
-    rank : array, shape (n,)
-        1 to 8; NaN (no CSI) is written as four zeros.
-    timezone : str
-        Zone of the logger's clock.
-    mcs, cqi : array, shape (n,), optional
-        As reported; by default those of a good link (27, 15).
-
-    Returns
-    -------
-    bytes
-        The file.
-    """
-    ri = _ri(rank)
-    some = ri > 0
-    columns = [
-        np.where(some, np.full(len(ri), default) if given is None else np.nan_to_num(np.asarray(given, float)), 0)
-        for given, default in ((mcs, 27), (cqi, 15))
-    ]
-    mcs_column, cqi_column = (column.astype(np.int64).tolist() for column in columns)
-    lines = [
-        f'{time},"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",{m},{r},{c},{3 if r else 0}\r\n'
-        for time, m, r, c in zip(
-            local_text(times, timezone, digits=3), mcs_column, ri.tolist(), cqi_column, strict=True
-        )
-    ]
-    return ("OK\n" + "".join(lines)).encode("ascii")
-
-
 def format_ri_csv(frame: pd.DataFrame, timezone: str) -> bytes:
     """Rank records with positions as the published six-column table ``ID,Time and date,...,NR RI``.
 
@@ -223,18 +186,3 @@ def format_ri_csv(frame: pd.DataFrame, timezone: str) -> bytes:
 
 def _cell(value: float, places: int) -> str:
     return "" if np.isnan(value) else repr(round(value, places))
-
-
-def format_nemo_csv(frame: pd.DataFrame, time_origin: str) -> bytes:
-    """Rank records with positions as the Nemo table, times in milliseconds after ``time_origin`` (UTC)."""
-    origin = np.datetime64(time_origin.removesuffix("Z"), "ns")
-    relative_ms: FloatArray = (frame["time"].to_numpy().astype("datetime64[ns]") - origin).astype(np.int64) / 1e6
-    names = ("latitude_deg", "longitude_deg", "altitude_m", "rank", "rsrp_dbm", "sinr_db", "cqi")
-    absent = [float("nan")] * len(frame)
-    columns = [frame[name].tolist() if name in frame.columns else absent for name in names]
-    lines = [
-        f"{i}," + ",".join("" if np.isnan(value) else repr(value) for value in row) + "\r\n"
-        for i, row in enumerate(zip(relative_ms.tolist(), *columns, strict=True))
-    ]
-    header = "index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi\r\n"
-    return (header + "".join(lines)).encode("ascii")

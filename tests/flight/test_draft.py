@@ -17,7 +17,7 @@ from aerpaw_cmp.flight.draft import draft, receiver_floor_db
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.logs.writers import format_nemo_csv
+from tests.log_texts import nemo_csv
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 ZONE = "America/New_York"
@@ -144,7 +144,7 @@ def test_relative_ranks_with_positions_need_no_origin(logs: Path) -> None:
     nemo = logs / "nemo.csv"
     (rank,) = ingest(logs / "UAV/modem_ri.csv", options=OPTIONS)
     frame = rank.result.streams[0].frame.assign(rsrp_dbm=-80.0, cqi=9.0)
-    nemo.write_bytes(format_nemo_csv(frame, "2025-06-01T14:00:00Z"))
+    nemo.write_bytes(nemo_csv(frame, "2025-06-01T14:00:00Z"))
     text, _ = draft(ingest(nemo), logs)
     assert "time_origin" not in text
     assert "no telemetry here" not in text  # its positions are its own
@@ -223,7 +223,7 @@ def test_a_draft_says_how_many_samples_it_compares(logs: Path) -> None:
 def test_levels_without_positions_do_not_spoil_ranks_that_have_them(logs: Path) -> None:
     (rank,) = ingest(logs / "UAV/modem_ri.csv", options=OPTIONS)
     frame = rank.result.streams[0].frame.assign(rsrp_dbm=-80.0, cqi=9.0)
-    (logs / "nemo.csv").write_bytes(format_nemo_csv(frame, "2025-06-01T14:00:00Z"))
+    (logs / "nemo.csv").write_bytes(nemo_csv(frame, "2025-06-01T14:00:00Z"))
     files = [*ingest(logs / "nemo.csv"), *ingest(logs / "LW1", options=OPTIONS)]
     text, remarks = draft(files, logs, timezone=ZONE)
     assert [log.path for log in parse_yaml(text, FlightFile).logs] == ["nemo.csv"]

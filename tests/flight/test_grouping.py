@@ -16,7 +16,8 @@ from aerpaw_cmp.flight.time_origin import origin_of
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Stream
-from aerpaw_cmp.logs.writers import format_nemo_csv, format_power_log, format_vehicle_out
+from aerpaw_cmp.logs.writers import format_power_log, format_vehicle_out
+from tests.log_texts import nemo_csv
 
 ZONE = "America/New_York"
 OPTIONS = ReadOptions(timezone=ZONE)
@@ -44,7 +45,7 @@ def write_flight(folder: Path, start: str, **how: float) -> pd.DataFrame:
 
 def nemo_of(frame: pd.DataFrame, origin: str) -> bytes:
     ranks = frame.iloc[30:250].assign(rank=2.0, ri_raw=2.0, rsrp_dbm=-80.0, sinr_db=20.0, cqi=10.0)
-    return format_nemo_csv(ranks, origin)
+    return nemo_csv(ranks, origin)
 
 
 def test_two_flights_in_a_folder_give_two_drafts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,13 +16,14 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.files import seal
+from aerpaw_cmp.common.stages import silent
 from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import campaign_tasks, sample
-from aerpaw_cmp.jobs.campaign_plan import batched, campaign_status, run_tasks
+from aerpaw_cmp.jobs.campaign_plan import batched, campaign_status, compute, kept_outcomes
 from aerpaw_cmp.jobs.campaign_tasks import Done, Order, Outcome, Task, carry_out, outcome_store, task_facts
 from aerpaw_cmp.jobs.outcomes import OutcomeStore, shapes_numbers, task_inputs, task_key
-from aerpaw_cmp.jobs.workers import Here, Processes
+from aerpaw_cmp.jobs.workers import Here, Processes, Workers
 from aerpaw_cmp.report.campaign_data import Failure, FlownTrack, RankRow, RssRow
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -33,6 +34,13 @@ TYPES = (Outcome, RssRow, RankRow, FlownTrack)
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sample.write_sample(tmp_path_factory.mktemp("season") / "flight")
+
+
+def run_tasks(tasks: list[Task], workers: Workers, keep: str | None = None) -> list[Outcome]:
+    """All tasks in order, as a campaign runs them."""
+    outcomes, orders = kept_outcomes(tasks, keep, silent)
+    compute(tasks, orders, workers, silent, outcomes)
+    return [outcomes[number] for number in range(len(tasks))]
 
 
 def track(number: float) -> Outcome:
@@ -248,7 +256,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from aerpaw_cmp.jobs import campaign_tasks
-from aerpaw_cmp.jobs.campaign_plan import run_tasks
+from aerpaw_cmp.jobs.campaign_plan import compute, kept_outcomes
 from aerpaw_cmp.jobs.workers import Here
 from aerpaw_cmp.report.campaign_data import FlownTrack
 import numpy as np
@@ -264,7 +272,8 @@ def one(task):
 campaign_tasks.run_task = one
 flight = Path(sys.argv[1])
 tasks = [campaign_tasks.Task(flight, f"f{i}", "as written", {"rss.bootstrap": i}, None) for i in range(4)]
-run_tasks(tasks, Here(), keep=sys.argv[2])
+outcomes, orders = kept_outcomes(tasks, sys.argv[2], print)
+compute(tasks, orders, Here(), print, outcomes)
 """
 
 

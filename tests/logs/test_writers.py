@@ -14,6 +14,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.logs import writers as logwriters
 from aerpaw_cmp.logs.readers import ReadOptions, identify
 from aerpaw_cmp.logs.records import ReadResult
+from tests.log_texts import nemo_csv, quectel_csv
 
 ZONE = "America/New_York"
 OPTIONS = ReadOptions(timezone=ZONE)
@@ -94,7 +95,7 @@ def test_sounder_needs_as_many_times_as_levels() -> None:
 
 def test_rank_csvs() -> None:
     frame = telemetry(6).assign(rank=[1.0, 2.0, np.nan, 4.0, 3.0, 2.0])
-    modem = read(logwriters.format_quectel_csv(frame["time"], frame["rank"], ZONE))
+    modem = read(quectel_csv(frame["time"], frame["rank"], ZONE))
     nr = next(one for one in modem.streams if one.name == "nr5g_csi").frame
     assert np.array_equal(nr["rank"], frame["rank"], equal_nan=True)
     assert modem.blank == 1, "the bare OK of the start script"
@@ -108,7 +109,7 @@ def test_rank_csvs() -> None:
 
 def test_nemo_csv() -> None:
     frame = telemetry(6).assign(rank=[1.0, 2.0, np.nan, 4.0, 3.0, 2.0])
-    data = logwriters.format_nemo_csv(frame, "2025-03-02T15:00:02Z")
+    data = nemo_csv(frame, "2025-03-02T15:00:02Z")
     back = read(data, ReadOptions(time_origin="2025-03-02T15:00:02Z")).streams[0].frame
     assert back["time"].equals(frame["time"])
     assert np.array_equal(back["rank"], frame["rank"], equal_nan=True)

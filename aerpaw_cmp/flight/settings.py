@@ -6,7 +6,8 @@ are errors that name the nearest valid key. Relative paths resolve against the f
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -30,7 +31,8 @@ from ..propagation.arrays import (
 )
 from ..propagation.search.interactions import Interaction
 from ..site.antennas import Isotropic
-from ..site.learned import BAND, Named, find_named
+from ..site.learned import BAND, Named, find_named, read_table
+from ..site.sphere_pattern import read_sphere_csv
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -648,21 +650,53 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
             named = find_named(name, folder)
             channels |= _with_antenna(settings, channels, key, named)
         except (InputError, UsageError) as error:
-            notes.append(f"antennas.{key}: {error.found}; isotropic in its place")
+            notes.append(f"antennas.{key}: {_reason(error)}; isotropic in its place")
     if channels != settings.link.channels:
         content["link"] = settings.link.model_copy(update={"channels": channels})
     receiver = settings.rank.receiver
     if receiver is not None and "/" in receiver and not (folder / receiver).is_file():
         try:
-            named = find_named(receiver, folder)
-            if named.entry.receivers:
-                file = str(named.folder / named.entry.receivers[0].file)
-                content["rank"] = settings.rank.model_copy(update={"receiver": file})
-        except (InputError, UsageError):
-            pass  # a file of another place: reading it says what is wrong
+            content["rank"] = settings.rank.model_copy(
+                update={"receiver": _receiver_file(find_named(receiver, folder))}
+            )
+        except (InputError, UsageError) as error:
+            if Path(receiver).suffix != ".json":  # else a file of another place: reading it says what is wrong
+                notes.append(f"rank.receiver: {_reason(error)}; not used")
+                content["rank"] = settings.rank.model_copy(update={"receiver": None})
     if notes:
         content["flight"] = settings.flight.model_copy(update={"notes": [*settings.flight.notes, *notes]})
     return settings.model_copy(update=content) if content else settings
+
+
+def _reason(error: InputError | UsageError) -> str:
+    """What was found instead of what was expected, in which file."""
+    where = f" in {Path(error.path).name}" if error.path else ""
+    return f"{error.found}{where}; expected: {error.expected}"
+
+
+def _receiver_file(named: Named) -> str:
+    """File of a learned rank receiver that can be read and was made from the logs that its entry names."""
+    if not named.entry.receivers:
+        raise UsageError("the entry has no rank receiver", expected="one learned from ranks")
+    path = named.folder / named.entry.receivers[0].file
+    try:
+        content = json.loads(read_table(path, "a rank receiver"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({error})", expected="a rank receiver", path=path) from None
+    _check_logs(content.get("trained_on", []) if isinstance(content, dict) else [], named, path)
+    return str(path)
+
+
+def _check_logs(trained_on: Sequence[str], named: Named, path: Path) -> None:
+    """Refuse a table that was learned from logs which its entry does not name: scores would trust the wrong ones."""
+    strange = set(trained_on) - set(named.entry.trained_on)
+    if strange:
+        raise InputError(
+            f"learned from logs (SHA-256 {min(strange)[:12]}...) that its entry does not name",
+            expected="the table that was written with the entry",
+            cause="a table of another calibration",
+            path=path,
+        )
 
 
 def _with_antenna(
@@ -674,6 +708,8 @@ def _with_antenna(
     ------
     UsageError
         No antenna of that name for this end, or one of another band.
+    InputError
+        A table that is damaged, or learned from other logs than its entry says.
     """
     end = "uav" if key == "uav" else "tower"
     tower, _, channel = key.partition(".")
@@ -689,8 +725,9 @@ def _with_antenna(
                 f"learned at {series.carrier_hz / 1e9:g} GHz, used at {link.carrier_hz / 1e9:g} GHz",
                 expected="an antenna of the same band",
             )
-        file = series.uav_file if end == "uav" else series.tower_file
-        antenna = AntennaSettings(model="sphere", file=str(named.folder / file))
+        path = named.folder / (series.uav_file if end == "uav" else series.tower_file)
+        _check_logs(read_sphere_csv(path).trained_on, named, path)
+        antenna = AntennaSettings(model="sphere", file=str(path))
         if end == "uav":
             out[name] = link.model_copy(update={"uav": ArraySettings(antenna=antenna)})
         else:

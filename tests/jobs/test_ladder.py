@@ -124,7 +124,7 @@ def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64) -> 
     site.write_bytes(Path(str(folder_of("lake_wheeler"))).with_suffix(".yaml").read_bytes())
     rows, columns = np.mgrid[0:19, 0:24]
     table = 2.0 * np.cos(np.radians(15.0 * columns)) + 0.1 * rows
-    sphere = sphere_csv(table, np.ones(table.shape), (f"aerpaw-cmp calibrate: some, trained_on sha256 {trained_on}",))
+    sphere = sphere_csv(table, np.ones(table.shape), (f"aerpaw-cmp calibrate: some, trained_on: {trained_on}",))
     series = LearnedSeries(
         tower="LW1",
         channel="A",

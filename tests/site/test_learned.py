@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,67 @@ def test_what_does_not_fit_is_left_out_and_said(folder: Path, name: str, carrier
     (note,) = settings.flight.notes
     assert said in note
     assert settings.link.channels == {}
+
+
+OTHER_LOGS = sphere_csv(np.zeros((7, 8)), np.ones((7, 8)), (f"trained_on: {'b' * 64}",)).encode()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "the columns are none"),
+        (b"\x1f\x8bgarbage", "a damaged gzip file"),
+        (b"azimuth_deg,elevation_deg,gain_dbi\n0,0,nan\n", "'0,0,nan' in A."),
+        (b"\xff\xfe\x00", "cannot be read"),
+        (None, "cannot be read"),
+        (OTHER_LOGS, "that its entry does not name"),
+    ],
+)
+@pytest.mark.parametrize("end", ["uav", "LW1.A"])
+def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: bytes | None, said: str) -> None:
+    """The report goes on with the isotropic antenna, in one note; the other end stays learned."""
+    table = folder_of(folder / "mine.yaml") / ("A.u.csv.gz" if end == "uav" else "A.t.csv.gz")
+    if content is None:
+        table.unlink()
+    else:
+        table.write_bytes(content)
+    settings = load_flight(flight(folder, {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}))
+    (note,) = settings.flight.notes
+    assert note.startswith(f"antennas.{end}: ")
+    assert said in note
+    assert note.endswith("isotropic in its place")
+    link = settings.link.channels["A"].build(["LW1"], Path("/nowhere"))
+    learned = {"LW1.A": link.tower_arrays["LW1"].patterns[0], "uav": link.uav_array.patterns[0]}
+    assert {name for name, one in learned.items() if isinstance(one, SpherePattern)} == {"LW1.A", "uav"} - {end}
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"{", "cannot be read"),
+        (b"\x1f\x8bgarbage", "a damaged gzip file"),
+        (json.dumps({"trained_on": ["b" * 64]}).encode(), "that its entry does not name"),
+        (None, "nothing learned is called"),
+    ],
+)
+def test_a_damaged_receiver_is_left_out_and_said(folder: Path, content: bytes | None, said: str) -> None:
+    found = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=CARRIER_HZ, file="r.json.gz")
+    remember(
+        folder / "mine.yaml",
+        "nr",
+        entry("A").model_copy(update={"series": [], "receivers": [found]}),
+        {"r.json.gz": b"{}"},
+    )
+    path = flight(folder, {})
+    name = "mine/nr" if content is not None else "mine/other"
+    if content is not None:
+        (folder_of(folder / "mine.yaml") / "r.json.gz").write_bytes(content)
+    path.write_text(path.read_text() + f"rank: {{receiver: {name}}}\n", encoding="utf-8")
+    settings = load_flight(path)
+    (note,) = settings.flight.notes
+    assert note.startswith("rank.receiver: ")
+    assert said in note
+    assert settings.rank.receiver is None
 
 
 @pytest.mark.parametrize(

@@ -84,6 +84,7 @@ SMALLEST: dict[str, list[str]] = {
     "output_faults": ["--kills", "5"],
     "pages": ["--only", "long", "--repeats", "1"],
     "performance": ["--docs", "{folder}/performance.md"],
+    "route_ahead": ["--minutes", "1"],
     "planted_fields": ["--sets", "1", "--targets", "200"],
     "planted_faults": ["--only", "foliage", "--every", "20"],
     "replay": ["--quick"],

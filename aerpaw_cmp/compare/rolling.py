@@ -85,9 +85,9 @@ class RouteAhead:
     """
 
     def __init__(self, route_m: FloatArray, trends: Mapping[str, FloatArray]) -> None:
-        self._route = np.asarray(route_m, dtype=np.float64)
+        self.route_m = np.asarray(route_m, dtype=np.float64)
         self._trends = {**{k: np.asarray(v, dtype=np.float64) for k, v in trends.items()},
-                        NONE: np.zeros(len(self._route))}  # fmt: skip
+                        NONE: np.zeros(len(self.route_m))}  # fmt: skip
         self._scores: dict[tuple[str, float], tuple[float, float]] = {}
         self._bins, self._open = _Bins(trends={name: [] for name in self._trends}), list[tuple[float, ...]]()
         self._start, self._reached = math.nan, 0
@@ -178,15 +178,15 @@ class RouteAhead:
         """The rest of the route from where the UAV is."""
         if len(self._bins.level) < LEAST:
             return None
-        window = slice(self._reached, self._reached + max(50, len(self._route) // 10))
-        self._reached += int(np.linalg.norm(self._route[window] - place, axis=1).argmin())
-        index = np.arange(self._reached, len(self._route))
+        window = slice(self._reached, self._reached + max(50, len(self.route_m) // 10))
+        self._reached += int(np.linalg.norm(self.route_m[window] - place, axis=1).argmin())
+        index = np.arange(self._reached, len(self.route_m))
         known = {key: total / weight for key, (total, weight) in self._scores.items()}
         trend, length = min(known, key=lambda key: known[key], default=(NONE, LENGTHS_M[-1]))
         now = self._bins.time_s[-1]
-        steps = np.linalg.norm(np.diff(self._route[index], axis=0, prepend=place[None]), axis=1)
+        steps = np.linalg.norm(np.diff(self.route_m[index], axis=0, prepend=place[None]), axis=1)
         count, later = len(self._bins.level), now + np.cumsum(steps) / SPEED_MPS
-        mean, sd = self._moments(_MODELS[length], count, self._route[index], later, [trend])[0]
+        mean, sd = self._moments(_MODELS[length], count, self.route_m[index], later, [trend])[0]
         within = math.sqrt(self.squares / self.samples) if self.samples else 0.0
         level = self._trends[trend][index] + mean
         return Ahead(index=index, level_db=level, sd_db=np.hypot(sd, within), trend=trend)

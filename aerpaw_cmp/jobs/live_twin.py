@@ -6,6 +6,7 @@ import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,11 @@ import numpy as np
 from ..common.errors import InputError, UsageError
 from ..common.units import FloatArray
 from ..compare.rank import channel_rank
+from ..compare.rolling import RouteAhead
 from ..flight.data import choose_site
 from ..flight.replay import replay_poses
 from ..flight.settings import FlightFile, LogSettings, load_flight
+from ..flight.simulate import plan_attitude, plan_trajectory
 from ..live.follow import TelemetryFollower, TelemetrySample, predict_along
 from ..live.predict import Predict, Prediction
 from ..live.simulator import ranks_of
@@ -24,12 +27,16 @@ from ..logs.readers import by_name
 from ..logs.writers import format_vehicle_out
 from ..maps.grid import Grid
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
+from ..propagation.field.baselines import free_space_dbm
 from ..report.live_page import LiveMap
 from ..site.site import Site
 
 MAP_HEIGHTS_M = (10.0, 30.0, 50.0, 70.0, 90.0, 110.0)
 MAP_CELLS = 70
 """Cells on the longer side of the map behind the flight."""
+ROUTE_STEP_S = 2.0
+ROUTE_SHOWN = 40
+"""Points of the rest of the route in one record."""
 DEMO_OFFSET_DB = -38.0
 DEMO_FADING_DB = 2.5
 
@@ -75,10 +82,31 @@ class LiveTwin:
             options=log.options(self.settings.timezone),
             reader=by_name(log.reader or "vehicle_out"),
         )
-        return predict_along(follower, self.at)
+        return predict_along(follower, partial(self.at, ahead=self.route_ahead()))
 
-    def at(self, sample: TelemetrySample) -> Prediction:
-        """Prediction at a pose of the telemetry."""
+    def route_ahead(self) -> RouteAhead | None:
+        """Prediction of the planned route that learns in flight; None without a plan."""
+        plan = self.settings.flight.plan
+        if plan is None:
+            return None
+        trajectory = plan_trajectory(plan)
+        time_s = np.arange(0.0, trajectory.duration_s + 1e-9, ROUTE_STEP_S)
+        place = trajectory.position_at(time_s)
+        place[:, 2] = np.maximum(place[:, 2] + self.site.datum.takeoff_ground_m, 0.5)
+        rotation = np.broadcast_to(np.eye(3), (len(place), 3, 3))
+        if self.settings.rt.attitude != "ignored":
+            _, _, yaw = plan_attitude(trajectory, time_s)
+            rotation = rotation_from_aircraft(0.0 * yaw, 0.0 * yaw, yaw)
+        _, level = self._replayed(place, rotation)
+        return RouteAhead(place, {"replay": level, "free space": self._free_space(place)})
+
+    def _free_space(self, place_m: FloatArray) -> FloatArray:
+        tower = self.site.towers[self.settings.rank.tower].position_m
+        link = self.settings.link.rank
+        return np.asarray(free_space_dbm(tower[None, :], place_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
+
+    def at(self, sample: TelemetrySample, ahead: RouteAhead | None = None) -> Prediction:
+        """Prediction at a pose of the telemetry; with ``ahead``, it can learn what is measured there."""
         if not np.isfinite([sample.latitude_deg, sample.longitude_deg, sample.altitude_m]).all():
             return Prediction()
         place, rotation = self._pose(sample)
@@ -90,7 +118,25 @@ class LiveTwin:
             east_m=east,
             north_m=north,
             up_m=up,
+            learn=None if ahead is None or not rank[0] else partial(self._learn, ahead, place, float(level[0])),
         )
+
+    def _learn(
+        self, ahead: RouteAhead, place: FloatArray, level: float, utc_ns: int, rsrp_dbm: float
+    ) -> dict[str, Any] | None:
+        """The rest of the route for the log and the page, after a record; None between two bins."""
+        free = float(self._free_space(place[None])[0])
+        rest = ahead.add(utc_ns / 1e9, place, rsrp_dbm, {"replay": level, "free space": free})
+        if rest is None:
+            return None
+        low, high = rest.interval_db
+        columns = np.column_stack([ahead.route_m[rest.index, :2], rest.level_db, low, high])
+        columns = columns[np.isfinite(columns).all(axis=1)]
+        if not len(columns):
+            return None
+        shown = columns[np.unique(np.linspace(0, len(columns) - 1, ROUTE_SHOWN).round().astype(int))].round(1)
+        median, least, most = columns[:, 2:].mean(axis=0).round(1).tolist()
+        return {"trend": rest.trend, "level_dbm": median, "interval_dbm": [least, most], "points": shown.tolist()}
 
     def map(self) -> LiveMap:
         """Predicted rank and level over the site at several heights, the UAV level and heading north."""

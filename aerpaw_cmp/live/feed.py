@@ -37,6 +37,7 @@ GPS_LOST_S = 5.0
 CLOCK_OFF_S = 2.0
 DISK_LOW_BYTES = 200 * 2**20
 STEP_SHOWN_S = 30.0
+POINTS_AHEAD = 40
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
 PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
@@ -100,6 +101,7 @@ class _Modem:
     disk_fault: str = ""
     offset_db: float | None = None
     inside: list[int] | None = None
+    ahead: dict[str, Any] | None = None
     age_s: float | None = None
     delay_s: float | None = None
     fix: float | None = None
@@ -121,7 +123,7 @@ class _Modem:
 
     _SHOWN = (
         "name", "port", "connected", "rank", "rsrp_dbm", "sinr_db", "gaps", "missed", "records", "bytes_written",
-        "disk_free_bytes", "offset_db", "inside", "predicts", "ended",
+        "disk_free_bytes", "offset_db", "inside", "ahead", "predicts", "ended",
     )  # fmt: skip
 
     def shown(self, now: float) -> dict[str, Any]:
@@ -298,6 +300,8 @@ class Feed:
             return
         modem.age_s, modem.delay_s = _finite(record.get("telemetry_age_s")), _finite(record.get("telemetry_delay_s"))
         modem.fix, modem.offset_db = _finite(record.get("fix")), _finite(record.get("offset_db"))
+        if (rest := record.get("ahead")) is not None:
+            modem.ahead = _rest_of_route(rest)
         modem.inside = [int(count) for count in record.get("inside") or ()] or None
         if record.get("east_m") is not None and not (modem.fix is not None and 0 <= modem.fix < 3):
             modem.gps_s = t
@@ -391,3 +395,12 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
     elif modem.unsynchronised:
         alarms["clock"] = "the clock is not synchronised (NTP or GPS): times may not fit the telemetry"
     return alarms
+
+
+def _rest_of_route(rest: Mapping[str, Any]) -> dict[str, Any]:
+    """What the page shows of the rest of a route; ValueError where a level is no number."""
+    level, (low, high) = float(rest["level_dbm"]), map(float, rest["interval_dbm"])
+    points = [[float(v) for v in point[:5]] for point in rest["points"][:POINTS_AHEAD]]
+    if not all(map(math.isfinite, [level, low, high, *(v for point in points for v in point)])):
+        raise ValueError("a level that is no number")
+    return {"trend": str(rest["trend"])[:20], "level": level, "interval": [low, high], "points": points}

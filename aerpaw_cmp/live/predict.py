@@ -17,6 +17,8 @@ from typing import Any
 
 RANKS = (1, 4)
 
+Learn = Callable[[int, float], "dict[str, Any] | None"]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
@@ -36,6 +38,8 @@ class Prediction:
         Age of the newest line of the telemetry log; None: no line so far.
     telemetry_delay_s : float or None
         Least delay of the lines that came lately: negative where the telemetry's clock is ahead of ours.
+    learn : callable, optional
+        ``learn(utc_ns, rsrp_dbm)`` takes what was measured here and gives the rest of the route anew, or None.
     """
 
     rank: int | None = None
@@ -46,6 +50,7 @@ class Prediction:
     fix: float | None = None
     telemetry_age_s: float | None = None
     telemetry_delay_s: float | None = None
+    learn: Learn | None = None
 
 
 Predict = Callable[[int], "Prediction | None"]
@@ -200,6 +205,9 @@ class PredictionWorker:
                 fields["level_interval_dbm"] = [_rounded(now.level_dbm + bound) for bound in bounds]
             if asked.rsrp_dbm is not None:
                 self._level.add(asked.rsrp_dbm - now.level_dbm)
+        if asked.rsrp_dbm is not None and now.learn is not None:
+            rest = now.learn(asked.utc_ns, asked.rsrp_dbm)
+            fields |= {} if rest is None else {"ahead": rest}
         fields["inside"] = [self._rank.inside, self._rank.given, self._level.inside, self._level.given]
         return fields
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from . import canvas
 from .against import Against, AgainstSeries
 from .canvas import FigureSpec
 from .names import safe_name
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SHARES = np.arange(0.1, 1.0, 0.1)
 """Of the reliability plot."""

@@ -12,7 +12,7 @@ from ..common.cells import guarded
 from ..common.jsonable import json_safe
 from ..common.provenance import KEY, union
 from ..logs.records import has_wall_clock
-from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel
+from .data import RANKS, Engine, Histogram, RankPanel, ReportData, RssPanel
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 from .words import audit_summary
 
@@ -36,18 +36,8 @@ def metrics(data: ReportData) -> dict[str, Any]:
         "site": {"name": data.site.name, "illustrative": data.site.illustrative},
         "versions": dict(sorted(data.versions.items())),
         "inputs": [
-            {
-                "path": f.path,
-                "sha256": f.sha256,
-                "reader": f.reader,
-                "lines": f.lines,
-                "accepted": f.accepted,
-                "rejected": f.rejected,
-                "blank": f.blank,
-                "role": f.role,
-                "warnings": list(f.warnings),
-                **({"learned_on": list(f.learned_on)} if f.learned_on else {}),
-            }
+            _named(f, "path sha256 reader lines accepted rejected blank role warnings")
+            | ({"learned_on": f.learned_on} if f.learned_on else {})
             for f in data.inputs
         ],
         KEY: list(union(*(f.learned_on for f in data.inputs))),
@@ -63,30 +53,17 @@ def metrics(data: ReportData) -> dict[str, Any]:
     return safe
 
 
-def _interval(value: Interval | None) -> list[float] | None:
-    return None if value is None else [value[0], value[1]]
+def _named(record: Any, names: str) -> dict[str, Any]:
+    """Fields of a record by name."""
+    return {name: getattr(record, name) for name in names.split()}
 
 
 def _rss_metrics(panel: RssPanel) -> dict[str, Any]:
     return {
-        "offset_db": panel.offset_db,
-        "rmse_db": panel.rmse_db,
-        "n": panel.n,
-        "n_out_of_coverage": panel.n_out_of_coverage,
-        "at_search_edge": panel.at_search_edge,
-        "correlation": panel.correlation,
-        "rmse_ci95_db": _interval(panel.rmse_ci95_db),
-        "offset_ci95_db": _interval(panel.offset_ci95_db),
-        "correlation_ci95": _interval(panel.correlation_ci95),
-        "n_effective": panel.n_effective,
-        "lag_s": panel.lag_s,
-        "lag_verdict": panel.lag_verdict,
-        "unit": panel.unit,
-        "fitted": list(panel.fitted),
-        "baselines": {b.name: {"offset_db": b.offset_db, "rmse_db": b.rmse_db} for b in panel.baselines},
-        "variants": {
-            v.name: {"offset_db": v.offset_db, "rmse_db": v.rmse_db, "fitted": v.fitted} for v in panel.variants
-        },
+        **_named(panel, "offset_db rmse_db n n_out_of_coverage at_search_edge correlation"),
+        **_named(panel, "rmse_ci95_db offset_ci95_db correlation_ci95 n_effective lag_s lag_verdict unit fitted"),
+        "baselines": {b.name: _named(b, "offset_db rmse_db") for b in panel.baselines},
+        "variants": {v.name: _named(v, "offset_db rmse_db fitted") for v in panel.variants},
         **panel.extra,
     }
 
@@ -104,14 +81,8 @@ def _rank_metrics(panel: RankPanel) -> dict[str, Any]:
         k_key(at.k): {
             **_histogram(at.histogram),
             "out_of_coverage": at.n_out_of_coverage,
-            "agreement": at.agreement,
-            "agreement_ci95": _interval(at.agreement_ci95),
-            "kappa": at.kappa,
-            "total_variation": at.total_variation,
-            "total_variation_ci95": _interval(at.total_variation_ci95),
-            "wasserstein": at.wasserstein,
-            "p_value": at.p_value,
-            "confusion": at.confusion,
+            **_named(at, "agreement agreement_ci95 kappa total_variation total_variation_ci95"),
+            **_named(at, "wasserstein p_value confusion"),
         }
         for at in panel.simulated
     }
@@ -122,8 +93,7 @@ def _rank_metrics(panel: RankPanel) -> dict[str, Any]:
             "n_no_csi": int((~np.isfinite(panel.measured)).sum()),
         },
         "simulated": simulated,
-        "best_k": panel.best_k,
-        "best_k_ci95": _interval(panel.best_k_ci95),
+        **_named(panel, "best_k best_k_ci95"),
         **panel.extra,
     }
 
@@ -131,25 +101,16 @@ def _rank_metrics(panel: RankPanel) -> dict[str, Any]:
 def _engine_metrics(engine: Engine) -> dict[str, Any]:
     audit = engine.audit
     return {
-        "engine": engine.engine,
-        "links": engine.links,
-        "seconds": engine.seconds,
-        "paths": engine.paths,
-        "left_out": list(engine.left_out),
-        **({} if engine.other_interactions is None else {"other_interactions": dict(engine.other_interactions)}),
+        **_named(engine, "engine links seconds paths left_out"),
+        **({} if engine.other_interactions is None else {"other_interactions": engine.other_interactions}),
         "audit": None
         if audit is None
         else {
             "summary": audit_summary(audit),
-            "reference": audit.reference,
-            "links": audit.links,
-            "missing_paths": audit.missing_paths,
-            "extra_paths": audit.extra_paths,
-            "rss_max_error_db": audit.rss_max_error_db,
+            **_named(audit, "reference links missing_paths extra_paths rss_max_error_db"),
             "rank_disagreement": {k_key(k): v for k, v in audit.rank_disagreement.items()},
             "field": None if audit.fields is None else audit.fields.as_dict(),
-            "seconds": audit.seconds,
-            "reference_seconds": audit.reference_seconds,
+            **_named(audit, "seconds reference_seconds"),
         },
     }
 

@@ -24,6 +24,7 @@ from .rank_figures import (
 from .rss_figures import (
     altitude,
     channel_difference,
+    detection_reliability,
     ladder,
     overview,
     residual_against_geometry,
@@ -191,6 +192,21 @@ def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
             draw=lambda: rss_diagnostics(panel),
         ),
     ]
+    if (score := panel.extra.get("detection")) and score["reliability"]:
+        result.append(
+            FigureSpec(
+                name=f"rss_detection_{stem}",
+                page=True,
+                section=section,
+                title=f"{panel.name}: is the probability of detection calibrated?",
+                caption="Fifths of the predicted probability against the share that the receiver detected; on the "
+                f"diagonal the forecast is calibrated. Brier score {score['brier']:.3f}, constant forecast "
+                f"{score['constant_brier']:.3f}; log score {score['log_score']:.3f}, constant "
+                f"{score['constant_log_score']:.3f} (held-out segments).",
+                alt=f"Reliability of the probability that {panel.name} detects the signal.",
+                draw=lambda: detection_reliability(panel),
+            )
+        )
     if any(name in GEOMETRY for name in panel.geometry):
         result.append(
             FigureSpec(

@@ -301,6 +301,22 @@ def offset_curve(ax: Axes, panel: RssPanel) -> None:
     ax.legend(loc="upper center", fontsize=7)
 
 
+def detection_reliability(panel: RssPanel) -> Figure:
+    """Share of detected samples over the probability that the predicted level gave them; area: samples."""
+    said, seen, n = np.array(panel.extra["detection"]["reliability"], dtype=np.float64).T
+    fig = figure((4.8, 3.6))
+    ax = fig.subplots()
+    ax.plot([0, 100], [0, 100], color="0.6", linewidth=1, label="calibrated")
+    ax.plot(100 * said, 100 * seen, color=SIMULATED, linewidth=1)
+    ax.scatter(100 * said, 100 * seen, s=12 + 120 * n / n.max(), color=SIMULATED, zorder=3, label="held-out segments")
+    ax.set_xlabel("Predicted probability of detection [%]")
+    ax.set_ylabel("Detected samples [%]")
+    ax.set_xlim(0, 100)
+    ax.set_ylim(0, 100)
+    ax.legend(loc="upper left")
+    return fig
+
+
 def residual_against_geometry(panel: RssPanel) -> Figure:
     """Residual against distance, angles, height, foliage, split by line of sight where known."""
     names = [name for name in GEOMETRY if name in panel.geometry]

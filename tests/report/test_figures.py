@@ -398,3 +398,19 @@ def test_the_forecast_of_a_receiver_is_the_first_figure_of_the_rank(report_data)
     assert max(v[:, 1].max() for v in bands) == pytest.approx(100.0)
     begin = [v[np.abs(v[:, 0] - v[:, 0].min()) < 1e-9, 1] for v in bands]
     assert [np.ptp(y) for y in begin] == pytest.approx([0.0, 100.0, 0.0, 0.0])
+
+
+def test_the_reliability_of_a_detection_is_drawn_where_it_was_scored(report_data):
+    panel = report_data.rss[0]
+    score = {
+        "reliability": [[0.1, 0.12, 50], [0.5, 0.45, 80], [0.9, 0.93, 200]], "brier": 0.11, "constant_brier": 0.2,
+        "log_score": 0.3, "constant_log_score": 0.6, "n": 330, "n_detected": 230, "floor_db": -15.0, "rmse_db": 9.0,
+        "detected_rmse_db": 7.0,
+    }  # fmt: skip
+    assert not any("rss_detection" in spec.name for spec in figures.figure_specs(report_data))
+    scored = dataclasses.replace(panel, extra={**panel.extra, "detection": score})
+    data = dataclasses.replace(report_data, rss=(scored, *report_data.rss[1:]))
+    (spec,) = [one for one in figures.figure_specs(data) if "rss_detection" in one.name]
+    assert "Brier score 0.110, constant forecast 0.200" in spec.caption
+    points = spec.draw().axes[0].collections[0].get_offsets()
+    np.testing.assert_allclose(points, [[10, 12], [50, 45], [90, 93]])

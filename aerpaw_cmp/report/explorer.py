@@ -109,7 +109,7 @@ def _rss(panel: RssPanel, start: np.datetime64, arrays: PackedArrays, limit: int
     residual = panel.residual_db
     pick = keep_extremes([panel.measured_db, residual], limit) if len(panel.time) else np.arange(0)
     models = [{"name": "ray tracing", "offset": _number(panel.offset_db), "rmse": _number(panel.rmse_db),
-               "level": arrays.add(panel.simulated_dbm[pick])}]  # fmt: skip
+               "level": arrays.add(panel.simulated_dbm[pick]), "learned_here": panel.training}]  # fmt: skip
     for one in panel.baselines:
         models.append({"name": pretty(one.name), "offset": _number(one.offset_db), "rmse": _number(one.rmse_db),
                        "level": arrays.add(one.level_dbm[pick])})  # fmt: skip

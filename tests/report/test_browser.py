@@ -256,3 +256,21 @@ def test_names_of_towers_stay_clear_of_the_key_of_the_edges_and_of_each_other(dr
         driver.execute_script("explorer.data.site.towers = arguments[0]; explorer.span(null)", kept)
     finally:
         driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_no_error_of_a_model_is_shown_on_the_flight_it_was_learned_from(small_report, tmp_path):
+    first, *rest = small_report.rss
+    learned = dataclasses.replace(first, extra={**first.extra, "trained_on": ["0" * 64]})
+    page = write.write_report(dataclasses.replace(small_report, rss=(learned, *rest)), tmp_path, drawn="page").files[0]
+    found = start("--window-size=1440,1200")
+    try:
+        open_page(found, page, "window.explorer")
+        choose(found, "choose-series", learned.name)
+        choose(found, "choose-model", "ray tracing")
+        shown = found.execute_script("return document.getElementById('span').textContent")
+        assert "n/a: learned from this flight" in shown
+        assert "RMSE with" not in shown
+        choose(found, "choose-model", "free space")
+        assert "RMSE with" in found.execute_script("return document.getElementById('span').textContent")
+    finally:
+        found.quit()

@@ -111,7 +111,8 @@
     rows.push(["Span", span]);
     if (s) {
       rows.push(["Samples", number(s.n, 0)]);
-      if (s.n) rows.push(["RMSE, offset refitted on the selection", number(s.rmse, 2, "dB")], ["Offset of the selection", number(s.offset, 1, "dB")],
+      if (rss().models[state.model].learned_here) rows.push(["RMSE", "n/a: learned from this flight"]);
+      else if (s.n) rows.push(["RMSE, offset refitted on the selection", number(s.rmse, 2, "dB")], ["Offset of the selection", number(s.offset, 1, "dB")],
         ["RMSE with the flight's offset", number(s.rmseFlight, 2, "dB")], ["Mean residual", number(s.bias, 2, "dB")], ["Correlation", number(s.correlation, 2)]);
     }
     if (r) rows.push(["Rank reports", number(r.n, 0)], ["Agreement", number(100 * r.agreement, 0, "%")]);
@@ -214,7 +215,7 @@
     }
     const place = data.track || s || r;
     if (place && get(place.up)) chart(target, "Height [m]", [Array.from(get(place.time)), column(get(place.up))], [line("height", css("--ink"))], tall - 50);
-    at("legend").textContent = s ? `dots: measured plus offset; line: ${s.models[state.model].name}${state.model === 0 && s.models[1] ? "; dashed: " + s.models[1].name : ""}` : "";
+    at("legend").textContent = s ? `dots: measured plus offset; line: ${s.models[state.model].name}${s.models[state.model].learned_here ? " with antennas learned from this flight" : ""}${state.model === 0 && s.models[1] ? "; dashed: " + s.models[1].name : ""}` : "";
   }
 
   // --- the map, plan or in three dimensions ---------------------------------------------------------------------------

@@ -65,7 +65,8 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     finer = np.array([_miss(time_s + shift, here, track_s, way) for shift in fine])
     distance = float(np.nanmin(finer))
     second = float(np.nanmin(misses[apart])) if np.isfinite(misses[apart]).any() else np.inf
-    if distance > AGREE_M or second < UNIQUE * max(distance, 1.0):
+    # like with like: the other places were tried each second, and between two seconds an aircraft flies some metres
+    if distance > AGREE_M or second < UNIQUE * max(float(misses[best]), 1.0):
         return None
     origin_s = zero_s + float(fine[int(np.nanargmin(finer))])
     return Origin(np.datetime64(round(origin_s * 1000), "ms").astype("datetime64[ns]"), distance)

@@ -166,3 +166,33 @@ def test_places_are_told_apart_along_either_axis(north: bool) -> None:
     assert grouping._meet(flight(0.9 * apart), span, (35.73, -78.7))
     for away in (1.1 * apart, -1.1 * apart):
         assert not grouping._meet(flight(away), span, (35.73, -78.7))
+
+
+def test_radios_meet_a_flight_up_to_the_slack_before_and_after() -> None:
+    from aerpaw_cmp.flight import grouping
+
+    begin, end = np.datetime64("2025-03-02T15:00:00", "ns"), np.datetime64("2025-03-02T15:05:00", "ns")
+    flight, second = grouping.Flight(files=[], span=(begin, end)), np.timedelta64(1, "s")
+    slack, long = grouping.SLACK, 10 * grouping.SLACK + (end - begin)
+    assert grouping._meet(flight, (end + slack - second, end + long), None)
+    assert not grouping._meet(flight, (end + slack + second, end + long), None)
+    assert grouping._meet(flight, (begin - long, begin - slack + second), None)
+    assert not grouping._meet(flight, (begin - long, begin - slack - second), None)
+    assert not grouping._meet(grouping.Flight(files=[]), (begin, end), None)
+
+
+def test_no_origin_for_a_lap_of_a_route_that_is_flown_again() -> None:
+    """A log of one lap lies on the track at two times; where the second lap is flown aside, at one."""
+    t = np.arange(440)
+    flown = track("2025-03-02T15:00:00", seconds=len(t))
+    lap = 2 * np.pi * t / 200.0
+    flown = flown.assign(
+        latitude_deg=35.73 + 2e-3 * np.sin(lap), longitude_deg=-78.7 + 3e-3 * np.cos(lap), altitude_m=30.0
+    )
+    log = flown.iloc[20:210]
+    log = log.assign(time=np.datetime64(0, "ns") + np.arange(len(log)) * np.timedelta64(1, "s"))
+    assert origin_of(stream_of(log), stream_of(flown)) is None
+    once = flown.assign(longitude_deg=flown["longitude_deg"] + np.where(t < 200, 2e-5 * t, 4e-3))
+    found = origin_of(stream_of(log.assign(longitude_deg=once["longitude_deg"].to_numpy()[20:210])), stream_of(once))
+    assert found is not None
+    assert abs(found.time - (np.datetime64("2025-03-02T15:00:20", "ns"))) <= np.timedelta64(150, "ms")

@@ -270,3 +270,22 @@ def test_inside_the_span_is_not_its_edge() -> None:
 def test_a_grid_that_fits_in_no_memory_is_refused() -> None:
     with pytest.raises(ValueError, match="2e\\+16 offsets to try"):
         offset_grid(1e-7, (-1e9, 1e9))
+
+
+@pytest.mark.parametrize("path_loss_db", [60.0, 95.5])
+def test_the_expected_offset_closes_a_link_budget(path_loss_db: float) -> None:
+    """A signal followed by hand through amplifiers and cables to the reading; the offset brings it to the simulation."""
+    full_scale_out_dbm, backoff_db, amplifier_db = 12.0, -4.0, 17.0  # transmitter: reference, digital level, PA
+    full_scale_in_dbm, cable_db = -35.0, -2.5  # receiver: what reads 0 dBFS at the port; a cable in front of it
+    at_antenna_dbm = full_scale_out_dbm + backoff_db + amplifier_db - path_loss_db
+    reading_db = at_antenna_dbm + cable_db - full_scale_in_dbm
+    simulated_dbm = 40.0 - path_loss_db
+    offset = expected_offset_db(
+        receiver_reference_dbm=full_scale_in_dbm,
+        transmitter_reference_dbm=full_scale_out_dbm,
+        simulated_transmit_dbm=40.0,
+        transmit_amplitude_dbfs=backoff_db,
+        transmit_gain_db=amplifier_db,
+        receive_gain_db=cable_db,
+    )
+    assert reading_db + offset == pytest.approx(simulated_dbm)

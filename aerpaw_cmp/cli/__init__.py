@@ -11,11 +11,11 @@ from typing import Any
 import typer
 
 from ..common.errors import UsageError
-from . import benchmark, campaign, diff, explain, flight, live, logs, machine, predict, site
+from . import benchmark, campaign, diff, explain, flight, live, logs, machine, plan, predict, site
 from .app import Interrupted, app
 from .shown import say
 
-GROUPS = (logs, flight, explain, campaign, benchmark, diff, predict, live, site, machine)
+GROUPS = (logs, flight, explain, campaign, benchmark, diff, predict, plan, live, site, machine)
 """The modules whose commands there are: importing them registers these."""
 
 

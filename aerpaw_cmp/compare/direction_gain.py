@@ -760,17 +760,31 @@ class GainFit:
             return np.concatenate([self._seen[f"body.{a}"] for a in self.antennas])
         return self._seen[f"{frame}.{antenna}"]
 
+    def sd_about_mean(self, samples: LinkSamples) -> FloatArray:
+        """Standard deviation (n,) of the gain along samples about its mean over them, as an own offset leaves it [dB].
+
+        Every sample must have both directions.
+        """
+        blocks, centre = self._chosen(samples, None), np.zeros(len(self._weights))
+        for block in blocks:
+            centre[block.start : block.stop] = _mean_features(block, argument_of(samples, block.term.frame))
+        return self._moments(samples.antenna, blocks, samples, centre)[1]
+
     def _moments(
-        self, antenna: str, blocks: Sequence[_Block], at: LinkSamples | FloatArray
+        self, antenna: str, blocks: Sequence[_Block], at: LinkSamples | FloatArray, about: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Sum of some terms along samples, or at arguments of their one frame: mean and standard deviation (n,)."""
+        """Sum of some terms along samples, or at arguments of their one frame: mean and standard deviation (n,).
+
+        ``about``: features (columns,) whose gain counts as zero; the mean over the bins of the fit without.
+        """
         from scipy.linalg import solve_triangular
 
         design, beyond = np.zeros((len(at), len(self._weights))), np.zeros(len(at))
+        centre = self._centre[antenna] if about is None else about
         for block in blocks:
             columns = slice(block.start, block.stop)
             features = _features(block, argument_of(at, block.term.frame) if isinstance(at, LinkSamples) else at)
-            design[:, columns] = features - self._centre[antenna][columns]
+            design[:, columns] = features - centre[columns]
             if block.knots is not None:  # what the knots say nothing about is as the prior has it
                 beyond += self._scale[block.start] ** 2 * np.maximum(1.0 - (features**2).sum(axis=1), 0.0)
         if not blocks:

@@ -19,6 +19,7 @@ from ..compare.correction import BIN_S, OFF, Base, Correction, choose, fixed_bas
 from ..compare.direction_gain import LinkSamples
 from ..compare.spread import BAND, Spread, fading_of
 from ..flight.data import FlightData, RssSeries, load_data
+from ..flight.learned_gain import pair_db
 from ..flight.replay import replay_poses
 from ..flight.settings import load_flight
 from ..flight.track import body_rotation
@@ -32,7 +33,7 @@ from ..site.siteyaml import load_site
 from .calibrate import observe
 from .calibrate_rank import RankSamples, read_receiver
 from .entrants import learned_base
-from .where import Asked, Targets, find_targets, flight_of, is_settings
+from .where import Asked, Targets, find_targets, flight_of, is_settings, level_samples
 
 HEADINGS = 8
 """Directions of the nose that count alike where it is not known."""
@@ -79,19 +80,8 @@ class Source:
 
     def samples(self, position_m: FloatArray, yaw_deg: FloatArray) -> LinkSamples:
         """Targets (n,) of a level aircraft as samples without a level."""
-        ray = position_m - self.tower_m
-        at_tower = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
-        rotation = body_rotation(np.zeros(len(yaw_deg)), np.zeros(len(yaw_deg)), yaw_deg)
-        return LinkSamples(
-            flight="",
-            tower=self.series.tower,
-            channel=self.series.channel,
-            time_s=np.zeros(len(ray)),
-            position_m=position_m,
-            at_uav=np.einsum("nji,nj->ni", rotation, -at_tower),
-            at_tower=at_tower,
-            residual_db=np.zeros(len(ray)),
-        )
+        end = self.series.tower, self.series.channel
+        return level_samples(end, self.tower_m, position_m, yaw_deg, np.zeros(len(yaw_deg)))
 
     def replayed_db(self, samples: LinkSamples) -> FloatArray:
         """Replayed level above free space (n,) of a level aircraft [dB]; NaN without a path."""
@@ -104,7 +94,8 @@ class Source:
         rotation = body_rotation(flat, flat, 90.0 - np.degrees(turn) if known else flat + 90.0)
         replayed = replay_poses(data.site, data.settings.rt, link, Poses(samples.position_m, rotation))
         level = replayed.rss_dbm if data.settings.rss.field == "coherent" else replayed.rss_power_dbm
-        return np.asarray(level[:, 0] - self.free_space_db(samples.position_m))
+        pair = pair_db(link, Poses(samples.position_m, rotation), self.tower_m[None, :])
+        return np.asarray(level[:, 0] + pair - self.free_space_db(samples.position_m))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,10 +162,10 @@ def predict(
             )
         known, said = counted_once(datas)
         observed, warnings = observe(known)
-        site = _site_of(where, known)
+        site = site_of(where, known)
         _check_shared(where, planned, known, site)
         targets = find_targets(where, site, asked or Asked(), logs_root)
-    sources = _sources(known, observed)
+    sources = sources_of(known, observed)
     with stages("choose"):
         samples = [o.samples for o in observed if o.samples.antenna in sources]
         beyond = bool(np.mean(_outside(targets, samples)[targets.known]) > 0.5)
@@ -206,7 +197,7 @@ def predict(
     )
 
 
-def _site_of(where: Path, known: Sequence[FlightData]) -> Site:
+def site_of(where: Path, known: Sequence[FlightData]) -> Site:
     """Of WHERE where it is a site, else of the flights; all must share a frame."""
     site = known[0].site
     if (is_settings(where) and flight_of(where) is None) or not where.exists():
@@ -240,7 +231,8 @@ def _check_shared(where: Path, planned: Any, known: Sequence[FlightData], site: 
     )
 
 
-def _sources(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
+def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
+    """Towers that stand still and their channels that a flight heard, by antenna."""
     heard = {o.samples.antenna for o in observed if np.isfinite(o.samples.residual_db).any()}
     out: dict[str, Source] = {}
     for data in known:

@@ -11,9 +11,11 @@ import pandas as pd
 
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
+from ..compare.direction_gain import LinkSamples
 from ..flight.data import FlightData, load_data
 from ..flight.settings import FlightFile, load_flight
 from ..flight.simulate import plan_attitude, plan_trajectory
+from ..flight.track import body_rotation
 from ..logs.route import read_route
 from ..maps.grid import Grid
 from ..site.site import Site
@@ -82,6 +84,41 @@ class Asked:
     heights_m: tuple[float, ...] = (40.0,)
     spacing_m: float = 30.0
     heading_deg: float | None = None
+
+
+def level_samples(
+    end: tuple[str, str], tower_m: FloatArray, position_m: FloatArray, yaw_deg: FloatArray, time_s: FloatArray
+) -> LinkSamples:
+    """Points of a level aircraft as samples without a level.
+
+    Parameters
+    ----------
+    end : (str, str)
+        Tower and channel.
+    tower_m : (3,)
+        Place of the array [m].
+    position_m : (n, 3)
+    yaw_deg : (n,)
+        Clockwise from north.
+    time_s : (n,)
+
+    Returns
+    -------
+    LinkSamples
+    """
+    ray = position_m - tower_m
+    at_tower = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
+    rotation = body_rotation(np.zeros(len(yaw_deg)), np.zeros(len(yaw_deg)), yaw_deg)
+    return LinkSamples(
+        flight="",
+        tower=end[0],
+        channel=end[1],
+        time_s=time_s,
+        position_m=position_m,
+        at_uav=np.einsum("nji,nj->ni", rotation, -at_tower),
+        at_tower=at_tower,
+        residual_db=np.zeros(len(ray)),
+    )
 
 
 def is_settings(path: Path) -> bool:

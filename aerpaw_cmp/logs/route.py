@@ -325,6 +325,30 @@ def _places(kind: str, body: str) -> list[tuple[float, ...]]:
     return places
 
 
+_AREA = re.compile(r"<Polygon\b[^>]*>.*?<outerBoundaryIs>(.*?)</outerBoundaryIs>", re.DOTALL)
+
+
+def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
+    """Outlines of the areas of a KML, such as a geofence: corners as latitude and longitude [deg].
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or has no area.
+    """
+    text = as_utf8(read_bytes(path)[0]).decode("utf-8", "replace")
+    try:
+        areas = [[(place[1], place[0]) for place in _places("Polygon", body)] for body in _AREA.findall(text)]
+    except InputError as error:
+        raise InputError(error.found, expected=error.expected, path=path) from error
+    areas = [area for area in areas if len(area) >= 3]
+    if not areas:
+        raise InputError("a map without an area", expected="a KML with a Polygon: a geofence", path=path)
+    if not all(abs(latitude) <= 90 and abs(longitude) <= 180 for area in areas for latitude, longitude in area):
+        raise InputError("a corner that is no place on earth", expected="longitude,latitude", path=path)
+    return areas
+
+
 # --- tables ------------------------------------------------------------------------------------------
 
 _NAMES = {

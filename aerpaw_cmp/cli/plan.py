@@ -1,0 +1,96 @@
+"""``plan``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+
+from .app import Force, Json, LogsRoot, command
+from .shown import print_json, say, table
+
+_FENCE = typer.Option(metavar="KML", help="Area that may be flown  [default: the area of the site]")
+_AVOID = typer.Option(metavar="KML", help="No-fly areas; repeatable.")
+_ROUTES = typer.Option("--route", metavar="FILE", help="Another candidate: .plan, KML, CSV or log; repeatable.")
+
+
+@command(
+    "plan",
+    examples=[
+        "aerpaw-cmp plan sphere --site lake_wheeler --tower LW1 --geofence fence.kml --minutes 12",
+        "aerpaw-cmp plan lake_wheeler --with flight1.yaml --with flight2.yaml --geofence fence.kml -o next",
+        "aerpaw-cmp plan mission.plan --with flight1.yaml --route a.kml --route b.plan",
+    ],
+)
+def plan(
+    target: Annotated[
+        str,
+        typer.Argument(help="Target: sphere (all directions), a site (a grid), a route, or points."),
+    ],
+    flights: Annotated[
+        Optional[list[Path]],  # noqa: UP045
+        typer.Option("--with", metavar="FLIGHT", help="flight.yaml that was flown; repeatable."),
+    ] = None,
+    site: Annotated[Optional[str], typer.Option(help="Site, where no flight names it.")] = None,  # noqa: UP045
+    tower: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(help="Tower whose antenna counts, without --with; repeatable  [default: all]"),
+    ] = None,
+    geofence: Annotated[Optional[Path], _FENCE] = None,  # noqa: UP045
+    avoid: Annotated[Optional[list[Path]], _AVOID] = None,  # noqa: UP045
+    routes: Annotated[Optional[list[Path]], _ROUTES] = None,  # noqa: UP045
+    minutes: Annotated[float, typer.Option(min=1.0, max=240.0, help="Battery: longest flight [min].")] = 15.0,
+    speed: Annotated[float, typer.Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
+    height: Annotated[
+        Optional[list[float]],  # noqa: UP045
+        typer.Option(help="Height of the tool's own patterns above take-off [m]; repeatable  [default: 40]"),
+    ] = None,
+    target_height: Annotated[
+        Optional[list[float]],  # noqa: UP045
+        typer.Option(help="Height of a target that is a site [m]; repeatable  [default: 40]"),
+    ] = None,
+    tower_distance: Annotated[float, typer.Option(min=0.0, help="Least distance to towers [m].")] = 30.0,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/plan-<TARGET>]"),
+    ] = None,
+    logs_root: LogsRoot = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Rank candidate flights by the standard deviation that they would leave."""
+    from ..jobs.next_flight import PlanAsked
+    from ..jobs.next_flight_run import run_plan
+    from ..jobs.where import Asked
+
+    asked = PlanAsked(
+        minutes=minutes,
+        speed_mps=speed,
+        heights_m=tuple(height or (40.0,)),
+        tower_distance_m=tower_distance,
+        fence=geofence,
+        avoid=tuple(avoid or ()),
+        routes=tuple(routes or ()),
+        towers=tuple(tower or ()),
+        target=Asked(heights_m=tuple(target_height or (40.0,)), spacing_m=60.0),
+    )
+    outcome = run_plan(
+        target, flights or (), asked, site_name=site, out=out, logs_root=logs_root, force=force, progress=say
+    )
+    print_json(outcome.metrics) if as_json else _print_summary(outcome)
+
+
+def _print_summary(outcome: Any) -> None:
+    m = outcome.metrics
+    print(m["sentence"])
+    rows = [
+        [c["name"], f"{c['sd_db']:.2f}", f"{c['length_m'] / 1000:.1f}", f"{c['minutes']:.1f}", c["refused"] or "yes"]
+        for c in m["candidates"]
+    ]
+    table(["route", "SD dB", "km", "min", "may be flown"], rows, "Candidates")
+    lengths = [[f"{p['minutes']:.1f}", f"{p['length_m'] / 1000:.1f}", f"{p['sd_db']:.2f}"] for p in m["length"]]
+    table(["min", "km", "SD dB"], lengths, "What a longer flight buys")
+    for text in m["warnings"][:10]:
+        say.warn(f"warning: {text}")
+    print(f"page: {outcome.folder / 'plan.html'}")

@@ -1,0 +1,158 @@
+"""plan.html with metrics.json, the chosen route as files, the map of expected standard deviations, and figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from ..common.cells import guarded
+from ..common.jsonable import json_safe
+from ..common.units import FloatArray
+from . import canvas
+from .canvas import FigureSpec, Picture
+from .export import write_file
+from .html import by_section, environment, policy
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanPage:
+    """What the page of ``plan`` shows.
+
+    ``candidates`` and ``curve`` hold rows of metrics.json; ``outline_m`` (k, 2) and ``holes_m`` bound where a route may
+    run; ``track_m`` (n, 3); ``place_m`` (m, 3) with ``before_db`` and ``after_db`` (m,); ``towers`` by name (3,).
+    """
+
+    target: str
+    sentence: str
+    antennas: Sequence[str]
+    flights: Sequence[str]
+    candidates: Sequence[Mapping[str, Any]]
+    curve: Sequence[Mapping[str, float]]
+    outline_m: FloatArray
+    holes_m: Sequence[FloatArray]
+    track_m: FloatArray
+    place_m: FloatArray
+    before_db: FloatArray
+    after_db: FloatArray
+    towers: Mapping[str, FloatArray]
+    files: Mapping[str, str]
+    warnings: Sequence[str]
+    generated: str
+    versions: Mapping[str, str]
+    stages_s: Mapping[str, float]
+
+
+def plan_metrics(data: PlanPage) -> dict[str, Any]:
+    """The numbers of the page under stable names."""
+    safe: dict[str, Any] = json_safe(
+        {
+            "target": data.target,
+            "sentence": data.sentence,
+            "antennas": list(data.antennas),
+            "flights": list(data.flights),
+            "sd_now_db": float(np.sqrt(np.mean(data.before_db**2))),
+            "candidates": list(data.candidates),
+            "length": list(data.curve),
+            "warnings": list(data.warnings),
+            "generated": data.generated,
+            "versions": dict(sorted(data.versions.items())),
+            "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
+        }
+    )
+    return safe
+
+
+def write_plan(data: PlanPage, folder: Path) -> list[Path]:
+    """Write the page and all files beside it; the page first."""
+    written = [write_file(folder / "metrics.json", json.dumps(plan_metrics(data), indent=2) + "\n")]
+    written += [write_file(folder / name, text) for name, text in data.files.items()]
+    columns = dict(zip(("east_m", "north_m", "height_m"), data.place_m.T, strict=True))
+    table: pd.DataFrame = pd.DataFrame({**columns, "sd_before_db": data.before_db, "sd_after_db": data.after_db})
+    guarded(table.round(3)).to_csv(folder / "sd_map.csv", index=False, lineterminator="\n")
+    drawn, files = canvas.write_figures(_figures(data), folder / "figures")
+    page = write_file(folder / "plan.html", _page(data, drawn))
+    return [page, *written, folder / "sd_map.csv", *files]
+
+
+def _figures(data: PlanPage) -> list[FigureSpec]:
+    out = [
+        FigureSpec(
+            name="map",
+            section="maps",
+            title="Standard deviation before and after the proposed flight",
+            caption="Root mean square over antennas and headings at each point of the target, dB. Line: the proposed "
+            "route. Grey: where a route may run.",
+            alt="Two maps of the expected standard deviation with the proposed route",
+            draw=lambda: _draw_map(data),
+            page=True,
+        )
+    ]
+    if len(data.curve) > 1:
+        out.append(
+            FigureSpec(
+                name="length",
+                section="length",
+                title="What a longer flight buys",
+                caption="The best of three candidates, flown for a part of the battery or beyond it; a longer flight "
+                "may hold the shorter one. Dashed: no further flight.",
+                alt="Expected standard deviation against flight time",
+                draw=lambda: _draw_curve(data),
+                page=True,
+            )
+        )
+    return out
+
+
+def _draw_map(data: PlanPage) -> Figure:
+    fig = canvas.figure((9.2, 4.8))
+    axes = fig.subplots(1, 2, sharex=True, sharey=True)
+    _, first, member = np.unique(data.place_m[:, :2].round(1), axis=0, return_index=True, return_inverse=True)
+    count = np.bincount(member.ravel())
+    both = [np.sqrt(np.bincount(member.ravel(), v**2) / count) for v in (data.before_db, data.after_db)]
+    low, high = float(min(v.min() for v in both)), float(max(v.max() for v in both))
+    for ax, values, title in zip(axes, both, ("now", "after the flight"), strict=True):
+        for ring in (data.outline_m, *data.holes_m):
+            ax.plot(ring[:, 0], ring[:, 1], color="0.75", linewidth=0.8)
+        place = data.place_m[first]
+        shown = ax.scatter(place[:, 0], place[:, 1], c=values, s=9, vmin=low, vmax=high, cmap="magma", rasterized=True)
+        fig.colorbar(shown, ax=ax, label="standard deviation [dB]", pad=0.02, shrink=0.85)
+        for name, at in data.towers.items():
+            ax.plot(at[0], at[1], "^", color="black", markersize=5)
+            ax.annotate(name, at[:2], xytext=(3, 3), textcoords="offset points", fontsize=7, annotation_clip=True)
+        ax.set_aspect("equal")
+        ax.set_title(title)
+        ax.set_xlabel("east [m]")
+    seen = np.concatenate([data.place_m[:, :2], data.outline_m, data.track_m[:, :2]])
+    reach = np.maximum(0.05 * np.ptp(seen, axis=0), 30.0)
+    axes[0].set_xlim(*(seen.min(axis=0) - reach)[[0]], *(seen.max(axis=0) + reach)[[0]])
+    axes[0].set_ylim(*(seen.min(axis=0) - reach)[[1]], *(seen.max(axis=0) + reach)[[1]])
+    axes[1].plot(data.track_m[:, 0], data.track_m[:, 1], color=canvas.MEASURED, linewidth=1.0)
+    axes[0].set_ylabel("north [m]")
+    return fig
+
+
+def _draw_curve(data: PlanPage) -> Figure:
+    fig = canvas.figure((7.0, 3.6))
+    ax = fig.subplots()
+    ax.plot([p["minutes"] for p in data.curve], [p["sd_db"] for p in data.curve], "o-", color=canvas.SIMULATED)
+    ax.axhline(float(np.sqrt(np.mean(data.before_db**2))), linestyle="--", color="0.5")
+    ax.set_xlabel("flight time [min]")
+    ax.set_ylabel("standard deviation over the target [dB]")
+    ax.set_ylim(bottom=0.0)
+    return fig
+
+
+def _page(data: PlanPage, pictures: Sequence[Picture]) -> str:
+    text: str = (
+        environment()
+        .get_template("plan.html.jinja")
+        .render(data=data, metrics=plan_metrics(data), sections=by_section(pictures), content_policy=policy())
+    )
+    return text

@@ -1,0 +1,104 @@
+"""Patterns within an area, and the files of a route: what is written is read back."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.flight.patterns import NOSES, Pattern, Waypoint, allowed_area, cut, flown, path_within, route_of
+from aerpaw_cmp.flight.route_files import kml_text, plan_text, waypoints_csv
+from aerpaw_cmp.logs.route import read_areas, read_route
+from aerpaw_cmp.site.siteyaml import load_site
+
+TOWER = np.array([[10.0, 20.0, 10.0]])
+SQUARE = shapely.box(-200, -150, 200, 150)
+NOTCH = shapely.box(-30, 0, 30, 400)
+AREA = allowed_area(SQUARE, [NOTCH], TOWER, 40.0)
+
+
+@pytest.mark.parametrize("nose", NOSES)
+@pytest.mark.parametrize(
+    ("shape", "azimuth", "turns"), [("lawnmower", 0.0, False), ("lawnmower", 40.0, True), ("cross", 0.0, False)]
+)
+def test_routes_stay_within_area_battery_and_away_from_towers(nose, shape, azimuth, turns):
+    route = route_of(Pattern(shape=shape, azimuth_deg=azimuth, height_m=35.0, nose=nose, turns=turns), AREA, 8.0, 300.0)
+    line = shapely.LineString(route.position_m[:, :2])
+    assert shapely.box(-200, -150, 200, 150).covers(line)
+    assert line.intersection(NOTCH).length < 5.0
+    assert line.distance(shapely.Point(*TOWER[0, :2])) > 38.0
+    assert 100.0 < route.duration_s <= 300.0
+    step = np.linalg.norm(np.diff(route.position_m, axis=0), axis=1)
+    assert step.max() < 8.01
+    assert len(np.unique(route.yaw_deg)) == 1 if nose == "fixed" and not turns else len(np.unique(route.yaw_deg)) > 2
+
+
+def test_the_way_round_an_obstacle_is_the_shorter_one():
+    ring = shapely.box(0, 0, 100, 100).difference(shapely.box(30, 20, 70, 70))
+    way = path_within(ring, np.array([10.0, 30.0]), np.array([90.0, 30.0]))
+    whole = shapely.LineString([(10, 30), *way, (90, 30)])
+    assert ring.buffer(1.5).covers(whole)
+    assert whole.length == pytest.approx(80.0 + 2 * 10.0, abs=3.0)  # below, not above
+    assert path_within(ring, np.array([10.0, 10.0]), np.array([90.0, 10.0])) == []
+
+
+def test_a_longer_battery_is_a_denser_lawnmower_and_a_cut_route_ends_in_time():
+    pattern = Pattern(shape="lawnmower", azimuth_deg=0.0, height_m=35.0, nose="along")
+    lengths = [route_of(pattern, AREA, 8.0, seconds).length_m for seconds in (60.0, 240.0, 600.0)]
+    assert lengths[0] < 0.5 * lengths[1] < 0.5 * lengths[2]
+    route = flown("r", [Waypoint(east_m=0, north_m=0, height_m=10, yaw_deg=5, hold_s=20),
+                        Waypoint(east_m=0, north_m=160, height_m=10, yaw_deg=90)], 8.0)  # fmt: skip
+    assert route.duration_s == 40.0
+    np.testing.assert_array_equal(route.position_m[:21, 1], 0.0)
+    np.testing.assert_allclose(route.position_m[30, 1], 80.0)
+    short = cut(route, 30.0, 8.0)
+    assert short.duration_s == 30.0
+    np.testing.assert_allclose(short.position_m, route.position_m[:31])
+
+
+def test_an_area_without_room_is_refused():
+    with pytest.raises(UsageError, match="leaves no area"):
+        allowed_area(shapely.box(0, 0, 50, 50), [], np.array([[25.0, 25.0, 0.0]]), 60.0)
+    with pytest.raises(UsageError, match="no leg of 40 m"):
+        route_of(
+            Pattern(shape="lawnmower", azimuth_deg=0.0, height_m=30.0, nose="along"),
+            shapely.box(0, 0, 20, 20),
+            8.0,
+            60.0,
+        )
+
+
+def test_files_hold_the_route_that_was_planned(tmp_path: Path):
+    frame = load_site("lake_wheeler").frame
+    ways = [
+        Waypoint(east_m=0.0, north_m=0.0, height_m=35.0, yaw_deg=90.0),
+        Waypoint(east_m=120.0, north_m=-40.0, height_m=35.0, yaw_deg=270.0, hold_s=8.0),
+        Waypoint(east_m=130.0, north_m=200.0, height_m=45.0, yaw_deg=10.0),
+    ]
+    for name, text in (
+        ("a.plan", plan_text(ways, frame, 8.0)), ("a.kml", kml_text(ways, frame, "a & b")), ("a.csv", waypoints_csv(ways, frame))
+    ):  # fmt: skip
+        (tmp_path / name).write_text(text)
+        table = read_route(tmp_path / name)
+        east, north = frame.to_local(table["latitude_deg"].to_numpy(), table["longitude_deg"].to_numpy())
+        np.testing.assert_allclose(east, [w.east_m for w in ways], atol=0.05)
+        np.testing.assert_allclose(north, [w.north_m for w in ways], atol=0.05)
+        np.testing.assert_allclose(table["altitude_m"], [w.height_m for w in ways])
+        if name != "a.kml":
+            np.testing.assert_allclose(table["yaw_deg"], [w.yaw_deg for w in ways])
+
+
+def test_a_geofence_is_read_and_what_is_none_is_one_message(tmp_path: Path):
+    fence = tmp_path / "fence.kml"
+    body = "<kml><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>{}</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></kml>"
+    fence.write_text(body.format("-78.7,35.72,0 -78.69,35.72,0 -78.69,35.73,0 -78.7,35.72,0"))
+    assert read_areas(fence) == [[(35.72, -78.7), (35.72, -78.69), (35.73, -78.69), (35.72, -78.7)]]
+    for bad, said in (
+        ("nan,x,0", "no number"),
+        ("-78.7,95,0 -78.69,95,0 -78.69,96,0", "no place on earth"),
+        ("", "without an area"),
+    ):
+        fence.write_text(body.format(bad))
+        with pytest.raises(InputError, match=said):
+            read_areas(fence)

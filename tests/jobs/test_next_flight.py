@@ -1,0 +1,100 @@
+"""The plan command on the packaged site: files, bad input, and headings where antennas are unknown."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.logs.route import read_route
+from aerpaw_cmp.site.siteyaml import load_site
+
+pytestmark = pytest.mark.usefixtures("few_pictures")
+
+SITE = ["--site", "lake_wheeler", "--tower", "LW1", "--minutes", "4"]
+
+
+def kml(path: Path, corners: list[tuple[float, float]]) -> Path:
+    """A geofence by east and north of the site [m]."""
+    east, north = np.array(corners, dtype=float).T
+    latitude, longitude = load_site("lake_wheeler").frame.to_geographic(east, north)
+    text = " ".join(f"{b:.7f},{a:.7f},0" for a, b in zip(latitude, longitude, strict=True))
+    path.write_text(
+        f"<kml><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>{text}</coordinates>"
+        "</LinearRing></outerBoundaryIs></Polygon></Placemark></kml>"
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("plan")
+    kml(folder / "fence.kml", [(-300, -250), (250, -250), (250, 250), (-300, 250)])
+    kml(folder / "small.kml", [(-20, -20), (20, -20), (20, 20), (-20, 20)])
+    kml(folder / "far.kml", [(9000, 0), (9500, 0), (9500, 500), (9000, 500)])
+    (folder / "points.csv").write_text("east_m,north_m,height_m\n0,100,40\n,,\n50,120,40\n")
+    (folder / "nowhere.csv").write_text("east_m,north_m,height_m\n,,\n")
+    (folder / "torn.plan").write_text('{"fileType": "Plan", "mission": {')
+    (folder / "long.csv").write_text("latitude_deg,longitude_deg,altitude_m\n35.72,-78.70,40\n35.74,-78.70,40\n")
+    return folder
+
+
+def test_plan_writes_the_best_route_and_prefers_headings(place: Path) -> None:
+    out = place / "out"
+    assert main(["plan", "sphere", *SITE, "--geofence", str(place / "fence.kml"), "--route", str(place / "long.csv"),
+                 "-o", str(out), "-q"]) == 0  # fmt: skip
+    metrics = json.loads((out / "metrics.json").read_text())
+    may = [c for c in metrics["candidates"] if not c["refused"]]
+    assert [c["sd_db"] for c in may] == sorted(c["sd_db"] for c in may)
+    (refused,) = [c for c in metrics["candidates"] if c["refused"]]
+    assert refused["name"] == "long.csv"
+    assert metrics["candidates"][-1] == refused
+    assert may[0]["sd_db"] < 0.9 * metrics["sd_now_db"]
+    fixed, turned = (min(c["sd_db"] for c in may if word in c["name"]) for word in ("nose to the north", "turned"))
+    assert turned < fixed
+    assert [p["sd_db"] for p in metrics["length"]] == sorted((p["sd_db"] for p in metrics["length"]), reverse=True)
+    route = read_route(out / "route.plan")
+    assert set(route["altitude_m"]) == {40.0}
+    frame = load_site("lake_wheeler").frame
+    east, north = frame.to_local(route["latitude_deg"].to_numpy(), route["longitude_deg"].to_numpy())
+    assert (np.abs(east + 25) < 276).all()
+    assert (np.abs(north) < 251).all()
+    table = pd.read_csv(out / "sd_map.csv")
+    assert (table["sd_after_db"] <= table["sd_before_db"] + 0.02).all()
+    assert "Candidates" in (out / "plan.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["sphere", "--geofence", "small.kml"], 2, "no route fits"),
+        (["points.csv", "--geofence", "far.kml"], 2, "outside the area"),
+        (["nowhere.csv"], 3, "no point has a position"),
+        (["points.csv", "--route", "torn.plan"], 3, "damaged QGroundControl plan"),
+        (["points.csv", "--route", "gone.kml"], 3, "gone.kml"),
+        (["sphere", "--geofence", "points.csv"], 3, "without an area"),
+        (["sphere", "--tower", "LW9"], 2, "no tower 'LW9'"),
+    ],
+)
+def test_bad_input_is_one_message(
+    place: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, said: str
+) -> None:
+    named = [str(place / w) if "." in w else w for w in words]
+    assert main(["plan", *named, *SITE, "-o", str(place / "bad"), "-q"]) == code
+    text = capsys.readouterr().err
+    assert said in text
+    assert "Traceback" not in text
+    assert not (place / "bad").exists()
+
+
+def test_points_without_a_position_are_left_out(place: Path) -> None:
+    out = place / "points_out"
+    assert (
+        main(["plan", str(place / "points.csv"), *SITE, "--geofence", str(place / "fence.kml"), "-o", str(out), "-q"])
+        == 0
+    )
+    table = pd.read_csv(out / "sd_map.csv")
+    assert len(table) == 2 * 4  # four headings at each of two points
+    assert table.notna().all().all()

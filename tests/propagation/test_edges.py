@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import cmath
 import itertools
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
-from scipy.special import fresnel
-from shapely.geometry import LineString, box
+from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation.arrays import Array, Link, Poses, single_element
+from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
 from aerpaw_cmp.propagation.edges import Edges
 from aerpaw_cmp.propagation.faces import site_faces, triangles
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.propagation.trace import trace
-from aerpaw_cmp.site.materials import face_material
 from aerpaw_cmp.site.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building, Site, Tower
 
@@ -49,171 +46,29 @@ BARN = Building("barn", box(40, -15, 52, 25), 8.0)
 # --- a second way: plain loops, the shortest way over each edge by a search, Kouyoumjian and Pathak's own formula ----
 
 
-def by_hand(site: Site, source: np.ndarray, target: np.ndarray) -> tuple[int, complex]:
-    """Number of paths over one edge, and their field between vertical isotropic antennas."""
-    count, total = 0, 0j
-    for building in site.buildings:
-        ring = list(building.footprint.normalize().exterior.coords)[:-1]
-        if building.footprint.normalize().exterior.is_ccw is False:
-            ring = ring[::-1]
-        top = building.base_m + building.height_m
-        for i, corner in enumerate(ring):
-            a, b, before = (np.array(p) for p in (corner, ring[(i + 1) % len(ring)], ring[i - 1]))
-            wall = (b - a) / np.linalg.norm(b - a)
-            out = np.array([wall[1], -wall[0], 0.0])
-            last = (a - before) / np.linalg.norm(a - before)
-            out_before = np.array([last[1], -last[0], 0.0])
-            rim = (np.append(a, top), np.append(b, top), out, np.array([0.0, 0, 1]), np.array([0.0, 0, -1]), 1.5)
-            turn = math.atan2(last[0] * wall[1] - last[1] * wall[0], float(last @ wall))
-            upright = (np.append(a, 0.0), np.append(a, top), out_before, out, np.append(-last, 0.0), 1 + turn / math.pi)
-            for edge in (rim, upright):
-                for below_s, below_t in itertools.product((False, True), repeat=2):
-                    field = over(site, edge, source, target, below_s, below_t)
-                    if field is not None:
-                        count, total = count + 1, total + field
-    return count, total
-
-
-MIRROR = np.array([1.0, 1.0, -1.0])
-
-
-def over(site, edge, source, target, below_s, below_t) -> complex | None:
-    start, end, out, out_n, _, _ = edge
-    s = source * MIRROR if below_s else source
-    t = target * MIRROR if below_t else target
-    if not all(max((p - start) @ out, (p - start) @ out_n) >= 0 for p in (s, t)):
-        return None
-
-    def way(x: float) -> float:
-        q = start + x * (end - start)
-        return float(np.linalg.norm(q - s) + np.linalg.norm(t - q))
-
-    best = minimize_scalar(way, bounds=(0, 1), method="bounded", options={"xatol": 1e-13})
-    if not 1e-6 < best.x < 1 - 1e-6:
-        return None
-    q = start + best.x * (end - start)
-    if (below_s or below_t) and q[2] < 0.01:
-        return None
-    for image, real, below in ((s, source, below_s), (t, target, below_t)):
-        spots = [real, q]
-        if below:
-            share = image[2] / (image[2] - q[2])
-            spots.insert(1, image + share * (q - image))
-        if any(hidden(site, u, v) for u, v in itertools.pairwise(spots)):
-            return None
-    return field_over(edge, q, s, t, below_s, below_t)
-
-
-def hidden(site: Site, a: np.ndarray, b: np.ndarray) -> bool:
-    for building in site.buildings:
-        inside = building.footprint.buffer(-1e-7).intersection(LineString([a[:2], b[:2]]))
-        if inside.is_empty or inside.length < 1e-6:
-            continue
-        for piece in getattr(inside, "geoms", [inside]):
-            shares = [np.linalg.norm(np.array(p) - a[:2]) / np.linalg.norm((b - a)[:2]) for p in piece.coords]
-            heights = [a[2] + share * (b[2] - a[2]) for share in shares]
-            if min(heights) < building.base_m + building.height_m - 1e-6:
-                return True
-    return False
-
-
-def transition(x: float) -> complex:
-    """F by Fresnel integrals; its series where they cancel."""
-    if x > 40.0:
-        return 1 + 1j / (2 * x) - 3 / (4 * x**2) - 15j / (8 * x**3) + 75 / (16 * x**4)
-    sine, cosine = fresnel(math.sqrt(2 * x / math.pi))
-    return 2j * math.sqrt(x) * cmath.exp(1j * x) * math.sqrt(math.pi / 2) * ((0.5 - cosine) - 1j * (0.5 - sine))
-
-
-def cotangent_term(angle: float, sign: int, n: float, kl: float) -> complex:
-    """``cot((pi + sign angle) / 2n) F(k L a)`` with the integer N of Kouyoumjian and Pathak."""
-    big = min((-1, 0, 1), key=lambda m: abs(2 * math.pi * n * m - angle - sign * math.pi))
-    a = 2 * math.cos((2 * n * math.pi * big - angle) / 2) ** 2
-    return transition(kl * a) / math.tan((math.pi + sign * angle) / (2 * n))
-
-
-def coefficients(cosine: float, name: str) -> tuple[complex, complex]:
-    made = face_material(name)
-    eta = made.relative_permittivity(HZ)
-    root = cmath.sqrt(eta - (1 - cosine**2))
-    te, tm = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
-    if made.thickness_m is not None:
-        echo = cmath.exp(-2j * K * made.thickness_m * root)
-        te, tm = (r * (1 - echo) / (1 - r * r * echo) for r in (te, tm))
-    return te, tm
-
-
-def vertical(way: np.ndarray) -> np.ndarray:
-    """Unit theta vector of a vertical antenna along ``way``."""
-    across = math.hypot(way[0], way[1])
-    return np.array([way[0] * way[2] / across, way[1] * way[2] / across, -across])
-
-
-def bounced(wave: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """Off the ground, arriving along ``way``."""
-    te, tm = coefficients(abs(way[2]), "medium_dry_ground")
-    sigma = np.cross(way, [0.0, 0, 1])
-    sigma /= np.linalg.norm(sigma)
-    upright = np.cross(sigma, way)
-    return te * (sigma @ wave) * sigma - tm * (upright @ wave) * (upright * MIRROR)
-
-
-def field_over(edge, q, s, t, below_s, below_t) -> complex:
-    _, _, out, _, along_face, n = edge
-    e = np.cross(along_face, out)
-    before, after = (q - s) / np.linalg.norm(q - s), (t - q) / np.linalg.norm(t - q)
-    near, far = np.linalg.norm(q - s), np.linalg.norm(t - q)
-    leaving = before * MIRROR if below_s else before
-    wave = vertical(leaving).astype(complex)
-    if below_s:
-        wave = bounced(wave, leaving)
-    cos_b = float(before @ e)
-    sin_b = math.sqrt(1 - cos_b**2)
-    angles = [math.atan2(v @ out, v @ along_face) % (2 * math.pi) for v in (-before, after)]
-    kl = K * near * far * sin_b**2 / (near + far)
-    less, more = angles[1] - angles[0], angles[1] + angles[0]
-    both = cotangent_term(less, 1, n, kl) + cotangent_term(less, -1, n, kl)
-    faces = cotangent_term(more, 1, n, kl) + cotangent_term(more, -1, n, kl)
-    half = (math.pi - less) / 2
-    flat = math.sin(angles[0] / n) * math.sin(angles[1] / n)  # 0 along a face, and as on a mirror where one reflects
-    flat *= math.sin(half) / abs(math.sin(half / n) * math.sin((math.pi + less) / (2 * n)))
-    flat = min(max(flat, -1.0), 1.0)
-    te, tm = coefficients(abs(flat) * sin_b, "concrete")
-    slope = math.hypot(cos_b * flat, math.cos(half))
-    c, a = math.cos(half) / slope, cos_b * flat / slope
-    face = np.array([[te * c * c - tm * a * a, (te + tm) * c * a], [-(te + tm) * c * a, tm * c * c - te * a * a]])
-    matrix = both * np.eye(2) + faces * face
-    matrix = -cmath.exp(-0.25j * math.pi) / (2 * n * math.sqrt(2 * math.pi * K) * sin_b) * matrix
-    into = np.array([(e - cos_b * before) / sin_b, np.cross(e, before) / sin_b])
-    outward = np.array([(e - cos_b * after) / sin_b, np.cross(e, after) / sin_b])
-    wave = (matrix @ (into @ wave)) @ outward
-    arriving = after
-    if below_t:
-        wave, arriving = bounced(wave, after), after * MIRROR
-    amplitude = WAVELENGTH / (4 * math.pi) / near * math.sqrt(near / (far * (near + far)))
-    return complex(vertical(-arriving) @ wave * amplitude * cmath.exp(-1j * K * (near + far)))
-
-
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_paths_and_field_by_plain_loops(seed: int) -> None:
-    site, _, flown = random_scene(40, buildings=5, seed=seed)
-    spots = flown.position_m.copy()
-    spots[::2, 2], spots[1::2, 2] = 2.0, 25.0
-    where = Poses(spots, np.broadcast_to(np.eye(3), (40, 3, 3)).copy())
-    link = Link(HZ, {"LW1": single_element()}, single_element())
-    ours, without = (replay(site, link, where, Search(diffraction=d)) for d in ("edges", "none"))
+    """Slanted arrays at both ends, H with the reflections: the audit's second implementation."""
+    site, link, flown = random_scene(40, buildings=5, seed=seed)
+    flown.position_m[::2, 2], flown.position_m[1::2, 2] = 2.0, 25.0
+    ours = replay(site, link, flown, Search(diffraction="edges"))
     assert ours.edge_paths is not None
-    seen = 0
-    for number in range(40):
-        if not np.isfinite(ours.rss_dbm[number, 0]) and not (ours.edge_paths.pose == number).any():
-            continue
-        count, field = by_hand(site, site.towers["LW1"].position_m, spots[number])
-        assert count == int((ours.edge_paths.pose == number).sum())
-        added = ours.h[number, 0, 0, 0] - without.h[number, 0, 0, 0]
-        # the transition function's series ends at 75 / (16 x^4): 1e-5 of an edge's field at x = 40
-        assert abs(added - field) <= 3e-5 * max(abs(field), abs(added)) + 1e-12
-        seen += count
-    assert seen > 300
+    assert len(ours.edge_paths) > 300
+    chosen = np.arange(0, 40, 3)
+    found = against_reference(site, flown, ours, chosen, Expected.of(link), ks=(10.0, 1000.0), max_depth=2)
+    assert found.failures == ()
+    assert found.doubtful <= 3
+    assert found.not_covered == ()
+
+
+def test_the_audit_sees_a_path_over_an_edge_that_is_not_there() -> None:
+    where = poses((70.0, 3.0, 2.0), (60.0, -40.0, 9.0))
+    ours = trace(place(BARN), LINK, where, diffraction="edges")
+    assert ours.edge_paths is not None
+    few = ours.edge_paths.select(np.arange(1, len(ours.edge_paths)))
+    for planted in (replace(ours, edge_paths=few), replace(ours, h=0.99 * ours.h)):
+        found = against_reference(place(BARN), where, planted, np.arange(2), Expected.of(LINK), ks=(10.0,), max_depth=2)
+        assert found.failures
 
 
 # --- laws ----------------------------------------------------------------------------------------------------------

@@ -494,10 +494,10 @@ class Reference:
         rays = [_unit(way)]
         for mirror in reversed(sequence):
             rays.insert(0, _plus(rays[0], mirror.normal, -2.0 * _dot(mirror.normal, rays[0])))
-        wave = _element(tower, tx, tower.mount, rays[0])
+        wave = element_wave(tower, tx, tower.mount, rays[0])
         for mirror, ray, onward in zip(sequence, rays[:-1], rays[1:], strict=True):
             wave = self._reflected(mirror, wave, ray, onward)
-        seen = _element(uav, rx, uav_turn, (-rays[-1][0], -rays[-1][1], -rays[-1][2]))
+        seen = element_wave(uav, rx, uav_turn, (-rays[-1][0], -rays[-1][1], -rays[-1][2]))
         wavelength = C_MPS / self.link.carrier_hz
         coupling = sum(a * b for a, b in zip(seen, wave, strict=True))
         spreading = min(1.0, wavelength / (4 * math.pi * length))
@@ -606,8 +606,23 @@ def fresnel(cosine: float, eta: complex, thickness_m: float | None, wavelength: 
     return te * (1 - echo) / (1 - te * te * echo), tm * (1 - echo) / (1 - tm * tm * echo)
 
 
-def _element(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -> Wave:
-    """Field of an element along ``ray`` in site axes; TR 38.901 7.3.2, model 2."""
+def element_wave(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -> Wave:
+    """Field of an element along ``ray`` in site axes; TR 38.901 7.3.2, model 2.
+
+    Parameters
+    ----------
+    array : ExpectedArray
+    number : int
+        The element.
+    turn : (3, 3)
+        Device to site.
+    ray : (3,)
+        Unit vector away from the device.
+
+    Returns
+    -------
+    (3,) complex
+    """
     back: Matrix = tuple(zip(*turn, strict=True))  # type: ignore[assignment]
     x, y, z = _times(back, ray)
     theta, phi = math.atan2(math.hypot(x, y), z), math.atan2(y, x)

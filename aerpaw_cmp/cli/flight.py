@@ -72,7 +72,14 @@ def report(
 
     if dry_run:
         plan = run.plan_report(
-            flight, out=out, logs_root=logs_root, engine=engine, audit=audit, figures=figures, force=force
+            flight,
+            out=out,
+            logs_root=logs_root,
+            engine=engine,
+            audit=audit,
+            figures=figures,
+            learned=learned,
+            force=force,
         )
         print_plan(plan, as_json)
         return 0

@@ -288,6 +288,7 @@ def plan_report(
     engine: str | None = None,
     audit: str | None = None,
     figures: str = "page",
+    learned: Path | None = None,
     force: bool = False,
 ) -> Any:
     """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing.
@@ -298,6 +299,7 @@ def plan_report(
     out, logs_root : Path, optional
     engine, audit : str, optional
     figures : str
+    learned : Path, optional
     force : bool
         As for :func:`run_report`.
 
@@ -313,11 +315,11 @@ def plan_report(
     from ..flight.settings import load_flight
     from .plan import report_plan
 
-    settings = _overridden(load_flight(flight), engine, audit)
+    settings = _overridden(load_flight(flight, learned), engine, audit)
     return report_plan(
         settings,
         flight,
-        inputs=input_files(settings, flight, logs_root),
+        inputs=[*input_files(settings, flight, logs_root), *([] if learned is None else [learned])],
         out=out or Path("reports") / settings.flight.name,
         logs_root=logs_root,
         figures=figures,

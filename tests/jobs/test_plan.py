@@ -111,3 +111,16 @@ def test_what_was_planned_is_what_runs_and_no_line_comes_twice(
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     ran = {name.removesuffix("_s") for name, seconds in metrics["stages"].items() if seconds > 0.01}
     assert {stage["name"].split()[0] for stage in plan["stages"]} - {"imports"} == ran
+
+
+def test_a_planned_report_reads_what_it_is_given_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """``--with`` counts in the plan: its settings are those of the report, and a damaged file is refused before it."""
+    file = short_flight(tmp_path, 1)
+    learned = tmp_path / "learned.yaml"
+    learned.write_text("link: {channels: {}}\nrt: {max_depth: 0}\n", encoding="utf-8")
+    line = ["report", file, "--logs-root", SAMPLE, "--audit", "none", "-o", tmp_path / "out"]
+    with_it, without = planned(capsys, *line, "--with", learned), planned(capsys, *line)
+    assert json.dumps(with_it) != json.dumps(without)
+    learned.write_text("rt: {max_depth: [", encoding="utf-8")
+    assert main([*map(str, [*line, "--with", learned]), "--dry-run"]) == 2
+    capsys.readouterr()

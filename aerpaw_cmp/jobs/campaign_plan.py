@@ -13,7 +13,7 @@ import numpy as np
 from ..common.errors import AerpawCmpError
 from ..common.stages import Progress, duration
 from ..report.campaign_data import Failure, FlownTrack
-from .campaign_tasks import Done, Order, Outcome, Task, carry_out, carry_out_all, fitted_to, outcome_store, task_facts
+from .campaign_tasks import Done, Order, Outcome, Task, carry_out, fitted_to, outcome_store, task_facts
 from .workers import Lost, Workers
 
 
@@ -273,57 +273,15 @@ def compute(
     if not orders:
         return
     watch = Watch(len(tasks), len(tasks) - len(orders), workers.count, progress)
-    batches = batched(orders, workers.count)
-    alone = [batch[0] for batch in batches if len(batch) == 1]
-    together = [batch for batch in batches if len(batch) > 1]
+    numbers = list(orders)
 
-    def through(number: int, result: Done | Lost) -> None:
+    def through(place: int, result: Done | Lost) -> None:
+        number = numbers[place]
         outcome = _outcome(orders[number], result)
         outcomes.put(number, outcome)
         watch(outcome, 0 if isinstance(result, Lost) else result.links)
 
-    def batch_through(place: int, results: list[Done] | Lost) -> None:
-        if isinstance(results, Lost):
-            alone.extend(together[place])  # one of them ended its worker; what is kept is not computed again
-            return
-        for number, result in zip(together[place], results, strict=True):
-            through(number, result)
-
-    def one_through(place: int, result: Done | Lost) -> None:
-        through(alone[place], result)
-
-    if together:
-        workers.run(carry_out_all, [tuple(orders[number] for number in batch) for batch in together], batch_through)
-    if alone:
-        workers.run(carry_out, [orders[number] for number in alone], one_through)
-
-
-BATCH = 4
-"""Tasks of one flight that a worker gets at a time: a scheduler spends as much on one order as on four."""
-
-SHARES = 8
-"""Batches that each worker gets at least, so that none waits long for the last."""
-
-
-def batched(orders: Mapping[int, Order], workers: int) -> list[list[int]]:
-    """Numbers of orders in batches: settings of one flight whose outcomes are kept as each ends.
-
-    Parameters
-    ----------
-    orders : mapping of int to Order
-    workers : int
-        Tasks at a time; one gets one order at a time, and so does everyone where nothing is kept.
-    """
-    size = min(BATCH, len(orders) // (SHARES * workers)) if workers > 1 else 1
-    batches: list[list[int]] = []
-    for number, order in orders.items():
-        last = orders[batches[-1][-1]] if batches else None
-        alike = last is not None and last.task.path == order.task.path and last.keep is not None
-        if alike and len(batches[-1]) < size and order.key is not None and order.keep is not None:
-            batches[-1].append(number)
-        else:
-            batches.append([number])
-    return batches
+    workers.run(carry_out, [orders[number] for number in numbers], through)
 
 
 def _outcome(order: Order, result: Done | Lost) -> Outcome:

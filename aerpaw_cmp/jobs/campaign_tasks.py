@@ -232,11 +232,6 @@ def carry_out(order: Order) -> Done:
     return dataclasses.replace(done, outcome=None) if store.save(order.key, outcome, manifest) else done
 
 
-def carry_out_all(orders: Sequence[Order]) -> list[Done]:
-    """:func:`carry_out` of one order after the other; each outcome is kept as soon as its task ends."""
-    return [carry_out(order) for order in orders]
-
-
 def _checked(order: Order) -> tuple[Facts | None, Outcome | None]:
     """What the task depends on as this process sees it, and its failure where that is something else."""
     if order.key is None:

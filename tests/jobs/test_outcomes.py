@@ -20,7 +20,7 @@ from aerpaw_cmp.common.stages import silent
 from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import campaign_tasks, sample
-from aerpaw_cmp.jobs.campaign_plan import batched, campaign_status, compute, kept_outcomes
+from aerpaw_cmp.jobs.campaign_plan import campaign_status, compute, kept_outcomes
 from aerpaw_cmp.jobs.campaign_tasks import Done, Order, Outcome, Task, carry_out, outcome_store, task_facts
 from aerpaw_cmp.jobs.outcomes import OutcomeStore, shapes_numbers, task_inputs, task_key
 from aerpaw_cmp.jobs.workers import Here, Processes, Workers
@@ -307,14 +307,10 @@ def _happened(task: Task) -> bool:
     return False
 
 
-@pytest.mark.parametrize("batches", [None, [[0, 1, 2], [3], [4, 5, 6]]])
 def test_a_lost_worker_costs_its_own_task_one_more_try(
-    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batches: list[list[int]] | None
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Fails on one pool for everything: there a killed worker loses all tasks. Also where several are one order."""
-    if batches is not None:
-        monkeypatch.setattr("aerpaw_cmp.jobs.campaign_plan.batched", lambda *_: batches)
-        monkeypatch.setattr("aerpaw_cmp.jobs.campaign_tasks.carry_out", lethal)
+    """Fails on one pool for everything: there a killed worker loses all tasks."""
     monkeypatch.setenv("AERPAW_CMP_TEST_MARKS", str(tmp_path))
     monkeypatch.setattr("aerpaw_cmp.jobs.campaign_plan.carry_out", lethal)
     monkeypatch.setattr("aerpaw_cmp.jobs.workers.get_context", lambda _kind: multiprocessing.get_context("fork"))
@@ -324,18 +320,3 @@ def test_a_lost_worker_costs_its_own_task_one_more_try(
     assert found[-1].failure is not None
     assert "worker process ended" in found[-1].failure.message
     assert [one.track.flight for one in found[:6] if one.track is not None] == [f"f{i}" for i in range(6)]
-
-
-def test_batches_are_settings_of_one_flight_and_few_where_there_are_few() -> None:
-    def order(flight: int, keep: str | None = "k") -> Order:
-        return Order(task=Task(Path(f"{flight}.yaml"), f"f{flight}", "s", {}, None), key="x", keep=keep)
-
-    many = {number: order(number // 6) for number in range(120)}
-    batches = batched(many, 2)
-    assert [number for batch in batches for number in batch] == list(range(120))
-    assert {len(batch) for batch in batches} == {4, 2}
-    assert all(len({number // 6 for number in batch}) == 1 for batch in batches)
-    assert all(len(batch) == 1 for batch in batched(many, 1))  # this process says after each how far it is
-    assert all(len(batch) == 1 for batch in batched({n: many[n] for n in range(20)}, 2))
-    kept_nowhere = {number: order(0, None) for number in range(120)}
-    assert all(len(batch) == 1 for batch in batched(kept_nowhere, 2)), "a lost worker would cost the whole batch"

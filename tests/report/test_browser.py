@@ -171,6 +171,19 @@ def test_the_readouts_stay_inside_a_small_window(driver):
         usual_width(driver)
 
 
+def test_on_a_telephone_no_readout_lies_over_a_chart(driver):
+    set_width(driver, 390, 844)
+    try:
+        found = driver.execute_script(
+            "document.querySelector('#charts').scrollIntoView();"
+            "return [document.querySelector('#charts'), document.querySelector('#span')].map(e => {"
+            "  const r = e.getBoundingClientRect(); return [r.top, r.bottom]; })"
+        )
+        assert found[1][0] >= found[0][1] - 1
+    finally:
+        usual_width(driver)
+
+
 def test_no_two_elements_share_an_identifier(driver):
     found = driver.execute_script("return Array.from(document.querySelectorAll('[id]'), e => e.id)")
     assert len(found) > 10

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -285,16 +286,14 @@ def _rank_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
         ),
     ]
     if forecast_of(panel) is not None:
-        result.insert(
-            0,
-            spec(
-                "rank_forecast",
-                "rank forecast along the flight",
-                "Probability of each rank by the fitted receiver, means along the flight; the reported ranks under it.",
-                f"Stacked probabilities of rank 1 to 4 at {panel.tower} over time, and the reported ranks.",
-                lambda: rank_forecast(data, panel),
-            ),
+        forecast = spec(
+            "rank_forecast",
+            "rank forecast along the flight",
+            "Probability of each rank by the fitted receiver, means along the flight; the reported ranks under it.",
+            f"Stacked probabilities of rank 1 to 4 at {panel.tower} over time, and the reported ranks.",
+            lambda: rank_forecast(data, panel),
         )
+        result.insert(0, dataclasses.replace(forecast, section="forecast"))
     if any(at.confusion is not None for at in panel.simulated):
         result.append(
             spec(

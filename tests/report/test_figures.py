@@ -391,7 +391,7 @@ def test_the_forecast_of_a_receiver_is_the_first_figure_of_the_rank(report_data)
     said = np.where(certain[:, None], [0.0, 1.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4])
     values = {**panel.values, **{f"probability_rank{rank + 1}": said[:, rank] for rank in range(4)}}
     data = dataclasses.replace(report_data, rank=(dataclasses.replace(panel, values=values), *report_data.rank[1:]))
-    first = next(spec for spec in figures.figure_specs(data) if spec.section.startswith("rank/"))
+    (first,) = [spec for spec in figures.figure_specs(data) if spec.section == "forecast"]
     assert first.name.startswith("rank_forecast")
     upper = first.draw().axes[0]
     bands = [band.get_paths()[0].vertices for band in upper.collections[:4]]

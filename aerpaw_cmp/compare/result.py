@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from .causes import Cause
 from .detection import DetectionScore
 from .field_difference import FieldAudit
 from .forecast import ForecastScore
@@ -174,6 +175,8 @@ class RssFurther:
     repeatability: Mapping[str, Repeated]
     foliage: Mapping[str, FoliageLoss] | None = None
     explained_by: Mapping[str, float]
+    likely_cause: Cause | None = None
+    """Of the error, where one is shown."""
     simulated_sd_db: float | None = None
     """Mean of what learned antennas state for one sample: gain, the flight's own nuisance, noise, fading."""
     error_bars: Mapping[str, float] | None = None

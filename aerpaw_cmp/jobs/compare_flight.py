@@ -20,6 +20,7 @@ from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
 from ..compare import rank as ranks
 from ..compare import rss, statistics
+from ..compare.causes import Cause
 from ..compare.detection import DetectionScore, score_detection
 from ..compare.forecast import ForecastScore, score_forecast
 from ..compare.ladder import log_distance_level_db
@@ -51,6 +52,7 @@ from ..propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, levels_of, stated_spread
+from .likely_cause import cause_of
 from .what_if import (
     expected_offset,
     foliage_rank_difference,
@@ -204,6 +206,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
             foliage=foliage_rss_difference(alternatives) or None,
             explained_by={name: table.explained for name, table in residual_by.items()},
+            likely_cause=None if trained else _cause(data.site, series, replayed, levels, simple["free_space"]),
             simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
             error_bars=None if stated is None else _error_bars(stated, None if trained else score.residual_db),
             elsewhere=_elsewhere(data, series),
@@ -218,6 +221,12 @@ def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
     errors = errors_elsewhere(data.settings.antennas, series, data.folder)
     names = ("rmse_db", "free_space_rmse_db", "rmse_4s_db")
     return None if errors is None else {name: getattr(errors, name) for name in names}
+
+
+def _cause(site: Site, series: RssSeries, replayed: Replayed, levels: Levels, free_space: FloatArray) -> Cause | None:
+    """The likely cause of the error of a channel; None where no trouble is shown."""
+    cause = cause_of(site, series.tower, rss.seconds(series.time), replayed, levels, free_space)
+    return None if cause.name == "none" else cause
 
 
 def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[str, float]:

@@ -18,6 +18,7 @@ from .words import (
     TOO_FEW_COMPARED,
     Judged,
     audit_paths,
+    cause_sentence,
     count,
     expected_sentence,
     first_sentence,
@@ -55,7 +56,7 @@ def verdict(data: ReportData) -> tuple[str, ...]:
         most = max([panel.n for panel in data.rss], default=0)
         return (NOTHING_COMPARED if not most else TOO_FEW_COMPARED.format(n=most), trust(data))
     first = " ".join(part for part in (first, expected_sentence(scored)) if part)
-    return first, " ".join(part for part in (_fails(scored), trust(data)) if part)
+    return first, " ".join(part for part in (_causes(scored) or _fails(scored), trust(data)) if part)
 
 
 def _training(data: ReportData) -> str:
@@ -185,6 +186,14 @@ def _best_k(panel: RankPanel) -> RankAtK | None:
 
 LONG_S = 5.0
 """A shorter stretch of error is a fade, not a fault of the model."""
+
+
+def _causes(panels: Sequence[RssPanel]) -> str:
+    """The cause that explains most of a channel's error; nothing where no channel shows one."""
+    known = [panel for panel in panels if panel.extra.get("likely_cause")]
+    if not known:
+        return ""
+    return cause_sentence(max(known, key=lambda panel: float(panel.extra["likely_cause"]["gain"])))
 
 
 def _fails(panels: Sequence[RssPanel]) -> str:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from ..common.provenance import KEY
 from ..compare.ladder import LadderRow
 from ..compare.result import BASELINE_TITLE, AuditResult
@@ -156,19 +158,71 @@ def expected_sentence(panels: Sequence[RssPanel]) -> str:
     return f"Expect {learned:.1f} dB on another flight (free space {free:.1f} dB)."
 
 
+CAUSES: dict[str, tuple[str, str]] = {
+    "clock": (
+        "the radio clock is {size:.1f} s {side} the telemetry clock (95 %: {low:+.1f} to {high:+.1f} s)",
+        "`rss: {{lag: apply}}`",
+    ),
+    "heading": (
+        "the UAV antenna is turned clockwise by {value:.0f} (95 %: {low:.0f} to {high:.0f}) degrees",
+        "check the mount of the antenna and the logged yaw",
+    ),
+    "tower": ("the log is that of {where}", "check `node:` of this log"),
+    "pattern": (
+        "the antenna pattern of the UAV: the error follows the direction of the tower",
+        "`aerpaw-cmp calibrate`",
+    ),
+    "blocked": (
+        "a loss of {value:.0f} dB (95 %: {low:.0f} to {high:.0f} dB) at {where} degrees from the tower",
+        "add to the site what stands there",
+    ),
+    "floor": ("the receiver shows no level below {value:.0f} {unit}", "`floor_db: {value:.0f}` for this log"),
+    "gain step": (
+        "the level steps by {value:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) at {at} UTC",
+        "check the gain of the receiver; compare the two parts apart",
+    ),
+}
+"""Causes of :mod:`aerpaw_cmp.compare.causes` in words, and what to do next."""
+
+
+def cause_sentence(panel: RssPanel) -> str:
+    """Effect, cause with its interval, and action; nothing where no cause is shown."""
+    cause = panel.extra.get("likely_cause")
+    if not cause:
+        return ""
+    text, action = CAUSES[cause["name"]]
+    numbers = [cause["estimate"], *(cause["ci95"] or (None, None))]
+    value, low, high = (math.nan if number is None else number for number in numbers)
+    at = ""
+    if cause["name"] == "gain step" and len(panel.time):
+        instant = panel.time.min() + np.timedelta64(int(float(cause["where"])), "s")
+        at = str(instant.astype("datetime64[s]"))[-8:]
+    facts = {
+        "value": value, "low": low, "high": high, "size": abs(value), "side": "ahead of" if value > 0 else "behind",
+        "where": cause["where"], "unit": panel.unit, "at": at,
+    }  # fmt: skip
+    return (
+        f"Likely cause at {panel.name}: {text.format(**facts).replace('-', MINUS)}. "
+        f"With it the RMSE is {cause['rmse_with_db']:.1f} instead of {cause['rmse_db']:.1f} dB (means over 1 s). "
+        f"Next: {action.format(**facts)}."
+    )
+
+
+MINUS = "\N{MINUS SIGN}"
+
+
 def local_error(panel: RssPanel, span: ErrorSpan) -> str:
-    """Where a channel is missed most, and the likely causes, those of the measurement first."""
-    causes = []
+    """Where a channel is missed most, and what is known of the measurement that may explain it."""
+    known = []
     if panel.lag_verdict == "cannot tell":
-        causes.append("a clock that could not be confirmed")
+        known.append("the radio clock could not be confirmed")
     if panel.extra.get("detection"):
-        causes.append("a receiver that lost its lock")
-    causes.append(span.cause or "antenna pattern or a missing path")
+        known.append("the receiver lost its lock on this flight")
     side = "above" if span.mean_error_db > 0 else "below"
     start, end = (str(t.astype("datetime64[s]"))[-8:] for t in (span.start, span.end))
     return (
         f"Largest local error: measured {abs(span.mean_error_db):.1f} dB {side} predicted, {panel.name}, "
-        f"{start}-{end} UTC. Likely cause: {', or '.join(causes)}."
+        f"{start}-{end} UTC. No cause is shown{'; ' + ' and '.join(known) if known else ''}."
     )
 
 

@@ -11,7 +11,7 @@ from aerpaw_cmp.compare.field_difference import FieldAudit
 from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.report.data import ErrorSpan
 from aerpaw_cmp.report.first_screen import headlines, pooled_db, verdict
-from aerpaw_cmp.report.words import DIFFERENCE, Judged, first_sentence, pretty, ranking_sentence
+from aerpaw_cmp.report.words import CAUSES, DIFFERENCE, Judged, first_sentence, pretty, ranking_sentence
 
 
 def test_pooled_error_is_that_of_all_samples_together():
@@ -102,8 +102,37 @@ def test_a_local_error_is_a_stretch_and_names_the_clock(report_data):
     said = verdict(data)[1]
     assert "measured 6.5 dB below predicted" in said
     assert "14:00:00-14:00:08 UTC" in said
-    assert "clock that could not be confirmed" in said
+    assert "the radio clock could not be confirmed" in said
+    assert "Likely cause" not in said  # none was tested and found
     assert "20.0" not in said
+
+
+@pytest.mark.parametrize(
+    ("name", "estimate", "ci95", "where", "said", "action"),
+    [
+        ("clock", -3.0, (-3.5, -2.5), "", "3.0 s behind the telemetry clock (95 %: −3.5 to −2.5 s)", "lag: apply"),
+        ("heading", 40.0, (30.0, 50.0), "", "turned clockwise by 40 (95 %: 30 to 50) degrees", "mount"),
+        ("tower", None, (None, None), "LW3", "the log is that of LW3", "node:"),
+        ("pattern", None, (None, None), "", "antenna pattern", "calibrate"),
+        ("blocked", 12.2, (10.0, 14.4), "30 to 75", "a loss of 12 dB (95 %: 10 to 14 dB) at 30 to 75 degrees", "site"),
+        ("floor", -88.4, (-89.0, -88.0), "", "no level below −88", "floor_db: -88"),
+        ("gain step", -6.0, (-7.0, -5.0), "90", "steps by −6.0 dB (95 %: −7.0 to −5.0 dB) at 14:01:30 UTC", "gain"),
+    ],
+)
+def test_a_cause_is_said_with_effect_interval_and_action(report_data, name, estimate, ci95, where, said, action):
+    first, *others = report_data.rss
+    cause = {
+        "name": name, "estimate": estimate, "ci95": ci95, "where": where, "rmse_db": 6.0, "rmse_with_db": 2.5, "gain": 40.0
+    }  # fmt: skip
+    time = np.datetime64("2025-06-01T14:00:00") + np.arange(len(first.time)) * np.timedelta64(1, "s")
+    panel = dataclasses.replace(first, time=time.astype("datetime64[ns]"), extra={**first.extra, "likely_cause": cause})
+    text = verdict(dataclasses.replace(report_data, rss=(panel, *others)))[1]
+    assert f"Likely cause at {panel.name}: " in text
+    assert said in text
+    assert "With it the RMSE is 2.5 instead of 6.0 dB" in text
+    assert action in text.partition("Next: ")[2]
+    assert not any(word in text for word in ("significant", "better", "worse"))
+    assert set(CAUSES) == {"clock", "heading", "tower", "pattern", "blocked", "floor", "gain step"}
 
 
 def test_one_wild_sample_that_moves_the_error_is_said(report_data):

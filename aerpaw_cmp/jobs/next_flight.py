@@ -170,6 +170,8 @@ def plan_flight(
         No candidate fits, a target far outside, a route that cannot be read.
     """
     stages = stages or Stages()
+    if Path(target).suffix and not Path(target).exists():
+        raise InputError("there is no such file", expected="sphere, a site, a route or points", path=Path(target))
     with stages("read"):
         datas, said = counted_once([load_data(load_flight(p), p.parent, logs_root) for p in flights])
         observed = observe(datas)[0] if datas else []

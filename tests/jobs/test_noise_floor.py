@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.units import noise_floor_dbm
-from aerpaw_cmp.flight.settings import LinkSettings
+from aerpaw_cmp.flight.data import load_data
+from aerpaw_cmp.flight.settings import LinkSettings, load_flight
 from aerpaw_cmp.propagation.arrays import Isotropic, Link, Poses, single_element
 from aerpaw_cmp.propagation.field.baselines import free_space_dbm
 from aerpaw_cmp.propagation.options import Field, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.siteyaml import load_site
+from tests.jobs.test_audit_raw import write_flight
 
 SITE = dataclasses.replace(load_site("lake_wheeler"), buildings=())
 EAST_M = np.array([100.0, 1000.0, 10_000.0, 90_000.0])
@@ -67,3 +69,15 @@ def test_settings():
         built(noise_floor_dbm=-110.0, bandwidth_hz=1e6)
     with pytest.raises(ValueError, match="needs bandwidth_hz"):
         built(noise_figure_db=5.0)
+
+
+@pytest.mark.parametrize(
+    ("keys", "named"), [("", True), (", bandwidth_hz: 20e6", False), (", noise_floor_dbm: -100", False)]
+)
+def test_a_rank_link_without_a_noise_floor_is_named(tmp_path: Path, keys: str, named: bool) -> None:
+    flight = write_flight(tmp_path)
+    text = flight.read_text(encoding="utf-8")
+    assert not any("link.rank" in line for line in load_data(load_flight(flight), tmp_path).warnings)  # 20 MHz
+    flight.write_text(text.replace("rt:", f"  rank: {{carrier_hz: 3.4e9{keys}}}\nrt:", 1), encoding="utf-8")
+    warnings = load_data(load_flight(flight), tmp_path).warnings
+    assert any("link.rank: no bandwidth_hz" in line and "-174 dBm" in line for line in warnings) == named

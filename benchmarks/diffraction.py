@@ -2,9 +2,10 @@
 
 1. 5 towers x ``--poses`` poses x 12 buildings, 4 x 4 elements, depth 2: replays without and with edges in turn, on one
    thread, ``--pairs`` times; the ratio is that of what diffraction adds to what the reflections take;
-2. with ``--town``: munich with 200 receivers, depth 2, single diffraction (Sionna RT must be installed: its scene).
+2. with ``--town``: munich with 200 receivers, depth 2, single diffraction (Sionna RT must be installed: its scene);
+3. with ``--flights``: flight files with the site's buildings, without and with edges: RMSE of levels, kappa of ranks.
 
-Run: python benchmarks/diffraction.py [--poses 10000] [--pairs 3] [--town] [--json]
+Run: python benchmarks/diffraction.py [--poses 10000] [--pairs 3] [--town] [--flights FILE... --logs-root DIR] [--json]
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from scenes import ends, shipped  # type: ignore[import-not-found]
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.bench import random_scene
+from aerpaw_cmp.jobs.notebook import open_flight
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import Replay, replay
@@ -66,14 +68,39 @@ def town(receivers: int = 200) -> dict[str, float]:
     return row | {"edge_paths": len(found.edge_paths or ()), "street_receivers": int(street.sum())}
 
 
+def flight(path: str, logs_root: str | None) -> list[dict[str, object]]:
+    """RMSE [dB] of each channel, and kappa of each tower's rank at K = 10, without and with edges."""
+    numbers: dict[tuple[str, str], list[float]] = {}
+    for mode in ("none", "edges"):
+        changed = {"site.without_buildings": False, "rt.diffraction": mode, "rt.audit_links": 0}
+        scores = open_flight(path, logs_root=logs_root, overrides=changed).compare()
+        for one in scores.result.rss:
+            numbers.setdefault((f"{one.tower} {one.channel}", "RMSE dB"), []).append(one.score.rmse_db)
+        if scores.result.rank:
+            table = scores.rank_to_frame()
+            for row in table[table.k == 10].itertuples():
+                numbers.setdefault((row.tower, "kappa"), []).append(row.kappa)
+    return [
+        {"flight": path, "series": series, "number": name, "without": round(two[0], 4), "with": round(two[1], 4)}
+        for (series, name), two in numbers.items()
+    ]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--poses", type=int, default=10_000)
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--town", action="store_true")
+    parser.add_argument("--flights", nargs="*", default=[])
+    parser.add_argument("--logs-root")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    result = {"load": os.getloadavg()[0], "boxes": boxes(options.poses, options.pairs)}
+    result: dict[str, object] = {"load": os.getloadavg()[0]}
+    if options.flights:
+        rows = [row for path in options.flights for row in flight(path, options.logs_root)]
+        result |= {f"{row['flight']} {row['series']}": row for row in rows}
+    else:
+        result["boxes"] = boxes(options.poses, options.pairs)
     if options.town:
         result["munich"] = town()
     print(json.dumps(result) if options.json else "\n".join(f"{name}: {value}" for name, value in result.items()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -72,7 +71,7 @@ def figure_specs(data: ReportData) -> list[FigureSpec]:
         result.append(serving_spec(data.serving))
     for rank in data.rank:
         if len(rank.time):
-            result += _rank_specs(data, rank)
+            result += [*_forecast_specs(data, rank), *_rank_specs(data, rank)]
     if data.against is not None:
         result += against_specs(data.against)
     return _with_own_names(result)
@@ -193,21 +192,7 @@ def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
             draw=lambda: rss_diagnostics(panel),
         ),
     ]
-    if (score := panel.extra.get("detection")) and score["reliability"]:
-        result.append(
-            FigureSpec(
-                name=f"rss_detection_{stem}",
-                page=True,
-                section=section,
-                title=f"{panel.name}: is the probability of detection calibrated?",
-                caption="Fifths of the predicted probability against the share that the receiver detected; on the "
-                f"diagonal the forecast is calibrated. Brier score {score['brier']:.3f}, constant forecast "
-                f"{score['constant_brier']:.3f}; log score {score['log_score']:.3f}, constant "
-                f"{score['constant_log_score']:.3f} (held-out segments).",
-                alt=f"Reliability of the probability that {panel.name} detects the signal.",
-                draw=lambda: detection_reliability(panel),
-            )
-        )
+    result += _detection_specs(panel, stem, section)
     if any(name in GEOMETRY for name in panel.geometry):
         result.append(
             FigureSpec(
@@ -235,6 +220,27 @@ def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
     return result
 
 
+def _detection_specs(panel: RssPanel, stem: str, section: str) -> list[FigureSpec]:
+    """The reliability of P(detected), where it was scored."""
+    score = panel.extra.get("detection")
+    if not score or not score["reliability"]:
+        return []
+    return [
+        FigureSpec(
+            name=f"rss_detection_{stem}",
+            page=True,
+            section=section,
+            title=f"{panel.name}: is the probability of detection calibrated?",
+            caption="Fifths of the predicted probability against the share that the receiver detected; on the "
+            f"diagonal the forecast is calibrated. Brier score {score['brier']:.3f}, constant forecast "
+            f"{score['constant_brier']:.3f}; log score {score['log_score']:.3f}, constant "
+            f"{score['constant_log_score']:.3f} (held-out segments).",
+            alt=f"Reliability of the probability that {panel.name} detects the signal.",
+            draw=lambda: detection_reliability(panel),
+        )
+    ]
+
+
 def _pair_spec(data: ReportData, pair: ChannelPair) -> FigureSpec:
     words = f"{pair.first} against {pair.second}"
     return FigureSpec(
@@ -248,6 +254,23 @@ def _pair_spec(data: ReportData, pair: ChannelPair) -> FigureSpec:
     )
 
 
+def _forecast_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
+    """Probabilities of a fitted receiver along the flight; they stand under the table of the result."""
+    if forecast_of(panel) is None:
+        return []
+    return [
+        FigureSpec(
+            name=f"rank_forecast_{safe_name(panel.tower)}",
+            page=True,
+            section="forecast",
+            title=f"{panel.tower}: rank forecast along the flight",
+            caption="Probability of each rank by the fitted receiver, means along the flight; the reported ranks under it.",
+            alt=f"Stacked probabilities of rank 1 to 4 at {panel.tower} over time, and the reported ranks.",
+            draw=lambda: rank_forecast(data, panel),
+        )
+    ]
+
+
 def _rank_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
     stem, section = safe_name(panel.tower), f"rank/{panel.tower}"
 
@@ -259,7 +282,7 @@ def _rank_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
             caption=caption,
             alt=alt,
             draw=draw,
-            page=name in ("rank_forecast", "rank_histogram", "rank_time"),
+            page=name in ("rank_histogram", "rank_time"),
         )
 
     result = [
@@ -285,15 +308,6 @@ def _rank_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
             lambda: rank_over_time(data, panel),
         ),
     ]
-    if forecast_of(panel) is not None:
-        forecast = spec(
-            "rank_forecast",
-            "rank forecast along the flight",
-            "Probability of each rank by the fitted receiver, means along the flight; the reported ranks under it.",
-            f"Stacked probabilities of rank 1 to 4 at {panel.tower} over time, and the reported ranks.",
-            lambda: rank_forecast(data, panel),
-        )
-        result.insert(0, dataclasses.replace(forecast, section="forecast"))
     if any(at.confusion is not None for at in panel.simulated):
         result.append(
             spec(

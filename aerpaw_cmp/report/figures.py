@@ -264,7 +264,7 @@ def _forecast_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
             page=True,
             section="forecast",
             title=f"{panel.tower}: rank forecast along the flight",
-            caption="Probability of each rank by the fitted receiver, means along the flight; the reported ranks under it.",
+            caption="Probability of each rank by the fitted receiver (means), above the reported ranks.",
             alt=f"Stacked probabilities of rank 1 to 4 at {panel.tower} over time, and the reported ranks.",
             draw=lambda: rank_forecast(data, panel),
         )

@@ -99,21 +99,36 @@ class Correction:
         code = self.flights.index(flight) if flight in self.flights else NEW_FLIGHT
         return _rows(samples, code)
 
-    def predict(self, samples: LinkSamples, flight: str | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Level above free space (n,), its standard deviation without and with the offset between flights [dB].
+    def predict(
+        self, samples: LinkSamples, flight: str | None = None, *, own_mean: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Level above free space (n,) and its standard deviation (n,) as a mean over :data:`BIN_S` [dB].
 
-        The standard deviations are those of a mean over :data:`BIN_S`: base, field, drift and noise.
+        The standard deviation holds base, field, drift and noise, and the offset between flights unless the samples
+        count about their ``own_mean``.
         """
         channel = self.channels.get(samples.antenna)
-        gain, gain_sd = self.predictor(samples)
         if channel is None:
             raise InputError(f"no flight has {samples.antenna}", expected="one of " + ", ".join(self.channels))
+        gain, gain_sd = self.predictor(samples)
         targets = self.rows_of(samples, flight)
         fit = FieldFit(self.model, channel.rows, channel.left_db)
-        mean, whole = fit.predict(targets)
-        _, shape = fit.predict(targets, ("place", "drift"))
-        rest = gain_sd**2 + self.model.noise_sd_db**2
-        return gain + mean, self.sd_factor * np.sqrt(shape**2 + rest), self.sd_factor * np.sqrt(whole**2 + rest)
+        asked = targets
+        if not self.on and flight not in self.flights and len(targets):
+            # without a field one target with a position stands for all
+            asked = targets.part(np.array([np.isfinite(targets.position_m).all(axis=1).argmax()]))
+        mean, sd = fit.predict(asked)
+        if own_mean:
+            _, sd = fit.predict(asked, ("place", "drift"))
+        return gain + mean, self.sd_factor * np.sqrt(sd**2 + gain_sd**2 + self.model.noise_sd_db**2)
+
+
+def between_blocks_db(channel: Channel) -> float:
+    """Standard deviation of what a base leaves, between blocks of :data:`BLOCK_M` [dB]; 0 for a single block."""
+    cell = np.floor(channel.rows.position_m[:, :2] / BLOCK_M).astype(np.int64)
+    member = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    means = np.bincount(member, weights=channel.left_db) / np.bincount(member)
+    return float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
 
 
 def _rows(samples: LinkSamples, code: int) -> Rows:

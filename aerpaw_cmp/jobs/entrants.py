@@ -185,8 +185,8 @@ def _corrected(
     for one, level in zip(question.asked, above, strict=True):
         known = any(_same(o, one) for o in question.train)
         fading, _ = fading_of([s for s in train if s.antenna == one.samples.antenna], BIN_S)
-        mean, shape, whole = correction.predict(one.samples, one.samples.flight if known else None)
-        out.append((level + mean, np.hypot(whole if known else shape, fading)))
+        mean, sd = correction.predict(one.samples, one.samples.flight if known else None, own_mean=not known)
+        out.append((level + mean, np.hypot(sd, fading)))
     return out
 
 

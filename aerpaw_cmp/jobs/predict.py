@@ -15,7 +15,7 @@ from ..common.provenance import union
 from ..common.stages import Progress, Stages
 from ..common.units import BoolArray, FloatArray
 from ..compare.calibration import Observed
-from ..compare.correction import BIN_S, OFF, Base, Correction, choose, fixed_base
+from ..compare.correction import BIN_S, OFF, Base, Correction, Predictor, between_blocks_db, choose, fixed_base
 from ..compare.direction_gain import LinkSamples
 from ..compare.spread import BAND, Spread, fading_of
 from ..flight.data import FlightData, RssSeries, load_data
@@ -42,8 +42,13 @@ HULL_M = 60.0
 HULL_UP_M = 20.0
 """Targets further than this from every sample that is known are flagged, horizontally and in height [m]."""
 
-AT_ONCE = 20_000
+AT_ONCE = 250_000
 """Targets that are predicted together: bounds the memory."""
+
+REPLAYED_AT_ONCE = 20_000
+
+MOST_DIRECTIONS = 5_000
+"""Of more targets at a time, learned antennas are evaluated once per degree of direction."""
 
 RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
 
@@ -92,10 +97,14 @@ class Source:
         flat = np.zeros(len(turn))
         known = data.settings.rt.attitude != "ignored"
         rotation = body_rotation(flat, flat, 90.0 - np.degrees(turn) if known else flat + 90.0)
-        replayed = replay_poses(data.site, data.settings.rt, link, Poses(samples.position_m, rotation))
-        level = replayed.rss_dbm if data.settings.rss.field == "coherent" else replayed.rss_power_dbm
-        pair = pair_db(link, Poses(samples.position_m, rotation), self.tower_m[None, :])
-        return np.asarray(level[:, 0] + pair - self.free_space_db(samples.position_m))
+        level = np.empty(len(samples))
+        for start in range(0, len(samples), REPLAYED_AT_ONCE):
+            part = slice(start, start + REPLAYED_AT_ONCE)
+            poses = Poses(samples.position_m[part], rotation[part])
+            replayed = replay_poses(data.site, data.settings.rt, link, poses)
+            field = replayed.rss_dbm if data.settings.rss.field == "coherent" else replayed.rss_power_dbm
+            level[part] = field[:, 0] + pair_db(link, poses, self.tower_m[None, :])
+        return np.asarray(level - self.free_space_db(samples.position_m))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -254,7 +263,7 @@ def _bases(
         return fixed_base(lambda s: gain(sources[s.antenna], s))
 
     bases: dict[str, Base] = {
-        "learned": learned_base,
+        "learned": lambda train: _by_degree(learned_base(train)),
         "free space": each(lambda _, s: np.zeros(len(s))),
         "none": each(lambda source, s: -source.free_space_db(s.position_m)),
     }
@@ -269,6 +278,25 @@ def _bases(
     if len({s.flight for s in samples}) < 2:
         bases = {"free space": bases.pop("free space"), **bases}
     return bases
+
+
+def _by_degree(predictor: Predictor) -> Predictor:
+    """A model of directions that takes many samples a degree at a time (gains have lengths of 11 degrees and more)."""
+
+    def predict(samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        if len(samples) <= MOST_DIRECTIONS:
+            return predictor(samples)
+        degrees = [
+            np.degrees(angle)
+            for ray in (samples.at_tower, samples.at_uav)
+            for angle in (np.arctan2(ray[:, 1], ray[:, 0]), np.arcsin(np.clip(ray[:, 2], -1.0, 1.0)))
+        ]
+        cells = np.round(np.column_stack(degrees)).astype(np.int64)
+        _, first, member = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        gain, sd = predictor(samples.part(first))
+        return gain[member.ravel()], sd[member.ravel()]
+
+    return predict
 
 
 # --- levels --------------------------------------------------------------------------------------------------------
@@ -292,6 +320,8 @@ def _levels(
         rows = good[start : start + AT_ONCE]
         level[rows], slow[rows] = _over_headings(targets, rows, source, correction)
         progress(f"predict {source.antenna}", (start + len(rows)) / len(good))
+    beyond = between_blocks_db(correction.channels[source.antenna])
+    slow = np.where(_outside(targets, mine), np.hypot(slow, beyond), slow)
     half = fading.half_width_db(slow, BAND)
     frame: pd.DataFrame = pd.DataFrame(
         {
@@ -325,7 +355,7 @@ def _over_headings(
     means, variances = [], []
     for turn in _turns(yaw):
         heading = np.where(np.isfinite(yaw), yaw, turn)
-        gain, _, sd = correction.predict(source.samples(position, heading))
+        gain, sd = correction.predict(source.samples(position, heading))
         means.append(gain)
         variances.append(sd**2)
     level = np.mean(means, axis=0)

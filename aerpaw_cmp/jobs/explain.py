@@ -22,6 +22,7 @@ from ..flight.settings import RtSettings, load_flight
 from ..propagation.arrays import Link, Poses
 from ..propagation.check.explain import (
     ExplainedPath,
+    edge_path_lines,
     explain_paths,
     near_an_edge,
     power_sum_dbm,
@@ -186,6 +187,7 @@ def run_explain(
         notes.append(
             "element pairs have paths of their own (rt.visibility: pairs); listed are those of the array centres"
         )
+    notes += edge_path_lines(replayed, np.asarray(source), pose, link)
     measured = float(series.measured_db[at]) if isinstance(series, RssSeries) else None
     return Explanation(
         flight=settings.flight.name,

@@ -335,8 +335,8 @@ def _bent(
     return _Bent(paths, h, power), [f"diffraction over {missing} and with more than one reflection on a side"]
 
 
-def edges_of(scene: Scene) -> Edges:
-    """Edges of the buildings or triangles of a scene."""
+def edges_of(scene: Scene | Replay) -> Edges:
+    """Edges of the buildings or triangles of a scene or a replay."""
     if scene.surfaces is not None:
         return Edges.of_surfaces(scene.surfaces)
     return Edges.of(scene.faces, float(scene.faces.offset_m[scene.faces.solid < 0].max(initial=0.0)))

@@ -14,6 +14,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation.arrays import Array, Link, Poses, single_element
+from aerpaw_cmp.propagation.check.explain import edge_path_lines
 from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
 from aerpaw_cmp.propagation.edges import Edges
 from aerpaw_cmp.propagation.faces import site_faces, triangles
@@ -257,3 +258,14 @@ def test_the_border_of_a_sheet_is_a_half_plane() -> None:
     assert result.edge_paths is not None
     at = result.edge_paths.vertices_m[:, 1]
     assert ((at[:, 2] == 6.0) & (np.abs(at[:, 1]) < 39.0)).sum() == 1
+
+
+def test_paths_over_edges_are_explained_by_their_levels() -> None:
+    where = poses((70.0, 3.0, 2.0))
+    result = trace(place(BARN), LINK, where, diffraction="edges")
+    lines = edge_path_lines(result, np.array([0.0, 0.0, 10.0]), where, LINK)
+    assert result.edge_paths is not None
+    assert len(lines) == len(result.edge_paths) == 2
+    assert all("edge of barn wall" in line for line in lines)
+    levels = [float(line.split()[2]) for line in lines]
+    assert 10 * math.log10(sum(10 ** (v / 10) for v in levels)) == pytest.approx(result.rss_power_dbm[0, 0], abs=0.02)

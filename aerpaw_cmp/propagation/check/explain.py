@@ -23,11 +23,13 @@ from ...common.units import (
     wavelength_m,
 )
 from ..arrays import Link, Poses
+from ..field.edges import Tables
+from ..field.edges import amplitudes as edge_amplitudes
 from ..field.fresnel import FaceMaterials, reflection_coefficients
 from ..field.geometry import Elements, geometry
 from ..field.sum import amplitudes, pattern_ends
 from ..paths import Faces, PathSet
-from ..replay import Replay
+from ..replay import Replay, edges_of
 from ..search.mirror import images_of, scene_tolerance_m, trace_back
 from ..search.occlusion import Occlusion
 from ..surfaces import Surfaces
@@ -134,6 +136,40 @@ def explain_paths(
         further = {name: float(loss[row]) for name, loss in further_db.items()}
         explained.append(_explained(one, faces, source_m, poses.position_m[0], link, seen, field[0], further))
     return tuple(sorted(explained, key=lambda path: -path.level_dbm))
+
+
+def edge_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Link) -> list[str]:
+    """Paths over edges of a replay of one link in words, strongest first, with their levels before foliage.
+
+    Parameters
+    ----------
+    replay : Replay
+    source_m : (3,)
+    poses : Poses
+        The pose.
+    link : Link
+        With that tower alone.
+
+    Returns
+    -------
+    list of str
+    """
+    paths, lines = replay.edge_paths, []
+    if paths is None or not len(paths):
+        return []
+    edges = edges_of(replay)
+    field = edge_amplitudes(paths, Tables.of(edges, replay.faces, source_m[None], poses, link), link)
+    level = link.transmit_power_dbm + db_from_power((np.abs(field) ** 2).mean(axis=(1, 2)))
+    for row in np.argsort(-level, kind="stable"):
+        steps = [
+            f"edge of {replay.faces.label[edges.face[edge, 0]]} and {replay.faces.label[edges.face[edge, 1]]} at "
+            + ", ".join(f"{x:.1f}" for x in paths.vertices_m[row, 1 + k]) + " m"
+            for k, edge in enumerate(paths.edge[row])
+            if edge >= 0
+        ]  # fmt: skip
+        before, after = ([replay.faces.label[face]] if face >= 0 else [] for face in paths.ground[row])
+        lines.append(f"diffracted path {level[row]:.2f} dBm: {', '.join([*before, *steps, *after])}")
+    return lines
 
 
 def _explained(

@@ -32,6 +32,9 @@ _SHELL_IS_NAMED = "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"
 """Typer's word for: do not look for a shell above this process (there may be none), it stands on the command line."""
 """Set by a shell that asks what may follow on the line."""
 ISSUES = "the project's issue tracker"
+BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Threads of BLAS: the tool solves many small systems, on which several threads wait for each other (3.6 times the
+processor time of the sample's report). What the user set stays."""
 
 
 def help_text() -> str:
@@ -155,6 +158,9 @@ def main(arguments: list[str] | None = None) -> int:
     int
         The exit code; exceptions end here.
     """
+    if arguments is None:  # a process of its own, in which NumPy is not loaded yet
+        for name in BLAS:
+            os.environ.setdefault(name, "1")
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     terminal.guard()
     before_dashes = arguments[: arguments.index("--")] if "--" in arguments else arguments

@@ -233,3 +233,12 @@ def test_an_output_does_not_take_the_place_of_a_closed_stream(tmp_path: Path) ->
     from aerpaw_cmp.logs.flight_file import is_flight_file
 
     assert is_flight_file(tmp_path / "f.h5")
+
+
+@pytest.mark.parametrize(("given", "used"), [(None, "1"), ("3", "3")])
+def test_blas_uses_one_thread_unless_the_user_says_otherwise(given: str | None, used: str) -> None:
+    environ = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    environ |= {} if given is None else {"OPENBLAS_NUM_THREADS": given}
+    code = "import os, sys; from aerpaw_cmp.__main__ import main; sys.argv[1:] = ['--help']; main(); print(os.environ['OPENBLAS_NUM_THREADS'])"
+    done = subprocess.run([sys.executable, "-c", code], env=environ, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == used

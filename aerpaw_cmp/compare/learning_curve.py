@@ -103,7 +103,8 @@ def with_one_more(points: Sequence[CurvePoint], name: str = "rmse_db") -> float:
 
     Notes
     -----
-    The square of the error is fitted as ``a + b / flights`` with b >= 0; ``b / flights`` is what averages out.
+    The square of the error is fitted as ``a + b / flights`` with b >= 0; ``b / flights`` is what averages out. The last
+    three sizes count: with the first flights an error may fall slowly, until they share directions.
 
     Examples
     --------
@@ -113,8 +114,8 @@ def with_one_more(points: Sequence[CurvePoint], name: str = "rmse_db") -> float:
     """
     if len(points) < 2:
         return math.nan
-    x = np.array([1.0 / p.flights for p in points])
-    square = np.array([getattr(p, name) ** 2 for p in points])
+    x = np.array([1.0 / p.flights for p in points[-3:]])
+    square = np.array([getattr(p, name) ** 2 for p in points[-3:]])
     slope = max(float(np.polyfit(x, square, 1)[0]), 0.0)
     last = points[-1].flights
     return math.sqrt(max(float(square[-1]) - slope * (1.0 / last - 1.0 / (last + 1)), 0.0))

@@ -53,6 +53,9 @@ def test_one_more_flight_follows_what_averages_out():
     assert with_one_more(points) == pytest.approx((9 + 4 / 4) ** 0.5)
     assert with_one_more(points, "rmse_4s_db") == pytest.approx((4 + 4 / 4) ** 0.5)
     assert "0.05 dB (3.16 dB" in words_of_curve(points)[0]
+    slow = [CurvePoint(flights=n, rmse_db=9.0, rmse_4s_db=9.0, fits=1, series=2) for n in (1, 2)]
+    late = [CurvePoint(flights=n, rmse_db=(9 + 90 / n) ** 0.5, rmse_4s_db=9.0, fits=1, series=2) for n in (3, 4, 5)]
+    assert with_one_more([*slow, *late]) == pytest.approx((9 + 90 / 6) ** 0.5)  # the first sizes have no part
     flat = [CurvePoint(flights=n, rmse_db=3.0 + 0.1 * n, rmse_4s_db=3.0, fits=1, series=2) for n in (1, 2)]
     assert with_one_more(flat) == pytest.approx(3.2)  # a curve that rises promises nothing
     assert np.isnan(with_one_more(points[:1]))

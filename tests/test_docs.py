@@ -185,3 +185,17 @@ def test_a_script_of_the_gallery_has_a_title_and_draws(script: Path) -> None:
     assert code.startswith('"""')
     assert "figure" in code
     compile(code, str(script), "exec")
+
+
+def test_pages_that_a_user_reads_are_short() -> None:
+    """Research notes and the reference may be long; every other page has at most 1200 words, and a place in the menu."""
+    menu = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    sections = re.split(r"^  - (?=[A-Z])", menu, flags=re.MULTILINE)
+    long = {page for part in sections if part.startswith("Reference:") for page in re.findall(r"[\w/]+\.md", part)}
+    assert len(long) > 10
+    for page in sorted((ROOT / "docs").rglob("*.md")):
+        name = page.relative_to(ROOT / "docs").as_posix()
+        assert name in menu, name
+        if name not in long and not name.startswith("research/"):
+            assert len(page.read_text(encoding="utf-8").split()) <= 1200, name
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1300

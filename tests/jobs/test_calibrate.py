@@ -188,7 +188,7 @@ def test_bad_input_is_one_message(folder: Path, capsys: pytest.CaptureFixture[st
     high["link"]["rss"]["carrier_hz"] = 3.7e9
     write(folder / "high.yaml", high)
     assert "3.3 and 3.7 GHz" in refusal(folder, capsys, base | {"flights": ["first.yaml", "high.yaml"]})
-    assert "gone.yaml" in refusal(folder, capsys, base | {"flights": ["first.yaml", "gone.yaml"]})
+    assert "gone.yaml" in refusal(folder, capsys, base | {"flights": ["first.yaml", "gone.yaml"]}, 3)
 
 
 def test_one_flight_is_learned_and_not_scored(folder: Path) -> None:

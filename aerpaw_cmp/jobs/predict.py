@@ -479,9 +479,9 @@ def sentence(prediction: Prediction) -> str:
     raw = correction.crps_db[key[0], OFF]
     with_field = min(v for (base, title), v in correction.crps_db.items() if base == key[0] and title != OFF)
     field = (
-        f"The residual field is on: it lowers the CRPS from {raw:.2f} to {with_field:.2f} dB on what is left out."
+        f"The residual field is on: it lowers the CRPS from {raw:.2f} to {with_field:.2f} dB on held-out samples."
         if correction.on
-        else f"The residual field is off: it does not lower the CRPS on what is left out "
+        else f"The residual field is off: it does not lower the CRPS on held-out samples "
         f"({with_field:.2f} against {raw:.2f} dB)."
     )
     return f"{expect} Model: {TITLES[correction.base]}. {field}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib import resources
@@ -61,6 +62,18 @@ def interval(value: tuple[float, float] | None, decimals: int = 1) -> str:
 def percent(share: float | None, decimals: int = 0) -> str:
     """A share as a percentage; an en dash where there is none."""
     return number(None if share is None else 100 * share, decimals, "%")
+
+
+def minute(instant: str) -> str:
+    """An ISO 8601 instant of UTC to the minute; any other text as it is.
+
+    Examples
+    --------
+    >>> minute("2026-11-23T06:11:20+00:00"), minute("later")
+    ('2026-11-23 06:11 UTC', 'later')
+    """
+    parts = re.fullmatch(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d):\d\d(?:\.\d+)?(?:Z|\+00:00)", instant)
+    return instant if parts is None else f"{parts[1]} {parts[2]} UTC"
 
 
 def duration(seconds: float | None) -> str:
@@ -156,7 +169,7 @@ def environment() -> Any:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        num=number, interval=interval, percent=percent, duration=duration, data_uri=data_uri, k=k_key,
+        num=number, interval=interval, percent=percent, duration=duration, minute=minute, data_uri=data_uri, k=k_key,
         flat=lambda s: list(flat(s)), clock=clock, picture_uri=picture_uri, more=more,
         audit_summary=words.audit_summary,
     )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from ..compare.spread import fading_of
 from ..flight.data import FlightData
 from ..flight.replay import attitude_rotation
 from ..propagation.arrays import Poses
-from ..propagation.field.baselines import tr36777_loss_db, two_ray_dbm
+from ..propagation.field.baselines import p1411_loss_db, tr36777_loss_db, two_ray_dbm
 from ..propagation.trace import trace
 from .benchmark import KEY, RANKS, Bench, Question, questions, utc_texts
 from .calibrate import rotation
@@ -88,14 +89,17 @@ def _two_ray(question: Question, bench: Bench) -> list[Answer]:
     return anchored(question, gain)
 
 
-def _standard(scenario: str) -> Entrant:
+Loss = Callable[[FloatArray, FloatArray, float], FloatArray]
+"""Loss (n,) [dB] at distances and heights (n,) [m] and a carrier [Hz]."""
+
+
+def _standard(loss_db: Loss) -> Entrant:
     def answer(question: Question, bench: Bench) -> list[Answer]:
         def gain(o: Observed) -> FloatArray:
             data = bench.data(o.samples.flight)
             tower, carrier = data.site.towers[o.samples.tower].position_m, _carrier(data, o)
             distance = np.linalg.norm(o.samples.position_m - tower, axis=1)
-            loss = tr36777_loss_db(scenario, distance, o.samples.position_m[:, 2], carrier)
-            return np.asarray(-loss - _free(o, tower, carrier))
+            return np.asarray(-loss_db(distance, o.samples.position_m[:, 2], carrier) - _free(o, tower, carrier))
 
         return anchored(question, gain)
 
@@ -221,8 +225,9 @@ LEVEL: dict[str, Entrant] = {
     "constant": _constant,
     "log_distance": _log_distance,
     "two_ray": _two_ray,
-    "tr36777_rma_av": _standard("RMa-AV"),
-    "tr36777_uma_av": _standard("UMa-AV"),
+    "tr36777_rma_av": _standard(partial(tr36777_loss_db, "RMa-AV")),
+    "tr36777_uma_av": _standard(partial(tr36777_loss_db, "UMa-AV")),
+    "p1411": _standard(lambda distance_m, _, carrier_hz: p1411_loss_db(distance_m, carrier_hz)),
     "kriging": _kriging,
     "replay_paper": _replay("rss_dbm", max_depth=2),
     "replay_drafted": _replay("rss_power_dbm", max_depth=1),

@@ -36,6 +36,7 @@ TITLES = {
     "two_ray": "two-ray",
     "tr36777_rma_av": "3GPP RMa-AV",
     "tr36777_uma_av": "3GPP UMa-AV",
+    "p1411": "ITU-R P.1411",
     "kriging": "Kriging of the level",
     "replay_paper": "ray tracing, the paper's settings",
     "replay_drafted": "ray tracing, as drafted",
@@ -137,7 +138,7 @@ def _words(order: Sequence[str], scores: Mapping[str, Mapping[str, Any]], key: s
 
 def _first_words(tables: Sequence[TaskTable]) -> str:
     """On how many tasks a model without ray tracing and learning is as good as any."""
-    simple = {TITLES[n] for n in ("free_space", "log_distance", "two_ray", "tr36777_rma_av", "tr36777_uma_av")}
+    simple = {TITLES[n] for n in ("free_space", "log_distance", "two_ray", "tr36777_rma_av", "tr36777_uma_av", "p1411")}
     simple |= {"constant", TITLES["kriging"]}
     won = [one.title for one in tables if one.bars and one.bars[0].title in simple]
     text = f"{len(tables)} tasks were scored. "

@@ -131,3 +131,23 @@ def tr36777_loss_db(scenario: str, distance_m: FloatArray, height_m: FloatArray,
         return np.asarray(28.0 + 22.0 * np.log10(distance_m) + 20.0 * np.log10(ghz))
     slope = np.maximum(23.9 - 1.8 * np.log10(np.maximum(height_m, 10.0)), 20.0)
     return np.asarray(slope * np.log10(distance_m) + 20.0 * np.log10(40.0 * np.pi * ghz / 3.0))
+
+
+def p1411_loss_db(distance_m: FloatArray, carrier_hz: float) -> FloatArray:
+    """Median loss (n,) between a station above the roofs and one in its sight [dB].
+
+    Source: ITU-R P.1411-12 section 4.2.1, line of sight in urban and suburban environments.
+
+    Parameters
+    ----------
+    distance_m : (n,)
+        Between the antennas; the recommendation covers 55 to 1200 m.
+    carrier_hz : float
+        Between 2.2 and 73 GHz.
+
+    Examples
+    --------
+    >>> p1411_loss_db(np.array([100.0, 1000.0]), 10e9).round(1).tolist()
+    [94.0, 116.9]
+    """
+    return np.asarray(22.9 * np.log10(distance_m) + 28.6 + 19.6 * np.log10(carrier_hz / 1e9))

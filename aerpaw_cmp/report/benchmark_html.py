@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .html import environment, policy
+from markupsafe import Markup
+
+from .html import environment, policy, script
 
 LEVEL_COLUMNS = {
     "rmse_db": ("RMSE", "dB"),
@@ -162,6 +164,8 @@ def benchmark_page(tables: Sequence[TaskTable], missing: Sequence[str], generate
     -------
     str
     """
+    code = script("benchmark.js")
+    names = dict.fromkeys(bar.title for table in tables for bar in table.bars)
     text: str = (
         environment()
         .get_template("benchmark.html.jinja")
@@ -171,7 +175,9 @@ def benchmark_page(tables: Sequence[TaskTable], missing: Sequence[str], generate
             missing=missing,
             generated=generated,
             version=version,
-            content_policy=policy(),
+            content_policy=policy(code),
+            code=Markup(code),
+            entrants=sorted(names),
         )
     )
     return text

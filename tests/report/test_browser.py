@@ -161,12 +161,32 @@ def test_the_readouts_stay_inside_a_small_window(driver):
     set_width(driver, 1440, 900)
     try:
         for place in ("#charts", "#map"):
-            found = driver.execute_script(
-                "document.querySelector(arguments[0]).scrollIntoView(); explorer.choose(explorer.series(explorer.data.rss[0].time)[5]);"
-                "return ['pose', 'span'].map(id => document.getElementById(id).getBoundingClientRect().bottom)",
+            driver.execute_script(
+                "document.querySelector(arguments[0]).scrollIntoView(); explorer.choose(explorer.series(explorer.data.rss[0].time)[5])",
                 place,
             )
+            frame(driver)
+            found = driver.execute_script(
+                "return ['pose', 'span'].map(id => document.getElementById(id).getBoundingClientRect().bottom)"
+            )
             assert max(found) <= 900
+    finally:
+        usual_width(driver)
+
+
+def test_readouts_lie_over_no_chart_until_a_pose_is_marked(driver, page):
+    open_page(driver, page, "window.explorer")
+    set_width(driver, 1440, 900)
+    try:
+        found = driver.execute_script(
+            "return [document.querySelector('#charts').getBoundingClientRect().bottom,"
+            " document.querySelector('#span').getBoundingClientRect().top, document.body.classList.contains('pointed')]"
+        )
+        assert found[2] is False
+        assert found[1] >= found[0] - 1
+        driver.execute_script("explorer.choose(explorer.series(explorer.data.rss[0].time)[5])")
+        frame(driver)
+        assert driver.execute_script("return document.body.classList.contains('pointed')")
     finally:
         usual_width(driver)
 

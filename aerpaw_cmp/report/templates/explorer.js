@@ -85,6 +85,7 @@
 
   function describe() {
     const s = rss(), r = rank(), rows = [], t = state.pose;
+    document.body.classList.toggle("pointed", t !== null || state.span !== null); // readouts keep in view only while they are asked for
     if (t === null) { cells(at("pose"), [["Pose", "point at a chart or at the map"]]); return; }
     rows.push(["Time", clock(t)]);
     if (s) {

@@ -173,7 +173,7 @@ def _rank_sentence(panels: Sequence[RankPanel]) -> str:
             agree = f" Per position they agree in {100 * at.agreement:.0f} % of samples{beside}."
             return (
                 f"Rank at {panel.tower} (K = {at.k:.10g}, best of {len(panel.simulated)} thresholds): predicted and "
-                f"reported shares differ by {100 * at.total_variation:.0f} percentage points in all."
+                f"reported shares differ by {points(at.total_variation)} in all."
                 + (agree if math.isfinite(at.agreement) else "")
             )
     return ""
@@ -306,10 +306,22 @@ def _rank(panel: RankPanel, at: RankAtK) -> Headline:
     agree = f"agreement {100 * at.agreement:.0f} %" if math.isfinite(at.agreement) else "no pose in common"
     return Headline(
         label=f"Rank at {panel.tower}, K = {at.k:.10g}",
-        value=f"{100 * at.total_variation:.0f} percentage points",
+        value=points(at.total_variation),
         interval="between predicted and reported shares"
         + (f" (95 %: {100 * bounds[0]:.0f} to {100 * bounds[1]:.0f})" if known and bounds is not None else ""),
         beside=f"{agree}; always saying {commonest['rank']}: {100 * commonest['agreement']:.0f} %"
         if commonest.get("rank")
         else agree,
     )
+
+
+def points(share: float) -> str:
+    """A difference of shares in whole percentage points.
+
+    Examples
+    --------
+    >>> points(0.012), points(0.18)
+    ('1 percentage point', '18 percentage points')
+    """
+    number = f"{100 * share:.0f}"
+    return f"{number} percentage point{'' if number == '1' else 's'}"

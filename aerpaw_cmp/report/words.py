@@ -186,7 +186,7 @@ CAUSES: dict[str, tuple[str, str]] = {
 
 
 def cause_sentence(panel: RssPanel) -> str:
-    """Effect, cause with its interval, and action; nothing where no cause is shown."""
+    """Effect, cause with its interval, and action; nothing where no likely cause was identified."""
     cause = panel.extra.get("likely_cause")
     if not cause:
         return ""
@@ -222,7 +222,7 @@ def local_error(panel: RssPanel, span: ErrorSpan) -> str:
     start, end = (str(t.astype("datetime64[s]"))[-8:] for t in (span.start, span.end))
     return (
         f"Largest local error: measured {abs(span.mean_error_db):.1f} dB {side} predicted, {panel.name}, "
-        f"{start}-{end} UTC. No cause is shown{'; ' + ' and '.join(known) if known else ''}."
+        f"{start}-{end} UTC. No likely cause was identified{'; ' + ' and '.join(known) if known else ''}."
     )
 
 

@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..common.errors import InputError, UsageError
-from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray, IntArray
+from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..logs.ingest import IngestedFile, ingest, read_log
 from ..logs.records import Stream
 from ..site.site import Site, Tower
@@ -614,13 +614,22 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
                 cause="a copy: leave one out, by its path or by 'skip'; another radio: give it its own 'channel'",
             )
     first = parts[0][1]
+    series = [one for _, one in parts]
     arrays: dict[str, Any] = {
-        field.name: np.concatenate([getattr(series, field.name) for _, series in parts])
-        for field in dataclasses.fields(first)
-        if isinstance(getattr(first, field.name), np.ndarray)
+        field.name: joined for field in dataclasses.fields(first) if len(joined := _joined(series, field.name))
     }
     voided = sum((Counter(series.flagged) for _, series in parts), Counter())
     return dataclasses.replace(first, flagged=dict(voided), **arrays)
+
+
+def _joined(parts: Sequence[RssSeries | RankSeries], name: str) -> AnyArray:
+    """A column of all parts, NaN where a part does not have it (a log that says no serving cell); empty if none has."""
+    given = [getattr(part, name) for part in parts]
+    if not any(isinstance(value, np.ndarray) for value in given):
+        return np.empty(0)
+    return np.concatenate(
+        [np.full(len(part.time), np.nan) if value is None else value for part, value in zip(parts, given, strict=True)]
+    )
 
 
 def _form(series: RssSeries | RankSeries) -> object:

@@ -45,6 +45,22 @@ def test_a_radio_started_anew_is_one_record(tmp_path: Path) -> None:
     assert len(parts.files) == 3
 
 
+def test_parts_of_which_one_says_no_serving_cell_are_one_record(tmp_path: Path) -> None:
+    """A phone that changed its log: where a part says nothing of the serving cell, nothing is known, in either order."""
+    halves = _halves(tmp_path, "LW1/USRP1_power_log.txt")
+    whole = _flight(tmp_path, *(f"path: {p}, node: LW1, channel: USRP1" for p in halves))
+    settings = load_flight(tmp_path / "flight.yaml")
+    for spoken in range(2):
+        files = read_logs(settings, tmp_path)
+        levels = [stream for file in files for stream in file.result.streams if stream.kind == "rss"]
+        levels[spoken].frame["serving"] = 1.0
+        (joined,) = gather(settings, tmp_path, files).rss
+        assert joined.serving is not None
+        assert len(joined.serving) == len(joined.time) == len(whole.rss[0].time)
+        assert np.nansum(joined.serving) == np.isfinite(joined.serving).sum() > 100
+        assert np.isnan(joined.serving).sum() > 100
+
+
 def test_a_rank_log_in_two_parts_is_one_record(tmp_path: Path) -> None:
     log = "UAV/modem_ri.csv"
     (whole,) = _flight(tmp_path, f"path: {SAMPLE / log}").rank

@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..common.errors import InputError, UsageError
+from ..common.gaussian import determining, gaussian_kernel
 from ..common.units import BoolArray, FloatArray, IntArray
 from .sphere import gaussian_features
 
@@ -238,21 +239,8 @@ def pair_knots(points: FloatArray, length: float, share: float = UNEXPLAINED, mo
     -------
     (knots, 6)
         In the order in which they were taken.
-
-    Notes
-    -----
-    Pivoted Cholesky decomposition of the kernel: the point of largest variance left is taken next (Harbrecht, Peters
-    and Schneider, Appl. Numer. Math. 62 (2012), doi:10.1016/j.apnum.2011.10.001).
     """
-    left, rows, taken = np.ones(len(points)), np.zeros((0, len(points))), list[int]()
-    while len(points) and left.max() > share and len(taken) < most:
-        at = int(left.argmax())
-        row = kernel(points[at : at + 1], points, length)[0] - rows[:, at] @ rows
-        rows = np.concatenate([rows, row[None] / math.sqrt(left[at])])
-        left = np.maximum(left - rows[-1] ** 2, 0.0)
-        left[at] = 0.0
-        taken.append(at)
-    return points[taken]
+    return points[determining(points, lambda one, other: gaussian_kernel(one, other, length), share, most)]
 
 
 def _features(block: _Block, argument: FloatArray, *, keep: bool = False) -> FloatArray:
@@ -262,7 +250,7 @@ def _features(block: _Block, argument: FloatArray, *, keep: bool = False) -> Flo
     from scipy.linalg import solve_triangular
 
     lower = _knot_factor(block.knots, block.term.length)
-    return np.asarray(solve_triangular(lower, kernel(block.knots, argument, block.term.length), lower=True).T)
+    return np.asarray(solve_triangular(lower, gaussian_kernel(block.knots, argument, block.term.length), lower=True).T)
 
 
 NUGGET = 1e-6
@@ -275,7 +263,7 @@ def _knot_factor(knots: FloatArray, length: float) -> FloatArray:
     """Cholesky factor of the kernel between the knots of a term; those of the last eight terms are kept."""
     key = repr(length).encode() + knots.tobytes()
     if key not in _kept_knots:
-        _kept_knots[key] = factor_of(kernel(knots, knots, length) + NUGGET * np.eye(len(knots)))
+        _kept_knots[key] = factor_of(gaussian_kernel(knots, knots, length) + NUGGET * np.eye(len(knots)))
         while len(_kept_knots) > 8:
             _kept_knots.popitem(last=False)
     return _kept_knots[key]
@@ -289,7 +277,7 @@ def _block_values(block: _Block, argument: FloatArray, weights: FloatArray) -> F
 
     lower = _knot_factor(block.knots, block.term.length)
     at_knots = solve_triangular(lower, weights, lower=True, trans="T")
-    return np.asarray(kernel(argument, block.knots, block.term.length) @ at_knots)
+    return np.asarray(gaussian_kernel(argument, block.knots, block.term.length) @ at_knots)
 
 
 FEATURES_MIB = 320
@@ -322,7 +310,7 @@ def _mean_features(block: _Block, argument: FloatArray) -> FloatArray:
     if block.knots is not None:
         from scipy.linalg import solve_triangular
 
-        at_knots = kernel(block.knots, argument, block.term.length).mean(axis=1)
+        at_knots = gaussian_kernel(block.knots, argument, block.term.length).mean(axis=1)
         return np.asarray(solve_triangular(_knot_factor(block.knots, block.term.length), at_knots, lower=True))
     digest = hashlib.blake2b(repr((block.term.length, argument.shape)).encode())
     digest.update(np.ascontiguousarray(argument).tobytes())
@@ -333,13 +321,6 @@ def _mean_features(block: _Block, argument: FloatArray) -> FloatArray:
             _kept_means.popitem(last=False)
     _kept_means.move_to_end(key)
     return _kept_means[key]
-
-
-def kernel(one: FloatArray, other: FloatArray, length: float) -> FloatArray:
-    """Gaussian kernel of unit variance between points (n, 3 or 6) and (m, 3 or 6): (n, m)."""
-    from scipy.spatial.distance import cdist
-
-    return np.asarray(np.exp(-cdist(one, other, "sqeuclidean") / (2.0 * length**2)))
 
 
 Pairs = Mapping[str, FloatArray]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..common.gaussian import gaussian_kernel
 from ..common.units import BoolArray, FloatArray, IntArray
 from .direction_gain import (
     GainFit,
@@ -25,7 +26,6 @@ from .direction_gain import (
     binned_series,
     factor_of,
     fit_gain,
-    kernel,
     whitener,
 )
 
@@ -148,7 +148,7 @@ def _covariance(terms: Sequence[Term], rows: Sequence[LinkSamples], same: BoolAr
         for term in terms:
             if (term.frame, term.length) == (frame, length):
                 weight[int(term.per == "antenna")] += term.sd_db**2
-        out += np.where(same, weight.sum(), weight[0]) * kernel(at, at, length)
+        out += np.where(same, weight.sum(), weight[0]) * gaussian_kernel(at, at, length)
     return out
 
 

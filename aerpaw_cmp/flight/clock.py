@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..common.gaussian import determining, gaussian_kernel
 from ..common.units import AnyArray, BoolArray, FloatArray
 from ..compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
 from ..compare.statistics import plain
@@ -362,31 +363,17 @@ class _Bins:
 
 
 def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray:
-    """Features (g, q) whose products are the covariance of a gain of unit variance over directions (g, 3).
-
-    A pivoted Cholesky factorisation picks the directions of the flight that say most about the others.
-    """
+    """Features (g, q) whose products are the covariance of a gain of unit variance over directions (g, 3)."""
     from scipy.linalg import solve_triangular
 
     known = np.isfinite(direction).all(axis=1)
     unit = direction[known] / np.linalg.norm(direction[known], axis=1, keepdims=True)
 
     def covariance(one: FloatArray, two: FloatArray) -> FloatArray:
-        squared = np.maximum(2.0 - 2.0 * one @ two.T, 0.0)
-        return np.asarray(np.mean([np.exp(-squared / (2.0 * chord**2)) for chord in chords], axis=0))
+        return np.asarray(np.mean([gaussian_kernel(one, two, chord) for chord in chords], axis=0))
 
     some = unit[:: max(1, len(unit) // 1500)]
-    left, factor = np.ones(len(some)), np.zeros((len(some), _FEATURES))
-    picked: list[int] = []
-    for column in range(min(_FEATURES, len(some))):
-        at = int(left.argmax())
-        if left[at] < _LEFT:
-            break
-        picked.append(at)
-        factor[:, column] = covariance(some, some[[at]])[:, 0] - factor[:, :column] @ factor[at, :column]
-        factor[:, column] /= np.sqrt(left[at])
-        left = np.maximum(left - factor[:, column] ** 2, 0.0)
-    base = some[picked]
+    base = some[determining(some, covariance, _LEFT, _FEATURES)]
     lower = np.linalg.cholesky(covariance(base, base) + 1e-9 * np.eye(len(base)))
     out = np.full((len(direction), len(base)), np.nan)
     out[known] = solve_triangular(lower, covariance(unit, base).T, lower=True).T

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..common.gaussian import gaussian_kernel
 from ..common.units import FloatArray
 
 NUGGET = 1e-3
@@ -46,14 +47,9 @@ class PairGain:
     def _factor(self) -> FloatArray:
         from scipy.linalg import cholesky
 
-        matrix = self._kernel(self.directions)
+        matrix = gaussian_kernel(self.directions, self.directions, self.length)
         matrix[np.diag_indices(len(matrix))] += NUGGET
         return np.asarray(cholesky(matrix, lower=True))
-
-    def _kernel(self, at: FloatArray) -> FloatArray:
-        from scipy.spatial.distance import cdist
-
-        return np.asarray(np.exp(-cdist(at, self.directions, "sqeuclidean") / (2.0 * self.length**2)))
 
     def at(self, directions: FloatArray, apart_sd_db: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gain and standard deviation of the level (n,) towards directions (n, 6) [dB].
@@ -80,7 +76,7 @@ class PairGain:
         weights = solve_triangular(self._factor, self.gain_db, lower=True)
         for start in range(0, len(directions), 4096):
             part = slice(start, start + 4096)
-            across = self._kernel(directions[part])
+            across = gaussian_kernel(directions[part], self.directions, self.length)
             half = solve_triangular(self._factor, across.T, lower=True)
             gain[part] = half.T @ weights
             known = np.minimum((half**2).sum(axis=0), 1.0)

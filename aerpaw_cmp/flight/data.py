@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
-from ..logs.ingest import IngestedFile, ingest, read_log
+from ..logs.ingest import Held, IngestedFile, ingest, read_log
 from ..logs.records import Stream
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
@@ -268,8 +268,10 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     InputError
         A missing file, a log of another kind than the flight file says, a log without any record.
     """
-    root = logs_root or folder
-    return tuple(read_log(root, log.path, log.options(settings.timezone), reader=log.reader) for log in settings.logs)
+    root, held = logs_root or folder, Held()
+    return tuple(
+        read_log(root, log.path, log.options(settings.timezone), reader=log.reader, held=held) for log in settings.logs
+    )
 
 
 SNR = "snr"

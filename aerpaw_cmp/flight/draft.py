@@ -15,7 +15,7 @@ import yaml
 
 from ..common.errors import InputError, UsageError, one_line
 from ..common.yamlfile import parse_yaml
-from ..logs.ingest import IngestedFile, read_log
+from ..logs.ingest import IngestedFile, name_inside, read_log
 from ..logs.records import Stream, has_wall_clock
 from ..site.learned import Learned, read_learned
 from ..site.siteyaml import load_site
@@ -386,8 +386,8 @@ class _Entries:
 
     def enter(self, file: IngestedFile) -> None:
         """One log: a line of ``logs:``, or the reason why not."""
-        place = Path(file.holder, file.path.lstrip("/")) if file.holder else Path(file.path)
-        path = os.path.relpath(place.resolve(), self.folder)
+        path = os.path.relpath(Path(file.holder or file.path).resolve(), self.folder)
+        path = str(Path(path, name_inside(file.path))) if file.holder else path
         shown = one_line(path)
         if (first := self.contents.setdefault(file.sha256, shown)) != shown:
             self.out.append(f"{shown}: the same bytes as {first}")

@@ -185,7 +185,7 @@ def sniffers_of(path: Path) -> list[str]:
         return []
     if (part := None if _present(path) else archives.inside(path)) is None:
         return [reader.name for reader in claims(_beginning(path)) if reader.kinds]
-    if _head(part[0]).startswith(_HDF5):
+    if _in_flight_file(path) is not None:
         return []  # a flight file knows the reader of each log
     content = archives.members(read_bytes(part[0])[0], part[0])
     data = as_utf8(content[part[1]].read(DEEP_BYTES)) if part[1] in content else b""
@@ -198,7 +198,13 @@ def _beginning(place: Path, count: int = DEEP_BYTES) -> bytes:
     return as_utf8(head if packed.form(head) is None else packed.head_of(place, count))
 
 
-def read_log(root: Path, name: str, options: ReadOptions, *, reader: str | None = None) -> IngestedFile:
+Held = dict[Path, list[IngestedFile]]
+"""Logs of flight files that were read, by the flight file."""
+
+
+def read_log(
+    root: Path, name: str, options: ReadOptions, *, reader: str | None = None, held: Held | None = None
+) -> IngestedFile:
     """One log of a flight file, which says where it lies and may say what it is.
 
     Parameters
@@ -211,6 +217,8 @@ def read_log(root: Path, name: str, options: ReadOptions, *, reader: str | None 
         What the file cannot say about itself.
     reader : str, optional
         In place of recognising it.
+    held : dict, optional
+        Flight files that one caller has read already; gets those that this call reads.
 
     Returns
     -------
@@ -234,7 +242,10 @@ def read_log(root: Path, name: str, options: ReadOptions, *, reader: str | None 
         )
     if reader is not None:
         _refuse_other_kind(path, by_name(reader))
-    files = ingest([path], options=options, reader=reader)
+    if (part := _in_flight_file(path)) is not None:
+        files = [_of_kind(_source(*part, held), None if reader is None else by_name(reader), part[0])]
+    else:
+        files = ingest([path], options=options, reader=reader)
     if len(files) != 1:
         names = ", ".join(one_line(Path(one.path).name) for one in files[:4])
         raise UsageError(
@@ -344,7 +355,7 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
     place = Path(path)
     if (part := None if _present(place) else archives.inside(place)) is not None:
         archive, name = part
-        if _head(archive).startswith(_HDF5):
+        if _in_flight_file(place) is not None:
             return _of_kind(_source(archive, name), reader, archive)
         content = archives.members(read_bytes(archive)[0], archive)
         if name not in content:
@@ -381,9 +392,27 @@ def _of_kind(file: IngestedFile, chosen: Reader | None, flight_file: Path) -> In
     return file
 
 
-def _source(flight_file: Path, name: str) -> IngestedFile:
+def _in_flight_file(path: Path) -> tuple[Path, str] | None:
+    """The flight file that a path leads into, and the name of the log in it."""
+    part = None if _present(path) else archives.inside(path)
+    return part if part is not None and _head(part[0]).startswith(_HDF5) else None
+
+
+def name_inside(path: str) -> str:
+    """The end of a log's path by which the flight file that holds it finds it.
+
+    Examples
+    --------
+    >>> name_inside("../logs/a.txt"), name_inside("/home/me/a.txt")
+    ('logs/a.txt', 'home/me/a.txt')
+    """
+    return "/".join(part for part in Path(os.path.normpath(path)).parts if part not in ("..", "/"))
+
+
+def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedFile:
     """One of the logs that a flight file holds, by its path or the end of it."""
-    files = read_flight(flight_file)
+    held = {} if held is None else held
+    files = held[flight_file] = held.get(flight_file) or read_flight(flight_file)
     named = [one for one in files if one.path == name or Path(one.path).as_posix().endswith(f"/{name}")]
     if len(named) != 1:
         known = ", ".join(one_line(one.path) for one in files)

@@ -15,6 +15,8 @@ from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.draft import draft, receiver_floor_db
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
+from aerpaw_cmp.logs import ingest as ingest_module
+from aerpaw_cmp.logs.flight_file import read_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from tests.log_texts import nemo_csv
@@ -295,3 +297,23 @@ def test_a_receiver_above_its_floor_shows_none(tmp_path: Path) -> None:
     (file,) = ingest([tmp_path / "levels_LW1.csv"], reader="generic_csv", options=ReadOptions(
         time_origin="2025-06-01T14:00:00Z", kind="rss", columns={"time": "t", "rss_db": "rss_dbm"}))  # fmt: skip
     assert receiver_floor_db([s for s in file.result.streams if s.kind == "rss"]) is None
+
+
+def test_a_draft_of_a_flight_file_names_logs_in_it_that_came_from_above(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Logs were named relative to a folder above; the flight file is read once for all of them."""
+    (tmp_path / "work").mkdir()
+    (tmp_path / "logs").symlink_to(SAMPLE)
+    monkeypatch.chdir(tmp_path / "work")
+    logs = ["../logs/UAV", "../logs/LW1"]
+    assert main(["ingest", *logs, "--timezone", ZONE, "-o", "flight.h5", "-q"]) == 0
+    assert main(["ingest", "flight.h5", "--draft", "draft.yaml", "-q"]) == 0
+    settings = load_flight(Path("draft.yaml"))
+    assert len(settings.logs) == 4
+    assert all(log.path.startswith("flight.h5/") for log in settings.logs)
+    calls: list[Path] = []
+    monkeypatch.setattr(ingest_module, "read_flight", lambda path: calls.append(path) or read_flight(path))
+    files = read_logs(settings, Path())
+    assert len(calls) == 1
+    assert sorted(Path(file.path).name for file in files) == sorted(Path(log.path).name for log in settings.logs)

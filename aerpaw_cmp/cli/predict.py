@@ -34,11 +34,11 @@ def predict(
     ] = None,
     out: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/predict-<WHERE>]"),
+        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/prediction-<WHERE>]"),
     ] = None,
     height: Annotated[
         Optional[list[float]],  # noqa: UP045
-        typer.Option(help="Height of a grid [m], repeatable; of route points without one [default: 40]."),
+        typer.Option(help="Height of a grid [m], repeatable; of route points without one  [default: 40]"),
     ] = None,
     spacing: Annotated[float, typer.Option(min=1.0, help="Spacing of a grid [m].")] = 30.0,
     heading: Annotated[

@@ -187,11 +187,6 @@ def climb(
     )  # fmt: skip
 
 
-def ladder_rows(ladder: Ladder, names: Sequence[tuple[str, str]]) -> list[LadderRow]:
-    """The ladder per tower and channel; ``names`` are (tower, channel) of each series."""
-    return [row for i, name in enumerate(names) for row in series_rows(ladder, i, name)]
-
-
 def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[LadderRow]:
     """The rows of one series.
 

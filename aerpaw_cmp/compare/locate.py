@@ -125,12 +125,11 @@ def level_track(
 
 @dataclass(frozen=True, slots=True)
 class Fits:
-    """Log evidence of places (m,), and slope, its standard deviation and level at 100 m (m,) if the node is there."""
+    """Log evidence of places (m,), and slope and its standard deviation (m,) if the node is there."""
 
     evidence: FloatArray
     slope: FloatArray
     slope_sd: FloatArray
-    level_100_m_db: FloatArray
 
 
 def fit_places(track: LevelTrack, places_m: ArrayLike) -> Fits:
@@ -200,7 +199,7 @@ def _fit(track: LevelTrack, places: FloatArray, shadow: FloatArray, noise: float
     precision = eye + terms.swapaxes(1, 2) @ (weight[:, :, None] * terms)
     evidence = value - 0.5 * (coefficient**2).sum(axis=1) - 0.5 * np.linalg.slogdet(precision)[1]
     slope_sd = SLOPE_SD * np.sqrt(np.linalg.inv(precision)[:, 1, 1])
-    return evidence, SLOPE + SLOPE_SD * coefficient[:, 1], slope_sd, _middle(track) + _FREE_DB * coefficient[:, 0]
+    return evidence, SLOPE + SLOPE_SD * coefficient[:, 1], slope_sd
 
 
 _LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))

@@ -443,9 +443,6 @@ def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximu
 FAR_M = 30_000.0
 """A flight further than this from every tower [m] was not flown at this site."""
 
-DISTANT_M = 5_000.0
-"""And from here on [m] the reader is told first."""
-
 
 def _check_place(data: FlightData, telemetry: Sequence[tuple[str, Stream]]) -> None:
     """A flight far from every tower is no flight of this site: exchanged or mirrored angles are named.

@@ -365,9 +365,7 @@ class Comparison:
         rows = []
         for one in self.result.rank:
             for k, fit in one.score.simulated.items():
-                numbers = {
-                    name: getattr(fit, name) for name in ("agreement", "kappa", "total_variation", "wasserstein")
-                }
+                numbers = {name: getattr(fit, name) for name in RANK_NUMBERS}
                 rows.append({"tower": one.tower, "k": k, "n": one.score.n, **numbers})
         table: pd.DataFrame = pd.DataFrame(rows)
         return table

@@ -29,7 +29,6 @@ LARGEST_XML = 256 * 2**20
 MOST_TRIANGLES = 20_000_000
 
 _SHAPES = ("ply", "obj", "rectangle", "cube", "merge")
-_IGNORED = ("sensor", "emitter", "integrator", "sampler", "film", "texture", "default", "medium")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,11 +8,16 @@ from aerpaw_cmp.compare.ladder import (
     climb,
     held_out_error_db,
     held_out_lines,
-    ladder_rows,
     log_distance_level_db,
     places_of,
+    series_rows,
     stretches_of,
 )
+
+
+def ladder_rows(ladder, names):
+    """The rows of every series."""
+    return [row for i, name in enumerate(names) for row in series_rows(ladder, i, name)]
 
 
 def wave(n, seed, sd=1.0):

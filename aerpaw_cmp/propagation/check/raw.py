@@ -273,12 +273,10 @@ def level(turn: Matrix) -> Matrix:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Place [m] and turn at an instant; how far it is from the nearest row [us], and the gap that it lies in [us]."""
+    """Place [m] and turn at an instant; no turn without attitude in the rows."""
 
     place_m: Vector
     turn: Matrix | None
-    from_row_us: int
-    gap_us: int
 
 
 class RawPath:
@@ -326,8 +324,7 @@ class RawPath:
         known = [row.angles_deg for row in (one, two) if row.angles_deg is not None and any(row.angles_deg)]
         if len(known) == 2 and all(math.isfinite(angle) for angles in known for angle in angles):
             turn = matrix(between(body_quaternion(*known[0]), body_quaternion(*known[1]), share))
-        nearest = min(time_us - one.time_us, two.time_us - time_us)
-        return Pose((east, north, max(up, self.ground_m + LOWEST_M)), turn, int(nearest), gap)
+        return Pose((east, north, max(up, self.ground_m + LOWEST_M)), turn)
 
 
 # ---------------------------------------------------------------- tables of gain

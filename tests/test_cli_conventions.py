@@ -13,6 +13,8 @@ import typer
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.cli.app import app
 from aerpaw_cmp.common.commands import COMMANDS
+from tests import json_page
+from tests.json_page import listed
 
 PROGRAM: Any = typer.main.get_command(app)
 VERBS = {name: command for name, command in PROGRAM.commands.items() if not hasattr(command, "commands")}
@@ -72,7 +74,7 @@ def test_a_missing_input_is_exit_code_3(
 
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "reference" / "json.md").read_text()
+PAGE = json_page.PAGE.read_text(encoding="utf-8")
 QUICK = {
     "doctor": "doctor",
     "formats": "formats",
@@ -90,8 +92,7 @@ def test_the_page_lists_what_json_prints(
     monkeypatch.chdir(tmp_path)
     main([*QUICK[name].split(), "--json"])
     printed = json.loads(capsys.readouterr().out)
-    (row,) = re.findall(rf"^\| `{name}` \| (.*?) \|", PAGE, re.MULTILINE)
-    assert ["schema", *re.findall(r"`(\w+)", row)] == list(printed)
+    assert ["schema", *listed(name)] == list(printed)
     assert f"`schema` is {printed['schema']}" in PAGE
 
 

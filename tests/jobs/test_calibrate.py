@@ -16,6 +16,7 @@ from aerpaw_cmp.jobs.calibrate import calibrate, load_calibration, observe, read
 from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
 from tests.jobs.sent_by_pickle import SentByPickle
+from tests.json_page import unlisted
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -78,6 +79,7 @@ def metrics(folder: Path) -> dict:
 
 
 def test_scores_are_those_of_what_was_left_out(metrics: dict) -> None:
+    assert unlisted("calibrate", metrics) == []
     assert {r["flight"] for r in metrics["scores"]["flight_left_out"]} == {"first", "second"}
     for split in SPLITS:
         assert len(metrics["scores"][split]) == 2, split

@@ -25,6 +25,7 @@ from aerpaw_cmp.jobs.campaign import load_campaign, run
 from aerpaw_cmp.jobs.campaign_fit import goes_round, search
 from aerpaw_cmp.jobs.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
+from tests.json_page import unlisted
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -330,6 +331,7 @@ def test_exit_codes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_json_is_alone_on_standard_output(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     written = result(folder, "quiet", "--json", flights=["first.yaml"])
     printed = json.loads(capsys.readouterr().out)
+    assert unlisted("campaign", printed) == []
     assert printed["rss"] == written["rss"]
     assert printed["repeatability"]["pairs"] == []
 
@@ -598,6 +600,7 @@ def test_status_dry_run_and_resume_say_what_is_kept(folder: Path, capsys: pytest
     capsys.readouterr()
     assert main(["campaign", "status", str(path), "--json", "--workers", "2"]) == 0
     found = json.loads(capsys.readouterr().out)
+    assert unlisted("campaign status", found) == []
     assert (found["tasks"], found["kept"], found["failed"], found["to_do"]) == (4, 2, 0, 2)
     assert {one["flight"] for one in found["to_do_tasks"]} == {"second"}
     assert found["estimate_s"] > 0

@@ -28,6 +28,7 @@ from aerpaw_cmp.propagation.search.crowns import Crowns
 from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
 from tests.jobs.sent_by_pickle import SentByPickle
+from tests.json_page import unlisted
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -224,6 +225,7 @@ def made(tmp_path_factory):
 
 def test_the_command_prints_one_object_that_is_the_metrics(made):
     folder, printed = made
+    assert unlisted("map", printed) == []
     assert printed == {"schema": 1, **json.loads((folder / "metrics.json").read_text())}
     assert printed["grid"] == {"columns": 6, "rows": 11, "positions": 66}
     assert {(m["antennas"], m["foliage"]) for m in printed["coverage"]} == {

@@ -18,6 +18,7 @@ from aerpaw_cmp.jobs.explain import run_explain
 from aerpaw_cmp.propagation import replay as replay_module
 from aerpaw_cmp.propagation.field.sum import mean_pair_power
 from aerpaw_cmp.propagation.options import Search
+from tests.json_page import unlisted
 
 ANTENNA = {"layout": "single", "antenna": {"model": "dipole"}}
 SETTINGS = {
@@ -85,6 +86,7 @@ def test_command_line_and_json(flown, capsys):
     path, _ = flown
     assert main(["explain", str(path), "--time", "4", "--tower", "LW1", "--json", "--quiet"]) == 0
     found = json.loads(capsys.readouterr().out)
+    assert unlisted("explain", found) == []
     assert found["tower"] == "LW1"
     assert found["time_s"] == 4.0
     assert found["paths"][0]["path"] == "line of sight"

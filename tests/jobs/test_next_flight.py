@@ -10,6 +10,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.logs.route import read_route
 from aerpaw_cmp.site.siteyaml import load_site
+from tests.json_page import unlisted
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -46,6 +47,7 @@ def test_plan_writes_the_best_route_and_prefers_headings(place: Path) -> None:
     assert main(["plan", "sphere", *SITE, "--geofence", str(place / "fence.kml"), "--route", str(place / "long.csv"),
                  "-o", str(out), "-q"]) == 0  # fmt: skip
     metrics = json.loads((out / "metrics.json").read_text())
+    assert unlisted("plan", metrics) == []
     may = [c for c in metrics["candidates"] if not c["refused"]]
     assert [c["sd_db"] for c in may] == sorted(c["sd_db"] for c in may)
     (refused,) = [c for c in metrics["candidates"] if c["refused"]]

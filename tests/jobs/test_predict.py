@@ -24,6 +24,7 @@ from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.prediction_html import write_prediction
 from aerpaw_cmp.site.siteyaml import load_site
+from tests.json_page import unlisted
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
 POINTS = """east_m,north_m,height_m,yaw_deg
@@ -110,6 +111,7 @@ def test_files_agree_with_each_other(tmp_path, prediction):
     levels = table[table["channel"] != "rank"]
     np.testing.assert_allclose(levels["level_db"], prediction.table["level_db"][: len(levels)], atol=1e-3)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert unlisted("predict", metrics) == []
     assert metrics["trained_on"] == list(prediction.trained_on)
     assert metrics["sentence"].startswith("Expect an RMSE of")
     assert metrics["sentence"] in files[0].read_text()

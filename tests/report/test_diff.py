@@ -19,6 +19,7 @@ from aerpaw_cmp.jobs.diff_reports import run_diff
 from aerpaw_cmp.report.diff_data import verdict
 from aerpaw_cmp.report.diff_html import diff_page, whiskers
 from aerpaw_cmp.report.write import write_report
+from tests.json_page import unlisted
 
 LINK = ("LW1", "USRP1")
 
@@ -355,6 +356,7 @@ def test_page_and_json_are_written_as_a_set_and_replace_no_report(noisy, tmp_pat
     out = tmp_path / "out"
     assert main(["diff", str(first), str(second), "-o", str(out), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
+    assert unlisted("diff", printed) == []
     assert printed == {"schema": 1, **json.loads((out / "diff.json").read_text(encoding="utf-8"))}
     assert printed["differs"] is True
     assert printed["levels"][0]["rmse"]["verdict"] == "worse"

@@ -207,7 +207,7 @@ def _page(bench: Bench, scores: Scores) -> str:
         about = {"title": one.title, "rule": rule, "kind": one.kind, "flights": bench.tests(task)}
         tables.append(task_table(task, {**about, "skipped": bench.skipped(task, training=False)}, rows))
     lacking = dict.fromkeys(text for task in bench.manifest.tasks for text in bench.skipped(task, training=True))
-    made = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    made = datetime.now(timezone.utc).isoformat(timespec="seconds")
     return benchmark_page(tables, list(lacking), made, __version__)
 
 

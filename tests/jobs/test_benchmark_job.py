@@ -8,6 +8,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -248,6 +249,25 @@ def _refused(place: Path, frame: pd.DataFrame, head: str = "") -> str:
             entry(place, frame, "bad", head), place / "logs", manifest=place / "manifest.yaml"
         )
     return str(caught.value)
+
+
+def test_the_ten_lines_of_the_page_make_an_entry_that_is_scored(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What docs/benchmark.md tells a stranger, from the template to the row, on made-up flights."""
+    monkeypatch.chdir(tmp_path)
+    data = ["--data", str(place / "logs"), "--manifest", str(place / "manifest.yaml")]
+    assert main(["benchmark", "template", *data, "-o", "predictions.csv", "--task", "unseen"]) == 0
+    page = (Path(__file__).parents[2] / "docs" / "benchmark.md").read_text()
+    (code,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    exec(compile(code, "docs/benchmark.md", "exec"), {"__name__": "page"})
+    capsys.readouterr()
+    line = ["benchmark", "score", "mine.csv", *data, "--task", "unseen", "--leaderboard", "leaderboard.json", "--json"]
+    assert main(line) == 0
+    scores = json.loads(capsys.readouterr().out)["scores"]["unseen"]
+    assert list(scores) == ["mine"]
+    assert scores["mine"]["rmse_db"] < 4.0  # the flights fall by 35 dB per decade, with a fade of 3 dB and noise of 2
+    assert len(json.loads(Path("leaderboard.json").read_text())) == 1
 
 
 def test_refusals_name_the_cause(place: Path, bench: benchmark.Bench) -> None:

@@ -41,8 +41,8 @@ Force = Annotated[bool, typer.Option("--force", help="Replace files that this to
 Export = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(
-        help="Also write the samples as geojson, geopackage, kmz, gpx, mat, netcdf, parquet or all; names joined by "
-        "commas, or repeated."
+        help="Also write the samples as geojson, geopackage, kmz, mat, netcdf or all; names joined by commas, or "
+        "repeated."
     ),
 ]
 LogsRoot = Annotated[

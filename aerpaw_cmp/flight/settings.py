@@ -513,7 +513,7 @@ class ReportSettings(Settings):
     """Ignored, and said so in the report: it will be refused in the next release."""
     audit: Literal["now", "later"] = "now"
     """``later``: the report is written without the audit; ``aerpaw-cmp audit`` fills it in."""
-    export: list[Literal["geojson", "geopackage", "kmz", "gpx", "mat", "netcdf", "parquet", "all"]] = []
+    export: list[Literal["geojson", "geopackage", "kmz", "mat", "netcdf", "all"]] = []
     """Formats of the samples besides rss.csv and rank.csv."""
 
 

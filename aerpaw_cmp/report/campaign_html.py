@@ -402,17 +402,6 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
     return text
 
 
-def write_parquet(table: pd.DataFrame, path: Path, progress: Progress = silent) -> list[Path]:
-    """The table as Parquet; nothing but a line of progress where pyarrow is not installed."""
-    try:
-        import pyarrow  # noqa: F401
-    except ImportError:
-        progress(f"{path.name} was not written: it needs pyarrow (pip install 'aerpaw-cmp[geo]')")
-        return []
-    # a column of numbers without any text is one of numbers, whatever else its rows are about
-    return [write_file(path, table.to_parquet(index=False, engine="pyarrow"))]
-
-
 def write_campaign(
     data: CampaignData, folder: str | Path, *, exports: Sequence[str] = (), progress: Progress = silent
 ) -> list[Path]:
@@ -443,14 +432,12 @@ def write_campaign(
     written = [
         write_file(folder / "campaign.json", numbers),
         write_file(folder / "campaign.csv", guarded(table).to_csv(index=False, lineterminator="\n")),
-        *write_parquet(table, folder / "campaign.parquet", progress),
     ]
     if data.repeats or data.rank_repeats:
         pairs = pair_frame(data)
         written.append(
             write_file(folder / f"{PAIR_TABLE}.csv", guarded(pairs).to_csv(index=False, lineterminator="\n"))
         )
-        written += write_parquet(pairs, folder / f"{PAIR_TABLE}.parquet", progress)
     tables = [path.name for path in written]
     drawn, pictures = canvas.write_figures(campaign_figures.figure_specs(data), folder / "figures")
     written += pictures

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ def whole(folder: Path) -> dict[str, Any]:
         settings={"as written": {}, "right azimuth": {YAW: YAW_DEG}},
         calibration="channel",
         held_out={"fit": {YAW: list(range(0, 360, 10))}, "fit_on": ["first"], "samples": 100},
-        export=["mat", "gpx"],
+        export=["mat", "kmz"],
     )
 
 
@@ -127,7 +128,8 @@ def test_the_samples_of_all_flights_are_exported(whole: dict[str, Any], folder: 
         rmse = np.sqrt(np.nanmean(link["residual_db"] ** 2))
         assert rmse == pytest.approx(rows[link["flight"], f"{link['tower']} {link['channel']}"]["rmse_db"], abs=1e-3)
         assert link["time_posix_s"][0] == pytest.approx(START_POSIX_S, abs=60)
-    assert (place / "track.gpx").read_text().count("<trk>") == 2
+    with zipfile.ZipFile(place / "samples.kmz") as archive:
+        assert archive.read("doc.kml").decode().count("<gx:Track>") == 2
     assert "exports/samples.mat" in (folder / "whole_out" / "campaign.html").read_text(encoding="utf-8")
     assert "exports/samples.mat" in (folder / "whole_out" / "SHA256SUMS").read_text(encoding="utf-8")
 

@@ -6,11 +6,9 @@ import base64
 import dataclasses
 import json
 import re
-import sys
 import zlib
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from aerpaw_cmp.report import campaign_explorer, campaign_figures, campaign_html, campaign_pairs, canvas
@@ -91,27 +89,6 @@ def test_hostile_names_stay_text(data):
     text = campaign_html.campaign_page(hostile, [], [])
     assert "<img" not in text
     assert text.count("</script>") == 2
-
-
-def test_tables_as_csv_and_parquet_are_the_same(data, tmp_path):
-    pytest.importorskip("pyarrow")
-    table = campaign_html.campaign_frame(data)
-    (path,) = campaign_html.write_parquet(table, tmp_path / "campaign.parquet")
-    back = pd.read_parquet(path)
-    assert list(back.columns) == campaign_html.CSV_COLUMNS
-    assert len(back) == len(data.rss) + len(data.failures)
-    assert back["rmse_db"].to_numpy() == pytest.approx(table["rmse_db"].to_numpy(float), nan_ok=True)
-    assert back["held_out_rmse_db"].iloc[0] == data.rss[0].held_out_rmse_db
-
-
-def test_without_pyarrow_a_line_says_what_is_missing(data, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    told = []
-    written = campaign_html.write_parquet(
-        campaign_html.campaign_frame(data), tmp_path / "campaign.parquet", lambda text, *_: told.append(text)
-    )
-    assert written == []
-    assert "aerpaw-cmp[geo]" in told[0]
 
 
 def test_figures_of_a_season_are_few_and_can_be_drawn(data):

@@ -199,23 +199,6 @@ def check_netcdf(folder, frames):
                 assert np.isnan(book["measured_rank"].values).any(), "no CSI stays missing"
 
 
-def check_parquet(folder, frames):
-    parquet_ = pytest.importorskip("pyarrow.parquet")
-    for kind, table in frames.items():
-        found = parquet_.read_table(folder / f"{kind}.parquet")
-        for name in COLUMNS[kind]:
-            same(table, name, found[name].to_pandas())
-        same_times(table, found["time"].to_pandas())
-        same_places(table, found["latitude_deg"].to_pandas(), found["longitude_deg"].to_pandas())
-        assert found["tower"].to_pylist() == table["tower"].tolist()
-        level = found.schema.field("simulated_dbm" if kind == "rss" else "level_dbm")
-        assert level.metadata[b"unit"] == b"dBm"
-        assert json.loads(found.schema.metadata[b"geo"])["columns"]["geometry"]["encoding"] == "WKB"
-        shape = found["geometry"][0].as_py()
-        assert np.frombuffer(shape[5:13])[0] == found["longitude_deg"][0].as_py()
-        assert found.column(COLUMNS[kind][0]).null_count == table[COLUMNS[kind][0]].isna().sum(), "null, not NaN"
-
-
 def check_mat(folder, frames):
     from scipy.io import loadmat
 
@@ -234,21 +217,6 @@ def check_mat(folder, frames):
         assert book[f"{kind}_units"]["simulated_dbm" if kind == "rss" else "level_dbm"] == "dBm"
     assert "synthetic" in book["about"]["remarks"]
     assert book["towers"]["latitude_deg"][0] == pytest.approx(35.7275)
-
-
-def check_gpx(folder, frames, data):
-    gpxpy = pytest.importorskip("gpxpy")
-    del frames
-    with (folder / "track.gpx").open(encoding="utf-8") as stream:
-        book = gpxpy.parse(stream)
-    points = [point for track in book.tracks for segment in track.segments for point in segment.points]
-    line = pd.DataFrame({"east_m": data.track.east_m, "north_m": data.track.north_m, "up_m": data.track.up_m})
-    line["time"] = pd.to_datetime(data.track.time).tz_localize("UTC")
-    same_places(line, [p.latitude for p in points], [p.longitude for p in points])
-    same(line, "up_m", [p.elevation for p in points], atol=1e-3)
-    same_times(line, [p.time for p in points])
-    assert [w.name for w in book.waypoints] == list(data.site.towers)
-    assert "above the ground" in book.tracks[0].description
 
 
 def valid_kml(folder, text):
@@ -312,15 +280,13 @@ CHECKS = {
     "geojson": check_geojson,
     "geopackage": check_geopackage,
     "netcdf": check_netcdf,
-    "parquet": check_parquet,
     "mat": check_mat,
-    "gpx": check_gpx,
     "kmz": check_kmz,
 }  # fmt: skip
 
 
 def checked(name, folder, frames, data):
-    more = (data,) if name in ("gpx", "kmz") else ()
+    more = (data,) if name == "kmz" else ()
     CHECKS[name](folder / formats.FOLDER, frames, *more)
 
 
@@ -365,8 +331,8 @@ def zeros_for_missing(monkeypatch, data):
     return changed(points.of_report(data), lambda table: table.fillna(dict.fromkeys(values, 0.0)))
 
 
-WITHOUT_UNITS = ("gpx", "kmz")
-"""Their lines show no missing value either."""
+WITHOUT_UNITS = ("kmz",)
+"""Its lines show no missing value either."""
 
 
 SHOWN = [(name, fault) for fault in (swap_places, shift_time, wrong_unit, zeros_for_missing) for name in write.FORMATS
@@ -412,10 +378,8 @@ def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatc
     )
     export = points.of_report(relative)
     assert not export.clock
-    write.write_exports(export, tmp_path, ["gpx", "kmz"])
-    place = tmp_path / "exports"
-    assert "<time>" not in (place / "track.gpx").read_text()
-    with zipfile.ZipFile(place / "samples.kmz") as archive:
+    write.write_exports(export, tmp_path, ["kmz"])
+    with zipfile.ZipFile(tmp_path / "exports" / "samples.kmz") as archive:
         text = archive.read("doc.kml").decode()
     assert "TimeSpan" not in text
     assert "no origin" in text
@@ -447,7 +411,7 @@ def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypat
 def test_same_flight_same_kmz(data, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        write.write_exports(points.of_report(data), tmp_path / name, ["kmz", "gpx", "geojson"])
+        write.write_exports(points.of_report(data), tmp_path / name, ["kmz", "geojson"])
     for path in sorted((tmp_path / "a" / "exports").iterdir()):
         assert path.read_bytes() == (tmp_path / "b" / "exports" / path.name).read_bytes()
 
@@ -473,7 +437,7 @@ def test_a_long_flight_is_thinned_with_its_extremes(data, tmp_path, monkeypatch)
 
 
 def test_formats_are_chosen_by_name():
-    assert formats.chosen_formats(["KMZ, gpx", "gpx"]) == ("kmz", "gpx")
+    assert formats.chosen_formats(["MAT, kmz", "kmz"]) == ("kmz", "mat")
     assert formats.chosen_formats(["all"]) == write.FORMATS
     assert formats.chosen_formats([]) == ()
     with pytest.raises(UsageError, match=r"'shapefile'.*geopackage"):
@@ -482,17 +446,16 @@ def test_formats_are_chosen_by_name():
     assert set(asked) == {*write.FORMATS, formats.ALL}
 
 
-@pytest.mark.parametrize(("name", "module"), [("netcdf", "netCDF4"), ("parquet", "pyarrow")])
-def test_a_missing_library_is_named_with_its_extra(name, module, data, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UsageError, match=rf"{module}.*aerpaw-cmp\[geo\]"):
-        formats.chosen_formats([name])
+def test_a_missing_library_is_named_with_its_extra(data, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "netCDF4", None)
+    with pytest.raises(UsageError, match=r"netCDF4.*aerpaw-cmp\[geo\]"):
+        formats.chosen_formats(["netcdf"])
     told = []
     write.write_exports(
-        points.of_report(data), tmp_path, formats.chosen_formats(["gpx", "all"]), lambda text, *_: told.append(text)
+        points.of_report(data), tmp_path, formats.chosen_formats(["kmz", "all"]), lambda text, *_: told.append(text)
     )
-    assert any(module in text and "aerpaw-cmp[geo]" in text for text in told)
-    assert not list((tmp_path / "exports").glob("*.nc" if name == "netcdf" else "*.parquet"))
+    assert any("netCDF4" in text and "aerpaw-cmp[geo]" in text for text in told)
+    assert not list((tmp_path / "exports").glob("*.nc"))
 
 
 @pytest.mark.parametrize("name", write.FORMATS)

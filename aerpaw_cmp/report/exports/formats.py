@@ -7,8 +7,8 @@ from collections.abc import Iterable
 
 from ...common.errors import UsageError
 
-FORMATS = ("geojson", "geopackage", "kmz", "gpx", "mat", "netcdf", "parquet")
-_NEEDS = {"netcdf": ("netCDF4", "xarray"), "parquet": ("pyarrow",)}
+FORMATS = ("geojson", "geopackage", "kmz", "mat", "netcdf")
+_NEEDS = {"netcdf": ("netCDF4", "xarray")}
 """By format: the modules that it needs besides the default installation."""
 
 ALL = "all"
@@ -25,8 +25,8 @@ def chosen_formats(*lists: str | Iterable[str]) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> chosen_formats(["gpx,kmz", "gpx"], "geojson")
-    ('geojson', 'kmz', 'gpx')
+    >>> chosen_formats(["mat,kmz", "mat"], "geojson")
+    ('geojson', 'kmz', 'mat')
     """
     names = [name for some in lists for name in ([some] if isinstance(some, str) else some)]
     wanted = [part.strip().lower() for name in names for part in name.split(",") if part.strip()]

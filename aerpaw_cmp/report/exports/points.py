@@ -270,15 +270,6 @@ def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[Flo
     )
 
 
-def well_known_binary(rows: Any) -> Any:
-    """Places as well-known binary, None where unknown; an unknown height is 0."""
-    import shapely
-
-    places = rows[["longitude_deg", "latitude_deg"]].to_numpy()
-    at = shapely.points(np.column_stack([places, np.nan_to_num(rows["up_m"].to_numpy())]))
-    return shapely.to_wkb(np.where(np.isfinite(places).all(axis=1), at, None), byte_order=1, flavor="iso")
-
-
 # --- from a report --------------------------------------------------------------------------------------------------
 
 

@@ -1,9 +1,8 @@
-"""Samples as tables of numbers: MATLAB 5, NetCDF after CF-1.11, Parquet with GeoParquet 1.1."""
+"""Samples as tables of numbers: MATLAB 5, NetCDF after CF-1.11."""
 
 from __future__ import annotations
 
 import io
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -12,16 +11,13 @@ import numpy as np
 
 from ...common.cf import WGS84, dataset, file_attributes, netcdf_bytes
 from ...common.errors import UsageError
-from .points import LABELS, PLACES, Column, Export, Points, well_known_binary
+from .points import LABELS, PLACES, Column, Export, Points
 
 LARGEST_MAT = 2**31 - 2**20
 """Bytes of one variable of a MATLAB 5 file, a little below its limit."""
 
 NO_CODE = -1
 """Stands for a missing code in NetCDF; attribute ``_FillValue``."""
-
-ROWS = 100_000
-"""Rows of one group of a Parquet file: what is held at once."""
 
 
 # --- MATLAB ---------------------------------------------------------------------------------------------------------
@@ -60,7 +56,7 @@ def write_mat(export: Export, folder: Path) -> list[Path]:
         if largest > LARGEST_MAT:
             raise UsageError(
                 f"{points.kind} has {len(points)} samples, {largest / 2**30:.1f} GiB: too many for a MATLAB 5 file",
-                expected="another format, such as parquet or netcdf (which MATLAB reads, too)",
+                expected="another format, such as netcdf (which MATLAB reads, too)",
             )
         content[points.kind] = _structs(points)
         content[f"{points.kind}_units"] = {_field(c.name): c.shown_unit or "1" for c in points.columns}
@@ -182,49 +178,3 @@ def _values(column: Column, values: Any) -> tuple[Any, ...]:
         return codes, shared | said, {"_FillValue": np.int8(NO_CODE)}
     other = {} if column.shown_unit in ("", column.unit) else {"comment": f"unit: {column.shown_unit}"}
     return values, {**shared, "units": column.unit, **other}, {"_FillValue": np.nan}
-
-
-# --- Parquet --------------------------------------------------------------------------------------------------------
-
-
-def write_parquet(export: Export, folder: Path) -> list[Path]:
-    """``<kind>.parquet``: units in the metadata of the columns, places as GeoParquet."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    paths = []
-    for points in export.sets:
-        schema = _schema(export, points)
-        path = folder / f"{points.kind}.parquet"
-        # a stream of Python's own: the disk's errors come as OSError
-        with path.open("wb") as stream, parquet.ParquetWriter(stream, schema, compression="zstd") as writer:
-            for start in range(0, len(points), ROWS):
-                part = points.table.iloc[start : start + ROWS]
-                part = part.assign(time=part["time"].dt.tz_localize("UTC"), geometry=well_known_binary(part))
-                writer.write_table(pa.Table.from_pandas(part, schema=schema, preserve_index=False))
-        paths.append(path)
-    return paths
-
-
-def _schema(export: Export, points: Points) -> Any:
-    import pyarrow as pa
-
-    text = pa.dictionary(pa.int32(), pa.string())
-    when = "instant, UTC" if export.clock else "instant after 1970-01-01: the logs have no origin of time"
-    fields = [("time", pa.timestamp("ns", tz="UTC"), {"unit": "", "description": when})]
-    fields += [(name, text, {"unit": "", "description": meaning}) for name, meaning in LABELS.items()]
-    fields += [(n, pa.float64(), {"unit": unit, "description": meaning}) for n, (unit, meaning) in PLACES.items()]
-    for c in points.columns:
-        codes = {"codes": json.dumps(dict(enumerate(c.flags)))} if c.flags else {}
-        kind = pa.int8() if c.flags else pa.float64()
-        fields.append((c.name, kind, {"unit": c.shown_unit, "description": c.meaning, **codes}))
-    said = {"unit": "", "description": "longitude, latitude [deg], up_m [m] as WKB"}
-    fields.append(("geometry", pa.binary(), said))
-    about = {"title": export.title, "name": export.name, "remarks": " ".join(export.remarks), **export.attributes}
-    # longitude and latitude default to WGS84 where GeoParquet names no CRS
-    shape = {"encoding": "WKB", "geometry_types": ["Point Z"]}
-    geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": shape}}
-    return pa.schema(
-        [pa.field(name, kind, metadata=metadata) for name, kind, metadata in fields],
-        metadata={**about, "geo": json.dumps(geo)},
-    )

@@ -1,4 +1,4 @@
-"""Samples as points and lines for maps: GeoJSON (RFC 7946), OGC GeoPackage 1.3 and GPX 1.1, all in WGS84."""
+"""Samples as points and lines for maps: GeoJSON (RFC 7946) and OGC GeoPackage 1.3, both in WGS84."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import errno
 import itertools
 import json
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ...maps.kml import xml_text
-from ...site.heights import HeightReference
-from ..names import iso_time
-from .points import LABELS, UP, Column, Export, Line, latitude_longitude, well_known_binary
+from .points import LABELS, UP, Column, Export, Line, latitude_longitude
 from .scales import Scale, scales_of
 
 _FIXED = (
@@ -211,7 +208,14 @@ def _extent(book: sqlite3.Connection, name: str, places: Any) -> None:
 
 
 def _shapes(rows: Any) -> list[bytes | None]:
-    return [None if shape is None else _HEAD + shape for shape in well_known_binary(rows)]
+    """Places as geometries, None where unknown; an unknown height is 0."""
+    import shapely
+
+    places = rows[["longitude_deg", "latitude_deg"]].to_numpy()
+    at = shapely.points(np.column_stack([places, np.nan_to_num(rows["up_m"].to_numpy())]))
+    known = np.isfinite(places).all(axis=1)
+    shapes = shapely.to_wkb(np.where(known, at, None), byte_order=1, flavor="iso")
+    return [None if shape is None else _HEAD + shape for shape in shapes]
 
 
 def _track(export: Export, line: Line) -> tuple[bytes, str, Any]:
@@ -256,55 +260,3 @@ def _style(book: sqlite3.Connection, layer: str, name: str, scale: Scale) -> Non
         " styleQML, useAsDefault, description) VALUES ('','',?,'geom',?,?,?,?)",
         (layer, name, qml, default, scale.title),
     )
-
-
-# --- GPX ------------------------------------------------------------------------------------------------------------
-
-_GPX = (
-    '<?xml version="1.0" encoding="UTF-8"?>\n<gpx version="1.1" creator="aerpaw-cmp" '
-    'xmlns="http://www.topografix.com/GPX/1/1" xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" '
-    'xsi:schemaLocation="http://www.topografix.com/GPX/1/1 http://www.topografix.com/GPX/1/1/gpx.xsd">\n'
-)
-
-
-def write_gpx(export: Export, folder: Path) -> list[Path]:
-    """``track.gpx``: one track per flight, broken where the position is unknown; towers as waypoints."""
-    base_m, words = _elevation(export)
-    path = folder / "track.gpx"
-    with path.open("w", encoding="utf-8", newline="\n") as stream:
-        stream.write(_GPX)
-        said = " ".join([words, *export.remarks])
-        stream.write(f"<metadata><name>{xml_text(export.title)}</name><desc>{xml_text(said)}</desc></metadata>\n")
-        for name, latitude, longitude, up in export.towers():
-            stream.write(
-                f'<wpt lat="{latitude:.8f}" lon="{longitude:.8f}"><ele>{base_m + up:.3f}</ele>'
-                f"<name>{xml_text(name)}</name></wpt>\n"
-            )
-        for line in export.lines:
-            stream.write(f"<trk><name>{xml_text(line.flight)}</name><desc>{xml_text(words)}</desc>\n")
-            stream.writelines(_segments(export, line, base_m))
-            stream.write("</trk>\n")
-        stream.write("</gpx>\n")
-    return [path]
-
-
-def _elevation(export: Export) -> tuple[float, str]:
-    """Height that is added to up for ``ele``, and the reference of ``ele`` in words."""
-    ground = export.site.datum.origin_ground
-    if ground is not None and ground.reference is HeightReference.ORTHOMETRIC:
-        return ground.value_m, "ele is metres above mean sea level."
-    return 0.0, "ele is metres above the ground at the site origin: the site does not say how high that lies."
-
-
-def _segments(export: Export, line: Line, base_m: float) -> Iterator[str]:
-    latitude, longitude = latitude_longitude(export.site.frame, line.east_m, line.north_m)
-    times = iso_time(line.time) if export.clock else np.full(len(line.time), "")
-    for known, numbers in itertools.groupby(range(len(times)), key=line.known.__getitem__):
-        if not known:
-            continue
-        yield "<trkseg>\n"
-        for i in numbers:
-            height = f"<ele>{base_m + line.up_m[i]:.3f}</ele>" if np.isfinite(line.up_m[i]) else ""
-            time = f"<time>{times[i]}</time>" if times[i] else ""
-            yield f'<trkpt lat="{latitude[i]:.8f}" lon="{longitude[i]:.8f}">{height}{time}</trkpt>\n'
-        yield "</trkseg>\n"

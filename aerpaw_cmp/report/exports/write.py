@@ -9,8 +9,8 @@ from ...common.stages import Progress, silent
 from .formats import FOLDER, FORMATS, missing_module
 from .kmz import write_kmz
 from .points import Export
-from .tables import write_mat, write_netcdf, write_parquet
-from .vectors import write_geojson, write_geopackage, write_gpx
+from .tables import write_mat, write_netcdf
+from .vectors import write_geojson, write_geopackage
 
 __all__ = ["FORMATS", "write_exports"]
 
@@ -18,10 +18,8 @@ _WRITERS: dict[str, Callable[[Export, Path], list[Path]]] = {
     "geojson": write_geojson,
     "geopackage": write_geopackage,
     "kmz": write_kmz,
-    "gpx": write_gpx,
     "mat": write_mat,
     "netcdf": write_netcdf,
-    "parquet": write_parquet,
 }
 
 

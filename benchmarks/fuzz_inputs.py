@@ -729,9 +729,8 @@ def run_block(target: Target, seed: int, start: int, stop: int) -> dict[str, Any
     }
 
 
-def run(chosen: Iterable[Target], inputs: int, seed: int, tell: Callable[[str], None]) -> list[dict[str, Any]]:
-    """A row per target: inputs, read, refused, violations, the slowest and all seconds of reading."""
-    rows = []
+def run(chosen: Iterable[Target], inputs: int, seed: int, tell: Callable[[str], None]) -> Iterator[dict[str, Any]]:
+    """A row per target, as soon as it is done: inputs, read, refused, violations, the slowest, seconds of reading."""
     for target in chosen:
         row: dict[str, Any] = {"target": target.name, "inputs": inputs, "read": 0, "refused": 0, "violation": 0}
         row |= {"reading_s": 0.0, "slowest_ms": 0.0}
@@ -742,8 +741,7 @@ def run(chosen: Iterable[Target], inputs: int, seed: int, tell: Callable[[str], 
             row["slowest_ms"] = max(row["slowest_ms"], block["slowest_ms"])
             for violation in block["violations"]:
                 tell(f"{target.name} {violation['index']}: {violation['what']}")
-        rows.append(row)
-    return rows
+        yield row
 
 
 def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
@@ -766,17 +764,17 @@ def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
         print(target.run(data, index))
         return []
     chosen = [t for name, t in known.items() if fnmatch.fnmatchcase(name, arguments.target)]
-    start = time.perf_counter()
-    rows = run(chosen, arguments.inputs, arguments.seed, lambda text: print(text, file=sys.stderr))
+    start, rows = time.perf_counter(), []
+    heads = ("inputs", "read", "refused", "violation", "slowest_ms", "ms/input")
+    if not arguments.json:
+        print(f"{'target':26} " + " ".join(f"{head:>10}" for head in heads))
+    for row in run(chosen, arguments.inputs, arguments.seed, lambda text: print(text, file=sys.stderr)):
+        rows.append(row)
+        if not arguments.json:  # each row at once: what an interrupted run has done counts
+            numbers = (*(row[key] for key in heads[:-1]), round(1e3 * row["reading_s"] / row["inputs"], 2))
+            print(f"{row['target']:26} " + " ".join(f"{number:10}" for number in numbers), flush=True)
     if arguments.json:
         print(json.dumps({"rows": rows, "seconds": round(time.perf_counter() - start, 1)}))
-    else:
-        heads = ("inputs", "read", "refused", "violation", "slowest_ms", "ms/input")
-        print(f"{'target':26} " + " ".join(f"{head:>10}" for head in heads))
-        for row in rows:
-            numbers = (row[key] for key in heads[:-1])
-            mean = 1e3 * row["reading_s"] / row["inputs"]
-            print(f"{row['target']:26} " + " ".join(f"{number:10}" for number in numbers) + f" {mean:10.2f}")
     if any(row["violation"] for row in rows):
         sys.exit(1)
     return rows

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,8 +23,6 @@ from aerpaw_cmp.logs.chunks import Column
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import KEPT_REJECTED, ReadResult, Stream
 
-from . import _decimal
-
 _STAMP = 28  # "[" + 26 characters of time + "]"
 _VALUE = 16  # od -f: right-aligned in sixteen columns
 _WIDTHS = (7, 8, 9)  # octal digits of the offset; seven until 8 MiB, then it grows
@@ -31,6 +30,7 @@ _MOST_REPEATS = 5_000_000
 _HEAD = rb"^\[(" + _time.TIME + rb")\] "
 _ODD = re.compile(_HEAD + rb"+([0-7]{7,12}) +(" + _lines.NUMBER + rb"|-?nan|-?inf)[ \t]*$")
 _STAR = re.compile(_HEAD + rb"+\*[ \t]*$")
+_PLAIN = re.compile(rb" *-?\d+(?:\.\d+)?")
 _FOOT = re.compile(_HEAD + rb"+([0-7]{7,12})[ \t]*$")
 
 
@@ -80,6 +80,17 @@ def _octal(cells: AnyArray) -> tuple[IntArray, BoolArray]:
     return digit.astype(np.int64) @ weight, np.all(digit <= 7, axis=1)
 
 
+def _decimals(cells: AnyArray) -> tuple[FloatArray, BoolArray]:
+    """Right-aligned decimals, ``(n, w)`` uint8, to numbers; what is not plain is left to the line's own pattern."""
+    text, raw = cells.view(f"S{cells.shape[1]}")[:, 0], cells.tobytes()
+    odd = raw.translate(None, b" -.0123456789") or b" ." in raw or b"-." in raw or (cells[:, -1] < 48).any()
+    with suppress(ValueError):  # of such characters, but no number: 1-2
+        if not odd:
+            return text.astype(np.float64), np.ones(len(cells), dtype=bool)
+    plain = np.array([_PLAIN.fullmatch(cell) is not None for cell in text.tolist()])
+    return np.where(plain, text, b"0").astype(np.float64), plain
+
+
 def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
     """Samples of all lines that have exactly the layout of ``ts`` and ``od``, without a Python loop over lines.
 
@@ -94,7 +105,7 @@ def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
         cells = lines.fixed(rows, _STAMP + 1 + width + _VALUE)
         wall, valid = _time.parse_digits(cells[:, 1 : _STAMP - 1], 6)
         offset, octal = _octal(cells[:, _STAMP + 1 : _STAMP + 1 + width])
-        value, plain = _decimal.decimal(np.ascontiguousarray(cells[:, _STAMP + 1 + width :].T), len(rows))
+        value, plain = _decimals(np.ascontiguousarray(cells[:, _STAMP + 1 + width :]))
         valid &= plain & (cells[:, 0] == 91) & (cells[:, _STAMP - 1] == 93) & (cells[:, _STAMP] == 32)
         valid &= cells[:, _STAMP + 1 + width] == 32
         digits = (cells[:, _STAMP + 1 : _STAMP + 1 + width] - np.uint8(48) <= 9).all(axis=1)

@@ -21,21 +21,26 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.units import AnyArray
+from aerpaw_cmp.logs import make_frames
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.records import Attribute, Kind, ReadResult, RejectedLine, Stream
 
 SCHEMA = "aerpaw-cmp-tap/1"
 _CRC = b',"crc":"'
 COMPANION_S = 2.0
 """RSRP and SINR older than this do not stand beside a rank."""
+
+Columns = dict[str, AnyArray]
+Answer = tuple[int, dict[str, Any], dict[str, Any], list[str]]
+"""Line of the log, its record, what was decoded of it, its flags."""
 
 
 def sniff(head: bytes) -> bool:
@@ -91,10 +96,10 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     for name, value in (("node", options.node), ("frequency_hz", options.frequency_hz)):
         if value is not None:
             common[name] = value
-    rsrp = _joined(log.rsrp)
+    rsrp = _joined("rss", log.rsrp)
     streams = []
     for query, name in _RANKS:
-        frame = _joined(log.rank[query])
+        frame = _joined("rank", log.rank[query])
         if frame is None:
             continue
         if name == "nr5g" or frame["rank"].notna().any():
@@ -127,8 +132,8 @@ class _Log:
 
     def __init__(self) -> None:
         self.header: dict[str, Any] | None = None
-        self.rank: dict[str, list[pd.DataFrame]] = {query: [] for query, _ in _RANKS}
-        self.rsrp: list[pd.DataFrame] = []
+        self.rank: dict[str, list[Columns]] = {query: [] for query, _ in _RANKS}
+        self.rsrp: list[Columns] = []
         self.lines = self.exchanges = self.blank = 0
         self.rejected: list[RejectedLine] = []
         self.events: list[str] = []
@@ -144,9 +149,9 @@ class _Log:
         exchanges = [(number, record) for number, record in records if record["kind"] == "exchange"]
         self.exchanges += len(exchanges)
         self.blank += blank + len(records) - len(exchanges)
-        for query, kept in self.rank.items():
-            kept.append(_rank_frame([item for item in exchanges if item[1].get("query") == query]))
-        self.rsrp.append(_rsrp_frame(exchanges))
+        for query, pieces in self.rank.items():
+            pieces.append(_rank_columns(exchanges, query))
+        self.rsrp.append(_rsrp_columns(exchanges))
         for _, record in records:
             self._note(record)
 
@@ -191,10 +196,14 @@ class _Log:
         return tuple(found)
 
 
-def _joined(frames: list[pd.DataFrame]) -> pd.DataFrame | None:
-    """All records, None where there are none."""
-    some = [frame for frame in frames if len(frame)]
-    return pd.concat(some, ignore_index=True) if some else None
+def _joined(kind: Kind, pieces: list[Columns]) -> pd.DataFrame | None:
+    """All records of a kind as a frame, None where there are none."""
+    some = [piece for piece in pieces if len(piece["time"])]
+    if not some:
+        return None
+    values = {name: np.concatenate([piece[name] for piece in some]) for name in some[0]}
+    time, line, flag = (values.pop(name) for name in ("time", "line", "flag"))
+    return make_frames.frame(kind, time, line, flag, values, own=True)
 
 
 def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:
@@ -223,12 +232,6 @@ def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]]
     return records, rejected, blank
 
 
-def _time(record: dict[str, Any]) -> tuple[int, float]:
-    """Middle of the exchange [ns] and half its span [s]."""
-    sent, last = int(record["sent_utc_ns"]), int(record["last_utc_ns"])
-    return (sent + last) // 2, (last - sent) / 2e9
-
-
 def _mapping(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
@@ -242,55 +245,40 @@ def _flags(record: dict[str, Any]) -> list[str]:
     return [str(flag) for flag in flags] if isinstance(flags, list) else []
 
 
-def _frame(columns: dict[str, list[Any]]) -> pd.DataFrame:
-    content: dict[str, Any] = {
-        "time": np.array(columns.pop("time", []), dtype="int64").astype("datetime64[ns]"),
-        "line": np.array(columns.pop("line", []), dtype=np.int64),
-        "flag": pd.Series(columns.pop("flag", []), dtype=object),
+def _columns(answers: list[Answer], names: Mapping[str, str]) -> Columns:
+    """Columns of some answers; ``names`` are those of the numbers and the keys under which they were decoded."""
+    spans = [(int(record["sent_utc_ns"]), int(record["last_utc_ns"])) for _, record, _, _ in answers]
+    columns: Columns = {
+        "time": np.array([(sent + last) // 2 for sent, last in spans], dtype=np.int64).astype("datetime64[ns]"),
+        "line": np.array([number for number, *_ in answers], dtype=np.int64),
+        "flag": np.array([";".join(flags) for *_, flags in answers], dtype=object),
+        "uncertainty_s": np.array([(last - sent) / 2e9 for sent, last in spans], dtype=np.float64),
     }
-    for name, values in columns.items():
-        content[name] = np.array(
-            [v if type(v) in (int, float) and abs(v) < 1e9 else np.nan for v in values], dtype=np.float64
-        )
-    frame: pd.DataFrame = pd.DataFrame(content)
-    return frame
+    for name, key in names.items():
+        cells: list[Any] = [values.get(key) for _, _, values, _ in answers]
+        sound = [cell if type(cell) in (int, float) and abs(cell) < 1e9 else np.nan for cell in cells]
+        columns[name] = np.array(sound, dtype=np.float64)
+    return columns
 
 
-def _rank_frame(items: list[tuple[int, dict[str, Any]]]) -> pd.DataFrame:
+def _rank_columns(exchanges: list[tuple[int, dict[str, Any]]], query: str) -> Columns:
     """Rank answers; a failed exchange is a row without rank, flagged with its status."""
-    columns: dict[str, list[Any]] = defaultdict(list)
-    for number, record in items:
-        values = _mapping(record.get("decoded"))
-        flags = _flags(record)
-        if record.get("status") != "ok":
-            flags.append(f"status:{record.get('status')}")
-        time_ns, uncertainty_s = _time(record)
-        columns["time"].append(time_ns)
-        columns["line"].append(number)
-        columns["flag"].append(";".join(flags))
-        for name in ("rank", "ri_raw", "mcs", "cqi", "pmi"):
-            columns[name].append(values.get(name))
-        columns["uncertainty_s"].append(uncertainty_s)
-    return _frame(columns)
-
-
-def _rsrp_frame(exchanges: list[tuple[int, dict[str, Any]]]) -> pd.DataFrame:
-    """RSRP and SINR of the NR serving cell."""
-    columns: dict[str, list[Any]] = defaultdict(list)
+    answers = []
     for number, record in exchanges:
-        if record.get("query") != "servingcell":
-            continue
+        if record.get("query") == query:
+            status = [] if record.get("status") == "ok" else [f"status:{record.get('status')}"]
+            answers.append((number, record, _mapping(record.get("decoded")), _flags(record) + status))
+    return _columns(answers, {name: name for name in ("rank", "ri_raw", "mcs", "cqi", "pmi")})
+
+
+def _rsrp_columns(exchanges: list[tuple[int, dict[str, Any]]]) -> Columns:
+    """RSRP and SINR of the NR serving cell."""
+    answers = []
+    for number, record in exchanges:
         values = _mapping(_mapping(record.get("decoded")).get("nr"))
-        if not values:
-            continue
-        time_ns, uncertainty_s = _time(record)
-        columns["time"].append(time_ns)
-        columns["line"].append(number)
-        columns["flag"].append(";".join(_flags(record)))
-        columns["rss_db"].append(values.get("rsrp_dbm"))
-        columns["sinr_db"].append(values.get("sinr_db"))
-        columns["uncertainty_s"].append(uncertainty_s)
-    return _frame(columns)
+        if record.get("query") == "servingcell" and values:
+            answers.append((number, record, values, _flags(record)))
+    return _columns(answers, {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"})
 
 
 def _beside(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.DataFrame:

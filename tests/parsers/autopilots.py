@@ -49,10 +49,10 @@ def _x25(data: bytes) -> int:
     return crc
 
 
-def tlog(version: int = 2) -> bytes:
-    """MAVLink telemetry: GLOBAL_POSITION_INT, ATTITUDE, GPS_RAW_INT of system 1, a heartbeat of system 255."""
+def tlog(version: int = 2, system: int = 1, count: int = COUNT) -> bytes:
+    """MAVLink telemetry: GLOBAL_POSITION_INT, ATTITUDE, GPS_RAW_INT of a system, a heartbeat of system 255."""
     out = b""
-    for i in range(COUNT):
+    for i in range(count):
         boot = 30_000 + 1000 * i
         position = struct.pack(
             "<IiiiihhhH", boot, 357_300_000 + i, -787_000_000 - i, 90_000, 1000 * i, 150, 250, -50, 9000
@@ -60,17 +60,17 @@ def tlog(version: int = 2) -> bytes:
         attitude = struct.pack("<Iffffff", boot, 0.0261799388, -0.0436332313, 1.5707963268, 0.0, 0.0, 0.0)
         gps = struct.pack("<QiiiHHHHBB", boot * 1000, 357_300_000, -787_000_000, 90_000, 90, 90, 100, 0, 4, 14)
         beat = struct.pack("<IBBBBB", 0, 6, 8, 0, 0, 3)
-        for kind, extra, payload, system in (
-            (33, 104, position, 1),
-            (30, 39, attitude, 1),
-            (24, 24, gps, 1),
+        for kind, extra, payload, sender in (
+            (33, 104, position, system),
+            (30, 39, attitude, system),
+            (24, 24, gps, system),
             (0, 50, beat, 255),
         ):
             if version == 2:
                 payload = payload.rstrip(b"\0") or b"\0"
-                body = bytes([len(payload), 0, 0, i, system, 1]) + kind.to_bytes(3, "little") + payload
+                body = bytes([len(payload), 0, 0, i, sender, 1]) + kind.to_bytes(3, "little") + payload
             else:
-                body = bytes([len(payload), i, system, 1, kind]) + payload
+                body = bytes([len(payload), i, sender, 1, kind]) + payload
             check = _x25(body + bytes([extra])).to_bytes(2, "little")
             out += (
                 (START_US + 1_000_000 * i).to_bytes(8, "big") + bytes([0xFD if version == 2 else 0xFE]) + body + check

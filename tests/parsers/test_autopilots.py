@@ -1,4 +1,4 @@
-"""The same pose from every autopilot's log, and what peers' libraries say of the same bytes."""
+"""Damaged logs of autopilots, and what peers' libraries say of the same bytes; their poses are in test_truth.py."""
 
 from __future__ import annotations
 
@@ -10,33 +10,13 @@ import pytest
 
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from tests.parsers import autopilots
-from tests.parsers.autopilots import COUNT, START_US
+from tests.parsers.autopilots import COUNT
 
 LOGS = {
     "ardupilot_bin": autopilots.dataflash(),
     "mavlink_tlog": autopilots.tlog(2),
     "px4_ulog": autopilots.ulog(),
 }
-EACH = [*LOGS.items(), *(("px4_ulog", autopilots.ulog(place)) for place in ("integers", "doubles"))]
-
-
-@pytest.mark.parametrize(("reader", "log"), EACH)
-def test_the_same_pose_from_each(reader: str, log: bytes) -> None:
-    (stream,) = by_name(reader).read(log, ReadOptions()).streams
-    frame = stream.frame
-    assert frame["time"].tolist() == [pd.Timestamp((START_US + i * 10**6) * 1000) for i in range(COUNT)]
-    assert frame["latitude_deg"].tolist() == pytest.approx([35.73 + i * 1e-7 for i in range(COUNT)], abs=1e-9)
-    assert frame["altitude_m"].tolist() == pytest.approx(range(COUNT)), "above home"
-    first = frame.iloc[0]
-    assert first[["roll_deg", "pitch_deg", "yaw_deg"]].tolist() == pytest.approx([1.5, -2.5, 90.0], abs=1e-3)
-    velocity = ["velocity_north_mps", "velocity_east_mps", "velocity_down_mps"]
-    assert first[velocity].tolist() == pytest.approx([1.5, 2.5, -0.5])
-    assert (first["fix"], first["satellites"]) == (4, 14)
-
-
-def test_mavlink_1_and_2_tell_the_same() -> None:
-    one, two = (by_name("mavlink_tlog").read(autopilots.tlog(version), ReadOptions()) for version in (1, 2))
-    pd.testing.assert_frame_equal(one.streams[0].frame, two.streams[0].frame)
 
 
 def test_damage_costs_a_message_and_not_the_log() -> None:

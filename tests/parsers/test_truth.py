@@ -6,6 +6,7 @@ seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -15,11 +16,13 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.io
 
 from aerpaw_cmp.logs.chunks import whole_lines
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions, identify
 from tests.frames import assert_same_result
+from tests.parsers import autopilots, samples
 
 BEGIN = np.datetime64("2025-03-02T15:00:00")
 LOCAL = ReadOptions(timezone="America/New_York")
@@ -31,7 +34,7 @@ class Case:
     """A file and what it says."""
 
     name: str
-    data: str
+    data: str | bytes
     truth: Truth
     reader: str
     options: ReadOptions = LOCAL
@@ -486,6 +489,118 @@ CASES |= {
 }
 
 
+# --- binary logs, MATLAB and the tap: the bytes are those of tests/parsers/autopilots.py and samples.py -------------------
+
+POSE = {
+    "time": [0.25 + i for i in range(5)],
+    "latitude_deg": [35.73] * 5,
+    "longitude_deg": [-78.7] * 5,
+    "altitude_m": [0.0, 1.0, 2.0, 3.0, 4.0],
+    "roll_deg": [1.5] * 5,
+    "pitch_deg": [-2.5] * 5,
+    "yaw_deg": [90.0] * 5,
+    "velocity_north_mps": [1.5] * 5,
+    "velocity_east_mps": [2.5] * 5,
+    "velocity_down_mps": [-0.5] * 5,
+    "fix": [4] * 5,
+    "satellites": [14] * 5,
+}
+OLD_FLASH = autopilots.dataflash().replace(b"POS\0", b"PXX\0").replace(b"XKF1", b"NKF1")
+MERGED_FLIGHT: Truth = {
+    "vehicle": {
+        "time": [0.25, 0.51, 0.77, 1.03, 1.29],
+        "latitude_deg": [35.73, 35.73025, 35.7305, 35.73075, 35.731],
+        "altitude_m": [0.5, 10.5, 20.5, 30.5, 40.5],
+        "pitch_deg": [-3.0] * 5,
+        "yaw_deg": [350.0, 355.0, 0.0, 5.0, 10.0],
+        "velocity_north_mps": [2.0] * 5,
+    },
+    "USRP1": {"rss_db": [-40.0, -41.0, np.nan, -43.0, -44.0]},
+    "USRP2": {"rss_db": [-45.0, -45.25, -45.5, -45.75, -46.0]},
+}
+FROM_TEN = replace(LOCAL, time_origin="2025-03-02T15:00:00Z")
+TAP: Truth = {
+    "nr5g": {"time": [0.202, 0.702], "rank": [2, np.nan], "mcs": [11, np.nan], "rsrp_dbm": [-80, -80]},
+    "nr5g_rsrp": {"time": [0.102], "rss_db": [-80], "sinr_db": [20]},
+}
+EXCHANGE = '{{"kind":"exchange","query":"{query}","status":"{status}","flags":[],"n":{n},{times},"decoded":{decoded}'
+
+
+def exchange(n: int, place: str, query: str, decoded: str, status: str = "ok") -> bytes:
+    """A line of the tap; ``place`` are hundredths of a second."""
+    times = samples.TAP_TIMES.format(place)
+    return samples.tap_line(EXCHANGE.format(query=query, status=status, n=n, times=times, decoded=decoded))
+
+
+def mat_of(**arrays: Any) -> bytes:
+    """A MATLAB 5 file."""
+    file = io.BytesIO()
+    scipy.io.savemat(file, arrays)
+    return file.getvalue()
+
+
+BINARY: dict[str, tuple[str, str, bytes, Truth, ReadOptions]] = {
+    "dataflash": ("ardupilot_bin", "x.bin", autopilots.dataflash(), {"vehicle": POSE}, LOCAL),
+    "dataflash of 2017, with positions of the receiver alone": (
+        "ardupilot_bin", "x.bin", OLD_FLASH, {"vehicle": POSE | {"altitude_m": [0.0] * 5}}, LOCAL
+    ),
+    "MAVLink 1": ("mavlink_tlog", "x.tlog", autopilots.tlog(1), {"vehicle": POSE}, LOCAL),
+    "MAVLink 2": ("mavlink_tlog", "x.tlog", autopilots.tlog(2), {"vehicle": POSE}, LOCAL),
+    "MAVLink, a second vehicle for a short while": (
+        "mavlink_tlog", "x.tlog", autopilots.tlog(2) + autopilots.tlog(2, system=7, count=2), {"vehicle": POSE}, LOCAL
+    ),
+    **{
+        f"PX4, position of the {place}": ("px4_ulog", "x.ulg", autopilots.ulog(place), {"vehicle": POSE}, LOCAL)
+        for place in ("estimator", "integers", "doubles")
+    },
+    "MATLAB, two channels": ("flight_mat", "x.mat", samples.mat_flight(), MERGED_FLIGHT, LOCAL),
+    "MATLAB 7.3": ("flight_mat", "x.mat", samples.mat_73(), MERGED_FLIGHT, LOCAL),
+    "MATLAB, LTE: the text is local, the epoch UTC": (
+        "flight_mat", "x.mat", samples.lte_flight(),
+        {
+            "vehicle": {"time": [0.25, 0.35, 0.45, 0.55, 0.65], "longitude_deg": [-78.7, -78.69975, -78.6995, -78.69925, -78.699]},
+            "RSRP": {"rss_db": [17.5, 17.25, np.nan, -150.0, 16.5]},
+            "RSRQ": {"value": [-6.5] * 5},
+        }, LOCAL,
+    ),
+    "MATLAB, processed: rows are counted, the heading is in radians": (
+        "flight_mat", "x.mat", samples.processed_flight(),
+        {
+            "vehicle": {"time": [0.0, 0.1, 0.2, 0.3], "yaw_deg": [90.0] * 4, "altitude_m": [30.0] * 4},
+            "RSRP": {"rss_db": [-80.0, -80 - 10 / 3, -80 - 20 / 3, -90.0]},
+        }, FROM_TEN,
+    ),
+    "I/Q of two channels": (
+        "iq_burst", samples.IQ_NAME, samples.iq_mat(),
+        {"USRP1": {"time": [0.25], "rss_db": [-20.0]}, "USRP2": {"time": [0.25], "rss_db": [-40.0]}}, LOCAL,
+    ),
+    "I/Q of one channel, one row; time in microseconds": (
+        "iq_burst", "results_3320000000_2000000_2025_03_02_10_00_01_500250.mat", mat_of(IQ=np.full((1, 64), 3 + 4j)),
+        {"USRP1": {"time": [1.50025], "rss_db": [10 * np.log10(25.0)]}}, LOCAL,
+    ),
+    "I/Q without a signal": (
+        "iq_burst", samples.IQ_NAME, mat_of(IQ=np.zeros((1, 8), dtype=complex)), {"USRP1": {"rss_db": [np.nan]}}, LOCAL,
+    ),
+    "tap: cell, rank, no CSI, a torn line": ("tap_jsonl", "x.jsonl", samples.TAP, TAP, LOCAL),
+    "tap: an answer that failed, then LTE": (
+        "tap_jsonl", "x.jsonl",
+        samples.TAP.rpartition(b'{"kind"')[0] + exchange(4, "80", "nr5g_csi", "{}", "timeout")
+        + exchange(5, "90", "lte_csi", '{"rank":1,"ri_raw":0,"cqi":7}'),
+        {
+            "nr5g": {"time": [0.202, 0.702, 0.802], "rank": [2, np.nan, np.nan], "flag": ["", "no_csi", "status:timeout"]},
+            "lte": {"time": [0.902], "rank": [1], "ri_raw": [0], "cqi": [7]},
+        }, LOCAL,
+    ),
+    "tap: the cell was asked longer ago than two seconds": (
+        "tap_jsonl", "x.jsonl",
+        samples.TAP.splitlines(keepends=True)[0] + exchange(1, "00", "servingcell", '{"nr":{"rsrp_dbm":-70,"sinr_db":5}}')
+        + exchange(2, "10", "nr5g_csi", '{"rank":3,"ri_raw":3}').replace(b"1740927600", b"1740927602"),
+        {"nr5g_rsrp": {"time": [0.002], "rss_db": [-70]}}, LOCAL,
+    ),
+}  # fmt: skip
+CASES |= {name: Case(file, data, truth, reader, how) for name, (reader, file, data, truth, how) in BINARY.items()}
+
+
 def shown(values: Any) -> list[Any]:
     """A column as it is compared: times in seconds, numbers to the microunit."""
     if values.dtype.kind == "M":
@@ -495,10 +610,13 @@ def shown(values: Any) -> list[Any]:
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_what_a_file_says_comes_out(case: Case) -> None:
-    data = case.data.encode()
-    reader = identify(data)
+    data = case.data if isinstance(case.data, bytes) else case.data.encode()
+    reader, options = identify(data), replace(case.options, file_name=case.name)
     assert reader.name == case.reader
-    result = reader.read(data, replace(case.options, file_name=case.name))
+    result = reader.read(data, options)
+    if reader.read_pieces is not None:
+        pieces = whole_lines(data[i : i + 37] for i in range(0, len(data), 37))
+        assert_same_result(reader.read_pieces(pieces, options), result)
     streams = {stream.name: stream.frame for stream in result.streams}
     for name, columns in case.truth.items():
         assert name in streams, f"{name} is not among {list(streams)}"

@@ -1,0 +1,342 @@
+"""Decisions that the first sentences of a page are chosen from: effect, 95 % interval and likely cause.
+
+The report's own causes are those of :mod:`.causes`. A cause is named only where its interval excludes "no effect";
+where several could be named, chance names any of them in at most :data:`FALSE_ALARMS` of the cases.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.units import BoolArray, FloatArray
+from .memory import FEWEST
+from .report_difference import LevelDifference
+from .season import mean_of_flights
+from .statistics import NO_INTERVAL, Interval, PairedDifference, mean_interval, paired_verdict, spread_interval
+
+FALSE_ALARMS = 0.02
+"""Share of sound campaigns in which a cause is named, over all that are tried together."""
+
+FEWEST_TO_COMPARE = 5
+"""Flights below which none of a campaign is called unlike the others."""
+
+NONE = "none"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """A decision.
+
+    Parameters
+    ----------
+    cause : str
+        What sentence and action are chosen by; ``none`` where nothing is shown.
+    effect : float
+        In the unit that the cause implies (dB, a ratio, a share); NaN where there is none.
+    interval : (low, high)
+        95 % interval of the effect; NaN where none can be given.
+    where : str
+        Flight, link, baseline or instant that the sentence names.
+    """
+
+    cause: str = NONE
+    effect: float = math.nan
+    interval: Interval = NO_INTERVAL
+    where: str = ""
+
+    @property
+    def known(self) -> bool:
+        """Whether there is an interval."""
+        return math.isfinite(self.interval[0]) and math.isfinite(self.interval[1])
+
+
+# --- campaign -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Shift:
+    chance: float
+    verdict: Verdict
+
+
+def campaign_verdict(
+    errors_db: Mapping[str, float], offsets_db: Mapping[str, Mapping[str, float]], order: Sequence[str]
+) -> Verdict:
+    """The one trouble of a season that stands out: a flight's error or offset, or a step in a link's offset.
+
+    Parameters
+    ----------
+    errors_db : mapping of str to float
+        Mean error of each flight [dB].
+    offsets_db : mapping of str to mapping of str to float
+        Simulated minus measured, mean of each flight, by link [dB].
+    order : sequence of str
+        Flights by date.
+
+    Returns
+    -------
+    Verdict
+        ``outlying error`` (effect: ratio to the other flights), ``outlying offset`` (dB), ``gain step`` (dB, with
+        link and first flight after it) or ``none``.
+
+    Notes
+    -----
+    Each candidate splits the flights in two; its two-sample t test with pooled variance is that of the externally
+    Studentised residual for one flight. The smallest chance counts times the number of candidates (Bonferroni).
+    """
+    found = [one for one in _shifts(errors_db, offsets_db, order) if math.isfinite(one.chance)]
+    best = min(found, key=lambda one: one.chance, default=None)
+    return best.verdict if best is not None and best.chance * len(found) < FALSE_ALARMS else Verdict()
+
+
+def _shifts(
+    errors_db: Mapping[str, float], offsets_db: Mapping[str, Mapping[str, float]], order: Sequence[str]
+) -> Iterator[_Shift]:
+    names = [name for name in order if errors_db.get(name, math.nan) > 0.0]
+    for i, chance, effect, ends in _each_alone(np.log([errors_db[name] for name in names])):
+        low, high = np.exp(ends)
+        ratio = Verdict(cause="outlying error", effect=math.exp(effect), interval=(low, high), where=names[i])
+        yield _Shift(chance if effect > 0.0 else math.nan, ratio)
+    about: dict[str, list[float]] = {}
+    for link, of in offsets_db.items():
+        here = [name for name in order if math.isfinite(of.get(name, math.nan))]
+        values = np.array([of[name] for name in here])
+        for name, value in zip(here, values - values.mean() if len(here) else values, strict=True):
+            about.setdefault(name, []).append(float(value))
+        for k in range(2, len(here) - 1):
+            chance, effect, ends = _split(values, np.arange(len(here)) >= k)
+            where = f"{link} from {here[k]}"
+            yield _Shift(chance, Verdict(cause="gain step", effect=effect, interval=ends, where=where))
+    flown = [name for name in order if name in about]
+    for i, chance, effect, ends in _each_alone(np.array([np.mean(about[name]) for name in flown])):
+        yield _Shift(chance, Verdict(cause="outlying offset", effect=effect, interval=ends, where=flown[i]))
+
+
+def _each_alone(values: FloatArray) -> Iterator[tuple[int, float, float, Interval]]:
+    """Each value against all others."""
+    for i in range(len(values)):
+        yield i, *_split(values, np.arange(len(values)) == i)
+
+
+def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interval]:
+    """Chance, difference of means (inside minus outside) and its 95 % interval, variance pooled."""
+    from scipy.special import stdtr, stdtrit  # scipy.stats would load for 0.2 s what two functions need
+
+    freedom, n = len(values) - 2, int(inside.sum())
+    if len(values) < FEWEST_TO_COMPARE or not 0 < n < len(values):
+        return math.nan, math.nan, NO_INTERVAL
+    one, other = values[inside], values[~inside]
+    effect = float(one.mean() - other.mean())
+    square = float(((one - one.mean()) ** 2).sum() + ((other - other.mean()) ** 2).sum()) / freedom
+    error = math.sqrt(max(square, 1e-12) * (1.0 / n + 1.0 / (len(values) - n)))
+    reach = float(stdtrit(freedom, 0.975)) * error
+    return 2.0 * float(stdtr(freedom, -abs(effect) / error)), effect, (effect - reach, effect + reach)
+
+
+# --- calibration ----------------------------------------------------------------------------------------------------
+
+
+def by_flight(
+    errors_db: Iterable[tuple[str, float]], other_db: Iterable[tuple[str, float]], where: str = ""
+) -> Verdict:
+    """Two models on the same flights, each flight one value: ``better``, ``worse``, ``not significant``, ``no interval``.
+
+    Parameters
+    ----------
+    errors_db, other_db : iterable of (flight, error)
+        Several errors of a flight (channels) count as their mean [dB].
+    where : str
+        Name of the other model.
+
+    Returns
+    -------
+    Verdict
+        Effect: mean over flights of the first minus the second model [dB]. Interval from
+        :data:`.season.FEWEST_FLIGHTS` flights on.
+    """
+    first, second = _means(errors_db), _means(other_db)
+    mean = mean_of_flights([first[name] - second[name] for name in first if name in second])
+    return Verdict(
+        cause=paired_verdict(mean.low, mean.high), effect=mean.mean, interval=(mean.low, mean.high), where=where
+    )
+
+
+def _means(errors_db: Iterable[tuple[str, float]]) -> dict[str, float]:
+    each: dict[str, list[float]] = {}
+    for flight, error in errors_db:
+        if math.isfinite(error):
+            each.setdefault(flight, []).append(error)
+    return {flight: float(np.mean(values)) for flight, values in each.items()}
+
+
+def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
+    """Whether what was learned turns with the aircraft: the body frame against frames that do not (:func:`by_flight`).
+
+    Parameters
+    ----------
+    against : sequence of Verdict
+        One per wrong frame.
+
+    Returns
+    -------
+    Verdict
+        ``antenna`` where each wrong frame is significantly worse, ``place`` where one is significantly better, else
+        ``not separable``; effect and interval of the nearer frame.
+    """
+    known = [one for one in against if math.isfinite(one.effect)]
+    if not known:
+        return Verdict()
+    said = {one.cause for one in known}
+    nearest = max((one for one in known if one.cause == "worse" or "worse" not in said), key=lambda one: one.effect)
+    cause = "place" if "worse" in said else "antenna" if said == {"better"} else "not separable"
+    return Verdict(cause=cause, effect=nearest.effect, interval=nearest.interval, where=nearest.where)
+
+
+# --- prediction -----------------------------------------------------------------------------------------------------
+
+_TWO_TRIED = 1.3
+"""99 % over 95 % of a normal distribution: a bias is named beyond it, since a spread is tried beside it."""
+
+LEAST_RATIO = 1.15
+"""Errors that are less than this times larger or smaller than stated are as stated."""
+
+
+def stated_errors(error_db: FloatArray, sd_db: FloatArray, common_db: FloatArray | float = 0.0) -> Verdict:
+    """Whether errors are as large as was stated for them.
+
+    Parameters
+    ----------
+    error_db, sd_db : (n,)
+        Measured minus predicted, and the standard deviation stated for it, in time order [dB].
+    common_db : float or (n,)
+        Part of that standard deviation that a whole flight may share (an offset) [dB].
+
+    Returns
+    -------
+    Verdict
+        ``narrow`` or ``wide`` (effect: errors over stated, as a ratio), ``biased`` (effect: mean error [dB]), else
+        ``none`` with the ratio and its interval; ``no interval`` of fewer than 20 samples.
+    """
+    good = np.isfinite(error_db) & np.isfinite(sd_db) & (sd_db > 0.0)
+    error, sd = error_db[good], sd_db[good]
+    if len(error) < FEWEST:
+        return Verdict(cause="no interval")
+    share = float(np.mean(np.square(np.broadcast_to(common_db, good.shape)[good])))
+    mean, ends = float(error.mean()), mean_interval(error)
+    reach = math.hypot(0.5 * (ends[1] - ends[0]), 1.96 * math.sqrt(share))
+    bias = Verdict(cause="biased", effect=mean, interval=(mean - reach, mean + reach))
+    ratio = error / sd
+    low, high = spread_interval(ratio)
+    # what a flight shares is no spread inside of it: it can hide a narrow interval, not make a wide one
+    allowed = share / float(np.mean(sd**2))
+    effect, within = float(np.sqrt(np.mean(ratio**2))), float(ratio.std())
+    spread = Verdict(effect=effect, interval=(low, max(effect, math.sqrt(high**2 + allowed))))
+    if abs(mean) > _TWO_TRIED * reach and mean**2 > (within**2 - 1.0) * float(np.mean(sd**2)):
+        return bias
+    if low > 1.0 and within > LEAST_RATIO:
+        return Verdict(cause="narrow", effect=within, interval=(low, high))
+    if spread.interval[1] < 1.0 and spread.effect < 1.0 / LEAST_RATIO:
+        return Verdict(cause="wide", effect=spread.effect, interval=spread.interval)
+    return spread
+
+
+# --- map ------------------------------------------------------------------------------------------------------------
+
+COVERED = 0.95
+"""A map with less than this share of its positions in coverage has gaps that a sentence explains."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Coverage:
+    """One height of a map: shares of its positions.
+
+    ``covered`` with the trees as mapped, ``clear`` without trees (NaN where not mapped), ``reached`` by any path
+    whatever its level (NaN where not known); ``outside`` lie further from every flight than a correction reaches.
+    """
+
+    height_m: float
+    covered: float
+    clear: float = math.nan
+    reached: float = math.nan
+    outside: float = 0.0
+
+
+def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
+    """How much of the worst height is covered, and what takes the rest.
+
+    Parameters
+    ----------
+    heights : sequence of Coverage
+
+    Returns
+    -------
+    Verdict
+        Effect: share covered at the height with the least. Causes: ``extrapolated`` (most positions lie beyond the
+        flights), ``threshold`` or ``no path`` (nothing is covered), ``level``, ``trees``, ``blocked`` (what takes most
+        of the gaps), ``none`` (at least :data:`COVERED`). A computed share has no interval.
+    """
+    if not heights:
+        return Verdict()
+    worst = min(heights, key=lambda one: one.covered)
+    gap = {
+        "level": _fraction(worst.reached - worst.covered),
+        "trees": _fraction(worst.clear - worst.covered),
+    }
+    gap["blocked"] = 1.0 - worst.covered - max(gap.values())
+    if worst.outside > 0.5:
+        cause = "extrapolated"
+    elif worst.covered == 0.0:
+        cause = "threshold" if gap["level"] > 0.0 else "no path"
+    elif worst.covered >= COVERED:
+        cause = NONE
+    else:
+        cause = max(gap, key=lambda name: gap[name])
+    return Verdict(cause=cause, effect=worst.covered, where=f"{worst.height_m:g} m")
+
+
+def _fraction(value: float) -> float:
+    return max(value, 0.0) if math.isfinite(value) else 0.0
+
+
+# --- diff -----------------------------------------------------------------------------------------------------------
+
+
+def changed_verdict(
+    pooled: PairedDifference | None,
+    levels: Sequence[LevelDifference],
+    changed: Mapping[str, int],
+    tolerance_db: float,
+) -> Verdict:
+    """What a difference between two reports comes from.
+
+    Parameters
+    ----------
+    pooled : PairedDifference, optional
+        RMSE over all links, second minus first report.
+    levels : sequence of LevelDifference
+    changed : mapping of str to int
+        Settings, inputs and versions that differ.
+    tolerance_db : float
+        Differences up to it count as none.
+
+    Returns
+    -------
+    Verdict
+        ``measured`` (the logs' levels differ), ``setting``, ``input``, ``version`` (the only kind that differs),
+        ``several``, ``unexplained`` (numbers differ, nothing else does), or ``none``; effect and interval of the RMSE.
+    """
+    moved = [x for one in levels for x in (one.measured_max_db, one.simulated_max_db, abs(one.rmse.difference_db))]
+    if not any(value > tolerance_db for value in moved):
+        cause = NONE
+    elif any(one.measured_max_db > tolerance_db for one in levels):
+        cause = "measured"
+    else:
+        kinds = [name for name, n in changed.items() if n]
+        cause = kinds[0] if len(kinds) == 1 else "several" if kinds else "unexplained"
+    if pooled is None or not pooled.n:
+        return Verdict(cause=cause)
+    return Verdict(cause=cause, effect=pooled.difference_db, interval=pooled.difference_ci95_db, where=pooled.verdict)

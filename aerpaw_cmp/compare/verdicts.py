@@ -24,6 +24,9 @@ FALSE_ALARMS = 0.02
 FEWEST_TO_COMPARE = 5
 """Flights below which none of a campaign is called unlike the others."""
 
+LEAST_DB = 2.0
+"""An offset that differs by less [dB] costs no decision, whatever its interval."""
+
 NONE = "none"
 
 
@@ -90,7 +93,10 @@ def campaign_verdict(
     """
     found = [one for one in _shifts(errors_db, offsets_db, order) if math.isfinite(one.chance)]
     best = min(found, key=lambda one: one.chance, default=None)
-    return best.verdict if best is not None and best.chance * len(found) < FALSE_ALARMS else Verdict()
+    if best is None or best.chance * len(found) >= FALSE_ALARMS:
+        return Verdict()
+    small = best.verdict.cause != "outlying error" and abs(best.verdict.effect) < LEAST_DB
+    return Verdict() if small else best.verdict
 
 
 def _shifts(
@@ -143,7 +149,7 @@ def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interva
 def by_flight(
     errors_db: Iterable[tuple[str, float]], other_db: Iterable[tuple[str, float]], where: str = ""
 ) -> Verdict:
-    """Two models on the same flights, each flight one value: ``better``, ``worse``, ``not significant``, ``no interval``.
+    """Two models on the same flights, one value per flight.
 
     Parameters
     ----------
@@ -155,7 +161,8 @@ def by_flight(
     Returns
     -------
     Verdict
-        Effect: mean over flights of the first minus the second model [dB]. Interval from
+        ``better``, ``worse``, ``not significant`` or ``no interval``, of the first model. Effect: mean over flights of
+        the first minus the second [dB]. Interval from
         :data:`.season.FEWEST_FLIGHTS` flights on.
     """
     first, second = _means(errors_db), _means(other_db)

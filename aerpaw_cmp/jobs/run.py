@@ -793,7 +793,8 @@ def run_campaign(
     from dataclasses import replace
 
     from ..flight.settings import load_flight
-    from ..report.campaign_html import campaign_metrics, warnings, write_campaign
+    from ..report.campaign_html import campaign_metrics, write_campaign
+    from ..report.campaign_words import warnings
     from ..report.exports.formats import chosen_formats
     from .campaign import load_campaign
     from .campaign import run as run_all

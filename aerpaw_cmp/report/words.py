@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..common.provenance import KEY
 from ..compare.ladder import LadderRow
 from ..compare.result import BASELINE_TITLE, AuditResult
+from ..compare.verdicts import Verdict
 from .data import ErrorSpan, Interval, RankPanel, ReportData, RssPanel
 
 FEW_SAMPLES = 30
@@ -176,7 +178,7 @@ CAUSES: dict[str, tuple[str, str]] = {
         "a loss of {value:.0f} dB (95 %: {low:.0f} to {high:.0f} dB) at {where} degrees from the tower",
         "add to the site what stands there",
     ),
-    "floor": ("the receiver shows no level below {value:.0f} {unit}", "`floor_db: {value:.0f}` for this log"),
+    "floor": ("the receiver shows no level below {value:.0f} {unit}", "`floor_db: {typed}` for this log"),
     "gain step": (
         "the level steps by {value:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) at {at} UTC",
         "check the gain of the receiver; compare the two parts apart",
@@ -190,22 +192,44 @@ def cause_sentence(panel: RssPanel) -> str:
     cause = panel.extra.get("likely_cause")
     if not cause:
         return ""
-    text, action = CAUSES[cause["name"]]
     numbers = [cause["estimate"], *(cause["ci95"] or (None, None))]
     value, low, high = (math.nan if number is None else number for number in numbers)
     at = ""
     if cause["name"] == "gain step" and len(panel.time):
         instant = panel.time.min() + np.timedelta64(int(float(cause["where"])), "s")
         at = str(instant.astype("datetime64[s]"))[-8:]
-    facts = {
-        "value": value, "low": low, "high": high, "size": abs(value), "side": "ahead of" if value > 0 else "behind",
-        "where": cause["where"], "unit": panel.unit, "at": at,
-    }  # fmt: skip
+    text, action = filled(
+        CAUSES[cause["name"]], value=value, low=low, high=high, size=abs(value), unit=panel.unit, at=at,
+        side="ahead of" if value > 0 else "behind", where=cause["where"], typed=f"{value:.0f}",
+    )  # fmt: skip
     return (
-        f"Likely cause at {panel.name}: {text.format(**facts).replace('-', MINUS)}. "
+        f"Likely cause at {panel.name}: {text}. "
         f"With it the RMSE is {cause['rmse_with_db']:.1f} instead of {cause['rmse_db']:.1f} dB (means over 1 s). "
-        f"Next: {action.format(**facts)}."
+        f"Next: {action}."
     )
+
+
+class _Number(float):
+    """A number whose minus is one in print; names that stand beside it keep their hyphens."""
+
+    def __format__(self, form: str) -> str:
+        return super().__format__(form).replace("-", MINUS)
+
+
+def filled(texts: Sequence[str], **facts: Any) -> list[str]:
+    """Texts with numbers and names put in."""
+    known = {name: _Number(fact) if isinstance(fact, float) else fact for name, fact in facts.items()}
+    return [text.format_map(known) for text in texts]
+
+
+def said_of(verdict: Verdict, table: Mapping[str, tuple[str, str]], **facts: Any) -> str:
+    """Sentence and action that a page's table has for the cause of a verdict; nothing where the table has none."""
+    if verdict.cause not in table:
+        return ""
+    low, high = verdict.interval
+    numbers = {"effect": verdict.effect, "size": abs(verdict.effect), "low": low, "high": high}
+    text, action = filled(table[verdict.cause], **numbers, where=verdict.where, **facts)
+    return f"{text} Next: {action}." if action else text
 
 
 MINUS = "\N{MINUS SIGN}"

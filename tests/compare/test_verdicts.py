@@ -1,10 +1,11 @@
 """Decisions behind the first sentences of five pages, on planted cases: the cause is named, chance is not accused.
 
-    python -m tests.compare.test_verdicts        prints the shares over 200 cases of each kind
+python -m tests.compare.test_verdicts        prints the shares over 200 cases of each kind
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -192,4 +193,4 @@ def test_an_unpaired_flight_takes_no_part() -> None:
 if __name__ == "__main__":
     for one in KINDS:
         named, wrongly, words = shares(one, 200)
-        print(f"{one.__name__:12} named {named:.1%}, sound cases accused {wrongly:.1%}, against the interval {words}")
+        sys.stdout.write(f"{one.__name__:12} named {named:.1%}, accused {wrongly:.1%}, against the interval {words}\n")

@@ -155,12 +155,31 @@ def test_the_page_opens_with_a_verdict_against_the_baselines_and_explains_its_me
     )  # fmt: skip
     shown = dataclasses.replace(data, rss=rows)
     n = sum(row.setting == first for row in rows)
-    said, means = campaign_html.verdict(shown)
+    said, means, stands_out = campaign_html.verdict(shown)
     assert said == (
         "Ray tracing: RMSE 7.0 dB; free space: 6.0 dB. "
         f"Ray tracing is significantly worse on {n} of {n} flights x channels (95 %)."
     )
-    assert "7.00 dB with each flight's own offset, 7.90 dB with the offset of the other flights" in means
+    assert "7.0 dB with each flight's own offset, 7.9 dB with the offset of the other flights" in means
+    assert "Expect 7.9 dB on a new flight" in means
+    assert stands_out.startswith("No flight and no link stands out. Largest error: ")
+    assert "Next: open the report of " in stands_out
     text = campaign_html.campaign_page(shown, [], [])
     assert text.index("significantly worse") < text.index("<main>")
     assert "<td>worse than free space; better than constant level</td>" in text
+
+
+def test_a_flight_with_another_gain_is_named_with_its_interval_and_what_to_do(data):
+    """9 dB more on all links of one flight of the first setting; the others keep their scatter."""
+    odd = data.reference_rows[len(data.reference_rows) // 2].flight
+    rows = tuple(
+        dataclasses.replace(row, difference=dataclasses.replace(row.moments, mean_db=row.moments.mean_db + 9.0))
+        if row.flight == odd
+        else row
+        for row in data.rss
+    )
+    shown = dataclasses.replace(data, rss=rows)
+    cause = campaign_html.cause(shown)
+    assert (cause.cause, cause.where) == ("outlying offset", odd)
+    assert cause.interval[0] < 9.0 < cause.interval[1]
+    assert f"Next: check transmit power, receiver gain and cables of {odd}." in campaign_html.verdict(shown)[2]

@@ -1,0 +1,238 @@
+"""Sentences of a campaign's page, each with the condition under which it may stand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..compare.rss import LEARNED_HERE
+from ..compare.verdicts import Verdict, campaign_verdict
+from .campaign_data import CampaignData, RankHeldOutFold, RssRow
+from .first_screen import most_telling, pooled_db
+from .names import k_key
+from .words import Judged, first_sentence, pretty, ranking_sentence, said_of
+
+FEW = 8
+"""Warnings of flights that stand one by one."""
+
+CAUSES: dict[str, tuple[str, str]] = {
+    "outlying error": (
+        "Flight {where} stands out: its RMSE is {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) that of the others.",
+        "open the report of {where} and read its likely cause",
+    ),
+    "outlying offset": (
+        "Flight {where} stands out: its offset differs by {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB).",
+        "check transmit power, receiver gain and cables of {where}",
+    ),
+    "gain step": (
+        "The offset steps by {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) at {where} on.",
+        "compare the flights before and after apart; check the gain of that receiver",
+    ),
+    "none": (
+        "No flight and no link stands out. Largest error: {flight}, {error:.1f} dB ({link}).",
+        "open the report of {flight}",
+    ),
+}
+"""Sentence and next step by :func:`~aerpaw_cmp.compare.verdicts.campaign_verdict`."""
+
+FEW_SETTINGS = 4
+"""Settings that a sentence names."""
+
+FEW_PAIRS = 0.25
+"""Below this share of samples with a pair, a repeatability floor is that of a few places."""
+
+
+def rss_flights(data: CampaignData) -> list[str]:
+    """Flights that have RSS, and those that failed: a flight with rank alone has no RMSE to miss."""
+    ranked = {row.flight for row in data.rank} - {row.flight for row in data.rss}
+    return [name for name in data.flights if name not in ranked]
+
+
+def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
+    """Mean RMSE over the links of each setting and flight [dB]; NaN where there is none."""
+    known: dict[tuple[str, str], list[float]] = {}
+    for row in data.rss:
+        if np.isfinite(row.rmse_db):
+            known.setdefault((row.setting, row.flight), []).append(row.rmse_db)
+    flights, nan = rss_flights(data), float("nan")
+    table = {
+        setting: {name: float(np.mean(known[setting, name])) if (setting, name) in known else nan for name in flights}
+        for setting in data.settings
+    }
+    return table
+
+
+def headline(data: CampaignData) -> list[str]:
+    """The result in a few sentences."""
+    out = []
+    table = mean_rmse(data)
+    means = {s: np.array([v for v in by.values() if np.isfinite(v)]) for s, by in table.items()}
+    means = {s: v for s, v in means.items() if len(v)}
+    if means:
+        best = min(means, key=lambda s: float(means[s].mean()))
+        spread = np.ptp([v.mean() for v in means.values()])
+        shown = means if len(means) <= FEW_SETTINGS else {best: means[best], data.reference: means.get(data.reference)}
+        out.append(
+            ("Mean RMSE over flights and links" + ("" if shown is means else f", {len(means)} settings") + ": ")
+            + "; ".join(f"{s}: {v.mean():.2f} dB" for s, v in shown.items() if v is not None)
+            + (f". Least: {best}." if spread > 0.005 else ".")
+        )
+    out += _ranked_words(data)
+    for setting in data.settings:
+        moved = [t for t in data.rank_transfers if t.setting == setting]
+        if moved:
+            out.append(
+                f"Rank, {setting}: at the K that the other flights choose, the total variation is "
+                + ", ".join(f"{t.total_variation:.3f} on {t.flight} (K = {k_key(t.k)})" for t in moved)
+                + "."
+            )
+    if data.repeats:
+        pairs = [p for p in data.repeats if p.n > 0]
+        if pairs:
+            mean = float(np.mean([p.rmse_db for p in pairs]))
+            share = 100 * float(np.mean([p.share for p in pairs]))
+            out.append(
+                f"Two flights at the same places differ by {mean:.1f} dB RMS after one constant "
+                f"({sum(p.n for p in pairs):,} pairs, {share:.0f} % of the samples)."
+            )
+        else:
+            out.append("No two flights pass the same places within the radius, so there is no repeatability floor.")
+    for fold in data.held_out:
+        held = [r for r in fold.rows if not r.fitted_here]
+        if held:
+            out.append(
+                f"Fitted on {', '.join(fold.fitted_on)}: on {', '.join(fold.applied_to)} the mean RMSE goes from "
+                f"{np.mean([r.start_rmse_db for r in held]):.2f} to {np.mean([r.rmse_db for r in held]):.2f} dB."
+            )
+    return out + [_rank_fold_words(fold) for fold in data.held_out_rank if fold.applied_to]
+
+
+def _rank_fold_words(fold: RankHeldOutFold) -> str:
+    """What a fit of rank is worth on flights that had no say."""
+    held = [r for r in fold.rows if not r.fitted_here]
+    kappa = [np.mean([getattr(r, f"{label}_kappa") for r in held]) for label in ("start", "fit")]
+    agree = [np.mean([getattr(r, name) for r in held]) for name in ("fit_agreement", "majority_agreement")]
+    ties = f"; {len(fold.ties)} other values fit as well" if fold.ties else ""
+    return (
+        f"Rank fitted on {', '.join(fold.fitted_on)}: on {', '.join(fold.applied_to)} kappa goes from {kappa[0]:.2f} "
+        f"to {kappa[1]:.2f}, {100 * agree[0]:.0f} % of the reports agree (always the commonest rank: "
+        f"{100 * agree[1]:.0f} %){ties}."
+    )
+
+
+def _ranked_words(data: CampaignData) -> list[str]:
+    """What the ranking by held-out error shows, and what it does not."""
+    ranking = data.season.over_all()
+    if len(ranking) < 2 or not data.season.held_out:
+        return []
+    first = (
+        f"With the offset of the other flights, {ranking[0].setting} has the smallest error "
+        f"({ranking[0].mean_db:.2f} dB over {ranking[0].n_flights} flights). "
+    )
+    return [first + ranking_sentence({entry.setting: entry.verdict for entry in ranking[1:]}, FEW_SETTINGS)]
+
+
+def warnings(data: CampaignData) -> list[str]:
+    """What must be known before the numbers are believed."""
+    out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures[:FEW]]
+    if len(data.failures) > FEW:
+        out = [f"{len(data.failures)} flights or settings gave no numbers: they stand under Failures."]
+    if data.held_out_failure:
+        out.append(f"Held-out fit: {data.held_out_failure}")
+    for fold in data.held_out:
+        on = ", ".join(fold.fitted_on)
+        out += [f"Fitted on {on}: {name} ended at a bound of its values." for name in fold.at_bounds]
+        out += [f"Fitted on {on}: {name} has no effect; its value means nothing." for name in fold.without_effect]
+        if not fold.applied_to:
+            out.append(f"Fitted on {on}: no flight was held out, so every number of the fit is scored on its own data.")
+    out += [
+        f"{row.flight}, {row.setting}, {row.link}: its antennas were learned from this very log, so it is not scored."
+        for row in data.rss
+        if LEARNED_HERE in row.fitted
+    ]
+    out += [
+        f"{row.flight}, {row.setting}, {row.link}: the best offset lies at the edge of the searched span."
+        for row in data.rss
+        if row.at_search_edge
+    ]
+    out += [
+        f"{pair.tower} {pair.channel}: only {100 * pair.share:.0f} % of the samples of {pair.first} have a pair on "
+        f"{pair.second}; their repeatability speaks for those places, not for the flights."
+        for pair in data.repeats
+        if 0 < pair.share < FEW_PAIRS
+    ]
+    out += [
+        f"Pooled offset {group.group}: its members are in different units ({', '.join(group.units)})."
+        for group in data.pooled
+        if len(group.units) > 1
+    ]
+    if data.synthetic:
+        out.append("Synthetic flights, made by simulation, that measure nothing: " + ", ".join(data.synthetic) + ".")
+    return list(dict.fromkeys(out))
+
+
+def worst_flights(data: CampaignData) -> list[tuple[str, float, str]]:
+    """Flights under the first-ranked setting, largest error first: name, mean error over links [dB], worst link."""
+    order = data.season.over_all()
+    return _by_error([row for row in data.rss if order and row.setting == order[0].setting], "held_out_rmse_db")
+
+
+def _by_error(rows: Sequence[RssRow], name: str) -> list[tuple[str, float, str]]:
+    by: dict[str, list[tuple[float, str]]] = {}
+    for row in rows:
+        error = getattr(row, name) if np.isfinite(getattr(row, name)) else row.rmse_db
+        if np.isfinite(error):
+            by.setdefault(row.flight, []).append((error, row.link))
+    flights = [(name, float(np.mean([e for e, _ in of])), max(of)[1]) for name, of in by.items()]
+    return sorted(flights, key=lambda entry: -entry[1])
+
+
+def verdict(data: CampaignData) -> list[str]:
+    """Ray tracing against the baselines under the first setting, and what each mean error is for."""
+    rows = [row for row in data.rss if row.setting == next(iter(data.settings)) and np.isfinite(row.rmse_db) and row.n]
+    if not rows:
+        return []
+    total = pooled_db([row.rmse_db for row in rows], [row.n for row in rows])
+    every = []
+    for name in dict.fromkeys(name for row in rows for name in row.baselines):
+        errors = [row.baselines.get(name, np.nan) for row in rows]
+        if np.isfinite(errors).all():
+            said = [row.verdicts[name] for row in rows if row.verdicts.get(name, "no interval") != "no interval"]
+            every.append(
+                Judged(ray_db=total, channels=len(rows), name=name, other_db=pooled_db(errors, [row.n for row in rows]),
+                       judged=len(said), better=said.count("better"), worse=said.count("worse"),
+                       unit="flights x channels")
+            )  # fmt: skip
+    out = [first_sentence(most_telling(every) if every else Judged(ray_db=total, channels=len(rows)))]
+    held = [row.held_out_rmse_db for row in rows if np.isfinite(row.held_out_rmse_db)]
+    own = float(np.mean([row.rmse_db for row in rows]))
+    if held:
+        out.append(
+            f"Mean RMSE: {own:.1f} dB with each flight's own offset, {np.mean(held):.1f} dB with the offset of the "
+            f"other flights. Expect {np.mean(held):.1f} dB on a new flight."
+        )
+    flight, error, link = _by_error(rows, "rmse_db")[0]
+    return [*out, said_of(cause(data), CAUSES, flight=flight, error=error, link=link)]
+
+
+def cause(data: CampaignData) -> Verdict:
+    """The trouble of the season under the first setting."""
+    rows = [row for row in data.reference_rows if np.isfinite(row.rmse_db) and row.n]
+    errors: dict[str, list[float]] = {}
+    offsets: dict[str, dict[str, float]] = {}
+    for row in rows:
+        errors.setdefault(row.flight, []).append(row.rmse_db)
+        offsets.setdefault(row.link, {})[row.flight] = row.moments.mean_db
+    order = sorted(data.flights, key=lambda name: data.season.started.get(name, ""))
+    return campaign_verdict({name: float(np.mean(of)) for name, of in errors.items()}, offsets, order)
+
+
+def beside_baselines(row: RssRow) -> str:
+    """Baselines that the ray tracing is significantly better and worse than, in one cell."""
+    parts = [
+        f"{word} than " + ", ".join(pretty(name) for name, said in row.verdicts.items() if said == word)
+        for word in ("worse", "better")
+        if word in row.verdicts.values()
+    ]
+    return "; ".join(parts) or ("not significant" if row.verdicts else "\u2013")

@@ -87,7 +87,7 @@ def make_inputs(folder: Path, wanted: list[str] | None = None) -> dict[str, Job]
         "bad_lines": 0, "clock_shift_s": {}, "telemetry_interval_s": 0.2,
     }  # fmt: skip
     plan["logs"] = [log for log in plan["logs"] if "USRP" not in log["path"] or log["path"].startswith("LW1/USRP1")]
-    plan |= {"rt": {"engine": "image", "max_depth": 1, "audit_links": 0}, "rss": {"lag": "off", "bootstrap": 20}}
+    plan |= {"rt": {"engine": "image", "max_depth": 1, "audit_links": 0}, "rss": {"lag": "off"}}
     commands: dict[str, dict[str, list[str]]] = collections.defaultdict(dict)
     for seed, variant in enumerate(VARIANTS):
         place = folder / variant

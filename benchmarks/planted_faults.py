@@ -196,8 +196,9 @@ def sample_flight(every: int = 40) -> Any:
 
     file = ROOT / "sample_logs" / "flight.yaml"
     settings = load_flight(file)
+    knobs = settings.rt.advanced.model_copy(update={"samples": 100_000})
     rt = settings.rt.model_copy(
-        update={"attitude": "logged", "foliage": "attenuating", "audit_links": 60, "samples": 100_000}
+        update={"attitude": "logged", "foliage": "attenuating", "audit_links": 60, "advanced": knobs}
     )
     settings = settings.model_copy(update={"rt": rt, "rss": settings.rss.model_copy(update={"lag": "off"})})
     data = gather(settings, file.parent, read_logs(settings, file.parent, None), None)

@@ -99,7 +99,11 @@ def main() -> None:
             reports.append(run(report(flight, folder / f"r{number}", *options)))
         cold = str(folder / "cache")
         content = yaml.safe_load(flight.read_text())
-        content["rt"] = {**content.get("rt", {}), "audit_links": 0, "samples": 10_000 if arguments.quick else 1_000_000}
+        content["rt"] = {
+            **content.get("rt", {}),
+            "audit_links": 0,
+            "advanced": {"samples": 10_000 if arguments.quick else 1_000_000},
+        }
         traced = folder / "sionna.yaml"
         if options:
             traced.write_text(yaml.safe_dump(content))
@@ -134,7 +138,7 @@ def main() -> None:
             "second_s": both[1]["wall_s"],
             "times_faster": both[0]["wall_s"] / both[1]["wall_s"],
             "second_replay_s": stages.get("replay_s"),
-            "samples": content["rt"]["samples"],
+            "samples": content["rt"]["advanced"]["samples"],
         },
     }
     if arguments.json:

@@ -156,7 +156,7 @@ def short_flight(number: int) -> dict[str, Any]:
     content["flight"]["name"] = f"flight_{number}"
     content["flight"]["plan"] = plan | {"seed": number, "waypoints": plan["waypoints"][:5], "bad_lines": 0}
     content["logs"] = content["logs"][:3]
-    return {**content, "rt": {"engine": "image", "max_depth": 1, "audit_links": 0}, "rss": {"bootstrap": 200}}
+    return {**content, "rt": {"engine": "image", "max_depth": 1, "audit_links": 0}}
 
 
 MEASURES: dict[str, Callable[[float], dict[str, float]]] = {

@@ -27,7 +27,7 @@ logs:
   - {path: vehicleOut.txt, reader: vehicle_out}
   - {path: power_log.txt, reader: sounder_log, node: LW1, channel: USRP1}
 rt: {audit_links: 0}
-rss: {bootstrap: 0, lag: "off"}
+rss: {lag: "off"}
 """
 
 Run = Callable[..., tuple[int, str]]

@@ -149,6 +149,18 @@ def test_the_keys_of_the_flight_file_page_are_real() -> None:
         assert keys, name
 
 
+def test_the_page_lists_every_knob_with_its_default() -> None:
+    from aerpaw_cmp.common.yamlfile import parse_yaml
+    from aerpaw_cmp.flight import settings as config
+
+    text = (ROOT / "docs" / "flight_yaml.md").read_text()
+    block = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)[1]
+    listed = parse_yaml("flight: f\nlogs: [{path: a}]\n" + block, config.FlightFile)
+    for knobs in (listed.rt.advanced, listed.rss.advanced, listed.rank.advanced):
+        assert knobs == type(knobs)()
+        assert knobs.model_fields_set == set(type(knobs).model_fields)
+
+
 def test_no_setting_is_without_effect() -> None:
     """Every key that a flight file may hold is read somewhere: a key that does nothing would be a promise not kept."""
     from aerpaw_cmp.flight import settings as config

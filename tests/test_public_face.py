@@ -110,7 +110,7 @@ def test_streams_of_one_name_keep_apart() -> None:
 
 @pytest.fixture(scope="module")
 def flight() -> ac.Flight:
-    return ac.open_flight(SAMPLE / "flight.yaml", overrides={"rss.lag": "off", "rss.bootstrap": 20})
+    return ac.open_flight(SAMPLE / "flight.yaml", overrides={"rss.lag": "off"})
 
 
 def test_a_flight_gives_its_series_as_frames(flight: ac.Flight) -> None:

@@ -29,7 +29,7 @@ def flight(folder: Path, **plan: object) -> Path:
         log for log in content["logs"] if "node" not in log or log.get("channel") in OFFSETS.get(log["node"], {})
     ]
     content["rt"] = {"engine": "image", "audit_links": 0}
-    content["rss"] = {"lag": "apply" if plan.get("clock_shift_s") else "off", "bootstrap": 400}
+    content["rss"] = {"lag": "apply" if plan.get("clock_shift_s") else "off"}
     path = folder / "flight.yaml"
     path.write_text(yaml.safe_dump(content))
     return path

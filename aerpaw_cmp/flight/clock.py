@@ -265,7 +265,7 @@ def _judged(lags: FloatArray, own: FloatArray, names: Sequence[str], window_s: f
     against = -float(total[np.abs(lags) <= SAME_S + 1e-9].max())
     verdict, reason = CANNOT_TELL, f"lags from {low:+.1f} to {high:+.1f} s explain the level about as well"
     if against > EVIDENCE_NAT and (left[0] == 0 or left[-1] == len(lags) - 1):
-        reason = f"the best lag lies near the edge of the window ({window_s:g} s): widen rss.lag_window_s"
+        reason = f"the best lag lies near the edge of the window ({window_s:g} s): widen rss.advanced.lag_window_s"
     elif against > EVIDENCE_NAT and not low <= 0.0 <= high:
         verdict, reason = SHIFTED, ""
     elif first >= -AGREE_S and last <= AGREE_S:

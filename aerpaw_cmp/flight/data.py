@@ -221,7 +221,7 @@ def _node_track(name: str, node: GroundNode, folder: Path, settings: FlightFile,
     track = Track(
         frame if logged else frame.assign(altitude_m=0.0),
         site.frame,
-        maximum_gap_s=settings.rt.maximum_gap_s,
+        maximum_gap_s=settings.rt.advanced.maximum_gap_s,
         ground_m=site.datum.takeoff_ground_m,
     )
     if not len(track):
@@ -361,7 +361,9 @@ def gather(
         warnings.append(f"link.channels names {', '.join(sorted(idle))}: no log is of such a channel")
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
-    track = _track(site, *telemetry[0], warnings, maximum_gap_s=settings.rt.maximum_gap_s) if telemetry else None
+    track = (
+        _track(site, *telemetry[0], warnings, maximum_gap_s=settings.rt.advanced.maximum_gap_s) if telemetry else None
+    )
     if track is None and rss and any(series.position_m is not None for _, series in rank):
         levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
         warnings.append(f"no telemetry log: the levels of {levels} have no positions and are left out")

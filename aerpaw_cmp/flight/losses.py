@@ -15,8 +15,8 @@ from .settings import RtSettings
 
 
 def crowns_reflect(trees: Trees, rt: RtSettings) -> bool:
-    """Whether crowns reflect: those of ``foliage: opaque``, unless ``rt.crown_reflections`` is off."""
-    return rt.foliage == "opaque" and rt.crown_reflections and len(trees) > 0
+    """Whether crowns reflect: those of ``foliage: opaque``, unless ``rt.advanced.crown_reflections`` is off."""
+    return rt.foliage == "opaque" and rt.advanced.crown_reflections and len(trees) > 0
 
 
 def reflecting_crowns(trees: Trees, rt: RtSettings) -> Crowns | None:
@@ -130,8 +130,8 @@ def _foliage_loss(trees: Trees, rt: RtSettings, carrier_hz: float, foliage: str,
         name,
         carrier_hz,
         in_leaf=leaves == "in",
-        gamma_db_per_m=rt.gamma_db_per_m if own else None,
-        maximum_db=rt.maximum_loss_db if own else None,
+        gamma_db_per_m=rt.advanced.gamma_db_per_m if own else None,
+        maximum_db=rt.advanced.maximum_loss_db if own else None,
     )
     index = crown_index(trees)
 

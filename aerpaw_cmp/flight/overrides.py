@@ -57,6 +57,8 @@ def _set(plain: dict[str, Any], key: str, value: Any) -> None:
             continue
         if not isinstance(here, dict):
             raise UsageError(f"the override {key!r} goes below {'.'.join(parts[:depth])!r}, which is a value")
+        if part not in here and part in here.get("advanced", ()):
+            here = here["advanced"]  # as dotted keys of 0.3 name it
         if part not in here:
             _add(plain, here, parts[:depth], part, key)
         if last:

@@ -200,7 +200,7 @@ def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock
     for tower in towers:
         progress(f"clock {tower}")
         channels = clock_channels(data, [s for s in data.rss if s.tower == tower])
-        estimated[tower] = judge_clock(channels, window_s=data.settings.rss.lag_window_s)
+        estimated[tower] = judge_clock(channels, window_s=data.settings.rss.advanced.lag_window_s)
     return [_clock_of(series, estimated[series.tower], apply=wanted == "apply") for series in data.rss]
 
 
@@ -418,7 +418,7 @@ def replay_poses(
     Raises
     ------
     UsageError
-        ``rt.interactions`` besides reflection with ``rt.engine: image``; what a replay raises.
+        ``rt.advanced.interactions`` besides reflection with ``rt.engine: image``; what a replay raises.
     """
     check_interactions(rt)
     others = engine is None if others is None else others
@@ -426,8 +426,8 @@ def replay_poses(
     if towers_m is not None:
         name = "+".join(link.tower_arrays)
         _check_moving(rt, engine, name)
-        run = Run(threads=rt.threads, progress=share_of(progress, f"replay {name}, which moves"))
-        each: Each = replay_pairs if rt.visibility == "pairs" else replay
+        run = Run(threads=rt.advanced.threads, progress=share_of(progress, f"replay {name}, which moves"))
+        each: Each = replay_pairs if rt.advanced.visibility == "pairs" else replay
         search = Search(max_depth=rt.max_depth, crowns=reflecting_crowns(site.trees, rt), diffraction=rt.diffraction)
         field = Field(path_loss(site, rt, link.carrier_hz))
         return replay_moving(site, link, poses, towers_m, search, field, run, each=each)
@@ -435,27 +435,26 @@ def replay_poses(
     search = Search(
         engine,
         max_depth=rt.max_depth,
-        samples=rt.samples,
-        batch=rt.batch,
+        samples=rt.advanced.samples,
         crowns=reflecting_crowns(site.trees, rt),
-        power_cut_db=rt.power_cut_db,
+        power_cut_db=rt.advanced.power_cut_db,
         diffraction=rt.diffraction,
-        interactions=rt.interactions if others else ("reflection",),
-        scattering_coefficient=rt.scattering_coefficient if others else None,
-        device=rt.device,
+        interactions=rt.advanced.interactions if others else ("reflection",),
+        scattering_coefficient=rt.advanced.scattering_coefficient if others else None,
+        device=rt.advanced.device,
     )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
-    alone = engine == "image" and rt.relevance_db is None and search.crowns is None
+    alone = engine == "image" and rt.advanced.relevance_db is None and search.crowns is None
     long = alone and len(poses) > BLOCK
     run = Run(
-        cache_dir=None if rt.cache else "",
-        threads=rt.threads,
+        cache_dir=None if rt.advanced.cache else "",
+        threads=rt.advanced.threads,
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" or long else None,
         on_estimate=lambda estimate: _tell(progress, name, estimate),
     )
-    field = Field(path_loss(site, rt, link.carrier_hz), rt.relevance_db)
-    each = replay_pairs if rt.visibility == "pairs" and engine == "image" else replay
+    field = Field(path_loss(site, rt, link.carrier_hz), rt.advanced.relevance_db)
+    each = replay_pairs if rt.advanced.visibility == "pairs" and engine == "image" else replay
     if long:
         each = partial(replay_in_parts, size=BLOCK, each=each)
     replayed = each(site, link, poses, search, field, run)
@@ -476,7 +475,7 @@ def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
     Raises
     ------
     UsageError
-        Engine sionna; ``rt.relevance_db``; ``rt.power_cut_db``.
+        Engine sionna; ``rt.advanced.relevance_db``; ``rt.advanced.power_cut_db``.
     """
     if engine != "image":
         raise UsageError(
@@ -484,16 +483,16 @@ def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
             expected="rt.engine: image (or --engine image)",
             cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
         )
-    if rt.relevance_db is not None:
+    if rt.advanced.relevance_db is not None:
         raise UsageError(
-            f"rt.relevance_db with towers.{name}, which moves",
-            expected="a tower that stands still, or no rt.relevance_db",
+            f"rt.advanced.relevance_db with towers.{name}, which moves",
+            expected="a tower that stands still, or no rt.advanced.relevance_db",
             cause="the relevance of a building depends on the place of the tower",
         )
-    if rt.power_cut_db is not None:
+    if rt.advanced.power_cut_db is not None:
         raise UsageError(
-            f"rt.power_cut_db with towers.{name}, which moves",
-            expected="a tower that stands still, or no rt.power_cut_db",
+            f"rt.advanced.power_cut_db with towers.{name}, which moves",
+            expected="a tower that stands still, or no rt.advanced.power_cut_db",
             cause="what the cut costs is checked for one place of the tower",
         )
 
@@ -529,7 +528,7 @@ def check_interactions(rt: RtSettings) -> None:
     """Refuse interactions that the engine has not; not in the settings, since ``--engine`` comes after them."""
     if rt.other_interactions and rt.engine != "sionna":
         raise UsageError(
-            f"rt.interactions: {', '.join(rt.interactions)} with engine {rt.engine!r}",
+            f"rt.advanced.interactions: {', '.join(rt.advanced.interactions)} with engine {rt.engine!r}",
             expected="rt.engine: sionna (or --engine sionna), or reflection alone",
             cause="the image engine searches reflections exactly and knows no other interaction",
         )

@@ -10,10 +10,18 @@ import json
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    field_validator,
+    model_validator,
+)
 
 from ..common.errors import InputError, UsageError
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, noise_floor_dbm, wavelength_m
@@ -34,6 +42,9 @@ from ..site.antennas import Isotropic
 from ..site.learned import BAND, Named, find_named, read_table
 from ..site.sphere_pattern import read_sphere_csv
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 Positive = Annotated[float, Field(gt=0)]
 
 
@@ -41,6 +52,35 @@ class Settings(BaseModel):
     """Base of all settings: frozen, nothing unknown, every number one."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class GroupedSettings(Settings):
+    """Settings whose numerical knobs stand below ``advanced``.
+
+    Files of 0.3 and before have the knobs beside it, and keys that are gone: both are read, and :func:`load_flight`
+    says so.
+    """
+
+    WITHOUT_EFFECT: ClassVar[tuple[str, ...]] = ()
+    """Keys of earlier releases that do nothing any more."""
+    _old: dict[str, str] = PrivateAttr(default_factory=dict)
+    """What became of the keys that stand at their old place, by key."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _from_old_places(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if not isinstance(data, dict):
+            return handler(data)
+        group = cls.model_fields.get("advanced")
+        knobs = set(type(group.default).model_fields) if group else set()
+        moved = {key: data[key] for key in data if key in knobs}
+        gone = [key for key in data if key in cls.WITHOUT_EFFECT]
+        content = {key: value for key, value in data.items() if key not in moved and key not in gone}
+        if moved:
+            content["advanced"] = {**dict(data.get("advanced") or {}), **moved}
+        settings = handler(content)
+        settings._old = {key: f"write advanced.{key}" for key in moved} | dict.fromkeys(gone, "has no effect")
+        return settings
 
 
 class AntennaSettings(Settings):
@@ -353,34 +393,20 @@ class GroundNode(Settings):
         return self
 
 
-class RtSettings(Settings):
-    """How the flight is replayed."""
+class AdvancedRt(Settings):
+    """Knobs of a replay that few flights need."""
 
-    engine: Literal["image", "sionna"] = "image"
-    max_depth: Annotated[int, Field(ge=0, le=3)] = 2
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=100_000_000)] = "auto"
     """Rays per tower of Sionna; ``auto`` raises the number until two pilots find the same paths."""
-    batch: Annotated[int, Field(ge=1, le=100)] = 50
     interactions: Annotated[list[Interaction], Field(min_length=1)] = ["reflection"]
     """Besides reflections, engine sionna: their power is added to RSS; H and ranks leave them out."""
-    diffraction: Literal["none", "edges", "all"] = "none"
-    """Paths over one edge of a building, in H, levels and ranks; ``all``: also with a wall or roof on one side."""
     scattering_coefficient: Annotated[float, Field(gt=0, le=1)] | None = None
     """Share of the reflected amplitude that every material scatters; needed with ``scattering``."""
-    attitude: Literal["logged", "level", "ignored"] = "ignored"
-    """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
-    foliage: Literal["none", "attenuating", "opaque"] = "none"
     crown_reflections: bool = True
     """Opaque crowns reflect besides blocking."""
-    foliage_model: Literal["p833", "weissberger"] = "p833"
     gamma_db_per_m: Positive | None = None
     maximum_loss_db: Positive | None = None
     """Replace P.833's specific attenuation and largest loss at the carrier."""
-    leaves: Literal["in", "out"] = "in"
-    reflection_loss_db: Annotated[float, Field(ge=0)] = 0.0
-    """Taken from every reflection besides its Fresnel coefficient (rough surfaces); to be fitted on other flights."""
-    ground_roughness_m: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Standard deviation of the ground's height: its specular reflection falls by Rayleigh's (Ament's) factor."""
     paired_foliage: bool = False
     """Also replay without trees and out of leaf, and report the differences."""
     relevance_db: Positive | None = None
@@ -388,34 +414,55 @@ class RtSettings(Settings):
     """Leave out reflections that their length alone puts this far below free space over their link."""
     visibility: Literal["centre", "pairs"] = "centre"
     """``pairs``: each element pair has its own paths (engine image); ``centre``: those of the array centres."""
-    audit_links: Annotated[int, Field(ge=0)] = 200
     maximum_gap_s: Positive = 3.0
     """Telemetry gaps longer than this are not bridged."""
     cache: bool = True
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Of Sionna's search (auto: a GPU where there is one) and, with cuda, of the field."""
+    """Of Sionna's search; auto: a GPU where there is one."""
     threads: Annotated[int, Field(ge=1, le=1024)] | None = None
     """Of compiled code; by default the cores this process may use. Results do not depend on it."""
 
+
+class RtSettings(GroupedSettings):
+    """How the flight is replayed."""
+
+    WITHOUT_EFFECT = ("batch",)
+
+    engine: Literal["image", "sionna"] = "image"
+    max_depth: Annotated[int, Field(ge=0, le=3)] = 2
+    diffraction: Literal["none", "edges", "all"] = "none"
+    """Paths over one edge of a building, in H, levels and ranks; ``all``: also with a wall or roof on one side."""
+    attitude: Literal["logged", "level", "ignored"] = "ignored"
+    """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
+    foliage: Literal["none", "attenuating", "opaque"] = "none"
+    foliage_model: Literal["p833", "weissberger"] = "p833"
+    leaves: Literal["in", "out"] = "in"
+    reflection_loss_db: Annotated[float, Field(ge=0)] = 0.0
+    """Taken from every reflection besides its Fresnel coefficient (rough surfaces); to be fitted on other flights."""
+    ground_roughness_m: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Standard deviation of the ground's height: its specular reflection falls by Rayleigh's (Ament's) factor."""
+    audit_links: Annotated[int, Field(ge=0)] = 200
+    advanced: AdvancedRt = AdvancedRt()
+
     @model_validator(mode="after")
     def _possible_interactions(self) -> RtSettings:
-        asked = self.interactions
+        asked, scattered = self.advanced.interactions, self.advanced.scattering_coefficient
         if len(set(asked)) < len(asked) or "reflection" not in asked:
             raise ValueError("interactions must name reflection, and each interaction once")
         if self.other_interactions and self.max_depth == 0:
             raise ValueError("interactions besides reflection need max_depth of 1 or more: each counts in it")
-        if self.diffraction != "none" and (self.visibility == "pairs" or "diffraction" in asked):
+        if self.diffraction != "none" and (self.advanced.visibility == "pairs" or "diffraction" in asked):
             raise ValueError("diffraction goes with visibility: centre, and without interactions: diffraction")
-        if "scattering" in asked and self.scattering_coefficient is None:
+        if "scattering" in asked and scattered is None:
             raise ValueError("interactions: scattering needs scattering_coefficient (materials of P.2040 state none)")
-        if "scattering" not in asked and self.scattering_coefficient is not None:
+        if "scattering" not in asked and scattered is not None:
             raise ValueError("scattering_coefficient belongs to interactions: scattering")
         return self
 
     @property
     def other_interactions(self) -> list[str]:
         """Interactions besides reflections."""
-        return [name for name in self.interactions if name != "reflection"]
+        return [name for name in self.advanced.interactions if name != "reflection"]
 
 
 class PortSettings(Settings):
@@ -447,23 +494,31 @@ MAXIMUM_OFFSETS = 1_000_000
 """The offset grid of a report may not be longer: 100 dB in steps of 0.0001 dB."""
 
 
-class RssSettings(Settings):
-    """How RSS is compared."""
+class AdvancedRss(Settings):
+    """Knobs of the level's comparison that few flights need."""
 
     step_db: Positive = 0.1
+    """Step of the offset search."""
+    lag_window_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
+    """Largest clock difference that is looked for."""
+
+
+class RssSettings(GroupedSettings):
+    """How RSS is compared."""
+
+    WITHOUT_EFFECT = ("bootstrap",)
+
     span_db: tuple[float, float] = (-50.0, 50.0)
     lag: Literal["off", "estimate", "apply"] | float = "estimate"
     """Radio minus telemetry clock: estimated and shown, estimated and applied, or taken off as given [s]."""
-    lag_window_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     field: Literal["coherent", "power", "local_mean"] = "coherent"
     """Which simulated RSS is compared."""
     window_s: Annotated[float, Field(ge=0)] = 0.0
     """Measurement averaged (in power) over this window; 0 leaves samples as they are."""
     minimum_height_m: float | None = None
     """Samples below this height are left out of the comparison, and counted."""
-    bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
-    """Of 0.3 and without effect: intervals of levels are not resampled any more."""
     reference_powers: ReferencePowers | None = None
+    advanced: AdvancedRss = AdvancedRss()
 
     @model_validator(mode="after")
     def _window_of_local_mean(self) -> RssSettings:
@@ -473,8 +528,8 @@ class RssSettings(Settings):
 
     @model_validator(mode="after")
     def _countable(self) -> RssSettings:
-        if (self.span_db[1] - self.span_db[0]) / self.step_db > MAXIMUM_OFFSETS:
-            raise ValueError(f"span_db over step_db gives more than {MAXIMUM_OFFSETS} offsets to try")
+        if (self.span_db[1] - self.span_db[0]) / self.advanced.step_db > MAXIMUM_OFFSETS:
+            raise ValueError(f"span_db over advanced.step_db gives more than {MAXIMUM_OFFSETS} offsets to try")
         return self
 
     @field_validator("span_db")
@@ -485,16 +540,23 @@ class RssSettings(Settings):
         return value
 
 
-class RankSettings(Settings):
+class AdvancedRank(Settings):
+    """Knobs of the rank's comparison that few flights need."""
+
+    bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
+    """Resamples for its intervals."""
+
+
+class RankSettings(GroupedSettings):
     """How rank is compared."""
 
     tower: str = "LW1"
     k: Annotated[list[Positive], Field(min_length=1, max_length=64)] = [10.0, 100.0, 1000.0]
     minimum_height_m: float | None = None
     """Samples below this height are left out, and counted (the README of a data set may ask for it)."""
-    bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
     receiver: str | None = None
     """Receiver file of ``calibrate``: gives a probability of each rank."""
+    advanced: AdvancedRank = AdvancedRank()
 
     @field_validator("k")
     @classmethod
@@ -504,13 +566,13 @@ class RankSettings(Settings):
         return value
 
 
-class ReportSettings(Settings):
+class ReportSettings(GroupedSettings):
     """What the report shows."""
+
+    WITHOUT_EFFECT = ("speed_table",)
 
     title: str | None = None
     waypoints: list[Waypoint] = []
-    speed_table: bool | None = None
-    """Ignored, and said so in the report: it will be refused in the next release."""
     audit: Literal["now", "later"] = "now"
     """``later``: the report is written without the audit; ``aerpaw-cmp audit`` fills it in."""
     export: list[Literal["geojson", "geopackage", "kmz", "mat", "netcdf", "all"]] = []
@@ -535,6 +597,11 @@ class FlightFile(Settings):
     rss: RssSettings = RssSettings()
     rank: RankSettings = RankSettings()
     report: ReportSettings = ReportSettings()
+
+    def old_keys(self) -> list[str]:
+        """What became of each key that stands at the place of an earlier release."""
+        groups = {"rt": self.rt, "rss": self.rss, "rank": self.rank, "report": self.report}
+        return [f"{name}.{key} ({fate})" for name, group in groups.items() for key, fate in group._old.items()]
 
     @model_validator(mode="before")
     @classmethod
@@ -590,6 +657,10 @@ def load_flight(path: str | Path, learned: Path | None = None) -> FlightFile:
         Unknown or duplicate keys, wrong types, wrong ranges: with the line and the nearest valid key.
     """
     settings = load_yaml(Path(path), FlightFile)
+    if old := settings.old_keys():
+        note = f"keys of an earlier release: {'; '.join(old)}. The next release refuses them."
+        flight = settings.flight.model_copy(update={"notes": [*settings.flight.notes, note]})
+        settings = settings.model_copy(update={"flight": flight})
     if learned is not None:
         settings = _joined(settings, _placed(load_yaml(learned, LearnedSettings), learned), learned)
     return with_learned(settings, Path(path).parent)

@@ -338,7 +338,7 @@ class Track:
             return f"most are {reason}" if reason else "there are no samples"
         return (
             f"it has a fix every {np.median(np.diff(self._time_s)):.0f} s; gaps above "
-            f"{self.maximum_gap_s:g} s (rt.maximum_gap_s) are not interpolated"
+            f"{self.maximum_gap_s:g} s (rt.advanced.maximum_gap_s) are not interpolated"
         )
 
     def _pose_at(self, instant: AnyArray) -> TrackPoses:

@@ -92,7 +92,9 @@ def audit_replays(
         paths=sum(len(r.replay.paths) for r in replays),
         settings={
             "max_depth": rt.max_depth,
-            "samples": max(r.replay.samples for r in replays) or rt.samples if replays else rt.samples,
+            "samples": max(r.replay.samples for r in replays) or rt.advanced.samples
+            if replays
+            else rt.advanced.samples,
             "attitude": rt.attitude,
             "foliage": rt.foliage,
             **_crown_settings(rt, replays),
@@ -114,7 +116,7 @@ def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, ob
     if rt.foliage != "opaque":
         return {}
     bounced = sum(int(r.replay.paths.off_crown.sum()) for r in replays)
-    return {"crown_reflections": rt.crown_reflections, "paths_off_crowns": bounced}
+    return {"crown_reflections": rt.advanced.crown_reflections, "paths_off_crowns": bounced}
 
 
 def _audit(
@@ -178,13 +180,12 @@ def _of_series(
         replayed.replay,
         Search(
             max_depth=rt.max_depth,
-            samples=rt.samples,
-            batch=rt.batch,
+            samples=rt.advanced.samples,
             crowns=reflecting_crowns(site.trees, rt),
-            power_cut_db=rt.power_cut_db,
+            power_cut_db=rt.advanced.power_cut_db,
         ),
         Field(loss=path_loss(site, rt, replayed.link.carrier_hz)),
-        Run(cache_dir=None if rt.cache else ""),
+        Run(cache_dir=None if rt.advanced.cache else ""),
         links=links,
         second=Second(expected=expected, ks=ks, reference_links=reference_links),
     )
@@ -240,8 +241,8 @@ def expected_loss(rt: RtSettings) -> ExpectedLoss:
     """Foliage and reflection loss as ``rt`` has them."""
     return ExpectedLoss(
         model=rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
-        gamma_db_per_m=rt.gamma_db_per_m,
-        maximum_db=rt.maximum_loss_db,
+        gamma_db_per_m=rt.advanced.gamma_db_per_m,
+        maximum_db=rt.advanced.maximum_loss_db,
         in_leaf=rt.leaves == "in",
         reflection_db=rt.reflection_loss_db,
         ground_roughness_m=rt.ground_roughness_m,

@@ -215,7 +215,7 @@ class Bench:
 
 def own_residual_db(measured_db: FloatArray, simulated_db: FloatArray, rules: RssSettings) -> FloatArray:
     """Measured minus simulated after the best offset of these very samples (n,)."""
-    fit = grid_offset(measured_db, simulated_db, step_db=rules.step_db, span_db=rules.span_db)
+    fit = grid_offset(measured_db, simulated_db, step_db=rules.advanced.step_db, span_db=rules.span_db)
     return measured_db + fit.offset_db - simulated_db
 
 
@@ -331,7 +331,7 @@ def _scores(benches: Mapping[str, Bench], point: Point, train: list[str], test: 
             if name in test and (series.tower, series.channel) in learned:
                 difference = np.concatenate(learned[series.tower, series.channel])
                 offset = grid_offset(
-                    np.zeros(len(difference)), difference, step_db=rules.step_db, span_db=rules.span_db
+                    np.zeros(len(difference)), difference, step_db=rules.advanced.step_db, span_db=rules.span_db
                 ).offset_db
             rows.append(
                 HeldOutRow(

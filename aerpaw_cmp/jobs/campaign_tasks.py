@@ -364,7 +364,7 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, logs: tuple[str,
             for name in result.baselines
             if name in result.further.compared_with
         },
-        step_db=rules.step_db,
+        step_db=rules.advanced.step_db,
         span_db=rules.span_db,
         measured_db=measured_db,
         simulated_dbm=result.simulated_dbm,

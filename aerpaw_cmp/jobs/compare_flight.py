@@ -62,7 +62,7 @@ from .what_if import (
 )
 
 FOLIAGE_RUNS = ("without trees", "trees in leaf", "trees out of leaf")
-"""Runs of ``rt.paired_foliage``; each is a column of rss.csv and, per K, of rank.csv."""
+"""Runs of ``rt.advanced.paired_foliage``; each is a column of rss.csv and, per K, of rank.csv."""
 
 AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
 """Both sides are averaged over these windows to see how much of the error is fading."""
@@ -142,7 +142,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         levels.simulated_db,
         baselines=simple,
         posed=levels.posed,
-        step_db=settings.step_db,
+        step_db=settings.advanced.step_db,
         span_db=settings.span_db,
         lag_s=float("nan") if clock is None else clock.result.radio_minus_telemetry_s,
         fitted_on_scored=("lag_s",) if clock is not None and clock.result.applied == APPLIED else (),
@@ -151,7 +151,9 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     without = score.rmse_db
     if wild.any():
         kept = np.where(wild, np.nan, levels.measured_db)
-        rest = offsets.grid_offset(kept, levels.simulated_db, step_db=settings.step_db, span_db=settings.span_db)
+        rest = offsets.grid_offset(
+            kept, levels.simulated_db, step_db=settings.advanced.step_db, span_db=settings.span_db
+        )
         without = rest.rmse_db
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
     other = rss_alternatives(data.site, data.settings.rt, replayed, settings.field)
@@ -160,7 +162,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     quantities = {**geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
     residual_by = rss.residual_tables(score.residual_db, quantities)
     curve_offset_db, curve_rmse_db = offsets.offset_curve(
-        levels.measured_db, levels.simulated_db, step_db=settings.step_db, span_db=settings.span_db
+        levels.measured_db, levels.simulated_db, step_db=settings.advanced.step_db, span_db=settings.span_db
     )
     if trained := learned_here(data, series, replayed.link):
         score, alternatives, residual_by = rss.without_errors(score), {}, {}
@@ -280,7 +282,7 @@ def _variants(settings: RssSettings, levels: Levels, alternatives: Mapping[str, 
     for name, level in alternatives.items():
         both = np.isfinite(levels.measured_db) & np.isfinite(level)
         measured, simulated = levels.measured_db[both], level[both]
-        fit = offsets.grid_offset(measured, simulated, step_db=settings.step_db, span_db=settings.span_db)
+        fit = offsets.grid_offset(measured, simulated, step_db=settings.advanced.step_db, span_db=settings.span_db)
         bounds = statistics.error_intervals(measured, simulated)
         out[name] = ModelLevel(
             level_dbm=level, offset_db=fit.offset_db, rmse_db=fit.rmse_db, rmse_ci95_db=bounds.rmse_db
@@ -297,7 +299,7 @@ def _averaged(
         "power_sum": replayed.spread(replayed.level_dbm("power")),
     }
     over_time = rss.averaged_fits(
-        series.time, levels.measured_db, simulations, windows_s=AVERAGING_WINDOWS_S, step_db=settings.step_db,
+        series.time, levels.measured_db, simulations, windows_s=AVERAGING_WINDOWS_S, step_db=settings.advanced.step_db,
         span_db=settings.span_db,
     )  # fmt: skip
     lengths = {
@@ -305,7 +307,7 @@ def _averaged(
         AVERAGING_LENGTH_M: f"{AVERAGING_LENGTH_M:g} m of path",
     }
     over_path = rss.path_averaged_fits(
-        position_m, levels.measured_db, simulations, lengths_m=tuple(lengths), step_db=settings.step_db,
+        position_m, levels.measured_db, simulations, lengths_m=tuple(lengths), step_db=settings.advanced.step_db,
         span_db=settings.span_db,
     )  # fmt: skip
     return {
@@ -364,7 +366,7 @@ def _detection(settings: RssSettings, series: RssSeries, levels: Levels) -> Dete
         detected[at],
         floor_db=floor_db,
         span_db=settings.span_db,
-        step_db=settings.step_db,
+        step_db=settings.advanced.step_db,
     )
 
 
@@ -382,7 +384,7 @@ def _censored(settings: RssSettings, levels: Levels) -> Censored | None:
         # the weakest level itself is a measurement: it is no "below"
         measured_floor_db=floors[0] - 1e-9,
         simulated_floor_db=floors[1] - 1e-9,
-        step_db=settings.step_db,
+        step_db=settings.advanced.step_db,
         span_db=settings.span_db,
     )
     return Censored(
@@ -567,7 +569,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         settings.k,
         time_s=(series.time[rows] - series.time[:1]) / np.timedelta64(1, "s") if len(rows) else None,
         sinr_db=sinr_db,
-        replicates=max(settings.bootstrap, 1),
+        replicates=max(settings.advanced.bootstrap, 1),
     )
     paired = foliage_ranks(data.site, data.settings.rt, replayed, kept, settings.k)
     sigma, towers = ranks.singular_values(h), tower_places(replayed)
@@ -617,7 +619,7 @@ def _receiver_forecast(
     if receiver.knows(samples):  # nothing is scored where it was fitted
         return probability, None, samples.logs
     constant = receiver.mixture.members[0].constant
-    replicates = max(data.settings.rank.bootstrap, 2)
+    replicates = max(data.settings.rank.advanced.bootstrap, 2)
     return probability, score_forecast(samples.rank, probability, said, constant, replicates=replicates), ()
 
 

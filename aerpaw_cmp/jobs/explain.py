@@ -88,7 +88,7 @@ class Explanation:
     differences : tuple of OtherEngine, optional
         Where both engines were asked.
     other_interactions : OtherPower, optional
-        Where ``rt.interactions`` names more than reflections; ``level_dbm`` and ``paths`` leave them out.
+        Where ``rt.advanced.interactions`` names more than reflections; ``level_dbm`` and ``paths`` leave them out.
     """
 
     flight: str
@@ -185,7 +185,7 @@ def run_explain(
         notes.append(f"rss.csv holds rss.field: {settings.rss.field}; the level here is the coherent sum")
     if replayed.pairs_differ is not None and replayed.pairs_differ.any():
         notes.append(
-            "element pairs have paths of their own (rt.visibility: pairs); listed are those of the array centres"
+            "each element pair has its own paths (rt.advanced.visibility: pairs); these are those of the array centres"
         )
     notes += edge_path_lines(replayed, np.asarray(source), pose, link)
     measured = float(series.measured_db[at]) if isinstance(series, RssSeries) else None
@@ -319,7 +319,7 @@ def _known(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
         raise UsageError(
             f"no pose is known at {_iso(series.time[at])}",
             expected="a time with telemetry",
-            cause="the telemetry starts later, ends earlier or has a gap (rt.maximum_gap_s)",
+            cause="the telemetry starts later, ends earlier or has a gap (rt.advanced.maximum_gap_s)",
         )
 
 
@@ -352,7 +352,8 @@ def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterato
 def _elsewhere(replayed: Replay) -> str:
     if replayed.engine == "sionna":
         return f"nothing is in its way: not found with {replayed.samples} samples per tower"
-    return "geometry allows it: stopped by the terrain, the ground of another tower, or left out by rt.power_cut_db"
+    stopped = "stopped by the terrain, the ground of another tower, or left out by rt.advanced.power_cut_db"
+    return f"geometry allows it: {stopped}"
 
 
 def _differences(
@@ -370,7 +371,8 @@ def _differences(
     missing = [key for key in mine if key not in others]
     more: set[tuple[int, ...]] = set()
     if missing:
-        wide = rt.model_copy(update={"samples": MORE_SAMPLES * max(theirs.samples, 1), "cache": False})
+        knobs = {"samples": MORE_SAMPLES * max(theirs.samples, 1), "cache": False}
+        wide = rt.model_copy(update={"advanced": rt.advanced.model_copy(update=knobs)})
         more = set(_by_plane(ours, replay_poses(site, wide, link, pose, engine="sionna", progress=progress))[1])
     for key in missing:
         path = explained[mine[key]]

@@ -244,7 +244,7 @@ def records_of(*modules: ModuleType) -> set[type]:
     }
 
 
-_WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links", "cache"}}
+_WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links": True, "advanced": {"cache"}}}
 """Settings that a campaign's outcome does not depend on: names, the plan of a simulation, pages, the audit, caches."""
 
 

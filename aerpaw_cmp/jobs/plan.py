@@ -246,7 +246,7 @@ def _by_first_faces(site: Site, rt: RtSettings, name: str, work: str, link: Link
     """The stage of a replay among thousands of faces, from the search of the first ones; None among few."""
     start = time.process_time()
     estimate = estimate_search(
-        site, link, poses, Search(max_depth=rt.max_depth, power_cut_db=rt.power_cut_db), threads=1
+        site, link, poses, Search(max_depth=rt.max_depth, power_cut_db=rt.advanced.power_cut_db), threads=1
     )
     if estimate is None:
         return None

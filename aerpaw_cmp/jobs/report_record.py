@@ -16,8 +16,6 @@ def report_record(flight_run: FlightRun, others: Sequence[InputFile]) -> ReportD
     data, settings = flight_run.data, flight_run.data.settings
     carriers = {replayed.link.carrier_hz for replayed in flight_run.replays.all}
     notes = foliage_notes(len(data.site.trees), settings.rt, carriers)
-    if settings.report.speed_table is not None:
-        notes = (*notes, "report.speed_table is ignored: 'aerpaw-cmp bench' measures speed against error")
     return report_data(
         data,
         flight_run.result,

@@ -117,8 +117,8 @@ def _alone(pattern: Any) -> Any:
 
 
 def foliage_alternatives(site: Site, rt: RtSettings, replayed: Replayed) -> dict[str, Fields]:
-    """Fields without trees, in leaf and out of leaf, where ``rt.paired_foliage`` asks and the site has trees."""
-    if not rt.paired_foliage or not len(site.trees):
+    """Fields without trees, in leaf and out of leaf, where ``paired_foliage`` asks and the site has trees."""
+    if not rt.advanced.paired_foliage or not len(site.trees):
         return {}
 
     def with_trees(foliage: str, leaves: str | None = None) -> Fields:
@@ -134,12 +134,12 @@ def foliage_alternatives(site: Site, rt: RtSettings, replayed: Replayed) -> dict
 
 def foliage_notes(trees: int, rt: RtSettings, carriers_hz: Collection[float]) -> tuple[str, ...]:
     """What a report must say of its foliage models, where the site has trees: how far they are stretched or assumed."""
-    if not trees or not (rt.foliage == "attenuating" or (rt.paired_foliage and rt.foliage != "opaque")):
+    if not trees or not (rt.foliage == "attenuating" or (rt.advanced.paired_foliage and rt.foliage != "opaque")):
         return ()
     notes = []
-    if rt.foliage_model == "p833" and (rt.gamma_db_per_m is None or rt.maximum_loss_db is None):
+    if rt.foliage_model == "p833" and (rt.advanced.gamma_db_per_m is None or rt.advanced.maximum_loss_db is None):
         notes += [note for carrier in sorted(carriers_hz) if (note := p833_note(carrier))]
-    if rt.leaves == "out" or rt.paired_foliage:
+    if rt.leaves == "out" or rt.advanced.paired_foliage:
         what = "gamma" if rt.foliage_model == "p833" else "the loss"
         notes.append(
             f"Trees out of leaf: {what} in leaf divided by {1 / LEAFLESS_FACTOR:g}. That is an assumption of this "

@@ -82,7 +82,7 @@ def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
     rss_settings = data.settings.get("rss") or {}
     return {
         "start": str(start.astype("datetime64[ms]")) if has_wall_clock(start) else "",
-        "step_db": rss_settings.get("step_db", 0.1),
+        "step_db": rss_settings.get("advanced", {}).get("step_db", 0.1),
         "span_db": list(rss_settings.get("span_db", (-50.0, 50.0))),
         "rss": [_rss(p, start, arrays, share(len(p.time))) for p in data.rss],
         "rank": [_rank(p, start, arrays, share(len(p.time))) for p in data.rank],

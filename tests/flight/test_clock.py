@@ -128,7 +128,7 @@ def test_too_few_samples_and_gaps_of_the_telemetry():
 def test_a_lag_outside_the_window_is_not_passed_off_as_a_result():
     clock = judge_clock([channel(6.0, 6, gain_db=12.0, memory_db=0.5)], window_s=5.0)
     assert clock.verdict == CANNOT_TELL
-    assert "widen rss.lag_window_s" in clock.reason
+    assert "widen rss.advanced.lag_window_s" in clock.reason
     assert -5.0 <= clock.ci95_s[0] <= clock.radio_minus_telemetry_s <= clock.ci95_s[1] <= 5.0
 
 

@@ -105,10 +105,10 @@ def test_names_in_the_flight_file_that_fit_nothing_are_told(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ("rss: {step_db: 1.0e-7, span_db: [-1.0e+9, 1.0e+9]}", "more than 1000000 offsets to try"),
-        ("rss: {step_db: .inf}", "finite number"),
-        ("rss: {lag_window_s: 1.0e+12}", "less than or equal to 3600"),
-        ("rt: {maximum_gap_s: .nan}", "finite number|greater than 0"),
+        ("rss: {span_db: [-1.0e+9, 1.0e+9], advanced: {step_db: 1.0e-7}}", "more than 1000000 offsets to try"),
+        ("rss: {advanced: {step_db: .inf}}", "finite number"),
+        ("rss: {advanced: {lag_window_s: 1.0e+12}}", "less than or equal to 3600"),
+        ("rt: {advanced: {maximum_gap_s: .nan}}", "finite number|greater than 0"),
     ],
 )
 def test_settings_that_no_memory_could_hold_are_refused_in_the_file(tmp_path: Path, keys: str, words: str) -> None:

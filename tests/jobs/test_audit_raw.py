@@ -57,8 +57,8 @@ link:
     tower: {{antenna: {{model: sphere, file: tower.csv}}, yaw_deg: 30}}
     uav: {{antenna: {{model: sphere, file: uav.csv}}, roll_deg: 90, slant_deg: 20}}
 rt: {{engine: image, max_depth: 1, attitude: logged, audit_links: 20}}
-rss: {{lag: {AHEAD_S}, bootstrap: 20}}
-rank: {{tower: T1, bootstrap: 20}}
+rss: {{lag: {AHEAD_S}}}
+rank: {{tower: T1}}
 """
 
 

@@ -49,7 +49,7 @@ def settings(name: str, antenna: dict, yaw_deg: float = 0.0, *, channel: str = "
         ],
         "link": {"rss": link},
         "rt": {"max_depth": 0, "attitude": "logged", "audit_links": 0},
-        "rss": {"bootstrap": 20, "lag": "off", "minimum_height_m": 20},
+        "rss": {"lag": "off", "minimum_height_m": 20},
         } | rest  # fmt: skip
 
 

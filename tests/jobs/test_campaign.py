@@ -67,7 +67,7 @@ def flight_settings(name: str, seed: int, yaw_deg: float) -> dict[str, Any]:
         ],
         "link": {"rss": {"carrier_hz": 3.3e9, "tower": {"antenna": {"model": "tr38901"}, "yaw_deg": yaw_deg}}},
         "rt": {"max_depth": 1},
-        "rss": {"bootstrap": 50, "lag": "off"},
+        "rss": {"lag": "off"},
     }
 
 
@@ -346,7 +346,7 @@ def test_json_is_alone_on_standard_output(folder: Path, capsys: pytest.CaptureFi
         ({"settings": {"x": {"rt.max_depth.y": 1}}}, "which is a value"),
         ({"settings": {"x": {"logs.7.path": "y"}}}, "no element '7'"),
         ({"held_out": {"fit": {YAW: [10, 0]}}}, "increasing"),
-        ({"held_out": {"fit": {"rss.step_db": [1, 2]}}}, "below link, rt or site"),
+        ({"held_out": {"fit": {"rss.advanced.step_db": [1, 2]}}}, "below link, rt or site"),
         ({"held_out": {"fit": {YAW: [0, 10]}, "fit_on": ["frist"]}}, "did you mean 'first'"),
         ({"held_out": {"fit": {YAW: [0, 10]}, "setting": "as writen"}}, "as written"),
         ({"held_out": {"fit": {"link.rss.towr.yaw_deg": [0, 10]}}}, "tower"),
@@ -515,7 +515,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
         settings["flight"]["plan"].update(rank_k=10, rank_interval_s=1.0, start=f"2025-06-0{seed}T10:00:00")
         track = {**settings["logs"][0], "path": f"rank_{name}/vehicleOut.txt"}  # not over that of the other tests
         settings["logs"] = [track, {"path": f"{name}/ri.csv", "reader": "quectel_ri", "node": "LW1"}]
-        settings["rank"] = {"k": [10, 100], "bootstrap": 20}
+        settings["rank"] = {"k": [10, 100], "advanced": {"bootstrap": 20}}
         (folder / f"rank_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
         assert main(["simulate", str(folder / f"rank_{name}.yaml")]) == 0
     found = result(folder, "ranks", "--export", "geojson", flights=["rank_first.yaml", "rank_second.yaml"])
@@ -591,7 +591,7 @@ def test_two_real_rank_flights_choose_one_k_when_slanted(tmp_path: Path) -> None
 
 
 def test_status_dry_run_and_resume_say_what_is_kept(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    settings = {"as written": {"rss.bootstrap": 11}, "level": {"rss.bootstrap": 12}}
+    settings = {"as written": {"rss.advanced.lag_window_s": 11}, "level": {"rss.advanced.lag_window_s": 12}}
     path = write_campaign(folder, "kept", flights=["first.yaml", "second.yaml"], settings=settings, keep="outcomes")
     campaign = load_campaign(path)
     run(

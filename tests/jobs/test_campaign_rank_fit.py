@@ -34,7 +34,7 @@ def flight(folder: Path, name: str, north_deg: float) -> FlightData:
         f"flight: {name}\nsite: {{file: lake_wheeler, without_buildings: true}}\nlogs:\n"
         f"  - {{path: {name}.csv, reader: generic_csv, kind: rank, node: LW1, ri_base: one, "
         'time_origin: "2024-07-02T12:00:00Z", columns: {time: t, ri_raw: ri, latitude_deg: lat, longitude_deg: lon, '
-        "altitude_m: alt}}\nrt: {max_depth: 1}\nrank: {minimum_height_m: 5, bootstrap: 0}\n",
+        "altitude_m: alt}}\nrt: {max_depth: 1}\nrank: {minimum_height_m: 5, advanced: {bootstrap: 0}}\n",
         encoding="utf-8",
     )
     settings = load_flight(folder / f"{name}.yaml")
@@ -74,9 +74,9 @@ def test_planted_mount_and_k_are_found_on_the_other_flight(flights: dict[str, Fl
 
 
 def test_a_key_without_effect_is_among_what_cannot_be_told_apart(flights: dict[str, FlightData]) -> None:
-    grids = {"link.rank.uav.yaw_deg": [90.0], "rank.k": [20.0], "rt.maximum_gap_s": [3.0, 4.0]}
+    grids = {"link.rank.uav.yaw_deg": [90.0], "rank.k": [20.0], "rt.advanced.maximum_gap_s": [3.0, 4.0]}
     (fold,) = fit_rank_all(flights, grids, ["one"], criterion="kappa")
-    assert fold.ties == ({"link.rank.uav.yaw_deg": 90.0, "rank.k": 20.0, "rt.maximum_gap_s": 4.0},)
+    assert fold.ties == ({"link.rank.uav.yaw_deg": 90.0, "rank.k": 20.0, "rt.advanced.maximum_gap_s": 4.0},)
     (other,) = fit_rank_all(
         flights, {"rank.k": [20.0, 2.0], "link.rank.uav.yaw_deg": [90.0]}, ["one"], criterion="kappa"
     )

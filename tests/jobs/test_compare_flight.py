@@ -50,8 +50,8 @@ logs:
      columns: {{time: t, latitude_deg: lat, longitude_deg: lon, altitude_m: alt, roll_deg: roll, pitch_deg: pitch, yaw_deg: yaw}}}}
 {logs}
 rt: {{engine: image, max_depth: 1, audit_links: 0, attitude: logged{rt}}}
-rss: {{bootstrap: 50, span_db: [-100, 100], lag: "off"{rss_keys}}}
-rank: {{bootstrap: 50}}
+rss: {{span_db: [-100, 100], lag: "off"{rss_keys}}}
+rank: {{advanced: {{bootstrap: 50}}}}
 {more}
 """
 
@@ -285,7 +285,7 @@ def test_channels_without_common_instants_make_no_pair(tmp_path: Path) -> None:
 def test_paired_foliage_reports_loss_and_rank_changes(tmp_path: Path) -> None:
     at = np.arange(0, 120, 0.5)
     path = flight(tmp_path, 120, rss={"USRP1": (at, free_space_db(at))}, rank=(at, np.full(len(at), 2.0)),
-                  rt=", paired_foliage: true")  # fmt: skip
+                  rt=", advanced: {paired_foliage: true}")  # fmt: skip
     data = gathered(path)
     # a wood on the line of sight: the track runs east of LW1 at 40 m, crowns reach 60 m here
     trees = data.site.trees
@@ -336,8 +336,8 @@ def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) 
         return data, replay_rss(data)[0]
 
     bare_data, bare = replayed("")
-    data, found = replayed(", foliage: opaque, paired_foliage: true")
-    off_data, off = replayed(", foliage: opaque, crown_reflections: false")
+    data, found = replayed(", foliage: opaque, advanced: {paired_foliage: true}")
+    off_data, off = replayed(", foliage: opaque, advanced: {crown_reflections: false}")
     bounced = int(found.replay.paths.off_crown.sum())
     assert bounced > 20
     assert (found.replay.rss_dbm != off.replay.rss_dbm).any()
@@ -385,9 +385,11 @@ def test_the_report_says_where_foliage_models_are_stretched_or_assumed(tmp_path:
     assert "out of leaf" not in stretched
     assert notes(", foliage: attenuating", 2.0e9) == ""
     assert "Trees at 2.6 GHz" in notes(", foliage: attenuating", 2.0e9, 2.6e9)
-    assert notes(", foliage: attenuating, gamma_db_per_m: 0.6, maximum_loss_db: 40", 3.4e9) == ""
+    assert notes(", foliage: attenuating, advanced: {gamma_db_per_m: 0.6, maximum_loss_db: 40}", 3.4e9) == ""
     assert "divided by 1.2. That is an assumption" in notes(", foliage: attenuating, leaves: out", 2e9)
-    assert "the loss in leaf divided by 1.2" in notes(", paired_foliage: true, foliage_model: weissberger", 2e9)
+    assert "the loss in leaf divided by 1.2" in notes(
+        ", advanced: {paired_foliage: true}, foliage_model: weissberger", 2e9
+    )
 
 
 def test_angles_are_those_of_the_tilted_antenna(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.flight import simulate
+from aerpaw_cmp.flight.settings import AdvancedRt
 from aerpaw_cmp.jobs import explain
 from aerpaw_cmp.jobs.explain import run_explain
 from aerpaw_cmp.propagation import replay as replay_module
@@ -39,7 +40,7 @@ SETTINGS = {
     ],
     "link": {"rss": {"carrier_hz": 3.3e9, "tower": {**ANTENNA, "slant_deg": [20.0]}, "uav": ANTENNA}},
     "rt": {"audit_links": 0, "attitude": "logged", "foliage": "attenuating", "reflection_loss_db": 1.5},
-    "rss": {"bootstrap": 20, "lag": "off"},
+    "rss": {"lag": "off"},
 }  # fmt: skip
 
 
@@ -121,7 +122,7 @@ def test_paths_that_one_engine_lacks_are_named_with_the_reason(flown, monkeypatc
         found = true(site, rt, link, pose, engine="image")
         if engine != "sionna":
             return found
-        few = rt.samples == "auto"
+        few = rt.advanced.samples == "auto"
         paths = found.paths.select(found.paths.depth < (1 if few else 2))
         return dataclasses.replace(found, paths=paths, engine="sionna", samples=1000)
 
@@ -149,14 +150,14 @@ def test_other_interactions_are_counted_beside_the_reflections(flown, monkeypatc
     path, _ = flown
     plain = run_explain(path, time="4", tower="LW1")
     settings = yaml.safe_load(path.read_text())
-    settings["rt"] |= {"engine": "sionna", "interactions": ["reflection", "diffraction"]}
+    settings["rt"] |= {"engine": "sionna", "advanced": {"interactions": ["reflection", "diffraction"]}}
     other = path.with_name("others.yaml")
     other.write_text(yaml.safe_dump(settings), encoding="utf-8")
     true, asked = explain.replay_poses, []
 
     def replay_poses(site, rt, link, pose, *, engine=None, others=None, **_):
         asked.append((engine, others))
-        found = true(site, rt.model_copy(update={"interactions": ["reflection"]}), link, pose, engine="image")
+        found = true(site, rt.model_copy(update={"advanced": AdvancedRt()}), link, pose, engine="image")
         power = 0.5 * mean_pair_power(found.h)
         kinds = {"diffraction": 2, "reflection + diffraction": 1}
         added = replay_module._with_others(found, link, ("reflection", "diffraction"), power, np.array([[3]]), kinds)
@@ -206,7 +207,7 @@ def test_simulate_logs_the_level_with_other_interactions(flown, monkeypatch):
     levels = {}
     for name, names in (("plain", ["reflection"]), ("others", ["reflection", "refraction"])):
         settings = yaml.safe_load(path.read_text())
-        settings["rt"] |= {"engine": "sionna", "interactions": names}
+        settings["rt"] |= {"engine": "sionna", "advanced": {"interactions": names}}
         other = path.with_name(f"{name}.yaml")
         other.write_text(yaml.safe_dump(settings), encoding="utf-8")
         assert main(["simulate", str(other), "-o", str(path.parent / name), "--quiet"]) == 0

@@ -47,7 +47,7 @@ logs:
   - {{path: rss.csv, reader: generic_csv, kind: rss, node: LW1, channel: A, time_origin: "{ORIGIN}",
      columns: {{time: t, rss_db: level}}}}
 rt: {{max_depth: 1, audit_links: 0}}
-rss: {{lag: "off", bootstrap: 100, span_db: [-100, 100]}}
+rss: {{lag: "off", span_db: [-100, 100]}}
 """,
         encoding="utf-8",
     )

@@ -25,7 +25,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     content = yaml.safe_load((SAMPLE / "flight.yaml").read_text(encoding="utf-8"))
     content["logs"] = content["logs"][:2]
     content["link"].pop("channels")
-    content |= {"rss": {"lag": "off", "bootstrap": 20}, "report": {"audit": "later"}}
+    content |= {"rss": {"lag": "off"}, "report": {"audit": "later"}}
     content["rt"] = {"engine": "image", "max_depth": 1, "audit_links": 5}
     content["site"] = {"file": "lake_wheeler", "without_buildings": True}
     (folder / "flight.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")

@@ -44,8 +44,8 @@ logs:
   - {{path: ri.csv, reader: generic_csv, kind: rank, node: ROVER, ri_base: one, time_origin: "{origin}",
      columns: {{time: t, ri_raw: ri}}}}
 rt: {{engine: {engine}, max_depth: 1, audit_links: 0}}
-rss: {{bootstrap: 20, lag: "off", span_db: [-100, 100]}}
-rank: {{bootstrap: 20, tower: ROVER}}
+rss: {{lag: "off", span_db: [-100, 100]}}
+rank: {{tower: ROVER}}
 """
 
 

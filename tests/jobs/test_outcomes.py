@@ -127,7 +127,13 @@ def key_of(settings: FlightFile, flight: Path) -> str:
 
 def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path) -> None:
     """One task of the sample flight, through the store and back: the same numbers, the same nested records."""
-    task = Task(flight, "f", "as written", {"rss.lag": "off", "rss.bootstrap": 10, "rank.bootstrap": 10}, None)
+    task = Task(
+        flight,
+        "f",
+        "as written",
+        {"rss.lag": "off", "rss.advanced.lag_window_s": 10, "rank.advanced.bootstrap": 10},
+        None,
+    )
     (first,) = run_tasks([task], Here(), keep=str(tmp_path))
     assert first.failure is None
     key = task_facts(task).key
@@ -140,7 +146,7 @@ def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path
     assert manifest["versions"]["aerpaw-cmp"]
     assert manifest["host"]
     assert {one["role"] for one in manifest["inputs"]} >= {"log", "site file (packaged)"}
-    assert manifest["settings"]["rss"]["bootstrap"] == 10
+    assert manifest["settings"]["rss"]["advanced"]["lag_window_s"] == 10
     assert manifest["seconds"] > 0
     assert manifest["links"] > 100
 
@@ -150,8 +156,8 @@ def test_a_key_is_of_everything_that_matters_and_of_nothing_else(flight: Path) -
     key = key_of(settings, flight)
     assert key == key_of(load_flight(flight), flight)
     assert key != key_of(overridden(settings, {"rt.max_depth": 1}), flight)
-    assert key != key_of(overridden(settings, {"rss.bootstrap": 7}), flight)
-    for aside in ({"report.title": "other"}, {"rt.audit_links": 3}, {"rt.cache": False}):
+    assert key != key_of(overridden(settings, {"rss.advanced.lag_window_s": 7}), flight)
+    for aside in ({"report.title": "other"}, {"rt.audit_links": 3}, {"rt.advanced.cache": False}):
         assert key == key_of(overridden(settings, aside), flight), aside
     log = flight.parent / settings.logs[0].path
     before = log.read_bytes()
@@ -167,7 +173,7 @@ LOADED = """
 import sys
 from pathlib import Path
 from aerpaw_cmp.jobs.campaign_tasks import Task, run_task
-task = Task(Path(sys.argv[1]), "f", "s", {"rss.bootstrap": 10, "rank.bootstrap": 10, "rss.lag": "off"}, None)
+task = Task(Path(sys.argv[1]), "f", "s", {"rss.advanced.lag_window_s": 10, "rank.advanced.bootstrap": 10, "rss.lag": "off"}, None)
 assert run_task(task).failure is None
 root = Path(sys.modules["aerpaw_cmp"].__file__).parent
 for module in list(sys.modules.values()):
@@ -185,7 +191,7 @@ def test_no_task_loads_code_that_its_key_leaves_out(flight: Path) -> None:
 
 
 def tasks_of(flight: Path, count: int = 4) -> list[Task]:
-    return [Task(flight, f"f{i}", "as written", {"rss.bootstrap": i}, None) for i in range(count)]
+    return [Task(flight, f"f{i}", "as written", {"rss.advanced.lag_window_s": 10.0 + i}, None) for i in range(count)]
 
 
 def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,7 +230,10 @@ def test_a_new_name_or_place_in_the_list_computes_nothing(
     asked: list[str] = []
     monkeypatch.setattr(campaign_tasks, "run_task", lambda task: asked.append(task.setting) or track(1.0))
     run_tasks([Task(flight, "f", "a", {}, None, True)], Here(), keep=str(tmp_path))
-    new = [Task(flight, "g", "first", {"rss.bootstrap": 3}, None, True), Task(flight, "g", "b", {}, None, False)]
+    new = [
+        Task(flight, "g", "first", {"rss.advanced.lag_window_s": 3}, None, True),
+        Task(flight, "g", "b", {}, None, False),
+    ]
     found = run_tasks(new, Here(), keep=str(tmp_path))
     assert asked == ["a", "first"]
     assert [one.track.flight for one in found if one.track is not None] == ["g", "g"]
@@ -271,7 +280,7 @@ def one(task):
 
 campaign_tasks.run_task = one
 flight = Path(sys.argv[1])
-tasks = [campaign_tasks.Task(flight, f"f{i}", "as written", {"rss.bootstrap": i}, None) for i in range(4)]
+tasks = [campaign_tasks.Task(flight, f"f{i}", "as written", {"rss.advanced.lag_window_s": 10.0 + i}, None) for i in range(4)]
 outcomes, orders = kept_outcomes(tasks, sys.argv[2], print)
 compute(tasks, orders, Here(), print, outcomes)
 """

@@ -41,8 +41,8 @@ SETTINGS: dict[str, Any] = {
         {"path": "small/ri.csv", "reader": "quectel_ri", "node": "LW1"},
     ],
     "rt": {"max_depth": 1, "audit_links": 0},
-    "rss": {"bootstrap": 50, "lag": "off"},
-    "rank": {"k": [10, 100], "bootstrap": 20},
+    "rss": {"lag": "off"},
+    "rank": {"k": [10, 100], "advanced": {"bootstrap": 20}},
     "report": {"export": ["mat"]},
 }  # fmt: skip
 

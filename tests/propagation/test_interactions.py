@@ -109,8 +109,8 @@ def test_only_sionna_knows_other_interactions(scenes):
     with pytest.raises(UsageError, match="scattering_coefficient"):
         other_searches(("scattering",), None)
     with pytest.raises(UsageError, match="engine 'image'"):
-        check_interactions(RtSettings(interactions=["reflection", "refraction"]))
-    check_interactions(RtSettings(engine="sionna", interactions=["reflection", "refraction"]))
+        check_interactions(RtSettings(advanced={"interactions": ["reflection", "refraction"]}))
+    check_interactions(RtSettings(engine="sionna", advanced={"interactions": ["reflection", "refraction"]}))
     assert other_searches(("reflection",), None) == ()
 
 
@@ -129,7 +129,7 @@ def test_only_sionna_knows_other_interactions(scenes):
 )
 def test_settings_that_cannot_be_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
-        RtSettings(engine="sionna", **settings)
+        RtSettings(engine="sionna", max_depth=settings.pop("max_depth", 2), advanced=settings)
 
 
 def wedge_gain(source, target, hard, carrier_hz):

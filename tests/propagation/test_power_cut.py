@@ -57,7 +57,7 @@ def test_every_path_left_out_is_as_weak_as_the_cut_says(monkeypatch, case, beams
 def test_what_it_costs_is_checked_by_a_full_search(case):
     site, link, poses = case
     whole, cut = replay(site, link, poses), replay(site, link, poses, Search(power_cut_db=CUT_DB))
-    (words,) = [text for text in cut.left_out if text.startswith("rt.power_cut_db 6")]
+    (words,) = [text for text in cut.left_out if text.startswith("rt.advanced.power_cut_db 6")]
     found = re.search(r"search of (\d+) poses: (\d+) of (\d+) paths, RSS changed by ([0-9.]+) dB", words)
     some = samples.spread(np.arange(len(poses)), power_cut.CHECKED_POSES)
     count = [int(np.isin(r.paths.pose, some).sum()) for r in (whole, cut)]

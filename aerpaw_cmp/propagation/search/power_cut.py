@@ -68,7 +68,7 @@ def loss_in_words(cut_db: float, whole: int, left_out: int, poses: int, change_d
     worst = float(np.abs(change_db).max(initial=0.0))
     gone = f", {lost} links without any path" if lost else ""
     return (
-        f"rt.power_cut_db {cut_db:g}: paths more than {ratio:.3g} times as long as their link, each at least "
+        f"rt.advanced.power_cut_db {cut_db:g}: paths more than {ratio:.3g} times as long as their link, each at least "
         f"{cut_db:g} dB below free space there (isotropic elements); checked by a full search of {poses} poses: "
         f"{left_out} of {whole} paths, RSS changed by {worst:.2g} dB at most{gone}"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -13,6 +14,8 @@ import typer
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.cli.app import app
 from aerpaw_cmp.common.commands import COMMANDS
+from aerpaw_cmp.live.export import ExportSummary
+from aerpaw_cmp.live.session import TapSummary
 from tests import json_page
 from tests.json_page import listed
 
@@ -94,6 +97,12 @@ def test_the_page_lists_what_json_prints(
     printed = json.loads(capsys.readouterr().out)
     assert ["schema", *listed(name)] == list(printed)
     assert f"`schema` is {printed['schema']}" in PAGE
+
+
+def test_the_page_lists_what_a_tap_prints() -> None:
+    """Its records become the object as they are."""
+    assert listed("tap") == [*(one.name for one in dataclasses.fields(TapSummary)), "modems"]
+    assert listed("tap --export") == [one.name for one in dataclasses.fields(ExportSummary)]
 
 
 def test_the_page_has_every_command() -> None:

@@ -119,17 +119,3 @@ def with_one_more(points: Sequence[CurvePoint], name: str = "rmse_db") -> float:
     slope = max(float(np.polyfit(x, square, 1)[0]), 0.0)
     last = points[-1].flights
     return math.sqrt(max(float(square[-1]) - slope * (1.0 / last - 1.0 / (last + 1)), 0.0))
-
-
-def words_of_curve(points: Sequence[CurvePoint]) -> list[str]:
-    """One sentence for terminal and page; none without a curve."""
-    if len(points) < 2:
-        return []
-    errors = ", ".join(f"{p.rmse_db:.2f}" for p in points)
-    counts = ", ".join(str(p.flights) for p in points)
-    more = with_one_more(points)
-    gain = points[-1].rmse_db - more
-    return [
-        f"Learned from {counts} other flights, the error on a flight left out is {errors} dB. One flight more would "
-        f"bring about {gain:.2f} dB ({more:.2f} dB, extrapolated)."
-    ]

@@ -191,15 +191,18 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
     Returns
     -------
     Verdict
-        ``antenna`` where each wrong frame is significantly worse, ``place`` where one is significantly better, else
-        ``not separable``; effect and interval of the nearer frame.
+        ``antenna`` where each wrong frame is significantly worse, ``place`` where one is significantly better, ``no
+        interval`` of too few flights, else ``not separable``; effect and interval of the nearer frame.
     """
     known = [one for one in against if math.isfinite(one.effect)]
     if not known:
         return Verdict()
     said = {one.cause for one in known}
     nearest = max((one for one in known if one.cause == "worse" or "worse" not in said), key=lambda one: one.effect)
-    cause = "place" if "worse" in said else "antenna" if said == {"better"} else "not separable"
+    if "worse" in said:
+        cause = "place"
+    else:
+        cause = {"better": "antenna", "no interval": "no interval"}.get("".join(said), "not separable")
     return Verdict(cause=cause, effect=nearest.effect, interval=nearest.interval, where=nearest.where)
 
 

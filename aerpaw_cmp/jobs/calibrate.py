@@ -31,13 +31,14 @@ from ..compare.direction_gain import (
     Term,
     column_forms,
 )
-from ..compare.learning_curve import CurvePoint, learning_curve, words_of_curve
+from ..compare.learning_curve import CurvePoint, learning_curve
 from ..compare.mount import GainOf
 from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..flight.training import counted_once, flight_logs
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.field.baselines import free_space_dbm, two_ray_dbm
+from ..report.calibration_words import sentences
 from ..site.learned import Source
 from .calibrate_rank import RankFitSettings
 from .workers import Lost, Workers
@@ -212,7 +213,7 @@ def calibrate(
         ground=ground,
         curve=curve,
         warnings=tuple(warnings),
-        words=(*words_of(scores, controls, ground), *words_of_curve(curve)),
+        words=sentences(scores, controls, None if ground is None else ground.likely_m, curve),
     )
 
 
@@ -557,52 +558,4 @@ def mount_warnings(learned: Learned) -> list[str]:
                 f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is likeliest, with a standard "
                 f"deviation of {mount.azimuth_sd_deg:.0f} deg"
             )
-    return out
-
-
-def words_of(
-    scores: Mapping[str, Sequence[Score]], controls: Mapping[str, Sequence[Score]], ground: GroundFit | None
-) -> list[str]:
-    """What the scores say: antenna, or memory of the place."""
-    headline = scores["flight_left_out"]
-    if not headline:
-        return ["Nothing is scored: one flight alone."]
-    mean = calibration.mean_rmse
-    free, here = mean(headline, "free_space_rmse_db"), mean(headline)
-    out = [
-        f"On flights left out the learned antennas leave {here:.2f} dB "
-        f"({mean(headline, 'rmse_4s_db'):.2f} dB over 4 s); free space leaves {free:.2f} dB."
-    ]
-    if sectors := scores["sector_left_out"]:
-        base, left = mean(sectors, "free_space_rmse_db"), mean(sectors)
-        gain = free - here
-        share = (base - left) / gain if gain > 0 else 0.0
-        out.append(
-            "Towards sectors of directions that no training flight has seen, with offsets from outside the sector: "
-            f"RMSE {left:.2f} dB, free space {base:.2f} dB. {100 * min(max(share, 0.0), 1.0):.0f} % of the gain over "
-            "free space carries over to new directions."
-        )
-    body, world, wrong = (
-        mean(controls.get(name, ())) for name in
-        ("body frame, no patterns", "world frame at the UAV", "heading turned the wrong way")
-    )  # fmt: skip
-    if math.isfinite(body) and math.isfinite(world):
-        kind = (
-            "at least partly antenna"
-            if body < min(world, wrong) - 0.05
-            else "not separable from the place: the headings are too similar"
-        )
-        out.append(
-            f"Without patterns, the UAV's gain in the body frame leaves {body:.2f} dB, in the world frame {world:.2f} "
-            f"dB, with the heading turned the wrong way {wrong:.2f} dB: it is {kind}."
-        )
-    if not scores["heading_left_out"]:
-        out.append("No heading could be left out: the flights share one.")
-    if ground is not None:
-        low, high = ground.likely_m
-        rough = f"{100 * low:.1f} cm or more" if math.isinf(high) else f"{100 * low:.1f} to {100 * high:.1f} cm"
-        out.append(
-            "A coherent ground ray is not in the data." if math.isinf(low) else
-            f"Roughness of the ground that the data allow: {rough}."
-        )  # fmt: skip
     return out

@@ -68,13 +68,17 @@ ON_GROUND_M = 1e-6
 """A reflection this near to a ground plane of the site is one off the ground."""
 
 
+NEAR_TERRAIN_M = 0.01
+"""The same over an elevation model, whose specular points are found by iteration."""
+
+
 def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     """Loss [dB] of ground reflections by ``rt.ground_roughness_m``; None where the ground is smooth.
 
     Parameters
     ----------
     site : Site
-        Its ground planes: that of the origin and those of its towers.
+        Its ground: planes of the origin and of its towers, and its elevation model.
     rt : RtSettings
     carrier_hz : float
 
@@ -111,6 +115,8 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
         for step in range(paths.vertices_m.shape[1]):
             corner = paths.vertices_m[:, step]
             on = np.abs(corner[:, 2:] - heights).min(axis=1) < ON_GROUND_M  # NaN where the path has no such corner
+            if site.dem is not None:
+                on |= np.abs(corner[:, 2] - site.dem.ground_m(corner[:, 0], corner[:, 1])) < NEAR_TERRAIN_M
             on &= paths.tree[:, step] < 0
             ray = corner[on] - here[on]
             sine = np.abs(ray[:, 2]) / np.maximum(np.linalg.norm(ray, axis=1), ON_GROUND_M)

@@ -428,7 +428,12 @@ def replay_poses(
         _check_moving(rt, engine, name)
         run = Run(threads=rt.advanced.threads, progress=share_of(progress, f"replay {name}, which moves"))
         each: Each = replay_pairs if rt.advanced.visibility == "pairs" else replay
-        search = Search(max_depth=rt.max_depth, crowns=reflecting_crowns(site.trees, rt), diffraction=rt.diffraction)
+        search = Search(
+            max_depth=rt.max_depth,
+            crowns=reflecting_crowns(site.trees, rt),
+            diffraction=rt.diffraction,
+            ridges=rt.advanced.ridges,
+        )
         field = Field(path_loss(site, rt, link.carrier_hz))
         return replay_moving(site, link, poses, towers_m, search, field, run, each=each)
     name = f"{engine} {'+'.join(link.tower_arrays)}"
@@ -439,12 +444,13 @@ def replay_poses(
         crowns=reflecting_crowns(site.trees, rt),
         power_cut_db=rt.advanced.power_cut_db,
         diffraction=rt.diffraction,
+        ridges=rt.advanced.ridges,
         interactions=rt.advanced.interactions if others else ("reflection",),
         scattering_coefficient=rt.advanced.scattering_coefficient if others else None,
         device=rt.advanced.device,
     )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
-    alone = engine == "image" and rt.advanced.relevance_db is None and search.crowns is None
+    alone = engine == "image" and rt.advanced.relevance_db is None and search.crowns is None and site.dem is None
     long = alone and len(poses) > BLOCK
     run = Run(
         cache_dir=None if rt.advanced.cache else "",

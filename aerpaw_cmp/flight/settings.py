@@ -400,6 +400,8 @@ class AdvancedRt(Settings):
     """Rays per tower of Sionna; ``auto`` raises the number until two pilots find the same paths."""
     interactions: Annotated[list[Interaction], Field(min_length=1)] = ["reflection"]
     """Besides reflections, engine sionna: their power is added to RSS; H and ranks leave them out."""
+    ridges: Literal["deygout", "bullington"] = "deygout"
+    """With diffraction: loss of the straight path over terrain that blocks it."""
     scattering_coefficient: Annotated[float, Field(gt=0, le=1)] | None = None
     """Share of the reflected amplitude that every material scatters; needed with ``scattering``."""
     crown_reflections: bool = True

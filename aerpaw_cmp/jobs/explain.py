@@ -339,6 +339,8 @@ def _paths(
     rough = roughness_loss(site, rt, link.carrier_hz)
     if rough is not None:
         further["rough ground"] = rough(replayed.paths, source[None], pose.position_m)
+    if replayed.paths.terrain_db.any():
+        further["terrain"] = replayed.paths.terrain_db
     return explain_paths(replayed.paths, replayed.faces, source, pose, link, further)
 
 

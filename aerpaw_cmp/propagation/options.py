@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
+from .field.ridges import Ridges
 from .paths import PathSet
 from .search.crowns import Crowns
 from .search.effort import OnEstimate
@@ -48,6 +49,9 @@ class Search:
     diffraction : {"none", "edges", "all"}
         Paths over one edge of a building: with the ground on either side ("edges"), and also with one wall or roof on
         one side ("all"). In H, levels and ranks, whichever engine finds the reflections.
+    ridges : {"deygout", "bullington"}
+        With diffraction, what the straight path loses over terrain that blocks it: up to three knife edges, or the one
+        where the horizons meet.
     interactions : sequence of {"reflection", "diffraction", "scattering", "refraction"}
         ``sionna`` only, but for reflections: the others' power is added to RSS, never to H
         (:mod:`aerpaw_cmp.propagation.search.interactions`).
@@ -67,6 +71,7 @@ class Search:
     power_cut_db: float | None = None
     check_power_cut: bool = True
     diffraction: Diffraction = "none"
+    ridges: Ridges = "deygout"
     interactions: Sequence[str] = ("reflection",)
     scattering_coefficient: float | None = None
     device: Device = "auto"

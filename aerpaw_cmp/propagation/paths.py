@@ -80,7 +80,7 @@ class Faces:
 
     def __post_init__(self) -> None:
         count = len(self.normal)
-        if len(self.along) == count:
+        if self.along.shape == (count, 3):
             return
         # any axis that is not the normal will do for a whole plane
         helper = np.eye(3)[np.argmin(np.abs(self.normal), axis=1)] if count else np.zeros((0, 3))
@@ -124,6 +124,8 @@ class PathSet:
         Reflection points for array centres, NaN where unused.
     tree : (paths, max_depth) int
         Tree whose crown reflects, -1 where something else does; left out, no crown does.
+    terrain_db : (paths,)
+        Loss by the terrain: at ground that is curved within the Fresnel zone, or over ridges; left out, none.
     """
 
     pose: IntArray
@@ -132,8 +134,11 @@ class PathSet:
     faces: IntArray
     vertices_m: FloatArray
     tree: IntArray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int64))
+    terrain_db: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
+        if len(self.terrain_db) != len(self.pose):
+            object.__setattr__(self, "terrain_db", np.zeros(len(self.pose)))
         if self.tree.shape != self.faces.shape:
             object.__setattr__(self, "tree", np.full(self.faces.shape, -1, dtype=np.int64))
 
@@ -147,10 +152,7 @@ class PathSet:
 
     def select(self, rows: AnyArray | slice) -> PathSet:
         """The paths of a mask, of indices or of a slice."""
-        pose, tower, depth, tree = self.pose[rows], self.tower[rows], self.depth[rows], self.tree[rows]
-        return PathSet(
-            pose=pose, tower=tower, depth=depth, faces=self.faces[rows], vertices_m=self.vertices_m[rows], tree=tree
-        )
+        return PathSet(**{one.name: getattr(self, one.name)[rows] for one in fields(self)})
 
     @classmethod
     def one_after_another(cls, pieces: Sequence[PathSet]) -> PathSet:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import UsageError
-from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, power_from_db
+from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, power_from_db, wavelength_m
 from ..site.site import Site
 from .arrays import Link, Poses
 from .cache import PathCache
@@ -18,6 +18,7 @@ from .edges import EdgePaths, Edges
 from .engines import chosen_samples, other_paths, path_cache, search_or_read
 from .field.edges import edge_channels
 from .field.relevance import idle_objects, in_words
+from .field.ridges import ridge_loss_db
 from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
 from .options import Field, Run, Search
 from .paths import Faces, PathSet
@@ -27,6 +28,7 @@ from .search.edges import find_edge_paths
 from .search.interactions import OtherInteractions, OtherSearch, path_powers
 from .search.power_cut import CHECKED_POSES, loss_in_words, within_cut
 from .search.samples import spread
+from .search.terrain import on_terrain
 from .surfaces import Surfaces
 
 LEVELS_AT_ONCE = 1024
@@ -196,8 +198,8 @@ def replay(
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
     notes += cache.warnings if cache else []
     notes += _checked_cut(site, scene, link, poses, search, field, cache)
-    scene, paths, stopped = passed(site, scene, poses, paths, search)
     bent, unmodelled = _bent(site, scene, link, poses, search, field, run)
+    scene, paths, stopped = passed(site, scene, link, poses, paths, search)
     result, idle = _evaluated(scene, link, poses, paths, search, field, run, bent)
     notes += [*stopped, *unmodelled]
     if searches:
@@ -215,12 +217,14 @@ def replay(
     )
 
 
-def passed(site: Site, scene: Scene, poses: Poses, paths: PathSet, search: Search) -> tuple[Scene, PathSet, list[str]]:
-    """Paths that terrain lets through, with those that bounce off crowns.
+def passed(
+    site: Site, scene: Scene, link: Link, poses: Poses, paths: PathSet, search: Search
+) -> tuple[Scene, PathSet, list[str]]:
+    """Paths over terrain that it lets through, with those that bounce off crowns.
 
     Parameters
     ----------
-    site, scene, poses, search
+    site, scene, link, poses, search
         As for :func:`replay`.
     paths : PathSet
         Of the engine.
@@ -233,10 +237,18 @@ def passed(site: Site, scene: Scene, poses: Poses, paths: PathSet, search: Searc
     notes : list of str
         What was stopped or left out.
     """
-    clear = _clear_of_terrain(site, scene, poses, paths)
+    scene, level, shaped, notes = _shaped_ground(site, scene, link, poses, paths)
+    clear = _clear_of_terrain(site, scene, poses, level)
+    if search.diffraction != "none" and site.dem is not None:
+        hidden = np.flatnonzero(~clear & (level.depth == 0))
+        ends = scene.sources_m[level.tower[hidden]], poses.position_m[level.pose[hidden]]
+        level.terrain_db[hidden] = ridge_loss_db(site.dem, *ends, wavelength_m(link.carrier_hz), search.ridges)
+        clear[hidden] = True
     lost = int((~clear).sum())
-    notes = [f"{lost} of {len(paths)} paths end at the terrain of the elevation model"] if lost else []
-    paths = paths.select(clear) if lost else paths
+    notes += [f"{lost} of {len(level)} paths end at the terrain of the elevation model"] if lost else []
+    paths = level.select(clear) if lost else level
+    if len(shaped):
+        paths = mirror.merge([paths, shaped], search.max_depth, None)
     if search.crowns is None:
         return scene, paths, notes
     if scene.surfaces is not None:
@@ -249,11 +261,27 @@ def passed(site: Site, scene: Scene, poses: Poses, paths: PathSet, search: Searc
     return scene, mirror.merge([paths, bounces], search.max_depth, None), notes
 
 
+def _shaped_ground(
+    site: Site, scene: Scene, link: Link, poses: Poses, paths: PathSet
+) -> tuple[Scene, PathSet, PathSet, list[str]]:
+    """Scene with tangent planes of the terrain, paths that stay on level ground, paths over the planes, notes."""
+    if site.dem is None or scene.surfaces is not None or not paths.faces.shape[1]:
+        return scene, paths, paths.select(slice(0, 0)), []
+    found = on_terrain(site.dem, scene.faces, scene.links_to(poses), paths, wavelength_m(link.carrier_hz))
+    notes = [
+        (found.unknown, "links over ground that the elevation model does not know: level ground reflects there"),
+        (found.dropped, "paths with two reflections off the ground: they are not followed over terrain"),
+    ]
+    more = np.zeros((len(scene.usable), len(found.faces) - len(scene.faces)), dtype=np.bool_)
+    scene = replace(scene, faces=found.faces, usable=np.concatenate([scene.usable, more], axis=1))
+    return scene, found.level, found.shaped, [f"{count} {what}" for count, what in notes if count]
+
+
 def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:
     """Paths (paths,) that the elevation model lets through.
 
-    The traced ground is a plane per tower; the terrain only blocks. It is asked on the direct line between the ends,
-    whose shadow a ground reflection shares; a path over walls alone is asked on each of its segments.
+    It is asked on the direct line between the ends, whose shadow a reflection off level ground shares; a path over
+    walls alone is asked on each of its segments.
     """
     if site.dem is None or len(paths) == 0:
         return np.ones(len(paths), dtype=np.bool_)
@@ -339,7 +367,8 @@ def edges_of(scene: Scene | Replay) -> Edges:
     """Edges of the buildings or triangles of a scene or a replay."""
     if scene.surfaces is not None:
         return Edges.of_surfaces(scene.surfaces)
-    return Edges.of(scene.faces, float(scene.faces.offset_m[scene.faces.solid < 0].max(initial=0.0)))
+    level = scene.faces.offset_m[scene.faces.solid == -1]
+    return Edges.of(scene.faces, float(level.max(initial=0.0)))
 
 
 def _evaluated(

@@ -68,8 +68,11 @@ class Scene:
         is_ground = faces.solid < 0
         usable = ~is_ground[None, :] | (faces.offset_m[None, :] == ground[:, None])
         up = poses.position_m[:, 2]
-        # terrain is not traced: a pose below a tower's own plane but above the lowest ground is no buried pose
-        buried = up[None, :] < np.minimum(ground, 0.0)[:, None]
+        # a pose below a tower's own plane but above the lowest ground, or above the terrain's, is no buried pose
+        lowest = np.minimum(ground, 0.0)[:, None]
+        if site.dem is not None:
+            lowest = np.fmin(lowest, site.dem.ground_m(*poses.position_m[:, :2].T))
+        buried = up[None, :] < lowest
         excluded = buried | inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
         return cls(faces, sources, usable, excluded)
 

@@ -1,12 +1,13 @@
-"""Digital elevation model: ground heights, and which links the ground blocks.
+"""Digital elevation model: ground heights, profiles under lines, and which lines the ground blocks.
 
-Reflections use a flat plane per tower: facets smaller than a Fresnel zone are no mirrors. The DEM only lifts what
-stands on it and cuts lines of sight.
+The ground it shapes reflects (:mod:`aerpaw_cmp.propagation.search.terrain`) and diffracts
+(:mod:`aerpaw_cmp.propagation.field.ridges`).
 """
 
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike
 from ..common.errors import InputError, UsageError
 from ..common.files import read_bounded
 from ..common.geodesy import SiteFrame, in_shape
-from ..common.units import BoolArray, FloatArray
+from ..common.units import BoolArray, FloatArray, IntArray
 
 EARTH_RADIUS_M = 6_371_000.0
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
@@ -105,22 +106,64 @@ class Dem:
         j = np.minimum(column.astype(np.int64), max(columns - 2, 0))
         u, v = row - i, column - j
         h = self.height_m
-        height = (h[i, j] * (1 - v) + h[i, j + 1] * v) * (1 - u) + (h[i + 1, j] * (1 - v) + h[i + 1, j + 1] * v) * u
-        return np.where(inside, height, np.nan)
+        # by differences: level ground is level to the last digit
+        south = h[i, j] + v * (h[i, j + 1] - h[i, j])
+        north = h[i + 1, j] + v * (h[i + 1, j + 1] - h[i + 1, j])
+        return np.where(inside, south + u * (north - south), np.nan)
 
     def ground_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
         """Up of the ground [m]: 0 at the origin of the site; NaN outside the grid."""
         return self.absolute_m(east_m, north_m) - self.absolute_m(0.0, 0.0)
 
-    def clear(self, source_m: FloatArray, target_m: FloatArray, *, clearance_m: float = 0.0) -> BoolArray:
+    def slope(self, east_m: FloatArray, north_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rise of the ground per metre to the east and to the north, from points 1/64 of a cell apart."""
+        step = self.cell_m / 128
+        return (
+            (self.ground_m(east_m + step, north_m) - self.ground_m(east_m - step, north_m)) / (2 * step),
+            (self.ground_m(east_m, north_m + step) - self.ground_m(east_m, north_m - step)) / (2 * step),
+        )
+
+    def profiles(self, source_m: FloatArray, target_m: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Ground under straight lines, at two samples per cell.
+
+        Parameters
+        ----------
+        source_m, target_m : (lines, 3)
+            East, north, up [m].
+
+        Yields
+        ------
+        some : (k,) int
+            Lines of like length.
+        share : (samples, k)
+            Of the way from source to target, 0 and 1 included; shorter lines repeat their last sample.
+        ground_m : (samples, k)
+            Up of the ground; NaN where it is unknown.
+        """
+        way = (target_m - source_m)[:, :2]
+        count = np.maximum(np.ceil(np.hypot(*way.T) / (self.cell_m / 2)).astype(np.int64), 2)
+        order = np.argsort(count)
+        begin = 0
+        while begin < len(order):
+            stop = begin + 1
+            while stop < len(order) and count[order[stop]] * (stop + 1 - begin) <= _SAMPLES_AT_ONCE:
+                stop += 1
+            some = order[begin:stop]
+            # samples of a line do not depend on its batch
+            share = np.minimum(np.arange(count[some].max() + 1)[:, None], count[some]) / count[some]
+            place = source_m[some, :2] + share[..., None] * way[some]
+            yield some, share, self.ground_m(place[..., 0], place[..., 1])
+            begin = stop
+
+    def clear(self, source_m: FloatArray, target_m: FloatArray, *, tolerance_m: float | FloatArray = 0.0) -> BoolArray:
         """Which straight lines stay above the ground.
 
         Parameters
         ----------
         source_m, target_m : (links, 3)
             East, north, up [m].
-        clearance_m : float
-            Height above the ground that must be free; the ends themselves are not tested.
+        tolerance_m : float or (links,)
+            Ground at most this much above a line does not block it; under the ends themselves none does.
 
         Returns
         -------
@@ -129,33 +172,41 @@ class Dem:
             Earth's bulge (0.08 m half-way along 2 km) is counted, refraction is not.
         """
         source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
-        length = np.hypot(*(target - source)[:, :2].T)
-        count = np.maximum(np.ceil(length / (self._cell_m() / 2)).astype(np.int64), 2)
-        free = np.ones(len(source), dtype=bool)
-        order = np.argsort(count)  # links of like length share a batch
-        begin = 0
-        while begin < len(order):
-            stop = begin + 1
-            while stop < len(order) and count[order[stop]] * (stop + 1 - begin) <= _SAMPLES_AT_ONCE:
-                stop += 1
-            some = order[begin:stop]
-            # samples of a link do not depend on its batch: shorter links repeat their last one
-            step = np.arange(1, count[some].max())[:, None]
-            share = np.minimum(step, count[some] - 1) / count[some]
-            point = source[some] + share[..., None] * (target - source)[some]
-            bulge = share * (1 - share) * length[some] ** 2 / (2 * EARTH_RADIUS_M)
-            ground = self.ground_m(point[..., 0], point[..., 1])
-            free[some] = ~(ground + clearance_m > point[..., 2] - bulge).any(axis=0)
-            begin = stop
+        tolerance, free = np.broadcast_to(tolerance_m, len(source)), np.ones(len(source), dtype=bool)
+        for some, share, ground in self.profiles(source, target):
+            intrusion = above_line(source[some], target[some], share, ground)
+            free[some] = ~((intrusion > tolerance[some]) & (share > 0.0) & (share < 1.0)).any(axis=0)
         return free
 
-    def _cell_m(self) -> float:
+    @property
+    def cell_m(self) -> float:
+        """Shorter side of a cell at the origin [m]."""
         if self.crs.lower() == "local":
             return min(self.step_x, self.step_y)
         x, y = self._to_grid.transform(self.frame.longitude_deg, self.frame.latitude_deg)
         longitude, latitude = self._to_grid.transform([x + self.step_x, x], [y, y + self.step_y], direction="INVERSE")
         east, north = self.frame.to_local(latitude, longitude)
         return float(np.hypot(east, north).min())
+
+
+def above_line(source_m: FloatArray, target_m: FloatArray, share: FloatArray, ground_m: FloatArray) -> FloatArray:
+    """Height of the ground, with the Earth's bulge, above straight lines.
+
+    Parameters
+    ----------
+    source_m, target_m : (lines, 3)
+        Ends [m].
+    share, ground_m : (samples, lines)
+        As :meth:`Dem.profiles` gives them.
+
+    Returns
+    -------
+    (samples, lines)
+        [m]; negative under the line.
+    """
+    length = np.hypot(*(target_m - source_m)[:, :2].T)
+    line = source_m[:, 2] + share * (target_m - source_m)[:, 2]
+    return np.asarray(ground_m + share * (1 - share) * length**2 / (2 * EARTH_RADIUS_M) - line)
 
 
 def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> Dem:

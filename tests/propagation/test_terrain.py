@@ -1,17 +1,22 @@
-"""An elevation model blocks what lies behind a ridge, and nothing else."""
+"""An elevation model shapes the ground: mirrors, shadows and ridges."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from shapely.geometry import box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.options import Search
-from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.paths import path_lengths
+from aerpaw_cmp.propagation.replay import Replay, replay
+from aerpaw_cmp.propagation.search.terrain import specular_points
 from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower
 
@@ -51,3 +56,113 @@ def test_a_wall_can_still_be_seen_when_the_direct_line_is_blocked(site: Site) ->
     there = Poses(np.array([[900.0, 0.0, 80.0]]), np.eye(3)[None])
     assert (replay(open_site, link, here, Search(max_depth=1)).paths.depth == 1).sum() == 2, "ground and wall"
     assert len(replay(open_site, link, there, Search(max_depth=1)).paths) == 0
+
+
+STEP_M = 10.0
+
+
+def shaped(height: Callable[[Any, Any], Any], buildings: tuple[Building, ...] = (), step: float = STEP_M) -> Site:
+    """A site whose ground has a height (east, north)."""
+    east, north = np.arange(-1500.0, 1500.0 + step, step), np.arange(-600.0, 600.0 + step, step)
+    grid = np.asarray(height(*np.meshgrid(east, north)), dtype=np.float64) + 87.3
+    dem = Dem(grid, west=east[0], south=north[0], step_x=step, step_y=step, crs="local", frame=FRAME)
+    tower = Tower("T", 35.7, -78.7, 0.0, 0.0, antenna_height_m=10.0, ground_m=float(dem.ground_m(0.0, 0.0)))
+    return Site("shaped", FRAME, {"T": tower}, dem=dem, buildings=buildings)
+
+
+def over(site: Site, position: Any, **search: Any) -> Replay:
+    link = Link(3.3e9, {"T": single_element()}, single_element())
+    place = np.atleast_2d(np.asarray(position, dtype=np.float64))
+    return replay(site, link, Poses(place, np.tile(np.eye(3), (len(place), 1, 1))), Search(**search))
+
+
+def test_level_ground_is_the_plane_without_a_model_bit_for_bit() -> None:
+    walls = (
+        Building("wall", box(-200.0, 100.0, 300.0, 104.0), 20.0),
+        Building("barn", box(50.0, -90.0, 70.0, -60.0), 9.0),
+    )
+    site = shaped(lambda e, _: 0 * e, walls)
+    random = np.random.default_rng(5)
+    places = np.column_stack([random.uniform(-900, 900, 80), random.uniform(-500, 500, 80), random.uniform(1, 90, 80)])
+    with_model, without = over(site, places), over(dataclasses.replace(site, dem=None), places)
+    assert (without.paths.depth == 2).sum() > 20
+    for name in ("h", "rss_dbm", "rss_power_dbm", "has_path"):
+        assert np.array_equal(getattr(with_model, name), getattr(without, name), equal_nan=True), name
+    assert np.array_equal(with_model.paths.vertices_m, without.paths.vertices_m, equal_nan=True)
+    assert len(with_model.faces) == len(without.faces)
+
+
+def test_a_slope_mirrors_the_tower_in_its_own_plane() -> None:
+    east, north = 0.04, -0.03
+    result = over(shaped(lambda e, n: east * e + north * n), [400.0, 150.0, 60.0], max_depth=1)
+    normal = np.array([-east, -north, 1.0]) / np.sqrt(1 + east**2 + north**2)
+    image = np.array([0.0, 0.0, 10.0]) - 2 * 10.0 * normal[2] * normal
+    (row,) = np.flatnonzero(result.paths.depth == 1)
+    assert result.faces.normal[result.paths.faces[row, 0]] == pytest.approx(normal, abs=1e-9)
+    length = path_lengths(result.paths, np.array([[0.0, 0.0, 10.0]]), np.array([[400.0, 150.0, 60.0]]))[row]
+    assert length == pytest.approx(np.linalg.norm(np.array([400.0, 150.0, 60.0]) - image), abs=1e-7)
+
+
+@pytest.mark.parametrize(("depth_m", "points"), [(0.2, 1), (12.0, 3)])
+def test_specular_points_of_a_valley_are_those_of_the_smooth_surface(depth_m: float, points: int) -> None:
+    """A deep trough focuses: three ways over it are stationary, of which a slow search along it finds the same."""
+
+    def height(east: Any, north: Any) -> Any:
+        return -depth_m * np.exp(-(((east - 260.0) / 60.0) ** 2)) + 0.02 * north
+
+    source, target = np.array([0.0, 0.0, 10.0]), np.array([520.0, 40.0, 40.0])
+    dem = shaped(height, step=1.0).dem
+    assert dem is not None
+    _, found, normal, part = specular_points(dem, source[None], target[None], wavelength_m(3.3e9))
+
+    def way(spot: Any) -> Any:
+        place = np.stack([spot[0], spot[1], height(spot[0], spot[1]) - height(0.0, 0.0)], axis=-1)
+        return np.linalg.norm(place - source, axis=-1) + np.linalg.norm(place - target, axis=-1)
+
+    across = np.linspace(-60.0, 100.0, 3201)
+    along = np.arange(2.0, 518.0, 0.1)
+    best = np.array([way((np.full_like(across, a), across)).min() for a in along])  # stationary across: the shortest
+    turns = np.flatnonzero(np.diff(np.sign(np.diff(best)))) + 1
+    assert len(turns) == points
+    assert part[0] > 0.85, "far from the trough the ground is nearly a plane"
+    assert (part[1:] < 0.9).all(), "a curved mirror is weaker"
+    rays = [(end - found) / np.linalg.norm(end - found, axis=1)[:, None] for end in (source, target)]
+    assert np.abs(np.cross(rays[0] + rays[1], normal)).max() < 0.02, "the normal halves the angle"
+    assert sorted(found[:, 0]) == pytest.approx(sorted(along[turns]), abs=1.5)
+    assert found[:, 2] == pytest.approx(height(found[:, 0], found[:, 1]) - height(0.0, 0.0), abs=0.05)
+
+
+def test_a_bump_before_the_specular_point_stops_its_leg_but_not_the_line_of_sight() -> None:
+    target = [600.0, 0.0, 50.0]  # level ground reflects at 100 m
+    assert (over(shaped(lambda e, _: 0 * e), target, max_depth=1).paths.depth == 1).sum() == 1
+    bump = over(shaped(lambda e, _: np.where(np.abs(e - 60.0) < 5.0, 9.0, 0.0)), target, max_depth=1).paths
+    assert (bump.depth == 0).sum() == 1
+    assert not (np.abs(bump.vertices_m[bump.depth == 1, 0, 0] - 100.0) < 20.0).any()
+
+
+def test_holes_keep_level_ground_and_cliffs_leave_no_gap() -> None:
+    target = [[400.0, 20.0, 50.0], [-400.0, 20.0, 50.0]]
+    hole = over(shaped(lambda e, _: np.where((e > 100.0) & (e < 200.0), np.nan, 0.004 * e)), target)
+    assert any("does not know" in note and note.startswith("1 ") for note in hole.left_out)
+    assert (hole.paths.depth[hole.paths.pose == 0] == 1).sum() == 1
+    assert hole.faces.solid[hole.paths.faces[(hole.paths.pose == 0) & (hole.paths.depth == 1), 0]].tolist() == [-1]
+    random = np.random.default_rng(2)
+    spots = np.column_stack(
+        [random.uniform(-900, 900, 200), random.uniform(-400, 400, 200), random.uniform(-45, 40, 200)]
+    )
+    for diffraction in ("none", "edges"):
+        cliff = over(shaped(lambda e, _: np.where(e > 100.0, -50.0, 0.0)), spots, diffraction=diffraction)
+        assert np.isfinite(cliff.h).all()
+        assert (cliff.h[spots[:, 0] > 300.0] != 0).any(), "poses below the tower's ground are not buried"
+
+
+@pytest.mark.parametrize("ridges", ["deygout", "bullington"])
+def test_behind_a_ridge_the_level_is_that_of_free_space_less_a_knife_edge(site: Site, ridges: str) -> None:
+    dark, lit = over(site, [900.0, 0.0, 20.0]), over(site, [900.0, 0.0, 20.0], diffraction="edges", ridges=ridges)
+    assert not dark.has_path.any()
+    direct = np.hypot(900.0, 10.0)
+    line = 10.0 + 10.0 * RIDGE_EAST_M / 900.0 - RIDGE_EAST_M * 400.0 / (2 * 6.371e6)
+    nu = (RIDGE_TOP_M - line) * np.sqrt(2 * direct / (wavelength_m(3.3e9) * direct * (5 / 9) * direct * (4 / 9)))
+    free = 40.0 - 20 * np.log10(4 * np.pi * direct / wavelength_m(3.3e9))
+    expected = free - 6.9 - 20 * np.log10(np.sqrt((nu - 0.1) ** 2 + 1) + nu - 0.1)
+    assert lit.rss_dbm[0, 0] == pytest.approx(expected - (10.02 if ridges == "bullington" else 0.0), abs=0.3)

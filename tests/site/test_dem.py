@@ -67,7 +67,7 @@ def test_ridge_blocks_what_passes_below_it() -> None:
     target = np.array([[400.0, 0, 49 - top], [400, 0, 51.1 - top], [-100, 0, 11 - top]])
     assert dem.clear(source, target).tolist() == [False, True, True]  # 29.5 m, 30.55 m over the crest; this side of it
     assert dem.clear(target, source).tolist() == [False, True, True]
-    assert dem.clear(source[1:2], target[1:2], clearance_m=1.0).tolist() == [False]
+    assert dem.clear(source[1:2], target[1:2], tolerance_m=-1.0).tolist() == [False]
 
 
 def test_earth_bulge_is_counted() -> None:

@@ -28,6 +28,7 @@ from ..paths import Faces, PathSet
 from ..replay import Replay
 from ..scene import Scene
 from ..search.mirror import planes_of
+from ..search.terrain import TERRAIN
 from .bent import bent_matrix
 from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
 
@@ -129,11 +130,14 @@ def against_reference(
     -------
     FieldAudit
     """
-    total = FieldAudit(reference_links=len(chosen) * len(replay.towers))
+    total, beyond = FieldAudit(reference_links=len(chosen) * len(replay.towers)), _over_terrain(replay)
     for number, name in enumerate(replay.towers):
         reference = Reference(site, name, expected.link, expected.loss)
         for row in chosen:
             mine = np.flatnonzero((replay.paths.pose == row) & (replay.paths.tower == number))
+            if beyond[mine].any():
+                total += FieldAudit(not_covered=(ON_TERRAIN,))
+                continue
             link = _OneLink(reference=reference, replay=replay, poses=poses, row=int(row), tower=number, mine=mine)
             total += link.paths_checked(max_depth, complete and site.dem is None)
             try:
@@ -161,8 +165,8 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
     FieldAudit
         ``phantom_paths`` and their failures; all else empty.
     """
-    count = 0
-    for row in rows:
+    count, beyond = 0, _over_terrain(replay)
+    for row in rows[~beyond[rows]]:
         tower = int(replay.paths.tower[row])
         reference = Reference(site, replay.towers[tower], expected.link, expected.loss)
         link = _OneLink(
@@ -178,6 +182,15 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
             count += 1
     failures = (f"{count} paths that cannot exist",) if count else ()
     return FieldAudit(phantom_paths=count, failures=failures)
+
+
+ON_TERRAIN = "reflections off shaped ground, and paths over ridges of the terrain"
+
+
+def _over_terrain(replay: Replay) -> BoolArray:
+    """Paths (paths,) off ground that is no level plane, or over ridges."""
+    shaped = np.append(replay.faces.solid == TERRAIN, False)
+    return np.asarray(shaped[replay.paths.faces].any(axis=1) | (replay.paths.terrain_db != 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,7 +436,7 @@ def against_sionna(
     )
     place = np.full(int(max(len(poses), 1)), -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
-    rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~replay.paths.off_crown)
+    rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~replay.paths.off_crown & ~_over_terrain(replay))
     ours = replace(replay.paths.select(rows), pose=place[replay.paths.pose[rows]])
     mine, other = _matched(ours, replay.faces, theirs.paths, scene.faces)
     total = _paths_against_sionna(ours.select(mine), replay, scene, few, probe, theirs, other)

@@ -72,7 +72,7 @@ def replay_pairs(
         spots = Poses(poses.position_m + turn @ uav.positions_m[element], poses.rotation)
         single = replace(link, tower_arrays=singles, uav_array=_single(uav, element), uav_transmits=False)
         paths = search_paths(several, single, spots, search, quiet)
-        geometry, paths, _ = passed(site, several, spots, paths, search)
+        geometry, paths, _ = passed(site, several, single, spots, paths, search)
         loss_db = field.loss_db(paths, geometry.sources_m, spots.position_m)
         fields = channel_matrices(paths, geometry.faces, geometry.sources_m, spots, single, loss_db)
         h[:, :, element] = fields.h[..., 0, 0].reshape(len(poses), towers, ports)

@@ -60,7 +60,7 @@ def replay_in_parts(
 def put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
     """One replay of parts, poses in their order; the parts are taken apart, so that memory holds them once."""
     first, count = parts[0], sum(map(len, rows))
-    # faces of crowns are numbered as they are met: other blocks have others
+    # faces of crowns and terrain are numbered as they are met: other blocks have others
     faces, shifted = _joined_faces(parts)
     bent = [part.edge_paths for part in parts]
     rest: dict[str, Any] = {
@@ -94,10 +94,9 @@ def _edge_paths(parts: list[EdgePaths], rows: list[IntArray]) -> EdgePaths:
 
 def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
     """Faces of all blocks and their paths over them; faces that all blocks share are held once."""
-    least = min(len(part.faces) for part in parts)
-    if all(len(part.faces) == least for part in parts):
+    common = min(_shared(parts[0].faces, part.faces) for part in parts)
+    if all(len(part.faces) == common for part in parts):
         return parts[0].faces, [part.paths for part in parts]
-    common = least if least == min(_shared(parts[0].faces, part.faces) for part in parts) else 0
     faces, out = _face_part(parts[0].faces, 0, common), []
     for part in parts:
         shift = len(faces) - common

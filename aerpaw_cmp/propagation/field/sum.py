@@ -108,6 +108,8 @@ def channel_matrices(
     table = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
     order = _by_link(paths, len(arrays))
     ordered = paths if order is None else paths.select(order)
+    if paths.terrain_db.any():
+        loss_db = paths.terrain_db if loss_db is None else loss_db + paths.terrain_db
     lost = None if loss_db is None else amplitude_from_db(-(loss_db if order is None else loss_db[order]))
     h = np.zeros((len(poses) * len(arrays), ports * uavs), dtype=np.complex128)
     power = np.zeros(len(paths))

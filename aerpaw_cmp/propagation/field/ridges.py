@@ -1,0 +1,128 @@
+"""Loss over ridges of the terrain: knife edges across the straight line between the ends.
+
+A profile is a column of samples: ``share`` (samples, links) of the way and ``intrusion_m``, the height of the ground
+above the line (:func:`aerpaw_cmp.site.dem.above_line`), NaN where it is unknown.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from ...common.units import FloatArray
+from ...site.dem import Dem, above_line
+
+Ridges = Literal["deygout", "bullington"]
+
+
+def ridge_loss_db(
+    dem: Dem, source_m: FloatArray, target_m: FloatArray, wavelength_m: float, method: Ridges = "deygout"
+) -> FloatArray:
+    """Diffraction loss of straight lines over the terrain.
+
+    Parameters
+    ----------
+    dem : Dem
+    source_m, target_m : (links, 3)
+        Ends [m].
+    wavelength_m : float
+    method : {"deygout", "bullington"}
+
+    Returns
+    -------
+    (links,)
+        [dB]
+    """
+    loss, law = np.zeros(len(source_m)), deygout_db if method == "deygout" else bullington_db
+    length = np.linalg.norm(target_m - source_m, axis=1)
+    for some, share, ground in dem.profiles(source_m, target_m):
+        intrusion = above_line(source_m[some], target_m[some], share, ground)
+        loss[some] = law(length[some], share, intrusion, wavelength_m)
+    return loss
+
+
+def knife_edge_db(nu: FloatArray) -> FloatArray:
+    """Loss of one knife edge [dB] by its parameter nu; 0 below -0.78.
+
+    Source: ITU-R P.526-15 eq. 31.
+    """
+    x = np.maximum(nu, -0.78) - 0.1
+    return np.where(nu > -0.78, np.maximum(6.9 + 20.0 * np.log10(np.sqrt(x * x + 1.0) + x), 0.0), 0.0)
+
+
+def _parameter(height_m: FloatArray, before_m: FloatArray, after_m: FloatArray, wavelength_m: float) -> FloatArray:
+    """Parameter nu of edges; -inf at the ends of a line and where the height is unknown."""
+    inner = (before_m > 0.0) & (after_m > 0.0) & np.isfinite(height_m)
+    both = np.where(inner, before_m * after_m, 1.0)
+    nu = np.where(inner, height_m, 0.0) * np.sqrt(2.0 * np.abs(before_m + after_m) / (wavelength_m * both))
+    return np.where(inner, nu, -np.inf)
+
+
+def deygout_db(length_m: FloatArray, share: FloatArray, intrusion_m: FloatArray, wavelength_m: float) -> FloatArray:
+    """Loss of up to three edges by Deygout's construction with Causebrook's correction.
+
+    Sources: Deygout, IEEE Trans. Antennas Propag. 14 (1966) 480, doi 10.1109/TAP.1966.1138719; Causebrook and Davies,
+    BBC Research Department report 1971/43.
+
+    Parameters
+    ----------
+    length_m : (links,)
+    share, intrusion_m : (samples, links)
+    wavelength_m : float
+
+    Returns
+    -------
+    (links,)
+        [dB]
+
+    Notes
+    -----
+    ``A + (A_1 - C_1) + (A_2 - C_2)``: the main edge and the main one of each side on the way to it, less
+    ``C = (6 - A + A_e) cos(alpha)``, with A_e the loss of the side's edge alone on the direct line and
+    ``cos(alpha)^2 = d_1 d_34 / (d_12 d_234)``; neither term is negative.
+    """
+    nu = _parameter(intrusion_m, share * length_m, (1.0 - share) * length_m, wavelength_m)
+    main, link = nu.argmax(axis=0), np.arange(len(length_m))
+    total = first = knife_edge_db(nu[main, link])
+    known = np.isfinite(nu[main, link])
+    at, top = np.where(known, share[main, link], 0.5), np.where(known, intrusion_m[main, link], 0.0)
+    for way, place in ((share, at), (1.0 - share, 1.0 - at)):
+        height = intrusion_m - top * way / place
+        side = _parameter(height, way * length_m, (place - way) * length_m, wavelength_m)
+        edge = side.argmax(axis=0)
+        s = np.minimum(way[edge, link], place)
+        cosine = np.sqrt(s * (1.0 - place) / (place * (1.0 - s)))
+        correction = np.maximum(6.0 - first + knife_edge_db(nu[edge, link]), 0.0) * cosine
+        total = total + np.maximum(knife_edge_db(side[edge, link]) - correction, 0.0)
+    return np.asarray(total)
+
+
+def bullington_db(length_m: FloatArray, share: FloatArray, intrusion_m: FloatArray, wavelength_m: float) -> FloatArray:
+    """Loss of the one edge where the horizons of both ends meet.
+
+    Source: ITU-R P.526-15 section 4.5.1.
+
+    Parameters
+    ----------
+    length_m : (links,)
+    share, intrusion_m : (samples, links)
+    wavelength_m : float
+
+    Returns
+    -------
+    (links,)
+        [dB]
+    """
+    before, after = share * length_m, (1.0 - share) * length_m
+    nu = _parameter(intrusion_m, before, after, wavelength_m).max(axis=0)
+    inner = (before > 0.0) & (after > 0.0) & np.isfinite(intrusion_m)
+    rise, fall = (
+        np.where(inner, intrusion_m / np.where(inner, way, 1.0), -np.inf).max(axis=0) for way in (before, after)
+    )
+    hidden = (rise > 0.0) & (fall > 0.0)
+    rise, fall = np.where(hidden, rise, 1.0), np.where(hidden, fall, 1.0)
+    place = fall / (rise + fall)
+    horizon = _parameter(rise * place * length_m, place * length_m, (1.0 - place) * length_m, wavelength_m)
+    loss = knife_edge_db(np.where(hidden, horizon, nu))
+    return np.asarray(loss - np.expm1(-loss / 6.0) * (10.0 + 0.02 * length_m / 1000.0))

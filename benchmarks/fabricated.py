@@ -1,4 +1,4 @@
-"""Results of a season that was never flown: the records of a campaign, and of a map, made up in numbers.
+"""Results that were never flown: the records of a season and of a flight, made up in numbers.
 
 Nothing is replayed. What is put in is known (offsets that drift, settings that differ, a hill of residuals), so that a
 page made from it can be checked against it; the size is a season's.
@@ -6,13 +6,20 @@ page made from it can be checked against it; the size is a season's.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.compare.offset import offset_curve
+from aerpaw_cmp.compare.rank import channel_rank, commonest_rank, compare_rank, singular_values
+from aerpaw_cmp.compare.result import Fit, ModelLevel, RankFurther, RankResult, RssFurther, RssResult
+from aerpaw_cmp.compare.rss import compare_rss, error_spans
 from aerpaw_cmp.jobs.season import with_season
 from aerpaw_cmp.report.campaign_data import CampaignData, Failure, FlownTrack, RssRow
-from aerpaw_cmp.report.data import Baseline, ReportData, RssPanel, Track
+from aerpaw_cmp.report.data import ReportData, Track
 from aerpaw_cmp.site.siteyaml import load_site
 
 DRIFT_DB_PER_30_DAYS = 0.4
@@ -90,6 +97,91 @@ def _row(
     )  # fmt: skip
 
 
+def rss_result(
+    tower: str, channel: str, time: Any, position_m: FloatArray, levels: Mapping[str, FloatArray], **more: Any
+) -> RssResult:
+    """Comparison of the levels ``measured`` and ``simulated`` (n,); the others are baselines.
+
+    Parameters
+    ----------
+    tower, channel : str
+    time : (n,) datetime64[ns]
+    position_m : (n, 3)
+    levels : mapping of str to (n,)
+    more
+        Further fields of the record.
+
+    Returns
+    -------
+    RssResult
+    """
+    baselines = {name: level for name, level in levels.items() if name not in ("measured", "simulated")}
+    measured, simulated = levels["measured"], levels["simulated"]
+    score = compare_rss(time, measured, simulated, baselines=baselines)
+    curve = offset_curve(measured, simulated)
+    further = RssFurther(
+        n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out, block_length=1,
+        identifiable_db=score.identifiable_db, trimmed=Fit(offset_db=score.offset_db, rmse_db=score.rmse_db),
+        n_too_low=0, n_no_pose=0, n_outliers=0, rmse_without_outliers_db=score.rmse_db, n_flagged={}, clock=None,
+        baseline_rmse_ci95_db=score.baseline_intervals, compared_with={}, averaged={}, repeatability={},
+        explained_by={},
+    )  # fmt: skip
+    given: dict[str, Any] = {
+        "unit": "dB re full scale", "posed": np.ones(len(time), bool), "line_of_sight": np.ones(len(time)),
+        "geometry": {}, "variants": {}, "residual_by": {}, "further": further,
+        "spans": tuple(error_spans(time, score.residual_db, position_m=position_m, largest=1)),
+    }  # fmt: skip
+    return RssResult(
+        tower=tower, channel=channel, time=time, measured_db=measured, simulated_dbm=simulated, position_m=position_m,
+        score=score, curve_offset_db=curve[0], curve_rmse_db=curve[1],
+        baselines={
+            name: ModelLevel(level_dbm=level, offset_db=score.baselines[name].offset_db,
+                             rmse_db=score.baselines[name].rmse_db, rmse_ci95_db=score.baseline_intervals[name])
+            for name, level in baselines.items()
+        },
+        **(given | more),
+    )  # fmt: skip
+
+
+def rank_result(tower: str, time: Any, position_m: FloatArray, measured: FloatArray, h: Any, **more: Any) -> RankResult:
+    """Comparison of reported ranks (n,) with channels ``h`` (n, n_rx, n_tx), for K of 10, 100 and 1000.
+
+    Parameters
+    ----------
+    tower : str
+    time : (n,) datetime64[ns]
+    position_m : (n, 3)
+    measured : (n,)
+    h : (n, n_rx, n_tx)
+    more
+        Further fields of the record.
+
+    Returns
+    -------
+    RankResult
+    """
+    seconds = (time - time[:1]) / np.timedelta64(1, "s")
+    score = compare_rank(measured, h, time_s=seconds, replicates=50)
+    further = RankFurther(
+        n_flagged={}, kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
+        commonest=commonest_rank(measured), repeat={},
+    )  # fmt: skip
+    given: dict[str, Any] = {"sinr_db": None, "level_dbm": np.full(len(time), -80.25), "foliage_rank": {}}
+    return RankResult(
+        tower=tower, n_samples=len(time), time=time, position_m=position_m, measured=measured, sigma=singular_values(h),
+        rank={k: channel_rank(h, k) for k in score.simulated}, score=score, further=further, **(given | more),
+    )  # fmt: skip
+
+
+def with_numbers(result: Any, **values: Any) -> Any:
+    """A result with other values of its fields, or of those of its score and of its further numbers, by name."""
+    own = {one.name: values.pop(one.name) for one in fields(result) if one.name in values}
+    for name in ("score", "further"):
+        part = own.get(name, getattr(result, name))
+        own[name] = replace(part, **{one.name: values.pop(one.name) for one in fields(part) if one.name in values})
+    return replace(result, **own, **values)
+
+
 def long_flight(samples: int = 50_000, channels: int = 10) -> ReportData:
     """A report of ten channels with so many samples together: levels of free space, noise, and nothing else."""
     rng = np.random.default_rng(2)
@@ -106,17 +198,12 @@ def long_flight(samples: int = 50_000, channels: int = 10) -> ReportData:
         distance = np.sqrt((east - tower.east_m) ** 2 + (north - tower.north_m) ** 2 + up**2)
         level = -30 - 20 * np.log10(distance)
         measured = level + 10.0 + rng.normal(0, 4, n)
-        residual = measured - 10.0 - level
+        levels = {"measured": measured, "simulated": level, "free_space": level - 1}
+        place = np.column_stack([east, north, up])
+        channel_name = f"USRP{number // len(towers) + 1}"
         panels.append(
-            RssPanel(
-                tower=tower.name, channel=f"USRP{number // len(towers) + 1}", unit="dBm", time=time,
-                measured_db=measured, simulated_dbm=level, measured_out_of_coverage=np.zeros(n, bool),
-                simulated_out_of_coverage=np.zeros(n, bool), offset_db=-10.0,
-                rmse_db=float(np.sqrt((residual**2).mean())), correlation=0.5, n=n, n_out_of_coverage=0,
-                east_m=east, north_m=north, up_m=up, geometry={"distance_m": distance},
-                baselines=(Baseline(name="free_space", level_dbm=level - 1, offset_db=-11.0, rmse_db=4.0),),
-            )
-        )  # fmt: skip
+            rss_result(tower.name, channel_name, time, place, levels, unit="dBm", geometry={"distance_m": distance})
+        )
     track = Track(time=time, east_m=east, north_m=north, up_m=up)
     return ReportData(
         title="A flight that was never flown", flight="long", site=site, generated="2026-11-21T00:00:00+00:00",

@@ -10,11 +10,11 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.outputs import file_digest
+from aerpaw_cmp.compare.result import RssResult
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.flight_run import run_flight
-from aerpaw_cmp.report.build import report_data, rss_panel
-from aerpaw_cmp.report.data import RssPanel
+from aerpaw_cmp.report.build import report_data
 from aerpaw_cmp.report.export import metrics
 
 SAMPLE = Path(__file__).parents[1] / "sample_logs" / "flight.yaml"
@@ -35,16 +35,16 @@ def flight(folder: Path, **plan: object) -> Path:
     return path
 
 
-def round_trip(folder: Path, **plan: object) -> dict[str, dict[str, RssPanel]]:
-    """Simulate through the command line, read the files back, compare; panels by tower and channel."""
+def round_trip(folder: Path, **plan: object) -> dict[str, dict[str, RssResult]]:
+    """Simulate through the command line, read the files back, compare; results by tower and channel."""
     path = flight(folder, **plan)
     assert main(["simulate", str(path)]) == 0
     settings = load_flight(path)
     data = gather(settings, folder, read_logs(settings, folder))
-    panels: dict[str, dict[str, RssPanel]] = {}
+    results: dict[str, dict[str, RssResult]] = {}
     for one in run_flight(data, audit=False).result.rss:
-        panels.setdefault(one.tower, {})[one.channel] = rss_panel(one)
-    return panels
+        results.setdefault(one.tower, {})[one.channel] = one
+    return results
 
 
 def test_planted_offsets_come_back_to_a_tenth_without_noise(tmp_path: Path) -> None:
@@ -52,8 +52,8 @@ def test_planted_offsets_come_back_to_a_tenth_without_noise(tmp_path: Path) -> N
     for tower, channels in OFFSETS.items():
         for channel, planted in channels.items():
             found = rss[tower][channel]
-            assert abs(found.offset_db - planted) < 0.1 + 1e-9, (tower, channel, found.offset_db)
-            assert not found.at_search_edge
+            assert abs(found.score.offset_db - planted) < 0.1 + 1e-9, (tower, channel, found.score.offset_db)
+            assert not found.score.at_edge
 
 
 def test_planted_offsets_lie_in_their_intervals_with_noise(tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_planted_offsets_lie_in_their_intervals_with_noise(tmp_path: Path) -> No
         rss = round_trip(folder, fading_db=3.0, seed=seed, rank_interval_s=5.0)
         for tower, channels in OFFSETS.items():
             for channel, planted in channels.items():
-                low, high = rss[tower][channel].offset_ci95_db
+                low, high = rss[tower][channel].score.intervals.offset_db
                 assert high - low < 8.0
                 inside.append(low <= planted <= high)
     # 12 intervals of 95 %: fewer than 9 inside has a probability below 3e-4
@@ -74,13 +74,13 @@ def test_planted_offsets_lie_in_their_intervals_with_noise(tmp_path: Path) -> No
 def test_planted_clock_shift_is_found_and_applied(tmp_path: Path) -> None:
     rss = round_trip(tmp_path, clock_shift_s={"LW1": 3.25, "LW2": -1.5})
     for tower, shift in {"LW1": 3.25, "LW2": -1.5}.items():
-        clock = rss[tower]["USRP1"].extra["clock"]
-        assert clock["verdict"] == "shifted"
-        assert clock["applied"] == "estimated and applied"
-        low, high = clock["ci95_s"]
+        clock = rss[tower]["USRP1"].further.clock
+        assert clock.verdict == "shifted"
+        assert clock.applied == "estimated and applied"
+        low, high = clock.ci95_s
         assert low <= shift <= high
-        assert abs(clock["radio_minus_telemetry_s"] - shift) < 0.15
-        assert abs(rss[tower]["USRP1"].offset_db - OFFSETS[tower]["USRP1"]) < 0.2
+        assert abs(clock.radio_minus_telemetry_s - shift) < 0.15
+        assert abs(rss[tower]["USRP1"].score.offset_db - OFFSETS[tower]["USRP1"]) < 0.2
 
 
 def test_the_clock_has_one_sign_on_every_path(tmp_path: Path) -> None:

@@ -12,14 +12,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+import numpy as np
+
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, db_from_amplitude
 from .causes import Cause
 from .detection import DetectionScore
 from .field_difference import FieldAudit
 from .forecast import ForecastScore
 from .ladder import LadderRow
 from .rank import CommonestRank, RankComparison, RankRepeat
-from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
+from .rss import LEARNED_HERE, ChannelDifference, ErrorSpan, ResidualBins, RssComparison
 from .serving import ServingComparison
 from .spread import StatedSpread
 from .statistics import Interval, PairedDifference
@@ -248,9 +250,36 @@ class RssResult:
         return f"{self.tower} {self.channel}".strip()
 
     @property
+    def training(self) -> bool:
+        """Whether the antennas were learned from the very logs of this series: no error is given then."""
+        return bool(self.further.trained_on)
+
+    @property
+    def clock_verdict(self) -> str:
+        """Verdict on the radio clock; empty where none was estimated."""
+        return "" if self.further.clock is None else self.further.clock.verdict
+
+    @property
+    def measured_out_of_coverage(self) -> BoolArray:
+        """Posed samples (n,) without a measured signal."""
+        return self.posed & ~np.isfinite(self.measured_db)
+
+    @property
+    def simulated_out_of_coverage(self) -> BoolArray:
+        """Posed samples (n,) without a path: ``Z`` in the plots."""
+        return self.posed & ~np.isfinite(self.simulated_dbm)
+
+    @property
     def calibrated_db(self) -> FloatArray:
         """Measurement plus offset (n,), comparable with ``simulated_dbm``."""
         return self.measured_db + self.score.offset_db
+
+    @property
+    def residual_db(self) -> FloatArray:
+        """Calibrated measurement minus simulation (n,); NaN where a side is missing, or was learned on this flight."""
+        if LEARNED_HERE in self.score.fitted_on_scored:
+            return np.full(len(self.time), np.nan)
+        return self.calibrated_db - self.simulated_dbm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -328,6 +357,12 @@ class RankResult:
     tower_m: FloatArray | None = None
     """Place (n, 3) of a tower that moves [m]; None of one that stands."""
 
+    @property
+    def singular_ratio_db(self) -> FloatArray:
+        """Second to last singular value over the first (n, m - 1) [dB]: why a rank is what it is."""
+        with np.errstate(invalid="ignore"):  # no channel: 0 / 0
+            return db_from_amplitude(self.sigma[:, 1:] / self.sigma[:, :1])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditResult:
@@ -375,3 +410,13 @@ class FlightResult:
     engine: EngineResult | None = None
     serving: ServingComparison | None = None
     ladder: tuple[LadderRow, ...] = ()
+
+    @property
+    def clocks(self) -> dict[str, ClockResult]:
+        """One clock per receiver."""
+        return {clock.receiver: clock for one in self.rss if (clock := one.further.clock) is not None}
+
+    @property
+    def series(self) -> tuple[RssResult | RankResult, ...]:
+        """Levels, then ranks."""
+        return (*self.rss, *self.rank)

@@ -12,8 +12,8 @@ from ..common.units import FloatArray, IntArray
 from ..compare.offset import Moments, difference_moments
 from ..compare.passes import cell_means
 from ..compare.result import Repeated
+from ..compare.statistics import Interval
 from ..site.site import Site
-from .data import Interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

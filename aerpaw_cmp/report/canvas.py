@@ -21,7 +21,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site, Trees
-from .data import RankPanel, ReportData, RssPanel
+from .data import ReportData
 from .export import write_file
 
 if TYPE_CHECKING:
@@ -252,8 +252,7 @@ def seconds_since(time: AnyArray, start: np.datetime64) -> FloatArray:
 def start_of(data: ReportData) -> np.datetime64:
     """The instant that is zero on every time axis: the first of the track, or of any panel."""
     times = [] if data.track is None or not len(data.track.time) else [data.track.time[0]]
-    panels: list[RssPanel | RankPanel] = [*data.rss, *data.rank]
-    times += [panel.time[0] for panel in panels if len(panel.time)]
+    times += [one.time[0] for one in data.series if len(one.time)]
     if not times:
         return np.datetime64(0, "ns")
     return times[0] if data.track is not None and len(data.track.time) else min(times)
@@ -672,8 +671,7 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
 
 def used_towers(data: ReportData) -> list[str]:
     """Towers that a panel of the report names, or all."""
-    panels: list[RssPanel | RankPanel] = [*data.rss, *data.rank]
-    used = dict.fromkeys(panel.tower for panel in panels)
+    used = dict.fromkeys(one.tower for one in data.series)
     return [name for name in used if name in data.site.towers] or list(data.site.towers)
 
 

@@ -14,15 +14,17 @@ from typing import Any
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray, IntArray
+from ..compare.result import ModelLevel, RankResult, RssResult
+from ..compare.rss import RssComparison
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site
 from .canvas import seconds_since, spread_out, start_of
-from .data import GEOMETRY, PosePaths, RankPanel, ReportData, RssPanel, tower_way
+from .data import GEOMETRY, PosePaths, ReportData, Source
 from .names import k_key
 from .packed import PackedArrays
 from .shapes import listed, outline, walls
-from .words import pretty
+from .words import nearest_k, pretty
 
 POINTS = 50_000
 """Samples of all series together that the page holds; beyond them each series is thinned, extremes kept."""
@@ -84,7 +86,7 @@ def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
         "start": str(start.astype("datetime64[ms]")) if has_wall_clock(start) else "",
         "step_db": rss_settings.get("advanced", {}).get("step_db", 0.1),
         "span_db": list(rss_settings.get("span_db", (-50.0, 50.0))),
-        "rss": [_rss(p, start, arrays, share(len(p.time))) for p in data.rss],
+        "rss": [_rss(p, data.sources.get(p.name), start, arrays, share(len(p.time))) for p in data.rss],
         "rank": [_rank(p, start, arrays, share(len(p.time))) for p in data.rank],
         "track": _track(data, start, arrays),
         "site": scene(data.site),
@@ -98,27 +100,31 @@ def as_json(content: Mapping[str, Any]) -> str:
     return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def _place(panel: RssPanel | RankPanel, pick: IntArray, arrays: PackedArrays) -> dict[str, int]:
+def _place(panel: RssResult | RankResult, pick: IntArray, arrays: PackedArrays) -> dict[str, int]:
     """Places of the UAV, and those of a tower that moves."""
-    names = {"east": panel.east_m, "north": panel.north_m, "up": panel.up_m}
-    names |= {f"tower_{axis}": values for axis, values in tower_way(panel).items()}
-    return {name: arrays.add(values[pick]) for name, values in names.items() if values is not None}
+    found = {axis: arrays.add(places[pick]) for axis, places in zip(AXES, panel.position_m.T, strict=True)}
+    if panel.tower_m is not None:
+        found |= {f"tower_{axis}": arrays.add(places[pick]) for axis, places in zip(AXES, panel.tower_m.T, strict=True)}
+    return found
 
 
-def _rss(panel: RssPanel, start: np.datetime64, arrays: PackedArrays, limit: int) -> dict[str, Any]:
-    residual = panel.residual_db
-    pick = keep_extremes([panel.measured_db, residual], limit) if len(panel.time) else np.arange(0)
-    models = [{"name": "ray tracing", "offset": _number(panel.offset_db), "rmse": _number(panel.rmse_db),
-               "level": arrays.add(panel.simulated_dbm[pick]), "learned_here": panel.training}]  # fmt: skip
-    for one in panel.baselines:
-        models.append({"name": pretty(one.name), "offset": _number(one.offset_db), "rmse": _number(one.rmse_db),
-                       "level": arrays.add(one.level_dbm[pick])})  # fmt: skip
+AXES = ("east", "north", "up")
+
+
+def _rss(
+    panel: RssResult, source: Source | None, start: np.datetime64, arrays: PackedArrays, limit: int
+) -> dict[str, Any]:
+    pick = keep_extremes([panel.measured_db, panel.residual_db], limit) if len(panel.time) else np.arange(0)
+    models = [{"name": "ray tracing", **_fit(panel.score), "level": arrays.add(panel.simulated_dbm[pick]),
+               "learned_here": panel.training}]  # fmt: skip
+    for name, one in panel.baselines.items():
+        models.append({"name": pretty(name), **_fit(one), "level": arrays.add(one.level_dbm[pick])})
     geometry = [
         {"name": GEOMETRY[key].replace("\n", " "), "values": arrays.add(values[pick])}
         for key, values in panel.geometry.items()
         if key in GEOMETRY
     ]
-    return {
+    said = {
         "name": panel.name,
         "tower": panel.tower,
         "unit": panel.unit,
@@ -128,42 +134,37 @@ def _rss(panel: RssPanel, start: np.datetime64, arrays: PackedArrays, limit: int
         "measured": arrays.add(panel.measured_db[pick]),
         "models": models,
         "geometry": geometry,
-        **({} if panel.source is None else _source(panel, pick, arrays)),
     }
+    if source is not None:
+        said |= {
+            "files": list(source.files),
+            "file": arrays.add(source.file[pick]),
+            "line": arrays.add(source.line[pick], "f8"),
+        }
+    return said
 
 
-def _source(panel: RssPanel, pick: IntArray, arrays: PackedArrays) -> dict[str, Any]:
-    """Where each sample stands in the logs: the files, and per sample its file and line."""
-    assert panel.source is not None
-    return {
-        "files": list(panel.source.files),
-        "file": arrays.add(panel.source.file[pick]),
-        "line": arrays.add(panel.source.line[pick], "f8"),
-    }
+def _fit(model: RssComparison | ModelLevel) -> dict[str, float | None]:
+    return {"offset": _number(model.offset_db), "rmse": _number(model.rmse_db)}
 
 
-def _rank(panel: RankPanel, start: np.datetime64, arrays: PackedArrays, limit: int) -> dict[str, Any]:
+def _rank(panel: RankResult, start: np.datetime64, arrays: PackedArrays, limit: int) -> dict[str, Any]:
     pick = keep_extremes([panel.measured], limit) if len(panel.time) else np.arange(0)
+    shares = [] if panel.probability is None else panel.probability.T
+    best = nearest_k(panel)
     return {
         "tower": panel.tower,
         "of": len(panel.time),
         "time": arrays.add(seconds_since(panel.time, start)[pick], "f8"),
         **_place(panel, pick, arrays),
         "measured": arrays.add(panel.measured[pick]),
-        "best": _best(panel),
-        "models": [{"name": f"K = {k_key(at.k)}", "rank": arrays.add(at.rank[pick])} for at in panel.simulated],
+        "best": 0 if best is None else list(panel.rank).index(best),
+        "models": [{"name": f"K = {k_key(k)}", "rank": arrays.add(rank[pick])} for k, rank in panel.rank.items()],
         "probability": [
-            {"name": name, "values": arrays.add(np.asarray(values, dtype=np.float64)[pick])}
-            for name, values in panel.values.items()
-            if name.startswith("probability")
+            {"name": f"probability_rank{rank}", "values": arrays.add(share[pick])}
+            for rank, share in enumerate(shares, start=1)
         ],
     }
-
-
-def _best(panel: RankPanel) -> int:
-    """Number of the K whose distribution comes nearest, shown first."""
-    distance = [np.nan_to_num(at.total_variation, nan=np.inf) for at in panel.simulated]
-    return int(np.argmin(distance)) if distance else 0
 
 
 def _track(data: ReportData, start: np.datetime64, arrays: PackedArrays) -> dict[str, int] | None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..common.cells import guarded
-from ..common.jsonable import json_safe
+from ..common.jsonable import fields_of, json_safe
 from ..common.provenance import KEY, union
+from ..common.units import FloatArray, IntArray
+from ..compare.result import APPLIED, GIVEN, ClockResult, EngineResult, RankResult, RssResult
+from ..compare.statistics import Interval
 from ..logs.records import has_wall_clock
-from .data import RANKS, Engine, Histogram, RankPanel, ReportData, RssPanel
+from .data import RANKS, ReportData
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 from .words import audit_summary
 
@@ -26,8 +29,11 @@ def metrics(data: ReportData) -> dict[str, Any]:
     Keys keep one order: that of the report. ``extra_metrics`` of the data is merged in last, key by key.
     """
     rss: dict[str, dict[str, Any]] = {}
-    for panel in data.rss:
-        rss.setdefault(panel.tower, {})[panel.channel] = _rss_metrics(panel)
+    for one in data.rss:
+        rss.setdefault(one.tower, {})[one.channel] = _rss_metrics(one)
+    pairs: dict[str, dict[str, Any]] = {}
+    for pair in data.pairs:
+        pairs.setdefault(pair.tower, {})[f"{pair.first} - {pair.second}"] = pair.score.as_dict()
     result: dict[str, Any] = {
         "flight": data.flight,
         "title": data.title,
@@ -41,12 +47,16 @@ def metrics(data: ReportData) -> dict[str, Any]:
             for f in data.inputs
         ],
         KEY: list(union(*(f.learned_on for f in data.inputs))),
-        "settings": json_safe(data.settings),
+        "settings": data.settings,
         "rss": rss,
-        "rank": {panel.tower: _rank_metrics(panel) for panel in data.rank},
+        "rank": {one.tower: _rank_metrics(one) for one in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),
         "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
         "warnings": list(data.warnings),
+        **({"ladder": data.ladder} if data.ladder else {}),
+        "clock": {name: clock_metrics(clock) for name, clock in data.clocks.items()},
+        **({} if data.serving is None else {"serving": data.serving.as_dict()}),
+        **({"pairs": pairs} if pairs else {}),
     }
     safe: dict[str, Any] = json_safe(result)
     merge(safe, json_safe(data.extra_metrics))
@@ -58,47 +68,84 @@ def _named(record: Any, names: str) -> dict[str, Any]:
     return {name: getattr(record, name) for name in names.split()}
 
 
-def _rss_metrics(panel: RssPanel) -> dict[str, Any]:
+def _rss_metrics(one: RssResult) -> dict[str, Any]:
+    score = one.score
     return {
-        **_named(panel, "offset_db rmse_db n n_out_of_coverage at_search_edge correlation"),
-        **_named(panel, "rmse_ci95_db offset_ci95_db correlation_ci95 n_effective lag_s lag_verdict unit fitted"),
-        "baselines": {b.name: _named(b, "offset_db rmse_db") for b in panel.baselines},
-        "variants": {v.name: _named(v, "offset_db rmse_db fitted") for v in panel.variants},
-        **panel.extra,
+        **_named(score, "offset_db rmse_db n n_out_of_coverage"),
+        "at_search_edge": score.at_edge,
+        **_named(score, "correlation rmse_ci95_db"),
+        "offset_ci95_db": score.intervals.offset_db,
+        "correlation_ci95": score.intervals.correlation,
+        "n_effective": score.intervals.autocorrelation.n_effective,
+        "lag_s": score.lag_s,
+        "lag_verdict": one.clock_verdict,
+        "unit": one.unit,
+        "fitted": score.fitted_on_scored,
+        "baselines": {name: _named(model, "offset_db rmse_db") for name, model in one.baselines.items()},
+        "variants": {
+            name: {**_named(model, "offset_db rmse_db"), "fitted": FITTED} for name, model in one.variants.items()
+        },
+        **fields_of(one.further),
+        "residual_by": {name: table.as_dict() for name, table in one.residual_by.items()},
     }
 
 
-def _histogram(histogram: Histogram) -> dict[str, Any]:
-    result: dict[str, Any] = {"histogram": dict(zip(map(str, RANKS), histogram.share, strict=True))}
-    if histogram.low is not None and histogram.high is not None:
-        pairs = zip(histogram.low, histogram.high, strict=True)
-        result["histogram_ci95"] = {str(r): [low, high] for r, (low, high) in zip(RANKS, pairs, strict=True)}
-    return result
+FITTED = "offset, on this flight"
+"""What every other model of the same samples has fitted."""
 
 
-def _rank_metrics(panel: RankPanel) -> dict[str, Any]:
+def clock_metrics(clock: ClockResult) -> dict[str, Any]:
+    """``clock.<receiver>`` of metrics.json: numbers, verdict, whether applied, and the checks it rests on."""
+    return {
+        **clock.checks,
+        **_named(clock, "radio_minus_telemetry_s ci95_s verdict reason"),
+        "applied": clock.applied in (APPLIED, GIVEN),
+    }
+
+
+def _histogram(share: FloatArray, intervals: Sequence[Interval]) -> dict[str, Any]:
+    names = [str(rank) for rank in RANKS]
+    return {
+        "histogram": dict(zip(names, share, strict=True)),
+        "histogram_ci95": dict(zip(names, intervals, strict=True)),
+    }
+
+
+def _rank_metrics(one: RankResult) -> dict[str, Any]:
+    score = one.score
     simulated = {
-        k_key(at.k): {
-            **_histogram(at.histogram),
-            "out_of_coverage": at.n_out_of_coverage,
-            **_named(at, "agreement agreement_ci95 kappa total_variation total_variation_ci95"),
-            **_named(at, "wasserstein p_value confusion"),
+        k_key(k): {
+            **_histogram(fit.histogram, fit.histogram_ci95),
+            **_named(fit, "out_of_coverage agreement agreement_ci95 kappa total_variation total_variation_ci95"),
+            "wasserstein": fit.wasserstein,
+            "p_value": fit.p_histogram,
+            "confusion": fit.confusion[1:],
         }
-        for at in panel.simulated
+        for k, fit in score.simulated.items()
     }
     return {
         "measured": {
-            **_histogram(panel.histogram),
-            "n": int(np.isfinite(panel.measured).sum()),
-            "n_no_csi": int((~np.isfinite(panel.measured)).sum()),
+            **_histogram(score.histogram, score.histogram_ci95),
+            "n": int(np.isfinite(one.measured).sum()),
+            "n_no_csi": int((~np.isfinite(one.measured)).sum()),
         },
         "simulated": simulated,
-        **_named(panel, "best_k best_k_ci95"),
-        **panel.extra,
+        "best_k": score.best_k,
+        "best_k_ci95": score.curve.best_k_interval,
+        **further_numbers(one),
     }
 
 
-def _engine_metrics(engine: Engine) -> dict[str, Any]:
+def further_numbers(one: RssResult | RankResult) -> dict[str, Any]:
+    """Numbers of a series that stand in a table of their own on the page, as JSON has them."""
+    numbers = {} if isinstance(one, RssResult) else one.score.as_dict()
+    for shown in ("measured", "simulated", "best_k", "best_k_ci95"):
+        numbers.pop(shown, None)
+    safe: dict[str, Any] = json_safe(numbers | fields_of(one.further))
+    return safe
+
+
+def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
     audit = engine.audit
     return {
         **_named(engine, "engine links seconds paths left_out"),
@@ -124,24 +171,24 @@ def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
             into[key] = value
 
 
-def rss_frame(panels: Iterable[RssPanel]) -> Any:
+def rss_frame(series: Sequence[RssResult]) -> Any:
     """All RSS samples as one table with the columns of :data:`RSS_COLUMNS` and one per baseline."""
-    return _whole(rss_tables(list(panels)), RSS_COLUMNS)
+    return _whole(rss_tables(series), RSS_COLUMNS)
 
 
-def rss_csv(panels: Iterable[RssPanel]) -> Iterator[str]:
+def rss_csv(series: Sequence[RssResult]) -> Iterator[str]:
     """The text of :func:`rss_frame` in pieces of bounded size."""
-    return _text(rss_tables(list(panels)), RSS_COLUMNS)
+    return _text(rss_tables(series), RSS_COLUMNS)
 
 
-def rank_frame(panels: Iterable[RankPanel]) -> Any:
+def rank_frame(series: Sequence[RankResult]) -> Any:
     """All rank samples as one table with the columns of :data:`RANK_COLUMNS` and one per K."""
-    return _whole(rank_tables(list(panels)), RANK_COLUMNS)
+    return _whole(rank_tables(series), RANK_COLUMNS)
 
 
-def rank_csv(panels: Iterable[RankPanel]) -> Iterator[str]:
+def rank_csv(series: Sequence[RankResult]) -> Iterator[str]:
     """The text of :func:`rank_frame` in pieces of bounded size."""
-    return _text(rank_tables(list(panels)), RANK_COLUMNS)
+    return _text(rank_tables(series), RANK_COLUMNS)
 
 
 _Table = tuple[Any, dict[str, Any]]
@@ -151,59 +198,91 @@ _ROWS = 50_000
 """Rows that are text at once."""
 
 
-def rss_tables(panels: list[RssPanel]) -> Iterator[_Table]:
-    """Times and further columns of rss.csv by panel, not yet rounded."""
-    names = list(dict.fromkeys(b.name for panel in panels for b in panel.baselines))
-    further = list(dict.fromkeys(name for panel in panels for name in panel.per_sample))
-    for panel in panels:
-        nowhere = np.full(len(panel.time), np.nan)
-        columns: dict[str, Any] = {
-            "tower": panel.tower,
-            "channel": panel.channel,
-            "unit": panel.unit,
-            "east_m": nowhere if panel.east_m is None else panel.east_m,
-            "north_m": nowhere if panel.north_m is None else panel.north_m,
-            "up_m": nowhere if panel.up_m is None else panel.up_m,
-            "measured_db": panel.measured_db,
-            "calibrated_db": panel.calibrated_db,
-            "simulated_dbm": panel.simulated_dbm,
-            "residual_db": panel.residual_db,
-            "measured_out_of_coverage": panel.measured_out_of_coverage.astype(int),
-            "simulated_out_of_coverage": panel.simulated_out_of_coverage.astype(int),
-        }
-        levels = {b.name: b.level_dbm for b in panel.baselines}
-        columns.update({f"{name}_dbm": levels.get(name, nowhere) for name in names})
-        columns.update({name: panel.per_sample.get(name, nowhere) for name in further})
-        yield panel.time, columns
+FOLIAGE_RUNS = ("without trees", "trees in leaf", "trees out of leaf")
+"""Variants that are columns of rss.csv, too."""
 
 
-def rank_tables(panels: list[RankPanel]) -> Iterator[_Table]:
-    """Times and further columns of rank.csv by panel, not yet rounded."""
+def rss_tables(series: Sequence[RssResult]) -> Iterator[_Table]:
+    """Times and further columns of rss.csv by tower and channel, not yet rounded; one that a series lacks is NaN."""
+    models = list(dict.fromkeys(name for one in series for name in one.baselines))
+    more = [_rss_columns(one) for one in series]
+    for one, own in zip(series, more, strict=True):
+        nowhere = np.full(len(one.time), np.nan)
+        yield (
+            one.time,
+            {
+                "tower": one.tower,
+                "channel": one.channel,
+                "unit": one.unit,
+                **_places(one.position_m),
+                "measured_db": one.measured_db,
+                "calibrated_db": one.calibrated_db,
+                "simulated_dbm": one.simulated_dbm,
+                "residual_db": one.residual_db,
+                "measured_out_of_coverage": one.measured_out_of_coverage.astype(int),
+                "simulated_out_of_coverage": one.simulated_out_of_coverage.astype(int),
+                **{f"{m}_dbm": one.baselines[m].level_dbm if m in one.baselines else nowhere for m in models},
+                **{name: own.get(name, nowhere) for name in dict.fromkeys(name for other in more for name in other)},
+            },
+        )
+
+
+def _rss_columns(one: RssResult) -> dict[str, FloatArray]:
+    """Columns that not every series has: runs with and without trees, stated intervals, the place of a moving tower."""
+    return {
+        **{f"simulated_{name.replace(' ', '_')}_dbm": model.level_dbm
+           for name, model in one.variants.items() if name in FOLIAGE_RUNS},
+        **({} if one.stated is None else one.stated.columns(one.simulated_dbm)),
+        **({} if one.tower_m is None else _places(one.tower_m, "tower_")),
+    }  # fmt: skip
+
+
+def _places(position_m: FloatArray, whose: str = "") -> dict[str, FloatArray]:
+    """Columns of positions (n, 3)."""
+    return dict(zip((f"{whose}east_m", f"{whose}north_m", f"{whose}up_m"), position_m.T, strict=True))
+
+
+def rank_tables(series: Sequence[RankResult]) -> Iterator[_Table]:
+    """Times and further columns of rank.csv by tower, not yet rounded; one that a series lacks is empty."""
     import pandas as pd
 
     def integers(values: Any) -> Any:
         return pd.Series(values, dtype="float64").astype("Int64").array  # NaN becomes an empty cell, 2.0 becomes 2
 
-    ks = sorted({at.k for panel in panels for at in panel.simulated})
-    further = list(dict.fromkeys(name for panel in panels for name in panel.per_sample))
-    values = list(dict.fromkeys(name for panel in panels for name in panel.values))
-    for panel in panels:
-        columns: dict[str, Any] = {
-            "tower": panel.tower,
-            "east_m": panel.east_m,
-            "north_m": panel.north_m,
-            "up_m": panel.up_m,
-            "measured_rank": integers(panel.measured),
-        }
-        ranks = {at.k: at.rank for at in panel.simulated}
-        for k in ks:
-            columns[f"simulated_rank_k{k_key(k)}"] = integers(ranks.get(k, np.full(len(panel.time), np.nan)))
-        nowhere = np.full(len(panel.time), np.nan)
-        columns.update({name: integers(panel.per_sample.get(name, nowhere)) for name in further})
-        # no path: no level, and a ratio of nothing; a vanishing singular value is an empty cell, too
-        seen = {name: panel.values.get(name, nowhere) for name in values}
-        columns.update({name: np.where(np.isfinite(v), v, np.nan) for name, v in seen.items()})
-        yield panel.time, columns
+    ks = sorted({k for one in series for k in one.rank})
+    ranks = [_rank_columns(one) for one in series]
+    numbers = [_number_columns(one) for one in series]
+    for one, foliage, own in zip(series, ranks, numbers, strict=True):
+        nowhere = np.full(len(one.time), np.nan)
+        yield (
+            one.time,
+            {
+                "tower": one.tower,
+                **_places(one.position_m),
+                "measured_rank": integers(one.measured),
+                **{f"simulated_rank_k{k_key(k)}": integers(one.rank.get(k, nowhere)) for k in ks},
+                **{n: integers(foliage.get(n, nowhere)) for n in dict.fromkeys(n for other in ranks for n in other)},
+                **{name: own.get(name, nowhere) for name in dict.fromkeys(name for other in numbers for name in other)},
+            },
+        )
+
+
+def _rank_columns(one: RankResult) -> dict[str, IntArray]:
+    """Simulated ranks with and without trees."""
+    return {
+        f"rank_{name.replace(' ', '_')}_k{k_key(k)}": rank
+        for name, per_k in one.foliage_rank.items()
+        for k, rank in per_k.items()
+    }
+
+
+def _number_columns(one: RankResult) -> dict[str, FloatArray]:
+    """What a receiver decides by; no path, a ratio of nothing and a vanishing singular value are empty cells."""
+    columns = {"level_dbm": one.level_dbm, **({} if one.tower_m is None else _places(one.tower_m, "tower_"))}
+    columns |= {f"sigma{i}_over_sigma1_db": ratio for i, ratio in enumerate(one.singular_ratio_db.T, start=2)}
+    if one.probability is not None:
+        columns |= {f"probability_rank{rank}": share for rank, share in enumerate(one.probability.T, start=1)}
+    return {name: np.where(np.isfinite(values), values, np.nan) for name, values in columns.items()}
 
 
 def _whole(tables: Iterator[_Table], columns: Iterable[str]) -> Any:

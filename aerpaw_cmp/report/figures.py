@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..compare.result import PairResult, RankResult, RssResult
 from .against_figures import against_specs
 from .canvas import POINTS_PER_CLOUD, FigureSpec, count
-from .data import GEOMETRY, ChannelPair, RankPanel, ReportData, RssPanel, Track
+from .data import GEOMETRY, ReportData, Track
 from .names import safe_name
 from .rank_figures import (
     agreement_curve,
     confusion,
-    forecast_of,
     rank_forecast,
     rank_histograms,
     rank_maps,
@@ -89,7 +89,7 @@ def _with_own_names(figures: list[FigureSpec]) -> list[FigureSpec]:
 
 def _overview_spec(data: ReportData) -> list[FigureSpec]:
     """The picture of the first screen where no script runs: the first channel, or the first rank."""
-    panels = [panel for panel in data.rss if len(panel.time) and panel.n]
+    panels = [panel for panel in data.rss if len(panel.time) and panel.score.n]
     if not panels:
         return []
     return [
@@ -136,9 +136,9 @@ def _track_specs(data: ReportData, track: Track) -> list[FigureSpec]:
     ]
 
 
-def _band_words(panel: RssPanel) -> str:
+def _band_words(panel: RssResult) -> str:
     """What the band of learned antennas is made of, and whether it holds on this flight."""
-    bars = panel.extra.get("error_bars")
+    bars = panel.further.error_bars
     if not bars:
         return ""
     parts = ", ".join(f"{what} {bars[name]:.1f} dB" for name, what in SPREAD_PARTS.items())
@@ -159,7 +159,7 @@ SPREAD_PARTS = {
 _HATCHED = "Hatched spans marked Z have no path in the simulation and are not scored. "
 
 
-def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
+def _rss_specs(data: ReportData, panel: RssResult) -> list[FigureSpec]:
     stem = f"{safe_name(panel.tower)}_{safe_name(panel.channel)}"
     section = f"rss/{panel.tower}/{panel.channel}"
     result = [
@@ -179,7 +179,11 @@ def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
                 else ""
             ),
             alt=f"RSS of {panel.name} over time, measured against simulated"
-            + (f"; RMSE {panel.rmse_db:.1f} dB over {panel.n} samples." if not panel.training else "; no error given."),
+            + (
+                f"; RMSE {panel.score.rmse_db:.1f} dB over {panel.score.n} samples."
+                if not panel.training
+                else "; no error given."
+            ),
             draw=lambda: rss_over_time(data, panel),
         ),
         FigureSpec(
@@ -220,10 +224,10 @@ def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
     return result
 
 
-def _detection_specs(panel: RssPanel, stem: str, section: str) -> list[FigureSpec]:
+def _detection_specs(panel: RssResult, stem: str, section: str) -> list[FigureSpec]:
     """The reliability of P(detected), where it was scored."""
-    score = panel.extra.get("detection")
-    if not score or not score["reliability"]:
+    score = panel.further.detection
+    if score is None or not score.reliability:
         return []
     return [
         FigureSpec(
@@ -232,16 +236,16 @@ def _detection_specs(panel: RssPanel, stem: str, section: str) -> list[FigureSpe
             section=section,
             title=f"{panel.name}: is the probability of detection calibrated?",
             caption="Fifths of the predicted probability against the share that the receiver detected; on the "
-            f"diagonal the forecast is calibrated. Brier score {score['brier']:.3f}, constant forecast "
-            f"{score['constant_brier']:.3f}; log score {score['log_score']:.3f}, constant "
-            f"{score['constant_log_score']:.3f} (held-out segments).",
+            f"diagonal the forecast is calibrated. Brier score {score.brier:.3f}, constant forecast "
+            f"{score.constant_brier:.3f}; log score {score.log_score:.3f}, constant "
+            f"{score.constant_log_score:.3f} (held-out segments).",
             alt=f"Reliability of the probability that {panel.name} detects the signal.",
             draw=lambda: detection_reliability(panel),
         )
     ]
 
 
-def _pair_spec(data: ReportData, pair: ChannelPair) -> FigureSpec:
+def _pair_spec(data: ReportData, pair: PairResult) -> FigureSpec:
     words = f"{pair.first} against {pair.second}"
     return FigureSpec(
         name=f"pair_{safe_name(pair.tower)}_{safe_name(pair.first)}_{safe_name(pair.second)}",
@@ -254,9 +258,9 @@ def _pair_spec(data: ReportData, pair: ChannelPair) -> FigureSpec:
     )
 
 
-def _forecast_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
+def _forecast_specs(data: ReportData, panel: RankResult) -> list[FigureSpec]:
     """Probabilities of a fitted receiver along the flight; they stand under the table of the result."""
-    if forecast_of(panel) is None:
+    if panel.probability is None:
         return []
     return [
         FigureSpec(
@@ -271,7 +275,7 @@ def _forecast_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
     ]
 
 
-def _rank_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
+def _rank_specs(data: ReportData, panel: RankResult) -> list[FigureSpec]:
     stem, section = safe_name(panel.tower), f"rank/{panel.tower}"
 
     def spec(name: str, title: str, caption: str, alt: str, draw: Callable[[], Figure]) -> FigureSpec:
@@ -308,7 +312,7 @@ def _rank_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
             lambda: rank_over_time(data, panel),
         ),
     ]
-    if any(at.confusion is not None for at in panel.simulated):
+    if panel.score.simulated:
         result.append(
             spec(
                 "rank_confusion",
@@ -319,7 +323,7 @@ def _rank_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
                 lambda: confusion(panel),
             )
         )
-    if panel.curve is not None:
+    if np.isfinite(panel.score.curve.agreement).any():
         result.append(
             spec(
                 "rank_k",

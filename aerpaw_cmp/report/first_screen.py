@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ..common.provenance import KEY, union
+from ..common.provenance import union
+from ..compare.forecast import ForecastScore
 from ..compare.memory import FEWEST
-from ..compare.result import AuditResult
-from .data import Baseline, RankAtK, RankPanel, ReportData, RssPanel
+from ..compare.result import AuditResult, RankResult, RssResult
+from ..compare.statistics import PairedDifference
+from .data import ReportData
 from .words import (
     NOTHING_COMPARED,
     TOO_FEW_COMPARED,
@@ -23,6 +24,7 @@ from .words import (
     expected_sentence,
     first_sentence,
     local_error,
+    nearest_k,
     pretty,
     training_sentence,
     trust,
@@ -53,7 +55,7 @@ def verdict(data: ReportData) -> tuple[str, ...]:
         learned = " ".join(part for part in (learned, expected_sentence(data.rss)) if part)
         return learned, " ".join(part for part in (_baseline_sentence(data.rss), first, trust(data)) if part)
     if not first:
-        most = max([panel.n for panel in data.rss], default=0)
+        most = max([panel.score.n for panel in data.rss], default=0)
         return (NOTHING_COMPARED if not most else TOO_FEW_COMPARED.format(n=most), trust(data))
     first = " ".join(part for part in (first, expected_sentence(scored)) if part)
     return first, " ".join(part for part in (_causes(scored) or _fails(scored), trust(data)) if part)
@@ -62,21 +64,21 @@ def verdict(data: ReportData) -> tuple[str, ...]:
 def _training(data: ReportData) -> str:
     """The sentence of a training flight; nothing where nothing was learned from the logs of this one."""
     for panels, what in ((data.rss, "the antennas"), (data.rank, "the receiver")):
-        learned = [panel for panel in panels if panel.extra.get(KEY)]
+        learned = [panel for panel in panels if panel.further.trained_on]
         if learned:
-            names = [panel.name if isinstance(panel, RssPanel) else panel.tower for panel in learned]
-            return training_sentence(names, what, union(*(panel.extra[KEY] for panel in learned)))
+            names = [panel.name if isinstance(panel, RssResult) else panel.tower for panel in learned]
+            return training_sentence(names, what, union(*(panel.further.trained_on or () for panel in learned)))
     return ""
 
 
-def _baseline_sentence(panels: Sequence[RssPanel]) -> str:
+def _baseline_sentence(panels: Sequence[RssResult]) -> str:
     """What a model without anything learned leaves on the panels of a training flight."""
     best = best_baseline([panel for panel in panels if panel.training])
     return "" if best is None else f"For comparison, {pretty(best[0])}: RMSE {best[1]:.1f} dB."
 
 
-def _scored(panels: Sequence[RssPanel]) -> list[RssPanel]:
-    return [panel for panel in panels if panel.n >= FEWEST and math.isfinite(panel.rmse_db)]
+def _scored(panels: Sequence[RssResult]) -> list[RssResult]:
+    return [panel for panel in panels if panel.score.n >= FEWEST and math.isfinite(panel.score.rmse_db)]
 
 
 def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
@@ -85,39 +87,41 @@ def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
     return float(np.sqrt((weight * np.asarray(rmse_db) ** 2).sum() / weight.sum()))
 
 
-def baseline_errors(panels: Sequence[RssPanel]) -> dict[str, float]:
+def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
     """Pooled RMSE [dB] of each baseline that all of these series have."""
-    names = [b.name for b in panels[0].baselines] if panels else []
     errors = {}
-    for name in names:
-        own = [_baseline(panel, name) for panel in panels]
-        known = [b.rmse_db for b in own if b is not None and math.isfinite(b.rmse_db)]
-        if len(known) == len(panels):
-            errors[name] = pooled_db(known, [panel.n for panel in panels])
+    for name in panels[0].baselines if panels else ():
+        known = [p.baselines[name].rmse_db for p in panels if name in p.baselines]
+        if len(known) == len(panels) and all(map(math.isfinite, known)):
+            errors[name] = pooled_db(known, [panel.score.n for panel in panels])
     return errors
 
 
-def best_baseline(panels: Sequence[RssPanel]) -> tuple[str, float] | None:
+def best_baseline(panels: Sequence[RssResult]) -> tuple[str, float] | None:
     """Name and pooled RMSE [dB] of the baseline with the smallest error; None without one that all have."""
     return min(baseline_errors(panels).items(), key=lambda item: item[1], default=None)
 
 
-def _baseline(panel: RssPanel, name: str) -> Baseline | None:
-    return next((b for b in panel.baselines if b.name == name), None)
+def _pooled(panels: Sequence[RssResult]) -> float:
+    """RMSE of the ray tracing over all samples of several series [dB]."""
+    return pooled_db([p.score.rmse_db for p in panels], [p.score.n for p in panels])
 
 
-def judged(panels: Sequence[RssPanel]) -> Judged | None:
+def _paired(panels: Sequence[RssResult], name: str) -> list[PairedDifference]:
+    """Ray tracing against one baseline, where both were scored on the same samples."""
+    return [p.further.compared_with[name] for p in panels if name in p.further.compared_with]
+
+
+def judged(panels: Sequence[RssResult]) -> Judged | None:
     """Ray tracing against the baseline that matters most: the best of those that it loses to, else the best of all."""
     if not panels:
         return None
-    total = pooled_db([p.rmse_db for p in panels], [p.n for p in panels])
-    best = best_baseline(panels)
+    total, best = _pooled(panels), best_baseline(panels)
     if best is None:
         return Judged(ray_db=total, channels=len(panels))
     every = []
     for name, error in baseline_errors(panels).items():
-        paired = [b.paired for p in panels if (b := _baseline(p, name)) is not None and b.paired is not None]
-        said = [pair.verdict for pair in paired if pair.verdict != "no interval"]
+        said = [pair.verdict for pair in _paired(panels, name) if pair.verdict != "no interval"]
         every.append(Judged(ray_db=total, channels=len(panels), name=name, other_db=error, judged=len(said),
                             better=said.count("better"), worse=said.count("worse")))  # fmt: skip
     return most_telling(every)
@@ -129,89 +133,78 @@ def most_telling(every: Sequence[Judged]) -> Judged:
     return min(lost or every, key=lambda one: one.other_db)
 
 
-def _forecast_of(panel: RankPanel) -> Mapping[str, Any] | None:
-    """Numbers of the fitted receiver's forecast of the rank, where it was scored."""
-    found = panel.extra.get("receiver")
-    return found if found and found["kappa"] is not None and found["log_score_gain"] is not None else None
+def _forecast_of(panel: RankResult) -> ForecastScore | None:
+    """Score of the fitted receiver's forecast of the rank, where there is one."""
+    score = panel.further.receiver
+    known = score is not None and math.isfinite(score.kappa) and math.isfinite(score.log_score_gain)
+    return score if known else None
 
 
-def _forecast_sentence(panel: RankPanel, found: Mapping[str, Any]) -> str:
+def _forecast_sentence(panel: RankResult, score: ForecastScore) -> str:
     return (
-        f"Rank forecast at {panel.tower} by the receiver learned on other flights: kappa {found['kappa']:.2f} (0 is "
-        f"chance), {_log_score(found)}."
-        f" The forecast rank agrees in {100 * found['agreement']:.0f} % of samples; always "
-        f"guessing the commonest agrees in {100 * found['majority_agreement']:.0f} %."
+        f"Rank forecast at {panel.tower} by the receiver learned on other flights: kappa {score.kappa:.2f} (0 is "
+        f"chance), {_log_score(score)}."
+        f" The forecast rank agrees in {100 * score.agreement:.0f} % of samples; always "
+        f"guessing the commonest agrees in {100 * score.majority_agreement:.0f} %."
     )
 
 
-def _log_score(found: Mapping[str, Any]) -> str:
-    side = "below" if found["log_score_gain"] > 0 else "above"
-    return f"log score {abs(100 * found['log_score_gain']):.0f} % {side} the constant forecast"
+def _log_score(score: ForecastScore) -> str:
+    side = "below" if score.log_score_gain > 0 else "above"
+    return f"log score {abs(100 * score.log_score_gain):.0f} % {side} the constant forecast"
 
 
-def _forecast_card(panel: RankPanel, found: Mapping[str, Any]) -> Headline:
-    low, high = found["kappa_ci95"]
+def _forecast_card(panel: RankResult, score: ForecastScore) -> Headline:
+    low, high = score.kappa_ci95
     return Headline(
         label=f"Rank forecast at {panel.tower}",
-        value=f"kappa {found['kappa']:.2f}",
-        interval=NO_INTERVAL if low is None or high is None else f"95 %: {low:.2f} to {high:.2f}",
-        beside=_log_score(found),
+        value=f"kappa {score.kappa:.2f}",
+        interval=f"95 %: {low:.2f} to {high:.2f}" if math.isfinite(low) and math.isfinite(high) else NO_INTERVAL,
+        beside=_log_score(score),
     )
 
 
-def _rank_sentence(panels: Sequence[RankPanel]) -> str:
+def _rank_sentence(panels: Sequence[RankResult]) -> str:
     for panel in panels:
-        if found := _forecast_of(panel):
-            return _forecast_sentence(panel, found)
-        at = _best_k(panel)
-        if at is not None:
-            commonest = panel.extra.get("commonest") or {}
+        if score := _forecast_of(panel):
+            return _forecast_sentence(panel, score)
+        k = nearest_k(panel)
+        if k is not None:
+            at, commonest = panel.score.simulated[k], panel.further.commonest
             beside = (
-                f"; always guessing {commonest['rank']} agrees in {100 * commonest['agreement']:.0f} %"
-                if commonest.get("rank") else ""
+                f"; always guessing {commonest.rank} agrees in {100 * commonest.agreement:.0f} %"
+                if commonest.rank else ""
             )  # fmt: skip
             agree = f" Per position they agree in {100 * at.agreement:.0f} % of samples{beside}."
             return (
-                f"Rank at {panel.tower} (K = {at.k:.10g}, best of {len(panel.simulated)} thresholds): predicted and "
+                f"Rank at {panel.tower} (K = {k:.10g}, best of {len(panel.score.simulated)} thresholds): predicted and "
                 f"reported shares differ by {points(at.total_variation)} in all."
                 + (agree if math.isfinite(at.agreement) else "")
             )
     return ""
 
 
-def _best_k(panel: RankPanel) -> RankAtK | None:
-    scored = [at for at in panel.simulated if math.isfinite(at.total_variation)]
-    return min(scored, key=lambda at: at.total_variation) if scored else None
-
-
 LONG_S = 5.0
 """A shorter stretch of error is a fade, not a fault of the model."""
 
 
-def _causes(panels: Sequence[RssPanel]) -> str:
+def _causes(panels: Sequence[RssResult]) -> str:
     """The cause that explains most of a channel's error; nothing where no channel shows one."""
-    known = [panel for panel in panels if panel.extra.get("likely_cause")]
-    if not known:
-        return ""
-    return cause_sentence(max(known, key=lambda panel: float(panel.extra["likely_cause"]["gain"])))
+    gains = [(one.gain, i) for i, panel in enumerate(panels) if (one := panel.further.likely_cause) is not None]
+    return cause_sentence(panels[max(gains)[1]]) if gains else ""
 
 
-def _fails(panels: Sequence[RssPanel]) -> str:
+def _fails(panels: Sequence[RssResult]) -> str:
     """Where the error is largest."""
     if not panels:
         return ""
-    worst = max(panels, key=lambda p: p.rmse_db)
-    if len(panels) > 1 and worst.rmse_db > pooled_db([p.rmse_db for p in panels], [p.n for p in panels]) + LARGE_DB:
-        return f"Largest error of a channel: {worst.name}, {worst.rmse_db:.1f} dB."
-    spans = [
-        (panel, span)
-        for panel in panels
-        for span in panel.worst
-        if (span.end - span.start) / np.timedelta64(1, "s") >= LONG_S
-    ]
+    worst = max(panels, key=lambda p: p.score.rmse_db)
+    if len(panels) > 1 and worst.score.rmse_db > _pooled(panels) + LARGE_DB:
+        return f"Largest error of a channel: {worst.name}, {worst.score.rmse_db:.1f} dB."
+    spans = [(panel, span) for panel in panels for span in panel.spans if span.end_s - span.start_s >= LONG_S]
     if not spans:
         return ""
-    panel, span = max(spans, key=lambda item: abs(item[1].mean_error_db))
+    panel, span = max(spans, key=lambda item: abs(item[1].mean_db))
     return local_error(panel, span)
 
 
@@ -222,12 +215,12 @@ def headlines(data: ReportData) -> list[Headline]:
     if panels:
         lines += [_error(panels), *_difference(panels)]
     for panel in data.rank:
-        found, at = _forecast_of(panel), _best_k(panel)
-        if found:
-            lines.append(_forecast_card(panel, found))
+        score, k = _forecast_of(panel), nearest_k(panel)
+        if score is not None:
+            lines.append(_forecast_card(panel, score))
             break
-        if at is not None:
-            lines.append(_rank(panel, at))
+        if k is not None:
+            lines.append(_rank(panel, k))
             break
     audit = None if data.engine is None else data.engine.audit
     if audit is not None:
@@ -247,9 +240,8 @@ def _audit(audit: AuditResult) -> Headline:
     return Headline(label="Audit", value=value, interval=audit_paths(audit), beside=beside)
 
 
-def _error(panels: Sequence[RssPanel]) -> Headline:
-    total = pooled_db([p.rmse_db for p in panels], [p.n for p in panels])
-    best = best_baseline(panels)
+def _error(panels: Sequence[RssResult]) -> Headline:
+    total, best = _pooled(panels), best_baseline(panels)
     return Headline(
         label="RMSE of the level" if len(panels) == 1 else f"RMSE of the level, {len(panels)} channels",
         value=f"{total:.1f} dB",
@@ -258,20 +250,19 @@ def _error(panels: Sequence[RssPanel]) -> Headline:
     )
 
 
-def _ends(panels: Sequence[RssPanel]) -> str:
+def _ends(panels: Sequence[RssResult]) -> str:
     if len(panels) == 1:
-        bounds = panels[0].rmse_ci95_db
-        if bounds is None or not all(map(math.isfinite, bounds)):
-            return NO_INTERVAL
-        return f"95 %: {bounds[0]:.1f} to {bounds[1]:.1f} dB"
-    return f"channels: {min(p.rmse_db for p in panels):.1f} to {max(p.rmse_db for p in panels):.1f} dB"
+        low, high = panels[0].score.rmse_ci95_db
+        return f"95 %: {low:.1f} to {high:.1f} dB" if math.isfinite(low) and math.isfinite(high) else NO_INTERVAL
+    errors = [panel.score.rmse_db for panel in panels]
+    return f"channels: {min(errors):.1f} to {max(errors):.1f} dB"
 
 
-def _difference(panels: Sequence[RssPanel]) -> list[Headline]:
+def _difference(panels: Sequence[RssResult]) -> list[Headline]:
     best = best_baseline(panels)
     if best is None:
         return []
-    paired = [b.paired for p in panels if (b := _baseline(p, best[0])) is not None and b.paired is not None]
+    paired = _paired(panels, best[0])
     if not paired:
         return []
     words = [one.verdict for one in paired]
@@ -299,18 +290,18 @@ def _difference(panels: Sequence[RssPanel]) -> list[Headline]:
     ]
 
 
-def _rank(panel: RankPanel, at: RankAtK) -> Headline:
-    bounds = at.total_variation_ci95
-    known = bounds is not None and all(map(math.isfinite, bounds))
-    commonest = panel.extra.get("commonest") or {}
+def _rank(panel: RankResult, k: float) -> Headline:
+    at, commonest = panel.score.simulated[k], panel.further.commonest
+    low, high = at.total_variation_ci95
+    known = math.isfinite(low) and math.isfinite(high)
     agree = f"agreement {100 * at.agreement:.0f} %" if math.isfinite(at.agreement) else "no pose in common"
     return Headline(
-        label=f"Rank at {panel.tower}, K = {at.k:.10g}",
+        label=f"Rank at {panel.tower}, K = {k:.10g}",
         value=points(at.total_variation),
         interval="between predicted and reported shares"
-        + (f" (95 %: {100 * bounds[0]:.0f} to {100 * bounds[1]:.0f})" if known and bounds is not None else ""),
-        beside=f"{agree}; always saying {commonest['rank']}: {100 * commonest['agreement']:.0f} %"
-        if commonest.get("rank")
+        + (f" (95 %: {100 * low:.0f} to {100 * high:.0f})" if known else ""),
+        beside=f"{agree}; always saying {commonest.rank}: {100 * commonest.agreement:.0f} %"
+        if commonest.rank
         else agree,
     )
 

@@ -19,11 +19,13 @@ import numpy as np
 from markupsafe import Markup
 
 from ..compare.ladder import LadderRow
+from ..compare.rss import PART_DB
 from ..logs.records import has_wall_clock
 from . import words
 from .canvas import Picture, start_of
 from .data import RANKS, ReportData
 from .explorer import as_json, payload
+from .export import FITTED, further_numbers
 from .first_screen import headlines, verdict
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
@@ -171,7 +173,7 @@ def environment() -> Any:
     environment.filters.update(
         num=number, interval=interval, percent=percent, duration=duration, minute=minute, data_uri=data_uri, k=k_key,
         flat=lambda s: list(flat(s)), clock=clock, picture_uri=picture_uri, more=more,
-        audit_summary=words.audit_summary,
+        audit_summary=words.audit_summary, further=further_numbers, instants=words.instants,
     )  # fmt: skip
     return environment
 
@@ -229,12 +231,14 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         files=files,
         notes=list(dict.fromkeys([*data.site.notes, *data.notes])),  # a flight repeats what its site says
         ranks=RANKS,
+        fitted=FITTED,
+        parted_db=PART_DB,
         headline=words.headline(data),
         verdicts=words.verdicts(data.rss, data.rank),
         ladder_verdict=words.ladder_verdict(data.ladder),
         ladder=ladder_table(data.ladder),
         warnings=words.warnings(data),
-        baselines=list(dict.fromkeys(b.name for panel in data.rss for b in panel.baselines)),
+        baselines=list(dict.fromkeys(name for one in data.rss for name in one.baselines)),
         rss_columns=RSS_COLUMNS,
         rank_columns=RANK_COLUMNS,
         rejected_shown=REJECTED_SHOWN,

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..common.units import FloatArray, IntArray
+from ..compare.statistics import Interval
 from ..site.site import Site
-from .data import Interval
 
 JOINT = "joint"
 """Name of the map in which the nearest tower serves."""

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..common.units import FloatArray
+from ..compare.rank import RankFit
+from ..compare.result import RankResult
 from ..site.site import Site
 from .canvas import (
     RANK_MARKER,
@@ -29,7 +31,7 @@ from .canvas import (
     start_of,
     time_axis,
 )
-from .data import RANKS, Histogram, RankAtK, RankPanel, ReportData
+from .data import RANKS, ReportData
 from .names import k_key
 
 if TYPE_CHECKING:
@@ -77,43 +79,46 @@ def rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: Fl
         )  # fmt: skip
 
 
-def rank_maps(data: ReportData, panel: RankPanel) -> Figure:
+def rank_maps(data: ReportData, panel: RankResult) -> Figure:
     """Measured rank and the rank of every K along the flight."""
     maps = [("Measured (reported RI)", panel.measured)]
-    maps += [(f"Ray tracing, K = {k_key(at.k)}", at.rank.astype(float)) for at in panel.simulated]
+    maps += [(f"Ray tracing, K = {k_key(k)}", rank.astype(float)) for k, rank in panel.rank.items()]
     columns = 2 if len(maps) > 1 else 1
     rows = -(-len(maps) // columns)
-    shape = plan_shape(panel.east_m, panel.north_m)
+    east, north, _ = panel.position_m.T
+    shape = plan_shape(east, north)
     fig = figure((9.2, rows * (3.9 / shape + 1.1)))
     axes = fig.subplots(rows, columns, squeeze=False)
     for ax, (title, rank) in zip(axes.ravel(), maps, strict=False):
-        rank_map(ax, data.site, panel.east_m, panel.north_m, rank, title)
-        frame_around(ax, panel.east_m, panel.north_m, shape=shape)
+        rank_map(ax, data.site, east, north, rank, title)
+        frame_around(ax, east, north, shape=shape)
     for ax in axes.ravel()[len(maps) :]:
         ax.set_visible(False)
     return fig
 
 
-def rank_histograms(panel: RankPanel) -> Figure:
+def rank_histograms(panel: RankResult) -> Figure:
     """Shares of rank 1 to 4, measured beside every K, with intervals where known."""
     fig = figure((9.2, 3.4))
     ax = fig.subplots()
     reported = int(np.isfinite(panel.measured).sum())
-    series: list[tuple[str, Histogram]] = [(f"measured ({count(reported)} samples)", panel.histogram)]
-    series += [(at_label(at), at.histogram) for at in panel.simulated]
+    score = panel.score
+    series = [(f"measured ({count(reported)} samples)", score.histogram, score.histogram_ci95)]
+    series += [(at_label(k, fit), fit.histogram, fit.histogram_ci95) for k, fit in score.simulated.items()]
     width = 0.8 / len(series)
     from matplotlib import colormaps
 
-    for number, (label, histogram) in enumerate(series):
+    for number, (label, shares, intervals) in enumerate(series):
         at = np.array(RANKS) + (number - (len(series) - 1) / 2) * width
         shade = SIMULATED if number == 0 else colormaps["cividis"](0.25 + 0.75 * number / max(len(series) - 1, 1))
-        share = np.nan_to_num(histogram.share)
+        share = np.nan_to_num(shares)
         ax.bar(
             at, 100 * share, width * 0.92, color=shade, edgecolor="black", linewidth=0.6, label=label,
             hatch=("", "///", "xxx", "...", "---", "\\\\\\")[number % 6],
         )  # fmt: skip
-        if histogram.low is not None and histogram.high is not None:
-            spread = 100 * np.stack([share - histogram.low, histogram.high - share]).clip(min=0)
+        low, high = np.array(intervals, dtype=np.float64).T
+        spread = 100 * np.stack([share - low, high - share]).clip(min=0)
+        if np.isfinite(spread).any():
             ax.errorbar(at, 100 * share, spread, fmt="none", ecolor="#D55E00", elinewidth=1.3, capsize=2.5)
     ax.set_xticks(RANKS, [f"{r}" for r in RANKS])
     ax.set_xlabel("Channel rank")
@@ -123,29 +128,28 @@ def rank_histograms(panel: RankPanel) -> Figure:
     return fig
 
 
-def at_label(at: RankAtK) -> str:
+def at_label(k: float, fit: RankFit) -> str:
     """Legend entry of one K."""
-    distance = "" if not np.isfinite(at.total_variation) else f" (total variation {at.total_variation:.2f})"
-    return f"K = {k_key(at.k)}{distance}"
+    distance = "" if not np.isfinite(fit.total_variation) else f" (total variation {fit.total_variation:.2f})"
+    return f"K = {k_key(k)}{distance}"
 
 
-def rank_over_time(data: ReportData, panel: RankPanel) -> Figure:
+def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
     """Measured rank and the rank of every K over time, one row each; SINR and singular values under them."""
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
-    rows = 1 + len(panel.simulated)
-    below = [1.3] * (panel.sinr_db is not None) + [2.2] * (panel.singular_ratio_db is not None)
+    rows = 1 + len(panel.rank)
+    below = [1.3] * (panel.sinr_db is not None) + [2.2]
     ratios = [1.0] * rows + below
     fig = figure((9.2, 1.1 * sum(ratios) + 0.5))
     axes = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
     draw_measured_rank(axes[0], seconds, panel)
-    for ax, at in zip(axes[1:], panel.simulated, strict=False):
-        rank = np.where(at.rank == 0, np.nan, at.rank)
+    for ax, (k, rank) in zip(axes[1:], panel.rank.items(), strict=False):
         ax.plot(
-            seconds, rank, linestyle="none", marker="|", markersize=7, rasterized=True, color=SIMULATED,
-            label=f"K = {k_key(at.k)}",
+            seconds, np.where(rank == 0, np.nan, rank), linestyle="none", marker="|", markersize=7, rasterized=True,
+            color=SIMULATED, label=f"K = {k_key(k)}",
         )  # fmt: skip
-        draw_out_of_coverage(ax, seconds, at.rank == 0, "Z: no path")
+        draw_out_of_coverage(ax, seconds, rank == 0, "Z: no path")
     for number, ax in enumerate(axes[:rows]):
         draw_waypoints(ax, data, start, names=number == 0)
         ax.set_yticks(RANKS)
@@ -159,26 +163,18 @@ def rank_over_time(data: ReportData, panel: RankPanel) -> Figure:
         )  # fmt: skip
         axes[rows].set_ylabel("SINR [dB]")
         axes[rows].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
-    if panel.singular_ratio_db is not None:
-        draw_singular_values(axes[-1], seconds, panel.singular_ratio_db, panel)
+    draw_singular_values(axes[-1], seconds, panel)
     time_axis(axes[-1], start)
     return fig
-
-
-def forecast_of(panel: RankPanel) -> FloatArray | None:
-    """Probabilities (n, 4) of rank 1 to 4 by a fitted receiver; None without one."""
-    columns = [panel.values.get(f"probability_rank{rank}") for rank in RANKS]
-    known = [np.asarray(one, dtype=np.float64) for one in columns if one is not None]
-    return np.column_stack(known) if len(known) == len(RANKS) else None
 
 
 _FORECAST_COLUMNS = 600
 """Means of the forecast along the flight: as many as a page can show."""
 
 
-def rank_forecast(data: ReportData, panel: RankPanel) -> Figure:
+def rank_forecast(data: ReportData, panel: RankResult) -> Figure:
     """Probability of each rank along the flight, the reported ranks under it."""
-    probability = forecast_of(panel)
+    probability = panel.probability
     assert probability is not None
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
@@ -206,9 +202,9 @@ def rank_forecast(data: ReportData, panel: RankPanel) -> Figure:
     return fig
 
 
-def draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankPanel) -> None:
+def draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankResult) -> None:
     """Reported ranks as ticks; those held over from an earlier report are smaller and grey."""
-    held = np.zeros(len(seconds), dtype=bool) if panel.stale is None else panel.stale
+    held = ~panel.score.staleness.fresh
     for mask, label, colour, size in (
         (~held, "measured", "#0072B2", 7),
         (held, "measured, held over", "#9A9A9A", 4),
@@ -220,30 +216,21 @@ def draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankPanel) -> None:
             )  # fmt: skip
 
 
-def draw_singular_values(ax: Axes, seconds: FloatArray, values: FloatArray, panel: RankPanel) -> None:
-    """Singular values relative to the largest, with every threshold K.
-
-    Parameters
-    ----------
-    ax : Axes
-    seconds : (n,)
-    values : (n, 3)
-        Second to fourth singular value over the first [dB].
-    panel : RankPanel
-        For its thresholds.
-    """
-    for column, (colour, marker) in enumerate((("#111111", "."), ("#0072B2", "."), ("#9AD0F0", "."))):
+def draw_singular_values(ax: Axes, seconds: FloatArray, panel: RankResult) -> None:
+    """Singular values relative to the largest, with every threshold K."""
+    values = panel.singular_ratio_db
+    for column, colour in enumerate(("#111111", "#0072B2", "#9AD0F0")[: values.shape[1]]):
         ax.plot(
-            seconds, values[:, column], linestyle="none", marker=marker, markersize=2, color=colour, rasterized=True,
+            seconds, values[:, column], linestyle="none", marker=".", markersize=2, color=colour, rasterized=True,
             label=f"σ{chr(0x2082 + column)}/σ₁",
         )  # fmt: skip
-    for number, at in enumerate(panel.simulated):
-        level = -20 * np.log10(at.k)
+    for number, k in enumerate(panel.rank):
+        level = -20 * np.log10(k)
         ax.axhline(
             level, color=TOWER, linewidth=0.9, linestyle=(0, (5, 2)), label="thresholds 1/K" if not number else None
         )
         ax.annotate(
-            f"K = {k_key(at.k)}",
+            f"K = {k_key(k)}",
             (0.004, level),
             xycoords=ax.get_yaxis_transform(),
             fontsize=7,
@@ -252,20 +239,20 @@ def draw_singular_values(ax: Axes, seconds: FloatArray, values: FloatArray, pane
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
             zorder=6,
         )
-    lowest = [-20 * np.log10(at.k) for at in panel.simulated] + values[np.isfinite(values)].tolist()
+    lowest = [-20 * np.log10(k) for k in panel.rank] + values[np.isfinite(values)].tolist()
     ax.set_ylim(max(min(lowest, default=-20.0) - 6.0, -110.0), 2.0)  # below -110 dB lies nothing but rounding
     ax.set_ylabel("Singular value\nover largest [dB]")
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
 
 
-def confusion(panel: RankPanel) -> Figure:
+def confusion(panel: RankResult) -> Figure:
     """Measured rank against simulated rank for every K, as counts and shares of the measured rank."""
-    with_table = [at for at in panel.simulated if at.confusion is not None]
+    fits = panel.score.simulated
     fig = figure((9.2, 3.3))
-    axes = fig.subplots(1, len(with_table), sharey=True, squeeze=False)[0]
+    axes = fig.subplots(1, len(fits), sharey=True, squeeze=False)[0]
     image = None
-    for ax, at in zip(axes, with_table, strict=True):
-        table = np.asarray(at.confusion, dtype=float)
+    for ax, (k, fit) in zip(axes, fits.items(), strict=True):
+        table = np.asarray(fit.confusion[1:], dtype=float)  # no report is no row
         total = table.sum(axis=1, keepdims=True)
         share = 100 * np.divide(table, total, out=np.zeros_like(table), where=total > 0)
         image = ax.imshow(np.where(total > 0, share, np.nan), cmap="cividis", vmin=0, vmax=100, aspect="auto")
@@ -281,8 +268,8 @@ def confusion(panel: RankPanel) -> Figure:
         ax.set_yticks(range(4), [f"{r}" for r in RANKS])
         ax.set_xlabel("Simulated rank")
         samples = count(int(table.sum()))
-        equal = f": equal in {100 * at.agreement:.0f} % of {samples}" if np.isfinite(at.agreement) else ""
-        ax.set_title(f"K = {k_key(at.k)}{equal}")
+        equal = f": equal in {100 * fit.agreement:.0f} % of {samples}" if np.isfinite(fit.agreement) else ""
+        ax.set_title(f"K = {k_key(k)}{equal}")
         ax.grid(visible=False)
     axes[0].set_ylabel("Measured rank")
     if image is not None:
@@ -290,25 +277,22 @@ def confusion(panel: RankPanel) -> Figure:
     return fig
 
 
-def agreement_curve(panel: RankPanel) -> Figure:
+def agreement_curve(panel: RankResult) -> Figure:
     """Agreement and total variation against continuous K."""
-    curve = panel.curve
+    curve, best = panel.score.curve, panel.score.best_k
     fig = figure((9.2, 3.4))
     ax = fig.subplots()
-    if curve is not None:
-        ax.semilogx(
-            curve.k, curve.agreement, color=SIMULATED, linewidth=1.3, label="agreement by pose (higher is better)"
-        )
-        ax.semilogx(
-            curve.k, curve.total_variation, color="#D55E00", linestyle=(0, (5, 2)), linewidth=1.3,
-            label="total variation of the histograms (lower is better)",
-        )  # fmt: skip
-    if panel.best_k_ci95 is not None and np.isfinite(panel.best_k_ci95).all():
-        ax.axvspan(*panel.best_k_ci95, color="#DDDDDD", hatch="///", alpha=0.6, label="95 % interval of the best K")
-    if np.isfinite(panel.best_k):
-        ax.axvline(panel.best_k, color=TOWER, linewidth=1.2, label=f"best K = {panel.best_k:.3g}")
-    for number, at in enumerate(panel.simulated):
-        ax.axvline(at.k, color=WAYPOINT, linestyle=":", linewidth=0.9, label="K of the report" if number == 0 else None)
+    ax.semilogx(curve.k, curve.agreement, color=SIMULATED, linewidth=1.3, label="agreement by pose (higher is better)")
+    ax.semilogx(
+        curve.k, curve.total_variation, color="#D55E00", linestyle=(0, (5, 2)), linewidth=1.3,
+        label="total variation of the histograms (lower is better)",
+    )  # fmt: skip
+    if np.isfinite(curve.best_k_interval).all():
+        ax.axvspan(*curve.best_k_interval, color="#DDDDDD", hatch="///", alpha=0.6, label="95 % interval of the best K")
+    if np.isfinite(best):
+        ax.axvline(best, color=TOWER, linewidth=1.2, label=f"best K = {best:.3g}")
+    for number, k in enumerate(panel.rank):
+        ax.axvline(k, color=WAYPOINT, linestyle=":", linewidth=0.9, label="K of the report" if number == 0 else None)
     ax.set_ylim(0.0, 1.02)
     plain_ticks(ax.xaxis)
     ax.set_xlabel("K (ratio of singular values)")

@@ -9,6 +9,8 @@ import numpy as np
 
 from ..common.units import FloatArray
 from ..compare.ladder import LadderRow
+from ..compare.result import PairResult, RankResult, RssResult
+from ..compare.rss import PART_DB
 from .canvas import (
     MEASURED,
     POINTS_PER_CLOUD,
@@ -39,7 +41,7 @@ from .canvas import (
     time_axis,
     used_towers,
 )
-from .data import GEOMETRY, ChannelPair, RankPanel, ReportData, RssPanel, Track, tower_way
+from .data import GEOMETRY, ReportData, Track
 from .words import pretty
 
 if TYPE_CHECKING:
@@ -47,28 +49,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def overview(data: ReportData, panel: RssPanel) -> Figure:
+def overview(data: ReportData, panel: RssResult) -> Figure:
     """The flight coloured by residual beside level and residual over time, of one channel."""
     fig = figure((9.2, 4.0))
     plan, right = fig.subplots(1, 2, width_ratios=(1.0, 1.5))
     residual = panel.residual_db
-    if panel.east_m is not None and panel.north_m is not None:
-        draw_site(plan, data.site, towers=[panel.tower])
-        few = cloud(residual)
-        points = plan.scatter(
-            panel.east_m[few], panel.north_m[few], c=residual[few], cmap="RdBu_r", vmin=-12, vmax=12, s=6, linewidths=0,
-            rasterized=True, zorder=5,
-        )  # fmt: skip
-        draw_node(plan, panel)
-        tower = data.site.towers.get(panel.tower)
-        ends = ([], []) if tower is None else ([tower.east_m], [tower.north_m])
-        way = tower_way(panel)
-        frame_around(
-            plan,
-            np.concatenate([panel.east_m, ends[0], way.get("east", [])]),
-            np.concatenate([panel.north_m, ends[1], way.get("north", [])]),
-        )
-        colour_bar(fig, points, plan, "Residual [dB]", "both")
+    draw_site(plan, data.site, towers=[panel.tower])
+    few = cloud(residual)
+    points = plan.scatter(
+        *panel.position_m[few, :2].T, c=residual[few], cmap="RdBu_r", vmin=-12, vmax=12, s=6, linewidths=0,
+        rasterized=True, zorder=5,
+    )  # fmt: skip
+    draw_node(plan, panel)
+    tower = data.site.towers.get(panel.tower)
+    ends = [] if tower is None else [tower.position_m[None]]
+    ends += [] if panel.tower_m is None else [panel.tower_m]
+    frame_around(plan, *np.concatenate([panel.position_m, *ends])[:, :2].T)
+    colour_bar(fig, points, plan, "Residual [dB]", "both")
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
     calibrated = panel.calibrated_db
@@ -85,10 +82,10 @@ def overview(data: ReportData, panel: RssPanel) -> Figure:
     return fig
 
 
-def draw_node(ax: Axes, panel: RssPanel | RankPanel) -> None:
+def draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
     """The way of a tower that moves; its mark stands in the middle of it."""
-    if way := tower_way(panel):
-        ax.plot(*thinned_plan(way["east"], way["north"]), color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5,
+    if panel.tower_m is not None:
+        ax.plot(*thinned_plan(*panel.tower_m[:, :2].T), color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5,
                 label=f"way of {panel.tower}")  # fmt: skip
 
 
@@ -98,8 +95,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     whole, close = fig.subplots(1, 2, width_ratios=(1.0, 1.35))
     draw_site(whole, data.site)
     draw_site(close, data.site)
-    panels: list[RssPanel | RankPanel] = [*data.rank, *data.rss]
-    nodes = {panel.tower: panel for panel in panels}.values()
+    nodes = {one.tower: one for one in data.series}.values()
     for panel in nodes:
         draw_node(whole, panel)
         draw_node(close, panel)
@@ -115,12 +111,12 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     near = [data.site.towers[name] for name in used_towers(data)]
     extent = float(np.nanmax([np.ptp(track.east_m), np.ptp(track.north_m), 100.0])) if len(track.east_m) else 100.0
     centre = np.array([np.nanmean(track.east_m), np.nanmean(track.north_m)])
-    ways = [way for way in map(tower_way, nodes) if way]
+    ways = [one.tower_m for one in nodes if one.tower_m is not None]
     near = [t for t in near if np.hypot(t.east_m - centre[0], t.north_m - centre[1]) < extent]
     frame_around(
         close,
-        np.concatenate([track.east_m, [t.east_m for t in near], *(way["east"] for way in ways)]),
-        np.concatenate([track.north_m, [t.north_m for t in near], *(way["north"] for way in ways)]),
+        np.concatenate([track.east_m, [t.east_m for t in near], *(way[:, 0] for way in ways)]),
+        np.concatenate([track.north_m, [t.north_m for t in near], *(way[:, 1] for way in ways)]),
     )
     for waypoint in data.waypoints:
         close.annotate(
@@ -153,9 +149,9 @@ def altitude(data: ReportData, track: Track) -> Figure:
 # --- RSS ----------------------------------------------------------------------------------------
 
 
-def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
+def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     """Calibrated measurement, simulation and baselines over time, and the residual under them."""
-    start = start_of(data)
+    start, score = start_of(data), panel.score
     seconds = seconds_since(panel.time, start)
     fig = figure((9.2, 5.6))
     ax, below = fig.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
@@ -167,21 +163,22 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
     few = cloud(calibrated)
     ax.plot(
         seconds[few], calibrated[few], linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
-        label=f"measured {signed(panel.offset_db)} dB ({count(panel.n)} scored)", zorder=3.5,
+        label=f"measured {signed(score.offset_db)} dB ({count(score.n)} scored)", zorder=3.5,
     )  # fmt: skip
-    for number, baseline in enumerate(panel.baselines):
-        colour, dashes = baseline_style(baseline.name, number)
+    for number, (name, baseline) in enumerate(panel.baselines.items()):
+        colour, dashes = baseline_style(name, number)
         # each model is drawn where its own best offset puts it against the same calibrated points
-        level = baseline.level_dbm + (panel.offset_db - baseline.offset_db)
+        level = baseline.level_dbm + (score.offset_db - baseline.offset_db)
         ax.plot(
             *thinned(seconds, level), color=colour, linestyle=dashes, linewidth=1.2,
-            zorder=2.5 if baseline.name == "two_ray" else 3.7,  # its dense fringes would hide the rest
-            label=f"{pretty(baseline.name)} (own offset)",
+            zorder=2.5 if name == "two_ray" else 3.7,  # its dense fringes would hide the rest
+            label=f"{pretty(name)} (own offset)",
         )  # fmt: skip
     ax.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing", zorder=3)
-    if "simulated_low_dbm" in panel.per_sample:
+    if panel.stated is not None:
         some = slice(None, None, max(1, len(seconds) // POINTS_PER_LINE))
-        low, high = (panel.per_sample[f"simulated_{end}_dbm"][some] for end in ("low", "high"))
+        band = panel.stated.columns(panel.simulated_dbm)
+        low, high = (band[f"simulated_{end}_dbm"][some] for end in ("low", "high"))
         ax.fill_between(seconds[some], low, high, color=SIMULATED, alpha=0.15, linewidth=0, label="90 % band", zorder=1)
     alone = lonely(panel.simulated_dbm)  # a line shows no single point between two gaps
     ax.plot(seconds[alone], panel.simulated_dbm[alone], linestyle="none", marker=".", markersize=4, color=SIMULATED)
@@ -195,41 +192,41 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
         label="measured − simulated",
     )  # fmt: skip
     below.axhline(0.0, color=SIMULATED, linewidth=0.8)
-    if np.isfinite(panel.rmse_db):
+    if np.isfinite(score.rmse_db):
         for sign in (-1, 1):
             below.axhline(
-                sign * panel.rmse_db, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 3)),
-                label=f"RMSE {panel.rmse_db:.1f} dB" if sign == 1 else None,
+                sign * score.rmse_db, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 3)),
+                label=f"RMSE {score.rmse_db:.1f} dB" if sign == 1 else None,
             )  # fmt: skip
     draw_waypoints(below, data, start, names=False)
     robust_limits(below, [residual], around=0.0)
     below.set_ylabel("Residual [dB]")
     time_axis(below, start)
-    handles, labels = only(below, ("measured − simulated", f"RMSE {panel.rmse_db:.1f} dB"))
+    handles, labels = only(below, ("measured − simulated", f"RMSE {score.rmse_db:.1f} dB"))
     below.legend(
         handles, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1
     )  # fmt: skip
     return fig
 
 
-def rss_diagnostics(panel: RssPanel) -> Figure:
+def rss_diagnostics(panel: RssResult) -> Figure:
     """Measured against simulated, histogram of the residual, RMSE against offset, residual against distance."""
     fig = figure((9.2, 3.1))
-    curve = panel.offset_curve is not None
+    curve = len(panel.curve_offset_db) > 0
     axes = fig.subplots(1, 3 if curve else 2)
     scatter_levels(axes[0], panel)
     residual_histogram(axes[1], panel)
-    if panel.offset_curve is not None:
+    if curve:
         offset_curve(axes[2], panel)
     return fig
 
 
-def scatter_levels(ax: Axes, panel: RssPanel) -> None:
+def scatter_levels(ax: Axes, panel: RssResult) -> None:
     """Calibrated measurement against simulation, with the line of equality."""
     few = cloud(panel.residual_db)
     ax.plot(
         panel.simulated_dbm[few], panel.calibrated_db[few], linestyle="none", marker=".", markersize=2, alpha=0.5,
-        color="#0072B2", rasterized=True, label=f"sample ({count(panel.n)})",
+        color="#0072B2", rasterized=True, label=f"sample ({count(panel.score.n)})",
     )  # fmt: skip
     both = np.isfinite(panel.simulated_dbm) & np.isfinite(panel.calibrated_db)
     if both.any():
@@ -246,7 +243,7 @@ def scatter_levels(ax: Axes, panel: RssPanel) -> None:
     ax.legend(loc="upper left", markerscale=4)
 
 
-def residual_histogram(ax: Axes, panel: RssPanel) -> None:
+def residual_histogram(ax: Axes, panel: RssResult) -> None:
     """Histogram of the residual beside the normal curve of the same RMSE."""
     residual = panel.residual_db[np.isfinite(panel.residual_db)]
     if len(residual):
@@ -256,9 +253,9 @@ def residual_histogram(ax: Axes, panel: RssPanel) -> None:
             np.clip(residual, -reach, reach), bins.tolist(), density=True, color=MEASURED, edgecolor="white",
             linewidth=0.3, label=f"residual ({count(len(residual))})",
         )  # fmt: skip
-        if np.isfinite(panel.rmse_db) and panel.rmse_db > 0:
+        if (rmse := panel.score.rmse_db) > 0:
             at = np.linspace(-reach, reach, 200)
-            height = np.exp(-0.5 * (at / panel.rmse_db) ** 2) / (panel.rmse_db * np.sqrt(2 * np.pi))
+            height = np.exp(-0.5 * (at / rmse) ** 2) / (rmse * np.sqrt(2 * np.pi))
             ax.plot(at, height, color=SIMULATED, linewidth=1.0, linestyle=(0, (4, 2)), label="normal, same RMSE")
         ax.set_ylim(top=1.35 * ax.get_ylim()[1])  # room for the legend above the bars
         ax.legend(loc="upper left", fontsize=7)
@@ -267,31 +264,29 @@ def residual_histogram(ax: Axes, panel: RssPanel) -> None:
     ax.set_title("Residual")
 
 
-def offset_curve(ax: Axes, panel: RssPanel) -> None:
+def offset_curve(ax: Axes, panel: RssResult) -> None:
     """RMSE against the candidate offset, with the chosen one and those of the baselines."""
-    curve = panel.offset_curve
-    if curve is None:
-        return
-    ax.plot(*thinned(curve.offset_db, curve.rmse_db), color=SIMULATED, linewidth=1.2, label="ray tracing")
-    span = (float(np.min(curve.offset_db)), float(np.max(curve.offset_db)))
-    if np.isfinite(panel.offset_db):
-        edge = " (edge of the search!)" if panel.at_search_edge else ""
+    tried, rmse, score = panel.curve_offset_db, panel.curve_rmse_db, panel.score
+    ax.plot(*thinned(tried, rmse), color=SIMULATED, linewidth=1.2, label="ray tracing")
+    span = (float(np.min(tried)), float(np.max(tried)))
+    if np.isfinite(score.offset_db):
+        edge = " (edge of the search!)" if score.at_edge else ""
         ax.plot(
-            panel.offset_db, panel.rmse_db, marker="o", color=TOWER, linestyle="none",
-            label=f"chosen: {signed(panel.offset_db).replace(' ', '')} dB{edge}",
+            score.offset_db, score.rmse_db, marker="o", color=TOWER, linestyle="none",
+            label=f"chosen: {signed(score.offset_db).replace(' ', '')} dB{edge}",
         )  # fmt: skip
-    for number, baseline in enumerate(panel.baselines):
-        colour, dashes = baseline_style(baseline.name, number)
+    for number, (name, baseline) in enumerate(panel.baselines.items()):
+        colour, dashes = baseline_style(name, number)
         if np.isfinite(baseline.offset_db):
-            ax.axvline(baseline.offset_db, color=colour, linestyle=dashes, linewidth=1.0, label=pretty(baseline.name))
-    centres = [panel.offset_db, *(b.offset_db for b in panel.baselines)]
+            ax.axvline(baseline.offset_db, color=colour, linestyle=dashes, linewidth=1.0, label=pretty(name))
+    centres = [score.offset_db, *(model.offset_db for model in panel.baselines.values())]
     near = [c for c in centres if np.isfinite(c)]
     if near:
         # the shape near the minimum decides; the rest of the span is a straight line
         low, high = min(near) - 10.0, max(near) + 10.0
-        shown = (curve.offset_db >= low) & (curve.offset_db <= high) & np.isfinite(curve.rmse_db)
+        shown = (tried >= low) & (tried <= high) & np.isfinite(rmse)
         ax.set_xlim(low, high)
-        ax.set_ylim(0.0, 1.5 * float(np.max(curve.rmse_db[shown], initial=1.0)))
+        ax.set_ylim(0.0, 1.5 * float(np.max(rmse[shown], initial=1.0)))
         for a, b in ((low, span[0]), (span[1], high)):
             if a < b:
                 ax.axvspan(a, b, color="#DDDDDD", hatch="///", linewidth=0, label="not searched")
@@ -301,9 +296,11 @@ def offset_curve(ax: Axes, panel: RssPanel) -> None:
     ax.legend(loc="upper center", fontsize=7)
 
 
-def detection_reliability(panel: RssPanel) -> Figure:
+def detection_reliability(panel: RssResult) -> Figure:
     """Share of detected samples over the probability that the predicted level gave them; area: samples."""
-    said, seen, n = np.array(panel.extra["detection"]["reliability"], dtype=np.float64).T
+    score = panel.further.detection
+    assert score is not None
+    said, seen, n = np.array(score.reliability, dtype=np.float64).T
     fig = figure((4.8, 3.6))
     ax = fig.subplots()
     ax.plot([0, 100], [0, 100], color="0.6", linewidth=1, label="calibrated")
@@ -317,7 +314,7 @@ def detection_reliability(panel: RssPanel) -> Figure:
     return fig
 
 
-def residual_against_geometry(panel: RssPanel) -> Figure:
+def residual_against_geometry(panel: RssResult) -> Figure:
     """Residual against distance, angles, height, foliage, split by line of sight where known."""
     names = [name for name in GEOMETRY if name in panel.geometry]
     columns = -(-len(names) // 2) if len(names) > 3 else len(names)
@@ -347,18 +344,14 @@ def residual_against_geometry(panel: RssPanel) -> Figure:
     return fig
 
 
-def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssPanel) -> None:
+def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssResult) -> None:
     """Residual against one quantity, with its running median and middle 80 %."""
     residual = panel.residual_db
-    sight = panel.line_of_sight
-    groups = (
-        [("sample", np.isfinite(residual), "#56B4E9", ".")]
-        if sight is None
-        else [
-            ("line of sight", sight & np.isfinite(residual), "#56B4E9", "."),
-            ("no line of sight", ~sight & np.isfinite(residual), "#D55E00", "x"),
-        ]
-    )
+    sight = panel.line_of_sight == 1.0
+    groups = [
+        ("line of sight", sight & np.isfinite(residual), "#56B4E9", "."),
+        ("no line of sight", ~sight & np.isfinite(residual), "#D55E00", "x"),
+    ]
     for label, chosen, colour, marker in groups:
         if chosen.any():
             rows = np.flatnonzero(chosen)
@@ -413,7 +406,7 @@ def running_levels(quantity: FloatArray, values: FloatArray, bins: int = 20, few
     return levels
 
 
-def seen_from_antennas(panel: RssPanel) -> Figure:
+def seen_from_antennas(panel: RssResult) -> Figure:
     """Where the tower's antenna sees the UAV and the UAV's sees the tower, each in its own frame; colour: residual."""
     seen = panel.geometry
     views = [("UAV, tower antenna frame", seen["azimuth_deg"], seen.get("tower_elevation_deg", seen["elevation_deg"]))]
@@ -450,7 +443,7 @@ def seen_from_antennas(panel: RssPanel) -> Figure:
     return fig
 
 
-def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
+def channel_difference(data: ReportData, pair: PairResult) -> Figure:
     """First minus second channel over time, measured and simulated, with the limit beyond which they part."""
     start = start_of(data)
     seconds = seconds_since(pair.time, start)
@@ -461,18 +454,15 @@ def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
         seconds[few], pair.difference_db[few], linestyle="none", marker=".", markersize=2.5, color=MEASURED,
         rasterized=True, label=f"measured ({count(int(np.isfinite(pair.difference_db).sum()))})", zorder=3,
     )  # fmt: skip
-    levels = [pair.difference_db]
-    if pair.simulated_difference_db is not None:
-        ax.plot(*thinned(seconds, pair.simulated_difference_db), color=SIMULATED, linewidth=0.9, label="ray tracing")
-        levels.append(pair.simulated_difference_db)
+    ax.plot(*thinned(seconds, pair.simulated_difference_db), color=SIMULATED, linewidth=0.9, label="ray tracing")
     for sign in (-1, 1):
         ax.axhline(
-            sign * pair.limit_db, color=TOWER, linewidth=0.9, linestyle=(0, (5, 2)),
-            label=f"{pair.limit_db:g} dB apart" if sign == 1 else None,
+            sign * PART_DB, color=TOWER, linewidth=0.9, linestyle=(0, (5, 2)),
+            label=f"{PART_DB:g} dB apart" if sign == 1 else None,
         )  # fmt: skip
     draw_waypoints(ax, data, start)
-    robust_limits(ax, levels, around=0.0)
-    reach = max(ax.get_ylim()[1], 1.1 * pair.limit_db)  # the limit is drawn, so it is seen
+    robust_limits(ax, [pair.difference_db, pair.simulated_difference_db], around=0.0)
+    reach = max(ax.get_ylim()[1], 1.1 * PART_DB)  # the limit is drawn, so it is seen
     ax.set_ylim(-reach, reach)
     time_axis(ax, start)
     ax.set_ylabel(f"{pair.first} − {pair.second} [dB]")

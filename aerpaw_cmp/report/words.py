@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ..common.provenance import KEY
+from ..common.units import AnyArray
 from ..compare.ladder import LadderRow
-from ..compare.result import BASELINE_TITLE, AuditResult
+from ..compare.result import BASELINE_TITLE, AuditResult, RankResult, RssResult
+from ..compare.rss import ErrorSpan
+from ..compare.statistics import Interval
 from ..compare.verdicts import Verdict
-from .data import ErrorSpan, Interval, RankPanel, ReportData, RssPanel
+from .data import ReportData
 
 FEW_SAMPLES = 30
 """Below this a panel is called too short for a verdict."""
@@ -148,9 +150,9 @@ def first_sentence(facts: Judged) -> str:
     return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{beside}. {said}"
 
 
-def expected_sentence(panels: Sequence[RssPanel]) -> str:
+def expected_sentence(panels: Sequence[RssResult]) -> str:
     """The error to expect on another flight; nothing unless every scored channel has it from flights left out."""
-    known = [panel.extra.get("elsewhere") for panel in panels]
+    known = [panel.further.elsewhere for panel in panels]
     if not known or not all(known):
         return ""
     learned, free = (
@@ -187,24 +189,23 @@ CAUSES: dict[str, tuple[str, str]] = {
 """Causes of :mod:`aerpaw_cmp.compare.causes` in words, and what to do next."""
 
 
-def cause_sentence(panel: RssPanel) -> str:
+def cause_sentence(panel: RssResult) -> str:
     """Effect, cause with its interval, and action; nothing where no likely cause was identified."""
-    cause = panel.extra.get("likely_cause")
-    if not cause:
+    cause = panel.further.likely_cause
+    if cause is None:
         return ""
-    numbers = [cause["estimate"], *(cause["ci95"] or (None, None))]
-    value, low, high = (math.nan if number is None else number for number in numbers)
+    value, (low, high) = cause.estimate, cause.ci95
     at = ""
-    if cause["name"] == "gain step" and len(panel.time):
-        instant = panel.time.min() + np.timedelta64(int(float(cause["where"])), "s")
+    if cause.name == "gain step" and len(panel.time):
+        instant = panel.time.min() + np.timedelta64(int(float(cause.where)), "s")
         at = str(instant.astype("datetime64[s]"))[-8:]
     text, action = filled(
-        CAUSES[cause["name"]], value=value, low=low, high=high, size=abs(value), unit=panel.unit, at=at,
-        side="ahead of" if value > 0 else "behind", where=cause["where"], typed=f"{value:.0f}",
+        CAUSES[cause.name], value=value, low=low, high=high, size=abs(value), unit=panel.unit, at=at,
+        side="ahead of" if value > 0 else "behind", where=cause.where, typed=f"{value:.0f}",
     )  # fmt: skip
     return (
         f"Likely cause at {panel.name}: {text}. "
-        f"With it the RMSE is {cause['rmse_with_db']:.1f} instead of {cause['rmse_db']:.1f} dB (means over 1 s). "
+        f"With it the RMSE is {cause.rmse_with_db:.1f} instead of {cause.rmse_db:.1f} dB (means over 1 s). "
         f"Next: {action}."
     )
 
@@ -235,17 +236,24 @@ def said_of(verdict: Verdict, table: Mapping[str, tuple[str, str]], **facts: Any
 MINUS = "\N{MINUS SIGN}"
 
 
-def local_error(panel: RssPanel, span: ErrorSpan) -> str:
+def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetime64]:
+    """Begin and end of a span of a series that was sampled at these times (n,)."""
+    first = time.min()
+    begin, end = (first + np.timedelta64(round(seconds * 1e9), "ns") for seconds in (span.start_s, span.end_s))
+    return begin, end
+
+
+def local_error(panel: RssResult, span: ErrorSpan) -> str:
     """Where a channel is missed most, and what is known of the measurement that may explain it."""
     known = []
-    if panel.lag_verdict == "cannot tell":
+    if panel.clock_verdict == "cannot tell":
         known.append("the radio clock could not be confirmed")
-    if panel.extra.get("detection"):
+    if panel.further.detection is not None:
         known.append("the receiver lost its lock on this flight")
-    side = "above" if span.mean_error_db > 0 else "below"
-    start, end = (str(t.astype("datetime64[s]"))[-8:] for t in (span.start, span.end))
+    side = "above" if span.mean_db > 0 else "below"
+    start, end = (str(t.astype("datetime64[s]"))[-8:] for t in instants(panel.time, span))
     return (
-        f"Largest local error: measured {abs(span.mean_error_db):.1f} dB {side} predicted, {panel.name}, "
+        f"Largest local error: measured {abs(span.mean_db):.1f} dB {side} predicted, {panel.name}, "
         f"{start}-{end} UTC. No likely cause was identified{'; ' + ' and '.join(known) if known else ''}."
     )
 
@@ -303,14 +311,14 @@ def _missing_paths(data: ReportData) -> int:
 
 
 DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
-    (lambda d: any(p.at_search_edge for p in d.rss), "an offset lies at the edge of its search"),
-    (lambda d: any(not p.n and not p.training for p in d.rss), "a channel could not be scored"),
+    (lambda d: any(p.score.at_edge for p in d.rss), "an offset lies at the edge of its search"),
+    (lambda d: any(not p.score.n and not p.training for p in d.rss), "a channel could not be scored"),
     (lambda d: any(moved_by_outliers(p) for p in d.rss), "{outliers}"),
     (lambda d: d.engine is not None and d.engine.audit is None and bool(d.audit_command), "audit pending"),
     (lambda d: d.engine is not None and d.engine.audit is None and not d.audit_command, "no audit"),
     (lambda d: _missing_paths(d) > 0, "the audit misses {missing} paths"),
     (lambda d: _field_failures(d) > 0, "the audit of the field failed {failed} times"),
-    (lambda d: any(p.lag_verdict == "cannot tell" for p in d.rss), "the radio clock could not be confirmed"),
+    (lambda d: any(p.clock_verdict == "cannot tell" for p in d.rss), "the radio clock could not be confirmed"),
     (lambda d: d.synthetic, "synthetic data"),
     (
         lambda d: not d.synthetic and d.site.illustrative and bool(d.site.buildings),
@@ -335,20 +343,18 @@ MOVED_DB = 0.3
 """Outlying samples that move an RMSE by more than this [dB] are named in the first words."""
 
 
-def moved_by_outliers(panel: RssPanel) -> float:
+def moved_by_outliers(panel: RssResult) -> float:
     """By how much outlying samples raise the RMSE of a channel [dB]; 0 below :data:`MOVED_DB`."""
-    without = panel.extra.get("rmse_without_outliers_db")
-    if without is None or not math.isfinite(panel.rmse_db) or panel.rmse_db - without <= MOVED_DB:
-        return 0.0
-    return float(panel.rmse_db - without)
+    moved = panel.score.rmse_db - panel.further.rmse_without_outliers_db
+    return float(moved) if moved > MOVED_DB else 0.0  # NaN moves nothing
 
 
 def _outliers_in_words(data: ReportData) -> str:
     panel = max(data.rss, key=moved_by_outliers, default=None)
     if panel is None or not moved_by_outliers(panel):
         return ""
-    n, without = panel.extra["n_outliers"], panel.extra["rmse_without_outliers_db"]
-    change = f"its RMSE from {without:.1f} to {panel.rmse_db:.1f} dB"
+    n, without = panel.further.n_outliers, panel.further.rmse_without_outliers_db
+    change = f"its RMSE from {without:.1f} to {panel.score.rmse_db:.1f} dB"
     return f"{count(n)} outlying sample{'s raise' if n > 1 else ' raises'} at {panel.name} {change}"
 
 
@@ -356,7 +362,7 @@ def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
-def verdicts(rss: Sequence[RssPanel], rank: Sequence[RankPanel]) -> list[str]:
+def verdicts(rss: Sequence[RssResult], rank: Sequence[RankResult]) -> list[str]:
     """One or two sentences per panel: how well the ray tracing predicts, and against what."""
     return [rss_verdict(panel) for panel in rss] + [rank_verdict(panel) for panel in rank]
 
@@ -405,79 +411,87 @@ def training_sentence(names: Sequence[str], what: str, digests: Sequence[str]) -
     )
 
 
-def rss_verdict(panel: RssPanel) -> str:
+def rss_verdict(panel: RssResult) -> str:
     """How well one channel is predicted, and whether the baselines do better."""
     if panel.training:
-        return training_sentence([panel.name], "the antennas", panel.extra[KEY])
-    if panel.n == 0 or not math.isfinite(panel.rmse_db):
+        return training_sentence([panel.name], "the antennas", panel.further.trained_on or ())
+    score = panel.score
+    if score.n == 0 or not math.isfinite(score.rmse_db):
         return f"{panel.name}: nothing to score; all {count(len(panel.time))} samples are out of coverage on one side."
     text = (
-        f"{panel.name}: RMSE of ray tracing {panel.rmse_db:.1f} dB{_within(panel.rmse_ci95_db)} "
-        f"after an offset of {signed(panel.offset_db)} dB"
+        f"{panel.name}: RMSE of ray tracing {score.rmse_db:.1f} dB{_within(score.rmse_ci95_db)} "
+        f"after an offset of {signed(score.offset_db)} dB"
     )
-    scored = [b for b in panel.baselines if math.isfinite(b.rmse_db)]
-    if not scored:
+    errors = {name: model.rmse_db for name, model in panel.baselines.items() if math.isfinite(model.rmse_db)}
+    if not errors:
         return text + "."
-    best = min(scored, key=lambda b: b.rmse_db)
-    if best.paired is None:
-        return f"{text}; {pretty(best.name)}: {best.rmse_db:.1f} dB."
-    words = best.paired.in_words(pretty(best.name))
+    best = min(errors, key=lambda name: errors[name])
+    paired = panel.further.compared_with.get(best)
+    if paired is None:
+        return f"{text}; {pretty(best)}: {errors[best]:.1f} dB."
+    words = paired.in_words(pretty(best))
     words = words.replace("(-", "(\u2212").replace("[-", "[\u2212")
     further = _detection_words(panel) + _snr_words(panel)
-    return f"{text}: {words}; {pretty(best.name)}: {best.rmse_db:.1f} dB.{further}"
+    return f"{text}: {words}; {pretty(best)}: {errors[best]:.1f} dB.{further}"
 
 
-def _detection_words(panel: RssPanel) -> str:
+def _detection_words(panel: RssResult) -> str:
     """What a receiver adds that loses its lock or ends at a floor: both parts of its score."""
-    score = panel.extra.get("detection")
-    if not score:
+    score = panel.further.detection
+    if score is None:
         return ""
     return (
-        f" The receiver detected the signal in {100 * score['n_detected'] / score['n']:.0f} % of {score['n']} samples. "
-        f"The predicted level gives P(detected) with a Brier score of {score['brier']:.2f} (held-out segments; a "
-        f"constant: {score['constant_brier']:.2f}). With a floor at {score['floor_db']:.0f}, all samples: RMSE "
-        f"{score['rmse_db']:.1f} dB; detected samples, which are selected by their level: "
-        f"{score['detected_rmse_db']:.1f} dB."
+        f" The receiver detected the signal in {100 * score.n_detected / score.n:.0f} % of {score.n} samples. "
+        f"The predicted level gives P(detected) with a Brier score of {score.brier:.2f} (held-out segments; a "
+        f"constant: {score.constant_brier:.2f}). With a floor at {score.floor_db:.0f}, all samples: RMSE "
+        f"{score.rmse_db:.1f} dB; detected samples, which are selected by their level: "
+        f"{score.detected_rmse_db:.1f} dB."
     )
 
 
-def _snr_words(panel: RssPanel) -> str:
+def _snr_words(panel: RssResult) -> str:
     """What a ratio to the noise adds: its error with nothing fitted."""
-    snr = panel.extra.get("snr")
-    if not snr:
+    snr = panel.further.snr
+    if snr is None:
         return ""
     return (
-        f" As a signal-to-noise ratio over {snr['noise_dbm']:.1f} dBm of noise, nothing fitted, it is "
-        f"{signed(snr['mean_error_db'])} dB from the replay in the mean ({snr['rmse_db']:.1f} dB RMSE)."
+        f" As a signal-to-noise ratio over {snr.noise_dbm:.1f} dBm of noise, nothing fitted, it is "
+        f"{signed(snr.mean_error_db)} dB from the replay in the mean ({snr.rmse_db:.1f} dB RMSE)."
     )
 
 
-def rank_verdict(panel: RankPanel) -> str:
+def rank_verdict(panel: RankResult) -> str:
     """Which K comes nearest to the modem, and how near."""
-    scored = [at for at in panel.simulated if math.isfinite(at.total_variation)]
-    if not scored:
+    k = nearest_k(panel)
+    if k is None:
         return f"{panel.tower} rank: nothing to score; no sample has both a reported rank and a simulated one."
-    best = min(scored, key=lambda at: at.total_variation)
-    learned = f" {training_sentence([panel.tower], 'the receiver', panel.extra[KEY])}" if panel.extra.get(KEY) else ""
+    best, logs = panel.score.simulated[k], panel.further.trained_on
+    learned = f" {training_sentence([panel.tower], 'the receiver', logs)}" if logs else ""
     agree = f" and agrees pose by pose in {100 * best.agreement:.0f} %" if math.isfinite(best.agreement) else ""
     kappa = f" (kappa {best.kappa:.2f}; 0 is chance{_beside_kappa(panel)})" if math.isfinite(best.kappa) else ""
     return (
-        f"{panel.tower} rank: of the K shown, K = {best.k:.10g} comes nearest to the reported distribution "
+        f"{panel.tower} rank: of the K shown, K = {k:.10g} comes nearest to the reported distribution "
         f"(total variation {best.total_variation:.2f}){agree}{kappa}.{learned}"
     )
 
 
-def _beside_kappa(panel: RankPanel) -> str:
+def nearest_k(panel: RankResult) -> float | None:
+    """The K whose distribution comes nearest to the reported one; None where nothing could be scored."""
+    distance = {
+        k: fit.total_variation for k, fit in panel.score.simulated.items() if math.isfinite(fit.total_variation)
+    }
+    return min(distance, key=lambda k: distance[k], default=None)
+
+
+def _beside_kappa(panel: RankResult) -> str:
     """What agreement needs no model, and what the modem's agreement with itself allows."""
     said = ""
-    commonest = panel.extra.get("commonest") or {}
-    if commonest.get("rank"):
-        said += f"; always saying {commonest['rank']} would agree in {100 * commonest['agreement']:.0f} %"
-    repeat = (panel.extra.get("repeat") or {}).get("same_heading") or (panel.extra.get("repeat") or {}).get(
-        "any_heading"
-    )
-    if repeat and repeat["n"] and repeat["kappa"] is not None and math.isfinite(repeat["kappa"]):
-        said += f"; the modem repeats itself at the same places to kappa {repeat['kappa']:.2f}"
+    commonest = panel.further.commonest
+    if commonest.rank:
+        said += f"; always saying {commonest.rank} would agree in {100 * commonest.agreement:.0f} %"
+    repeat = panel.further.repeat.get("same_heading") or panel.further.repeat.get("any_heading")
+    if repeat is not None and repeat.n and math.isfinite(repeat.kappa):
+        said += f"; the modem repeats itself at the same places to kappa {repeat.kappa:.2f}"
     return said
 
 
@@ -516,16 +530,16 @@ def warnings(data: ReportData) -> list[str]:
     return texts
 
 
-def _rss_warnings(panel: RssPanel) -> list[str]:
-    texts = []
-    if panel.at_search_edge:
+def _rss_warnings(panel: RssResult) -> list[str]:
+    texts, score = [], panel.score
+    if score.at_edge:
         texts.append(
             f"{panel.name}: the best offset lies at the edge of the searched span, so it and its RMSE are no result. "
             "Widen the span, and check the transmit power and the unit of the log."
         )
-    if 0 < panel.n < FEW_SAMPLES:
-        texts.append(f"{panel.name}: only {panel.n} samples were scored, too few for a verdict.")
-    if panel.n_out_of_coverage and len(panel.time) and panel.n_out_of_coverage > 0.2 * len(panel.time):
-        share = 100 * panel.n_out_of_coverage / len(panel.time)
+    if 0 < score.n < FEW_SAMPLES:
+        texts.append(f"{panel.name}: only {score.n} samples were scored, too few for a verdict.")
+    if score.n_out_of_coverage > 0.2 * len(panel.time):
+        share = 100 * score.n_out_of_coverage / len(panel.time)
         texts.append(f"{panel.name}: {share:.0f} % of the samples are out of coverage and not part of the RMSE.")
     return texts

@@ -20,6 +20,7 @@ from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.report import figures
 from aerpaw_cmp.report.build import report_data
+from aerpaw_cmp.report.export import metrics
 from aerpaw_cmp.report.serving_figures import shown_confusion
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -100,7 +101,7 @@ def test_the_report_of_a_phone_shows_the_matrix_of_metrics_json(phone: Path) -> 
     found = run_flight(gather(settings, phone, read_logs(settings, phone)), audit=False)
     record = report_data(found.data, found.result)
     assert record.serving is not None
-    entry = record.extra_metrics["serving"]
+    entry = metrics(record)["serving"]
     (spec,) = (p for p in figures.figure_specs(record) if p.section == "serving")
     assert spec.page
     names, table = shown_confusion(record.serving)

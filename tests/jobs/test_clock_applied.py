@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.result import ESTIMATED
+from aerpaw_cmp.compare.result import ESTIMATED, FlightResult
 from aerpaw_cmp.flight.clock import ClockEstimate
 from aerpaw_cmp.flight.replay import _clock_of, telemetry_time
-from aerpaw_cmp.report.build import clock_warnings, clocks_of, metrics_beyond_panels
+from aerpaw_cmp.report.build import clock_warnings
+from aerpaw_cmp.report.export import clock_metrics
 
 TIME = np.datetime64("2024-07-15T15:48:16", "ns") + (np.arange(100) * 1e9).astype("timedelta64[ns]")
 SERIES: Any = SimpleNamespace(tower="LW1", time=TIME)
@@ -26,16 +27,6 @@ def estimate(verdict: str, **more: Any) -> ClockEstimate:
     return ClockEstimate(**{**keys, **more})
 
 
-def result(clock: Any) -> Any:
-    further = SimpleNamespace(clock=clock.result)
-    return SimpleNamespace(
-        rss=[SimpleNamespace(further=further, residual_by={}, tower="LW1", channel=c) for c in "ab"],
-        pairs=(),
-        ladder=(),
-        serving=None,
-    )
-
-
 @pytest.mark.parametrize("verdict", ["ok", "shifted", "cannot tell"])
 @pytest.mark.parametrize("apply", [True, False])
 def test_an_estimate_that_is_told_from_zero_is_applied(verdict: str, apply: bool) -> None:
@@ -43,14 +34,13 @@ def test_an_estimate_that_is_told_from_zero_is_applied(verdict: str, apply: bool
     used = apply and verdict != "cannot tell"
     shift = (TIME - telemetry_time(TIME, clock)) / np.timedelta64(1, "s")
     np.testing.assert_allclose(shift, 2.5 if used else 0.0)
-    written = metrics_beyond_panels(result(clock))["clock"]
-    assert set(written) == {"LW1"}
+    written = clock_metrics(clock.result)
     assert {
         "radio_minus_telemetry_s": 2.5,
-        "ci95_s": [2.3, 2.7],
+        "ci95_s": (2.3, 2.7),
         "verdict": verdict,
         "applied": used,
-    }.items() <= written["LW1"].items()
+    }.items() <= written.items()
 
 
 def test_an_interval_that_holds_zero_is_not_applied() -> None:
@@ -60,17 +50,19 @@ def test_an_interval_that_holds_zero_is_not_applied() -> None:
 
 
 def test_a_correction_that_was_asked_for_and_not_made_is_said() -> None:
-    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("cannot tell"), apply=True)))
+    (text,) = clock_warnings({"LW1": _clock_of(SERIES, estimate("cannot tell"), apply=True).result})
     assert "not corrected: flat level" in text
-    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("shifted"), apply=True)))
+    (text,) = clock_warnings({"LW1": _clock_of(SERIES, estimate("shifted"), apply=True).result})
     assert "2.50 s ahead of the telemetry clock" in text
     assert "it was corrected" in text
-    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("shifted"), apply=False)))
+    (text,) = clock_warnings({"LW1": _clock_of(SERIES, estimate("shifted"), apply=False).result})
     assert "rss.lag: apply would" in text
-    (text,) = clock_warnings(result(_clock_of(SERIES, estimate("cannot tell"), apply=False)))
+    (text,) = clock_warnings({"LW1": _clock_of(SERIES, estimate("cannot tell"), apply=False).result})
     assert "could not be checked: flat level" in text
-    assert clock_warnings(result(_clock_of(SERIES, estimate("ok", ci95_s=(-0.3, 0.2)), apply=True))) == ()
+    assert clock_warnings({"LW1": _clock_of(SERIES, estimate("ok", ci95_s=(-0.3, 0.2)), apply=True).result}) == ()
 
 
 def test_channels_of_a_receiver_share_a_clock() -> None:
-    assert len(clocks_of(result(_clock_of(SERIES, estimate("ok"), apply=False)))) == 1
+    clock = _clock_of(SERIES, estimate("ok"), apply=False).result
+    channels: Any = [SimpleNamespace(further=SimpleNamespace(clock=clock)) for _ in "ab"]
+    assert FlightResult(rss=tuple(channels)).clocks == {"LW1": clock}

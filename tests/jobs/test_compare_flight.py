@@ -14,7 +14,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import noise_floor_dbm
-from aerpaw_cmp.compare.result import FlightResult, RssResult
+from aerpaw_cmp.compare.result import RssResult
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.replay import replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
@@ -24,16 +24,9 @@ from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_seri
 from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.jobs.run import _paths_of_pose
 from aerpaw_cmp.jobs.what_if import foliage_notes
-from aerpaw_cmp.report.build import (
-    metrics_beyond_panels,
-    pair_panel,
-    rank_panel,
-    rank_warnings,
-    rss_panel,
-    rss_warnings,
-    track_of,
-)
-from aerpaw_cmp.report.data import RssPanel
+from aerpaw_cmp.report.build import rank_warnings, rss_warnings, track_of
+from aerpaw_cmp.report.export import rank_tables, rss_tables
+from aerpaw_cmp.report.words import instants
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
@@ -95,23 +88,8 @@ def gathered(path: Path) -> FlightData:
     return gather(settings, path.parent, read_logs(settings, path.parent))
 
 
-@dataclasses.dataclass(frozen=True)
-class Compared:
-    """The numbers of a series, and what a report makes of them."""
-
-    result: RssResult
-
-    @property
-    def panel(self) -> RssPanel:
-        return rss_panel(self.result)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        return rss_warnings(self.result)
-
-
-def compared_rss(path: Path) -> list[Compared]:
-    return [Compared(result) for result in run_flight(gathered(path), audit=False).result.rss]
+def compared_rss(path: Path) -> list[RssResult]:
+    return list(run_flight(gathered(path), audit=False).result.rss)
 
 
 def free_space_db(at: Any) -> Any:
@@ -130,11 +108,11 @@ def test_all_out_of_coverage_has_no_numbers_but_counts(tmp_path: Path, capsys: p
     at = np.arange(0, 60, 0.5)
     path = flight(tmp_path, rss={"USRP1": (at, np.full(len(at), FLOOR_DB))})
     (one,) = compared_rss(path)
-    assert one.panel.n == 0
-    assert one.panel.n_out_of_coverage == len(at)
-    assert np.isnan(one.panel.rmse_db)
-    assert np.isnan(one.panel.offset_db)
-    assert any("no sample" in text for text in one.warnings)
+    assert one.score.n == 0
+    assert one.score.n_out_of_coverage == len(at)
+    assert np.isnan(one.score.rmse_db)
+    assert np.isnan(one.score.offset_db)
+    assert any("no sample" in text for text in rss_warnings(one))
     found = report_completes(path, capsys, code=1)["rss"]["LW1"]["USRP1"]  # nothing was compared: no success
     assert found["rmse_db"] is None
     assert found["n"] == 0
@@ -144,10 +122,10 @@ def test_all_out_of_coverage_has_no_numbers_but_counts(tmp_path: Path, capsys: p
 def test_one_sample_fits_itself_and_claims_no_interval(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = flight(tmp_path, rss={"USRP1": ([20.0], [-70.0])})
     (one,) = compared_rss(path)
-    assert one.panel.n == 1
-    assert one.panel.rmse_db <= 0.05 + 1e-9
-    assert np.isnan(one.panel.correlation)
-    assert not np.isfinite(one.panel.rmse_ci95_db).any()
+    assert one.score.n == 1
+    assert one.score.rmse_db <= 0.05 + 1e-9
+    assert np.isnan(one.score.correlation)
+    assert not np.isfinite(one.score.rmse_ci95_db).any()
     assert report_completes(path, capsys, code=1)["rss"]["LW1"]["USRP1"]["correlation"] is None
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "Nothing could be compared: no channel has 20 samples" in page
@@ -169,9 +147,9 @@ def test_one_wild_sample_is_flagged_kept_and_said_first(tmp_path: Path, capsys: 
 def test_a_constant_series_has_an_offset_and_no_correlation(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.5)
     (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, np.full(len(at), -70.0))}))
-    assert one.panel.n == len(at)
-    assert np.isnan(one.panel.correlation)
-    assert one.panel.rmse_db == pytest.approx(np.nanstd(one.panel.simulated_dbm), abs=0.01)
+    assert one.score.n == len(at)
+    assert np.isnan(one.score.correlation)
+    assert one.score.rmse_db == pytest.approx(np.nanstd(one.simulated_dbm), abs=0.01)
 
 
 def test_duplicate_and_backward_stamps_give_the_numbers_of_the_sorted_log(tmp_path: Path) -> None:
@@ -185,10 +163,10 @@ def test_duplicate_and_backward_stamps_give_the_numbers_of_the_sorted_log(tmp_pa
     in_order = np.sort(twice)
     (one,) = compared_rss(flight(tmp_path / "a", rss={"USRP1": (at[in_order], level[in_order])}))
     (two,) = compared_rss(flight(tmp_path / "b", rss={"USRP1": (at[twice], level[twice])}))
-    assert one.panel.n == two.panel.n == len(twice)
-    assert two.panel.rmse_db == pytest.approx(one.panel.rmse_db, abs=1e-9)
-    assert two.panel.offset_db == one.panel.offset_db
-    assert two.panel.rmse_ci95_db == pytest.approx(one.panel.rmse_ci95_db, abs=0.2)
+    assert one.score.n == two.score.n == len(twice)
+    assert two.score.rmse_db == pytest.approx(one.score.rmse_db, abs=1e-9)
+    assert two.score.offset_db == one.score.offset_db
+    assert two.score.rmse_ci95_db == pytest.approx(one.score.rmse_ci95_db, abs=0.2)
 
 
 def test_nan_on_both_sides_is_censored_not_averaged(tmp_path: Path) -> None:
@@ -198,37 +176,37 @@ def test_nan_on_both_sides_is_censored_not_averaged(tmp_path: Path) -> None:
     deaf = level < np.quantile(level, 0.3)
     (whole,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, level)}))
     (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, np.where(deaf, FLOOR_DB, level))}))
-    assert one.panel.n == (~deaf).sum()
-    assert one.panel.n_out_of_coverage == deaf.sum()
-    censored = one.panel.extra["censored"]
-    assert censored["n_measured_below"] == deaf.sum()
+    assert one.score.n == (~deaf).sum()
+    assert one.score.n_out_of_coverage == deaf.sum()
+    censored = one.further.censored
+    assert censored.n_measured_below == deaf.sum()
     # losing the weak samples shifts the plain offset; the censored fit undoes most of that
-    assert abs(censored["offset_db"] - whole.panel.offset_db) < abs(one.panel.offset_db - whole.panel.offset_db)
+    assert abs(censored.offset_db - whole.score.offset_db) < abs(one.score.offset_db - whole.score.offset_db)
 
 
 def test_an_optimum_at_the_edge_is_an_error_to_look_at(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.5)
     path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + 160)})
     (one,) = compared_rss(path)
-    assert one.panel.at_search_edge
-    assert any("edge" in text for text in one.warnings)
+    assert one.score.at_edge
+    assert any("edge" in text for text in rss_warnings(one))
 
 
 def test_radio_samples_outside_the_telemetry_have_no_pose_and_are_not_out_of_coverage(tmp_path: Path) -> None:
     at = np.arange(40, 80, 0.5)
     (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}))
-    assert one.panel.extra["n_no_pose"] == (at > 60).sum()
-    assert one.panel.n == (at <= 60).sum()
-    assert one.panel.n_out_of_coverage == 0
+    assert one.further.n_no_pose == (at > 60).sum()
+    assert one.score.n == (at <= 60).sum()
+    assert one.score.n_out_of_coverage == 0
 
 
 def test_too_low_samples_are_counted_apart(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.5)
     (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}))
-    assert one.panel.extra["n_too_low"] == 0
+    assert one.further.n_too_low == 0
     (low,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}, rss_keys=", minimum_height_m: 50"))
-    assert low.panel.extra["n_too_low"] == len(at)
-    assert low.panel.n == low.panel.n_out_of_coverage == 0
+    assert low.further.n_too_low == len(at)
+    assert low.score.n == low.score.n_out_of_coverage == 0
 
 
 def test_ri_only_ever_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -236,12 +214,13 @@ def test_ri_only_ever_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     path = flight(tmp_path, rank=(at, np.full(len(at), 2.0)))
     data = gathered(path)
     (replayed,) = replay_rank(data)
-    panel = rank_panel(compare_rank_series(data, data.rank[0], replayed))
-    assert panel.histogram.share.tolist() == [0.0, 1.0, 0.0, 0.0]
-    for at_k in panel.simulated:
+    score = compare_rank_series(data, data.rank[0], replayed).score
+    assert score.histogram.tolist() == [0.0, 1.0, 0.0, 0.0]
+    assert score.simulated
+    for at_k in score.simulated.values():
         assert 0.0 <= at_k.agreement <= 1.0
         assert np.isnan(at_k.kappa) or at_k.kappa <= 1e-9  # a constant modem agrees by chance alone
-        assert at_k.total_variation == pytest.approx(1.0 - at_k.histogram.share[1])
+        assert at_k.total_variation == pytest.approx(1.0 - at_k.histogram[1])
     found = report_completes(path, capsys)["rank"]["LW1"]
     assert found["measured"]["histogram"] == {"1": 0.0, "2": 1.0, "3": 0.0, "4": 0.0}
 
@@ -260,26 +239,24 @@ def test_two_channels_part_where_one_was_pushed_down(tmp_path: Path, capsys: pyt
     level = free_space_db(at)
     pushed = np.where((at > 30) & (at < 36), level - 25, level)
     path = flight(tmp_path, rss={"USRP1": (at, level), "USRP2": (at + 0.05, pushed)})
-    (found,) = pairs_of([one.result for one in compared_rss(path)])
-    pair = pair_panel(found)
+    (pair,) = pairs_of(compared_rss(path))
     assert (pair.first, pair.second) == ("USRP1", "USRP2")
     assert len(pair.time) == len(at)  # 0.05 s is less than half a sampling interval
     assert abs(np.nanmedian(pair.difference_db)) < 5.0  # each channel after its own offset
-    (span,) = pair.apart
+    (span,) = pair.score.spans
+    begin, end = instants(pair.time, span)
     start = np.datetime64(ORIGIN.removesuffix("Z"), "ns")
-    assert (span.start - start) / np.timedelta64(1, "s") == pytest.approx(30.25, abs=0.6)
-    assert (span.end - start) / np.timedelta64(1, "s") == pytest.approx(35.75, abs=0.6)
-    assert span.mean_error_db > 15
-    assert metrics_beyond_panels(FlightResult(pairs=(found,)))["pairs"]["LW1"]["USRP1 - USRP2"][
-        "share_parted"
-    ] == pytest.approx(0.1, abs=0.03)
+    assert (begin - start) / np.timedelta64(1, "s") == pytest.approx(30.25, abs=0.6)
+    assert (end - start) / np.timedelta64(1, "s") == pytest.approx(35.75, abs=0.6)
+    assert span.mean_db > 15
+    assert pair.score.share_parted == pytest.approx(0.1, abs=0.03)
     assert "pairs" in report_completes(path, capsys)
 
 
 def test_channels_without_common_instants_make_no_pair(tmp_path: Path) -> None:
     early, late = np.arange(0, 20, 0.25), np.arange(30, 60, 0.25)
     path = flight(tmp_path, rss={"USRP1": (early, free_space_db(early)), "USRP2": (late, free_space_db(late))})
-    assert pairs_of([one.result for one in compared_rss(path)]) == []
+    assert pairs_of(compared_rss(path)) == []
 
 
 def test_paired_foliage_reports_loss_and_rank_changes(tmp_path: Path) -> None:
@@ -297,26 +274,27 @@ def test_paired_foliage_reports_loss_and_rank_changes(tmp_path: Path) -> None:
     )  # fmt: skip
     data = dataclasses.replace(data, site=dataclasses.replace(data.site, trees=wood))
     (replayed,) = replay_rss(data)
-    panel = rss_panel(compare_rss_series(data, data.rss[0], replayed))
-    names = [v.name for v in panel.variants]
+    panel = compare_rss_series(data, data.rss[0], replayed)
+    names = list(panel.variants)
     assert names[-3:] == ["without trees", "trees in leaf", "trees out of leaf"]
-    assert panel.variants[-3].rmse_db == pytest.approx(panel.rmse_db, abs=1e-9)  # the flight itself has none
-    found = panel.extra["foliage"]
-    assert found["trees_in_leaf"]["mean_loss_db"] > found["trees_out_of_leaf"]["mean_loss_db"] > 0.0
-    assert found["trees_in_leaf"]["share_above_1_db"] > 0.1
+    # the flight itself has none
+    assert panel.variants["without trees"].rmse_db == pytest.approx(panel.score.rmse_db, abs=1e-9)
+    found = panel.further.foliage
+    assert found["trees_in_leaf"].mean_loss_db > found["trees_out_of_leaf"].mean_loss_db > 0.0
+    assert found["trees_in_leaf"].share_above_1_db > 0.1
     (ranked,) = replay_rank(data)
-    per_pose = panel.per_sample
+    ((_, per_pose),) = rss_tables([panel])
     loss = per_pose["simulated_without_trees_dbm"] - per_pose["simulated_trees_in_leaf_dbm"]
-    assert np.nanmean(loss) == pytest.approx(found["trees_in_leaf"]["mean_loss_db"])
-    ranks = rank_panel(compare_rank_series(data, data.rank[0], ranked))
-    per_k = ranks.per_sample
+    assert np.nanmean(loss) == pytest.approx(found["trees_in_leaf"].mean_loss_db)
+    ranks = compare_rank_series(data, data.rank[0], ranked)
+    ((_, per_k),) = rank_tables([ranks])
     changed = per_k["rank_trees_in_leaf_k10"] != per_k["rank_without_trees_k10"]
-    changes = ranks.extra["foliage"]
-    assert changed.mean() == pytest.approx(changes["trees_in_leaf"]["10"]["share_changed"])
+    changes = ranks.further.foliage
+    assert changed.mean() == pytest.approx(changes["trees_in_leaf"]["10"].share_changed)
     assert set(changes) == {"trees_in_leaf", "trees_out_of_leaf"}
     for by_k in changes.values():
         for one in by_k.values():
-            assert one["share_changed"] == pytest.approx((one["n_lower"] + one["n_higher"]) / len(at))
+            assert one.share_changed == pytest.approx((one.n_lower + one.n_higher) / len(at))
 
 
 def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) -> None:
@@ -353,8 +331,8 @@ def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) 
     assert sum("one off a crown" in label for label in lines) == here.off_crown.sum()
     assert len(lines) <= len(here)
     # the run without trees has lost the paths over crowns as well
-    panel = rss_panel(compare_rss_series(data, data.rss[0], found))
-    columns = panel.per_sample
+    panel = compare_rss_series(data, data.rss[0], found)
+    ((_, columns),) = rss_tables([panel])
     bare_dbm = bare.spread(bare.replay.rss_dbm[:, 0])
     np.testing.assert_allclose(columns["simulated_without_trees_dbm"], bare_dbm, atol=1e-9)
     np.testing.assert_allclose(columns["simulated_trees_in_leaf_dbm"], panel.simulated_dbm, atol=1e-9)
@@ -399,7 +377,7 @@ def test_angles_are_those_of_the_tilted_antenna(tmp_path: Path) -> None:
     path = flight(tmp_path, 40, rss={"USRP1": (at, free_space_db(at))}, more=tilted)
     data = gathered(path)
     (replayed,) = replay_rss(data)
-    seen = rss_panel(compare_rss_series(data, data.rss[0], replayed)).geometry
+    seen = compare_rss_series(data, data.rss[0], replayed).geometry
     mount = replayed.link.tower_arrays["LW1"].mount
     ray = replayed.poses.position_m - data.site.towers["LW1"].position_m
     upward = np.degrees(np.arcsin(ray @ mount[:, 2] / np.linalg.norm(ray, axis=1)))
@@ -422,25 +400,25 @@ link:
 def test_alternatives_change_only_what_they_name(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.5)
     path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}, more=DIPOLES)
-    panel = compared_rss(path)[0].panel
-    rmse = {v.name: v.rmse_db for v in panel.variants}
+    panel = compared_rss(path)[0]
+    rmse = {name: model.rmse_db for name, model in panel.variants.items()}
     assert set(rmse) == {
         "antennas as measured, without added gain",
         "isotropic antennas",
         "heading only",
         "attitude ignored",
     }
-    assert rmse["heading only"] == pytest.approx(panel.rmse_db, abs=1e-9)  # this flight is level
-    assert abs(rmse["attitude ignored"] - panel.rmse_db) > 0.02  # but heads elsewhere than the site's east
+    assert rmse["heading only"] == pytest.approx(panel.score.rmse_db, abs=1e-9)  # this flight is level
+    assert abs(rmse["attitude ignored"] - panel.score.rmse_db) > 0.02  # but heads elsewhere than the site's east
     (tmp_path / "iso").mkdir()
-    plain = compared_rss(flight(tmp_path / "iso", rss={"USRP1": (at, free_space_db(at))}))[0].panel
-    assert rmse["isotropic antennas"] == pytest.approx(plain.rmse_db, abs=1e-9)
+    plain = compared_rss(flight(tmp_path / "iso", rss={"USRP1": (at, free_space_db(at))}))[0]
+    assert rmse["isotropic antennas"] == pytest.approx(plain.score.rmse_db, abs=1e-9)
     assert not plain.variants
     (tmp_path / "alone").mkdir()
     alone = DIPOLES.replace(", installed_db: [2.0, 0.0]", "")
-    bare = compared_rss(flight(tmp_path / "alone", rss={"USRP1": (at, free_space_db(at))}, more=alone))[0].panel
-    assert rmse["antennas as measured, without added gain"] == pytest.approx(bare.rmse_db, abs=1e-9)
-    assert abs(bare.rmse_db - panel.rmse_db) > 0.1
+    bare = compared_rss(flight(tmp_path / "alone", rss={"USRP1": (at, free_space_db(at))}, more=alone))[0]
+    assert rmse["antennas as measured, without added gain"] == pytest.approx(bare.score.rmse_db, abs=1e-9)
+    assert abs(bare.score.rmse_db - panel.score.rmse_db) > 0.1
 
 
 def test_reference_powers_give_the_expected_offset(tmp_path: Path) -> None:
@@ -452,23 +430,23 @@ def test_reference_powers_give_the_expected_offset(tmp_path: Path) -> None:
     port = "{file: powers.csv, receivers: {USRP1: {node: LW1, gain_db: 30, extra_gain_db: 14}}, transmitter: {node: uav, gain_db: 70, amplifier: true}}"
     level = free_space_db(at)
     path = flight(tmp_path, rss={"USRP1": (at, level)}, rss_keys=f", reference_powers: {port}")
-    panel = compared_rss(path)[0].panel
-    found = panel.extra["expected_offset"]
+    panel = compared_rss(path)[0]
+    found = panel.further.expected_offset
     # reading + 30 dB gain removed + reference - 14 dB of amplifiers; the simulation sends 40 dBm where 12 were sent
-    assert found["expected_db"] == pytest.approx(30.0 - 35.5 - 14.0 + 40.0 - 12.0)
-    assert found["fitted_minus_expected_db"] == pytest.approx(panel.offset_db - found["expected_db"])
+    assert found.expected_db == pytest.approx(30.0 - 35.5 - 14.0 + 40.0 - 12.0)
+    assert found.fitted_minus_expected_db == pytest.approx(panel.score.offset_db - found.expected_db)
 
 
 def test_same_footing_and_residual_tables_are_in_the_metrics(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     at = np.arange(0, 60, 0.25)
     (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + rng.normal(0, 3, len(at)))}))
-    footing = one.panel.extra["averaged"]
-    assert footing["coherent"]["0 s"]["rmse_db"] == pytest.approx(one.panel.rmse_db)
-    assert footing["power_sum"]["4 s"]["rmse_db"] < footing["power_sum"]["0 s"]["rmse_db"]
-    tables = metrics_beyond_panels(FlightResult(rss=(one.result,)))["rss"]["LW1"]["USRP1"]["residual_by"]
+    footing = one.further.averaged
+    assert footing["coherent"]["0 s"].rmse_db == pytest.approx(one.score.rmse_db)
+    assert footing["power_sum"]["4 s"].rmse_db < footing["power_sum"]["0 s"].rmse_db
+    tables = {name: table.as_dict() for name, table in one.residual_by.items()}
     assert {"distance_m", "elevation_deg", "azimuth_deg", "uav_azimuth_deg", "heading_deg", "time_s"} <= set(tables)
-    assert sum(tables["distance_m"]["n"]) == one.panel.n
+    assert sum(tables["distance_m"]["n"]) == one.score.n
 
 
 def test_the_track_of_a_rank_log_with_positions_of_its_own_is_the_logs(tmp_path: Path) -> None:
@@ -486,10 +464,10 @@ def test_a_local_mean_averages_both_sides_and_all_models(tmp_path: Path) -> None
     rss = {"USRP1": (at, free_space_db(at) + rng.normal(0, 3, len(at)))}
     (as_logged,) = compared_rss(flight(tmp_path, rss=rss))
     (mean,) = compared_rss(flight(tmp_path, rss=rss, rss_keys=", field: local_mean, window_s: 4"))
-    footing = as_logged.panel.extra["averaged"]["coherent"]["4 s"]
-    assert mean.panel.rmse_db == pytest.approx(footing["rmse_db"], abs=1e-9)
-    two_ray = {b.name: b for b in mean.panel.baselines}["two_ray"]
-    assert np.nanstd(np.diff(two_ray.level_dbm)) < np.nanstd(np.diff(as_logged.panel.baselines[1].level_dbm))
+    footing = as_logged.further.averaged["coherent"]["4 s"]
+    assert mean.score.rmse_db == pytest.approx(footing.rmse_db, abs=1e-9)
+    two_ray = mean.baselines["two_ray"]
+    assert np.nanstd(np.diff(two_ray.level_dbm)) < np.nanstd(np.diff(as_logged.baselines["two_ray"].level_dbm))
 
 
 def test_a_local_mean_without_a_window_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -507,8 +485,8 @@ def test_reflection_loss_weakens_reflections_only_and_ends_as_free_space(tmp_pat
         rt = data.settings.rt.model_copy(update={"reflection_loss_db": loss})
         data = dataclasses.replace(data, settings=data.settings.model_copy(update={"rt": rt}))
         (replayed,) = replay_rss(data)
-        levels[loss] = rss_panel(compare_rss_series(data, data.rss[0], replayed))
-    ripple = {loss: np.nanstd(p.simulated_dbm - p.baselines[0].level_dbm) for loss, p in levels.items()}
+        levels[loss] = compare_rss_series(data, data.rss[0], replayed)
+    ripple = {loss: np.nanstd(p.simulated_dbm - p.baselines["free_space"].level_dbm) for loss, p in levels.items()}
     assert ripple[0.0] > ripple[3.0] > 0.1
     assert ripple[200.0] < 1e-6, "only the line of sight is left"
 
@@ -643,18 +621,18 @@ def snr_flight(folder: Path, above_db: float, link: str) -> Any:
 
 
 def test_an_snr_is_the_level_over_the_noise_that_is_given(tmp_path: Path) -> None:
-    one = snr_flight(tmp_path / "a", 2.5, ", bandwidth_hz: 20e6, noise_figure_db: 7")[0].panel
-    found = one.extra["snr"]
-    assert found["noise_dbm"] == pytest.approx(-93.96, abs=0.01)  # kTB of 20 MHz at 290 K and 7 dB
-    without_offset = snr_flight(tmp_path / "b", 0.0, ", bandwidth_hz: 20e6, noise_figure_db: 7")[0].panel.extra["snr"]
-    assert found["mean_error_db"] - without_offset["mean_error_db"] == pytest.approx(2.5, abs=1e-9)
-    assert found["rmse_db"] == pytest.approx(np.hypot(one.extra["snr"]["mean_error_db"], one.rmse_db), abs=0.01)
-    wider = snr_flight(tmp_path / "c", 0.0, ", bandwidth_hz: 40e6, noise_figure_db: 7")[0].panel.extra["snr"]
-    assert wider["mean_error_db"] - without_offset["mean_error_db"] == pytest.approx(10 * np.log10(2.0), abs=1e-6)
+    one = snr_flight(tmp_path / "a", 2.5, ", bandwidth_hz: 20e6, noise_figure_db: 7")[0]
+    found = one.further.snr
+    assert found.noise_dbm == pytest.approx(-93.96, abs=0.01)  # kTB of 20 MHz at 290 K and 7 dB
+    without_offset = snr_flight(tmp_path / "b", 0.0, ", bandwidth_hz: 20e6, noise_figure_db: 7")[0].further.snr
+    assert found.mean_error_db - without_offset.mean_error_db == pytest.approx(2.5, abs=1e-9)
+    assert found.rmse_db == pytest.approx(np.hypot(one.further.snr.mean_error_db, one.score.rmse_db), abs=0.01)
+    wider = snr_flight(tmp_path / "c", 0.0, ", bandwidth_hz: 40e6, noise_figure_db: 7")[0].further.snr
+    assert wider.mean_error_db - without_offset.mean_error_db == pytest.approx(10 * np.log10(2.0), abs=1e-6)
 
 
 def test_the_noise_under_an_snr_cuts_nothing_off(tmp_path: Path) -> None:
-    deaf = snr_flight(tmp_path / "a", 0.0, ", noise_floor_dbm: -20")[0].panel
-    assert deaf.n == 120  # a level below -20 dBm would be out of coverage
-    assert deaf.extra["snr"]["noise_dbm"] == -20.0
-    assert snr_flight(tmp_path / "b", 0.0, "")[0].panel.extra.get("snr") is None
+    deaf = snr_flight(tmp_path / "a", 0.0, ", noise_floor_dbm: -20")[0]
+    assert deaf.score.n == 120  # a level below -20 dBm would be out of coverage
+    assert deaf.further.snr.noise_dbm == -20.0
+    assert snr_flight(tmp_path / "b", 0.0, "")[0].further.snr is None

@@ -1,6 +1,5 @@
 """A flight against a rover that drives: from its log of positions to the report's numbers."""
 
-import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,8 +19,6 @@ from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.report import explorer
-from aerpaw_cmp.report.build import rank_panel, rss_panel
-from aerpaw_cmp.report.data import tower_way
 from aerpaw_cmp.report.export import rank_csv, rss_csv
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -146,8 +143,8 @@ def test_the_audit_takes_moments_at_which_the_rover_stands_where_it_was(case):
 
 def test_the_tables_carry_the_place(case):
     _, data, (one,), (rank,) = case
-    rss = "".join(rss_csv([rss_panel(compare_rss_series(data, data.rss[0], one))])).splitlines()
-    ranks = "".join(rank_csv([rank_panel(compare_rank_series(data, data.rank[0], rank))])).splitlines()
+    rss = "".join(rss_csv([compare_rss_series(data, data.rss[0], one)])).splitlines()
+    ranks = "".join(rank_csv([compare_rank_series(data, data.rank[0], rank)])).splitlines()
     for head, first, *_ in (rss, ranks):
         row = dict(zip(head.split(","), first.split(","), strict=True))
         place = [float(row[f"tower_{axis}_m"]) for axis in ("east", "north", "up")]
@@ -157,9 +154,8 @@ def test_the_tables_carry_the_place(case):
 def test_the_drawings_show_the_way(case):
     """The page's plan and the figures: where it stood at each sample, not its middle alone."""
     _, data, (one,), (rank,) = case
-    rss = rss_panel(compare_rss_series(data, data.rss[0], one))
-    assert tower_way(dataclasses.replace(rss, per_sample={})) == {}
-    ranks = rank_panel(compare_rank_series(data, data.rank[0], rank))
+    rss = compare_rss_series(data, data.rss[0], one)
+    ranks = compare_rank_series(data, data.rank[0], rank)
     t = np.arange(0.0, SECONDS, 0.5)
     known = (t <= 50) | (t >= 60)
     kept: list[np.ndarray] = []
@@ -168,10 +164,8 @@ def test_the_drawings_show_the_way(case):
     found = np.stack([kept[drawn[f"tower_{axis}"]] for axis in ("east", "north", "up")], axis=1)
     np.testing.assert_allclose(found[known[::3]], rover(t)[::3][known[::3]], atol=1e-3)
     assert np.isnan(found[~known[::3]]).all()
-    for panel in (rss, ranks):
-        way = tower_way(panel)
-        assert np.nanmax(way["east"]) == pytest.approx(60.0, abs=1e-3)
-        assert np.nanmax(way["north"]) == pytest.approx(56.0, abs=0.5)
+    for result in (rss, ranks):
+        assert np.nanmax(result.tower_m, axis=0)[:2] == pytest.approx([60.0, 56.0], abs=0.5)
 
 
 def test_what_cannot_be_is_one_message(tmp_path, capsys):

@@ -9,27 +9,13 @@ import pytest
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.compare.result import AuditResult, EngineResult, ModelLevel, PairResult, RankResult, RssResult
+from aerpaw_cmp.compare.rss import ChannelDifference
 from aerpaw_cmp.logs.records import RejectedLine
-from aerpaw_cmp.report.data import (
-    Audit,
-    Baseline,
-    ChannelPair,
-    Engine,
-    ErrorSpan,
-    Histogram,
-    InputFile,
-    KCurve,
-    OffsetCurve,
-    RankAtK,
-    RankPanel,
-    ReportData,
-    RssPanel,
-    Track,
-    Variant,
-    Waypoint,
-)
+from aerpaw_cmp.report.data import InputFile, ReportData, Track, Waypoint
 from aerpaw_cmp.report.maps_data import Correlation, Layer, LearningCurve, MapError, MapsData, PaperRow, RankMap, RssMap
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Tower, Trees
+from benchmarks.fabricated import rank_result, rss_result
 
 WAVELENGTH = 299_792_458.0 / 3.3e9
 
@@ -87,11 +73,7 @@ def make_track(n: int = 6000) -> Track:
     return Track(time=time, east_m=east, north_m=north, up_m=up)
 
 
-def rmse_of(difference: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(difference**2)))
-
-
-def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> RssPanel:
+def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> RssResult:
     rng = np.random.default_rng(seed)
     position = np.stack([track.east_m, track.north_m, track.up_m], axis=1)
     t = site.towers[tower].position_m
@@ -115,40 +97,16 @@ def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> R
     simulated = np.where(blocked, np.nan, simulated)
     silent = (np.arange(len(d)) > 5900) & (tower == "LW4")
     measured = np.where(silent, np.nan, measured)
-    offset = round(float(np.nanmean(simulated - measured)), 1)
-    residual = measured + offset - simulated
-    candidates = np.arange(-500, 501) / 10
-    curve = np.sqrt(np.nanmean(residual**2) + 0 * candidates + (candidates - offset) ** 2)
-    baselines = []
-    for name, level in (("free_space", free), ("two_ray", two)):
-        own = round(float(np.nanmean(level - measured)), 1)
-        baselines.append(Baseline(name=name, level_dbm=level, offset_db=own, rmse_db=rmse_of(measured + own - level)))
-    rmse = rmse_of(residual)
-    worst = int(np.nanargmax(np.abs(residual)))
-    return RssPanel(
-        tower=tower, channel=channel, unit="dB re full scale", time=track.time, measured_db=measured,
-        simulated_dbm=simulated, measured_out_of_coverage=np.isnan(measured),
-        simulated_out_of_coverage=np.isnan(simulated), offset_db=offset, rmse_db=rmse,
-        correlation=float(np.corrcoef(simulated[np.isfinite(residual)], measured[np.isfinite(residual)])[0, 1]),
-        n=int(np.isfinite(residual).sum()), n_out_of_coverage=int(np.isnan(residual).sum()), at_search_edge=False,
-        rmse_ci95_db=(rmse - 0.24, rmse + 0.31), offset_ci95_db=(offset - 0.5, offset + 0.4), n_effective=311.0,
-        lag_s=0.12, lag_verdict="ok", baselines=tuple(baselines),
-        offset_curve=OffsetCurve(offset_db=candidates, rmse_db=curve), east_m=track.east_m, north_m=track.north_m,
-        up_m=track.up_m,
+    levels = {"measured": measured, "simulated": simulated, "free_space": free, "two_ray": two}
+    worse = ModelLevel(level_dbm=free, offset_db=40.0, rmse_db=7.5, rmse_ci95_db=(6.0, 8.0))
+    return rss_result(
+        tower, channel, track.time, position, levels, line_of_sight=np.where(blocked, 0.0, 1.0),
         geometry={"distance_m": d, "azimuth_deg": azimuth, "elevation_deg": np.degrees(np.arcsin((track.up_m - t[2]) / d)), "altitude_m": track.up_m},
-        line_of_sight=~blocked,
-        variants=(Variant(name="iso arrays", offset_db=offset, rmse_db=rmse + 1, rmse_ci95_db=(rmse, rmse + 2)), Variant(name="patterns, attitude", offset_db=offset, rmse_db=rmse, fitted="mount, on flight 70 m")),
-        extra={"repeatability_db": 3.0, "robust": {"offset_db": offset}},
-        worst=(ErrorSpan(start=track.time[max(worst - 20, 0)], end=track.time[min(worst + 20, len(d) - 1)], east_m=float(track.east_m[worst]), north_m=float(track.north_m[worst]), up_m=float(track.up_m[worst]), mean_error_db=float(residual[worst]), cause="a null of the two-ray pattern"),),
+        variants={"iso arrays": worse, "patterns, attitude": worse},
     )  # fmt: skip
 
 
-def shares(rank: np.ndarray) -> np.ndarray:
-    rank = rank[np.isfinite(rank) & (rank > 0)]
-    return np.array([(rank == r).mean() if len(rank) else np.nan for r in (1, 2, 3, 4)])
-
-
-def make_rank(site: Site, track: Track) -> RankPanel:
+def make_rank(site: Site, track: Track) -> RankResult:
     pick = slice(0, None, 6)
     east, north, up, time = track.east_m[pick], track.north_m[pick], track.up_m[pick], track.time[pick]
     rng = np.random.default_rng(11)
@@ -157,28 +115,10 @@ def make_rank(site: Site, track: Track) -> RankPanel:
     ratio = np.stack([-8 - 0.02 * d + slow, -22 - 0.06 * d + slow, -40 - 0.1 * d + slow], axis=1)
     measured = 1.0 + (ratio + rng.normal(0, 3, ratio.shape) > -24).sum(axis=1)
     measured[40:55] = np.nan
-    at = []
-    for k in (10.0, 100.0, 1000.0):
-        rank = 1 + (ratio > -20 * np.log10(k)).sum(axis=1)
-        rank[up < 3] = 0
-        both = np.isfinite(measured) & (rank > 0)
-        table = np.array([[int(((measured == m) & (rank == s)).sum()) for s in range(5)] for m in (1, 2, 3, 4)])
-        difference = np.abs(shares(measured) - shares(rank.astype(float)))
-        h = shares(rank.astype(float))
-        at.append(RankAtK(k=k, rank=rank, histogram=Histogram(share=h, low=(h - 0.03).clip(0), high=h + 0.03), n_out_of_coverage=int((rank == 0).sum()), agreement=float((measured == rank)[both].mean()), total_variation=float(difference.sum() / 2), wasserstein=0.3, kappa=0.21, agreement_ci95=(0.3, 0.5), total_variation_ci95=(0.1, 0.2), confusion=table))  # fmt: skip
-    ks = np.geomspace(2, 3000, 60)
-    agreement = np.array([float(np.nanmean((1 + (ratio > -20 * np.log10(k)).sum(axis=1)) == measured)) for k in ks])
-    variation = np.array(
-        [np.abs(shares(1.0 + (ratio > -20 * np.log10(k)).sum(axis=1)) - shares(measured)).sum() / 2 for k in ks]
-    )
-    h = shares(measured)
-    return RankPanel(
-        tower="LW1", time=time, east_m=east, north_m=north, up_m=up, measured=measured,
-        histogram=Histogram(share=h, low=(h - 0.04).clip(0), high=h + 0.04), simulated=tuple(at),
-        best_k=float(ks[agreement.argmax()]), best_k_ci95=(13.0, 21.0),
-        curve=KCurve(k=ks, agreement=agreement, total_variation=variation), singular_ratio_db=ratio,
-        sinr_db=18 + slow, stale=np.arange(len(d)) % 50 > 45,
-    )  # fmt: skip
+    h = np.zeros((len(d), 4, 4), dtype=complex)
+    h[:, range(4), range(4)] = 10 ** (np.column_stack([np.zeros(len(d)), ratio]) / 20)
+    h[up < 3] = 0
+    return rank_result("LW1", time, np.column_stack([east, north, up]), measured, h, sinr_db=18 + slow)
 
 
 def make_report() -> ReportData:
@@ -198,23 +138,22 @@ def make_report() -> ReportData:
         for seed, (tower, channel) in enumerate((("LW1", "USRP1"), ("LW1", "USRP2"), ("LW4", "USRP1")))
     )
     difference = rss[0].calibrated_db - rss[1].calibrated_db
-    pair = ChannelPair(
-        tower="LW1",
-        first="USRP1",
-        second="USRP2",
-        time=track.time,
-        difference_db=difference,
-        simulated_difference_db=np.zeros(len(difference)),
-        apart=rss[0].worst,
-    )
-    engine = Engine(
+    parted = ChannelDifference(
+        n=len(difference), mean_db=0.0, std_db=1.0, correlation=0.9, share_parted=0.0, interval_std_db=(0.9, 1.1),
+        spans=list(rss[0].spans),
+    )  # fmt: skip
+    pair = PairResult(
+        tower="LW1", first="USRP1", second="USRP2", time=track.time, difference_db=difference,
+        simulated_difference_db=np.zeros(len(difference)), score=parted,
+    )  # fmt: skip
+    engine = EngineResult(
         engine="image",
         links=18000,
         seconds=0.71,
         paths=38211,
         settings={"max_depth": 2, "relevance_db": 0.01},
         left_out=("shed (0.002 dB at most)",),
-        audit=Audit(
+        audit=AuditResult(
             reference="sionna",
             links=200,
             missing_paths=0,

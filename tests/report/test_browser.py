@@ -9,6 +9,7 @@ import pytest
 
 from aerpaw_cmp.compare.offset import grid_offset
 from aerpaw_cmp.report import write
+from benchmarks.fabricated import with_numbers
 from tests.report.browsing import (
     asked_outside,
     choose,
@@ -73,7 +74,7 @@ def test_a_model_and_a_span_change_the_numbers(driver, small_report):
     start_s = driver.execute_script("const s = explorer.data.rss[0]; return explorer.series(s.time)[0]")
     driver.execute_script("explorer.span([arguments[0], arguments[1]])", start_s + first - 1e-6, start_s + last + 1e-6)
     inside = (seconds >= first) & (seconds <= last)
-    baseline = next(b for b in panel.baselines if b.name == "free_space")
+    baseline = panel.baselines["free_space"]
     fit = grid_offset(panel.measured_db[inside], baseline.level_dbm[inside])
     found = driver.execute_script("return explorer.statistics()")
     assert found["n"] == fit.n
@@ -293,7 +294,7 @@ def test_names_of_towers_stay_clear_of_the_key_of_the_edges_and_of_each_other(dr
 
 def test_no_error_of_a_model_is_shown_on_the_flight_it_was_learned_from(small_report, tmp_path):
     first, *rest = small_report.rss
-    learned = dataclasses.replace(first, extra={**first.extra, "trained_on": ["0" * 64]})
+    learned = with_numbers(first, trained_on=("0" * 64,))
     page = write.write_report(dataclasses.replace(small_report, rss=(learned, *rest)), tmp_path, drawn="page").files[0]
     found = start("--window-size=1440,1200")
     try:

@@ -32,8 +32,8 @@ def test_arrays_come_back_as_they_were(report_data):
         assert np.diff(array(content, one["time"])).min() >= 0
     for one, rank in zip(content["rank"], report_data.rank, strict=True):
         assert array(content, one["measured"]) == pytest.approx(rank.measured, nan_ok=True)
-        best = rank.simulated[one["best"]]
-        assert best.total_variation == min(at.total_variation for at in rank.simulated)
+        distance = [fit.total_variation for fit in rank.score.simulated.values()]
+        assert distance[one["best"]] == min(distance)
 
 
 def test_equal_arrays_are_stored_once(report_data):
@@ -47,7 +47,7 @@ def test_a_sample_names_its_log_and_line(report_data):
     panel = report_data.rss[0]
     n = len(panel.time)
     source = Source(files=("a.txt", "b.txt"), file=np.arange(n) % 2, line=np.arange(n) + 7)
-    content = explorer.payload(dataclasses.replace(report_data, rss=(dataclasses.replace(panel, source=source),)))
+    content = explorer.payload(dataclasses.replace(report_data, rss=(panel,), sources={panel.name: source}))
     one = content["rss"][0]
     assert one["files"] == ["a.txt", "b.txt"]
     assert array(content, one["line"])[3] == 10
@@ -60,10 +60,9 @@ def test_long_series_are_thinned_with_their_extremes(report_data):
     rng = np.random.default_rng(1)
     level = rng.normal(-80, 5, n)
     level[77_777] = -10.0
-    names = ("east_m", "north_m", "up_m", "simulated_dbm")
     long = dataclasses.replace(
-        panel, time=panel.time[0] + np.arange(n) * np.timedelta64(100, "ms"), measured_db=level, geometry={}, baselines=(),
-        **{name: np.resize(getattr(panel, name), n) for name in names},
+        panel, time=panel.time[0] + np.arange(n) * np.timedelta64(100, "ms"), measured_db=level, geometry={}, baselines={},
+        simulated_dbm=np.resize(panel.simulated_dbm, n), position_m=np.resize(panel.position_m, (n, 3)),
     )  # fmt: skip
     content = explorer.payload(dataclasses.replace(report_data, rss=(long,), rank=()))
     one = content["rss"][0]
@@ -90,8 +89,8 @@ def test_extremes_stay(values, limit):
 def test_a_pose_shows_the_probability_of_each_rank(report_data):
     panel = report_data.rank[0]
     share = np.linspace(0.0, 1.0, len(panel.time))
-    ranked = dataclasses.replace(panel, values={**panel.values, "probability_rank2": share})
+    ranked = dataclasses.replace(panel, probability=np.column_stack([1 - share, share, 0 * share, 0 * share]))
     found = explorer.payload(dataclasses.replace(report_data, rank=(ranked,)))
-    (one,) = found["rank"][0]["probability"]
+    _, one, *_ = found["rank"][0]["probability"]
     assert one["name"] == "probability_rank2"
     np.testing.assert_allclose(array(found, one["values"]), share, atol=1e-6)

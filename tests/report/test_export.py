@@ -7,8 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aerpaw_cmp.compare.result import EngineResult
 from aerpaw_cmp.report import export, names
-from aerpaw_cmp.report.data import Engine
+from benchmarks.fabricated import with_numbers
 
 
 def test_metrics_hold_the_contract(report_data):
@@ -18,11 +19,11 @@ def test_metrics_hold_the_contract(report_data):
     assert {"path", "sha256", "reader", "lines", "accepted", "rejected"} <= set(m["inputs"][0])
     one = m["rss"]["LW1"]["USRP2"]
     panel = report_data.rss[1]
-    assert one["offset_db"] == panel.offset_db
-    assert one["rmse_ci95_db"] == list(panel.rmse_ci95_db)
+    assert one["offset_db"] == panel.score.offset_db
+    assert one["rmse_ci95_db"] == list(panel.score.rmse_ci95_db)
     assert one["baselines"]["two_ray"] == {
-        "offset_db": panel.baselines[1].offset_db,
-        "rmse_db": panel.baselines[1].rmse_db,
+        "offset_db": panel.baselines["two_ray"].offset_db,
+        "rmse_db": panel.baselines["two_ray"].rmse_db,
     }
     assert {"n", "n_out_of_coverage", "at_search_edge", "correlation", "lag_s"} <= set(one)
     rank = m["rank"]["LW1"]
@@ -37,12 +38,12 @@ def test_metrics_hold_the_contract(report_data):
 
 
 def test_nan_is_null_and_extra_metrics_are_merged(report_data):
-    bad = dataclasses.replace(
+    bad = with_numbers(
         report_data.rss[0],
         rmse_db=float("nan"),
         correlation=float("-inf"),
-        rmse_ci95_db=(float("nan"), 1.0),
-        extra={"when": np.datetime64("2024-01-01"), "mask": np.array([True])},
+        intervals=dataclasses.replace(report_data.rss[0].score.intervals, rmse_db=(float("nan"), 1.0)),
+        n_flagged={"when": np.datetime64("2024-01-01"), "mask": np.array([True])},
     )
     data = dataclasses.replace(
         report_data,
@@ -55,9 +56,9 @@ def test_nan_is_null_and_extra_metrics_are_merged(report_data):
     assert one["correlation"] is None
     assert one["rmse_ci95_db"] == [None, 1.0]
     assert one["repeat_db"] == 3.0
-    assert one["n"] == bad.n, "merging must not drop what was there"
-    assert one["when"] == "2024-01-01"
-    assert one["mask"] == [True]
+    assert one["n"] == bad.score.n, "merging must not drop what was there"
+    assert one["n_flagged"]["when"] == "2024-01-01"
+    assert one["n_flagged"]["mask"] == [True]
     assert m["new"] == {"1": [2, None]}
 
 
@@ -77,7 +78,7 @@ def test_rss_csv_comes_back_as_it_went(report_data, tmp_path):
         assert len(rows) == len(panel.time)
         np.testing.assert_allclose(rows.measured_db, panel.measured_db, atol=6e-5)
         np.testing.assert_allclose(rows.residual_db, panel.residual_db, atol=6e-5)
-        np.testing.assert_allclose(rows.two_ray_dbm, panel.baselines[1].level_dbm, atol=6e-5)
+        np.testing.assert_allclose(rows.two_ray_dbm, panel.baselines["two_ray"].level_dbm, atol=6e-5)
         np.testing.assert_array_equal(rows.simulated_out_of_coverage == 1, panel.simulated_out_of_coverage)
         late = np.abs(rows.time_utc.dt.tz_localize(None).to_numpy() - panel.time)
         assert late.max() <= np.timedelta64(500, "us")
@@ -96,8 +97,7 @@ def test_tables_written_in_pieces_are_the_tables(report_data, rows, monkeypatch)
             else value
             for f in dataclasses.fields(panel)
         }  # fmt: skip
-        others = ("geometry", "baselines") if hasattr(panel, "geometry") else ("values", "simulated")
-        nothing = {name: type(getattr(panel, name))() for name in others}
+        nothing = {"geometry": {}, "baselines": {}} if hasattr(panel, "geometry") else {"rank": {}}
         return dataclasses.replace(panel, **{**cut, **nothing})
 
     bare = [dataclasses.replace(few(p, 9), time=p.time[:9] - p.time[0]) for p in report_data.rss]
@@ -105,7 +105,7 @@ def test_tables_written_in_pieces_are_the_tables(report_data, rows, monkeypatch)
         whole = export.rss_frame(panels).to_csv(index=False, lineterminator="\n")
         assert "".join(export.rss_csv(panels)) == whole
     rank = report_data.rank[0]
-    one, two = few(rank, 11), dataclasses.replace(few(rank, 5), values={"level_dbm": np.arange(5.0)})
+    one, two = few(rank, 11), dataclasses.replace(few(rank, 5), probability=np.full((5, 4), 0.25))
     for ranks in ([], [one, two], [two, one]):
         whole = export.rank_frame(ranks).to_csv(index=False, lineterminator="\n")
         assert "".join(export.rank_csv(ranks)) == whole
@@ -131,8 +131,8 @@ def test_rank_csv_keeps_no_csi_apart_from_no_path(report_data, tmp_path):
     back = pd.read_csv(path)
     panel = report_data.rank[0]
     np.testing.assert_array_equal(back.measured_rank.isna(), np.isnan(panel.measured))
-    np.testing.assert_array_equal(back["simulated_rank_k10"], panel.simulated[0].rank)
-    assert (back["simulated_rank_k10"] == 0).sum() == panel.simulated[0].n_out_of_coverage
+    np.testing.assert_array_equal(back["simulated_rank_k10"], panel.rank[10.0])
+    assert (back["simulated_rank_k10"] == 0).sum() == panel.score.simulated[10.0].out_of_coverage
 
 
 def test_tables_without_rows_have_their_columns():
@@ -141,7 +141,7 @@ def test_tables_without_rows_have_their_columns():
 
 
 def test_panels_with_different_baselines_share_one_table(report_data):
-    bare = dataclasses.replace(report_data.rss[0], baselines=(), channel="bare", east_m=None)
+    bare = dataclasses.replace(report_data.rss[0], baselines={}, channel="bare")
     frame = export.rss_frame([bare, report_data.rss[1]])
     assert frame[frame.channel == "bare"].free_space_dbm.isna().all()
     assert frame[frame.channel == "USRP2"].free_space_dbm.notna().all()
@@ -162,16 +162,17 @@ def test_time_is_rounded_not_cut(stored, text):
 
 def test_no_engine_no_audit(report_data):
     assert export.metrics(dataclasses.replace(report_data, engine=None))["rt"] is None
-    bare = dataclasses.replace(report_data, engine=Engine(engine="sionna", links=1, seconds=1.0))
+    bare = dataclasses.replace(report_data, engine=EngineResult(engine="sionna", links=1, seconds=1.0))
     assert export.metrics(bare)["rt"]["audit"] is None
 
 
 def test_rank_csv_holds_what_a_receiver_decides_by(report_data):
     """Level and ratios of singular values; empty where there is no path, never infinite."""
     panel = report_data.rank[0]
-    level, ratio = np.full(len(panel.time), -80.0), np.full(len(panel.time), -12.5)
-    level[1], ratio[2] = np.nan, -np.inf
-    table = export.rank_frame([dataclasses.replace(panel, values={"level_dbm": level, "sigma2_over_sigma1_db": ratio})])
+    level, sigma = np.full(len(panel.time), -80.0), np.tile([1.0, 10**-0.625], (len(panel.time), 1))
+    level[1], sigma[2, 1] = np.nan, 0.0
+    with np.errstate(divide="ignore"):
+        table = export.rank_frame([dataclasses.replace(panel, level_dbm=level, sigma=sigma)])
     assert table["level_dbm"].isna().to_numpy().nonzero()[0].tolist() == [1]
     assert table["sigma2_over_sigma1_db"].isna().to_numpy().nonzero()[0].tolist() == [2]
     assert table["sigma2_over_sigma1_db"][0] == -12.5

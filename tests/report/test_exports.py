@@ -18,6 +18,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.compare.spread import NO_SPREAD, StatedSpread
 from aerpaw_cmp.flight.settings import ReportSettings
 from aerpaw_cmp.report.export import rank_frame, rss_frame
 from aerpaw_cmp.report.exports import formats, kmz, points, tables, vectors, write
@@ -26,36 +27,32 @@ ODD = 'LW<4> & "ö"'
 DBM = "0.1 lg(re 1 mW)"
 
 
-def thinned(panel, every, **change):
-    """Every so many samples of a panel."""
-    n = len(panel.time)
+def thinned(record, every, **change):
+    """Every so many samples of a record."""
+    n = len(record.time)
     cut = {
         f.name: value[::every]
-        for f in dataclasses.fields(panel)
-        if isinstance(value := getattr(panel, f.name), np.ndarray) and len(value) == n
+        for f in dataclasses.fields(record)
+        if isinstance(value := getattr(record, f.name), np.ndarray) and len(value) == n
     }
-    if hasattr(panel, "baselines"):
-        cut["baselines"] = tuple(dataclasses.replace(b, level_dbm=b.level_dbm[::every]) for b in panel.baselines)
-    if hasattr(panel, "simulated"):
-        cut["simulated"] = tuple(dataclasses.replace(at, rank=at.rank[::every]) for at in panel.simulated)
-    return dataclasses.replace(panel, **cut, **change)
+    if hasattr(record, "baselines"):
+        cut["baselines"] = {
+            name: dataclasses.replace(b, level_dbm=b.level_dbm[::every]) for name, b in record.baselines.items()
+        }
+    if hasattr(record, "rank"):
+        cut["rank"] = {k: rank[::every] for k, rank in record.rank.items()}
+    return dataclasses.replace(record, **cut, **change)
 
 
 @pytest.fixture(scope="module")
 def data(report_data):
     """A short flight: a name that must be escaped, a position that is unknown, levels out of coverage, no CSI."""
     first, last = thinned(report_data.rss[0], 60), thinned(report_data.rss[2], 60, tower=ODD)
-    east, north, up = (np.array(v) for v in (first.east_m, first.north_m, first.up_m))
-    east[7] = north[7] = up[7] = np.nan
-    first = dataclasses.replace(
-        first,
-        east_m=east,
-        north_m=north,
-        up_m=up,
-        unit="dBm",
-        per_sample={"simulated_sd_db": np.full(len(first.time), 2.5)},
-    )
-    rank = thinned(report_data.rank[0], 10, values={"level_dbm": np.linspace(-90, -50, 100)})
+    place = np.array(first.position_m)
+    place[7] = np.nan
+    stated = StatedSpread(gain_sd_db=np.full(len(first.time), 2.5), spread=NO_SPREAD)
+    first = dataclasses.replace(first, position_m=place, unit="dBm", stated=stated)
+    rank = dataclasses.replace(thinned(report_data.rank[0], 10), level_dbm=np.linspace(-90, -50, 100))
     track = thinned(report_data.track, 30)
     return dataclasses.replace(
         report_data, track=track, rss=(first, last), rank=(rank,), synthetic=True, title="Flight <1> & more"
@@ -397,10 +394,9 @@ def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypat
     assert write.write_exports(points.of_report(nothing), tmp_path / "b", write.FORMATS)
     silent = dataclasses.replace(
         data.rss[0],
-        **{
-            name: np.full(len(data.rss[0].time), np.nan)
-            for name in ("measured_db", "simulated_dbm", "east_m", "north_m", "up_m")
-        },
+        measured_db=np.full(len(data.rss[0].time), np.nan),
+        simulated_dbm=np.full(len(data.rss[0].time), np.nan),
+        position_m=np.full((len(data.rss[0].time), 3), np.nan),
     )
     (tmp_path / "c").mkdir()
     assert write.write_exports(
@@ -429,7 +425,7 @@ def test_a_long_flight_is_thinned_with_its_extremes(data, tmp_path, monkeypatch)
     kmz.write_kmz(export, folder)
     with zipfile.ZipFile(folder / "samples.kmz") as archive:
         text = archive.read("doc.kml").decode()
-    largest = float(np.nanmax(level + panel.offset_db - panel.simulated_dbm))
+    largest = float(np.nanmax(level + panel.score.offset_db - panel.simulated_dbm))
     assert f"{largest:.1f} dB</name>" in text
     assert "Thinned to about" in text
     lines = text.split("LW1 USRP1, Residual")[1].split("</Folder>")[0]

@@ -12,8 +12,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 
+from aerpaw_cmp.compare.detection import DetectionScore
+from aerpaw_cmp.compare.result import RankResult, RssResult
 from aerpaw_cmp.report import canvas, figures, html, rss_figures
-from aerpaw_cmp.report.data import Histogram, RankPanel, ReportData, RssPanel, Track
+from aerpaw_cmp.report.data import ReportData, Track
+from benchmarks.fabricated import rank_result, rss_result, with_numbers
 
 
 def drawn(data: ReportData):
@@ -59,15 +62,22 @@ def test_file_names_are_safe_and_unique(report_data):
     assert len(names) == len(set(names))
 
 
-def long_panel(panel: RssPanel, times: int) -> RssPanel:
-    n = len(panel.time) * times
-    time = panel.time[0] + (np.arange(n) * 1e8).astype("timedelta64[ns]")
-    rows = {
-        f: np.tile(getattr(panel, f), times)
-        for f in ("measured_db", "simulated_dbm", "measured_out_of_coverage", "simulated_out_of_coverage")
-    }
-    baselines = tuple(dataclasses.replace(b, level_dbm=np.tile(b.level_dbm, times)) for b in panel.baselines)
-    return dataclasses.replace(panel, time=time, baselines=baselines, geometry={}, line_of_sight=None, **rows)
+def compared_again(panel: RssResult, rows: object, **change: object) -> RssResult:
+    """The comparison of some of its samples."""
+    levels = {"measured": panel.measured_db, "simulated": panel.simulated_dbm}
+    levels |= {name: model.level_dbm for name, model in panel.baselines.items()}
+    return rss_result(
+        panel.tower, panel.channel, panel.time[rows], panel.position_m[rows],
+        {name: level[rows] for name, level in levels.items()} | change,
+        geometry={name: values[rows] for name, values in panel.geometry.items()},
+        line_of_sight=panel.line_of_sight[rows],
+    )  # fmt: skip
+
+
+def long_panel(panel: RssResult, times: int) -> RssResult:
+    long = compared_again(panel, np.tile(np.arange(len(panel.time)), times))
+    time = panel.time[0] + (np.arange(len(long.time)) * 1e8).astype("timedelta64[ns]")
+    return dataclasses.replace(long, time=time, geometry={})
 
 
 def test_svg_stays_small_however_long_the_flight(report_data):
@@ -95,69 +105,23 @@ def test_style_leaves_the_users_settings_alone(small_report):
     assert dict(matplotlib.rcParams) == before
 
 
-def one_sample(panel: RssPanel) -> RssPanel:
-    pick = slice(3000, 3001)
-    fields = (
-        "time",
-        "measured_db",
-        "simulated_dbm",
-        "measured_out_of_coverage",
-        "simulated_out_of_coverage",
-        "east_m",
-        "north_m",
-        "up_m",
-        "line_of_sight",
-    )
-    baselines = tuple(dataclasses.replace(b, level_dbm=b.level_dbm[pick]) for b in panel.baselines)
-    return dataclasses.replace(
-        panel,
-        n=1,
-        baselines=baselines,
-        geometry={k: v[pick] for k, v in panel.geometry.items()},
-        **{f: getattr(panel, f)[pick] for f in fields},
-    )
+def one_sample(panel: RssResult) -> RssResult:
+    return compared_again(panel, slice(3000, 3001))
 
 
-def all_out(panel: RssPanel) -> RssPanel:
-    nothing = np.full(len(panel.time), np.nan)
-    return dataclasses.replace(
-        panel,
-        simulated_dbm=nothing,
-        simulated_out_of_coverage=np.ones(len(nothing), dtype=bool),
-        offset_db=np.nan,
-        rmse_db=np.nan,
-        correlation=np.nan,
-        n=0,
-        n_out_of_coverage=len(nothing),
-        offset_curve=None,
-        baselines=(),
-        rmse_ci95_db=None,
-    )
+def all_out(panel: RssResult) -> RssResult:
+    return compared_again(panel, slice(None), simulated=np.full(len(panel.time), np.nan))
 
 
-def no_csi(panel: RankPanel) -> RankPanel:
-    nothing = Histogram(share=np.full(4, np.nan))
-    at = tuple(
-        dataclasses.replace(
-            a,
-            rank=np.zeros_like(a.rank),
-            histogram=nothing,
-            agreement=np.nan,
-            total_variation=np.nan,
-            confusion=np.zeros((4, 5), dtype=int),
-        )
-        for a in panel.simulated
-    )
-    return dataclasses.replace(
-        panel,
-        measured=np.full(len(panel.time), np.nan),
-        histogram=nothing,
-        simulated=at,
-        curve=None,
-        singular_ratio_db=np.full((len(panel.time), 3), np.nan),
-        best_k=np.nan,
-        best_k_ci95=None,
-    )
+def no_csi(panel: RankResult) -> RankResult:
+    n = len(panel.time)
+    return rank_result("LW1", panel.time, panel.position_m, np.full(n, np.nan), np.zeros((n, 4, 4), dtype=complex))
+
+
+def few_thresholds(panel: RankResult, most: int) -> RankResult:
+    kept = list(panel.rank)[:most]
+    simulated = {k: panel.score.simulated[k] for k in kept}
+    return with_numbers(panel, rank={k: panel.rank[k] for k in kept}, simulated=simulated)
 
 
 def still(track: Track) -> Track:
@@ -180,10 +144,10 @@ def drawn_before():
     [
         lambda d: {"rss": (one_sample(d.rss[0]),), "rank": ()},
         lambda d: {"rss": (all_out(d.rss[2]),), "rank": ()},
-        lambda d: {"rss": (dataclasses.replace(d.rss[2], offset_db=50.0, at_search_edge=True),), "rank": ()},
+        lambda d: {"rss": (with_numbers(d.rss[2], offset_db=50.0, at_edge=True),), "rank": ()},
         lambda d: {"rss": (), "rank": (no_csi(d.rank[0]),)},
-        lambda d: {"rss": (), "rank": (dataclasses.replace(d.rank[0], simulated=(), curve=None, singular_ratio_db=None),)},
-        lambda d: {"rss": (), "rank": (dataclasses.replace(d.rank[0], simulated=d.rank[0].simulated[:1]),)},
+        lambda d: {"rss": (), "rank": (few_thresholds(d.rank[0], 0),)},
+        lambda d: {"rss": (), "rank": (few_thresholds(d.rank[0], 1),)},
         lambda d: {"rss": (), "rank": (), "track": still(d.track)},
         lambda d: {"rss": (), "rank": (), "track": Track(time=d.track.time[:1], east_m=d.track.east_m[:1], north_m=d.track.north_m[:1], up_m=d.track.up_m[:1])},
         lambda d: {"rss": (), "rank": (), "track": dataclasses.replace(d.track, up_m=np.full(len(d.track.time), np.nan))},
@@ -260,14 +224,8 @@ def test_drawing_without_the_unseen_pass_gives_the_same_picture(small_report):
 def relative(data: ReportData) -> ReportData:
     """The same flight from logs whose times are relative: they count from 1970."""
     back = data.track.time[0] - np.datetime64("1969-12-31T23:57:31", "ns")
-    rss = tuple(
-        dataclasses.replace(
-            p, time=p.time - back,
-            worst=tuple(dataclasses.replace(w, start=w.start - back, end=w.end - back) for w in p.worst),
-        )
-        for p in data.rss
-    )  # fmt: skip
-    pairs = tuple(dataclasses.replace(p, time=p.time - back, apart=()) for p in data.pairs)
+    rss = tuple(dataclasses.replace(p, time=p.time - back) for p in data.rss)
+    pairs = tuple(dataclasses.replace(p, time=p.time - back) for p in data.pairs)
     return dataclasses.replace(
         data, track=dataclasses.replace(data.track, time=data.track.time - back), waypoints=(), rss=rss, pairs=pairs,
         rank=tuple(dataclasses.replace(p, time=p.time - back) for p in data.rank),
@@ -279,7 +237,7 @@ def test_relative_times_count_from_the_first_sample(small_report):
     labels = [ax.get_xlabel() for _, fig in drawn(data) for ax in data_axes(fig) if "Time after" in ax.get_xlabel()]
     assert labels
     assert set(labels) == {"Time after the first sample [s]"}
-    assert any(panel.worst for panel in data.rss)
+    assert any(panel.spans for panel in data.rss)
     page = html.page(data, [], [])
     assert "From (s)" in page
     assert "23:57" not in page
@@ -389,8 +347,7 @@ def test_the_forecast_of_a_receiver_is_the_first_figure_of_the_rank(report_data)
     n = len(panel.time)
     certain = np.arange(n) < n // 2
     said = np.where(certain[:, None], [0.0, 1.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4])
-    values = {**panel.values, **{f"probability_rank{rank + 1}": said[:, rank] for rank in range(4)}}
-    data = dataclasses.replace(report_data, rank=(dataclasses.replace(panel, values=values), *report_data.rank[1:]))
+    data = dataclasses.replace(report_data, rank=(dataclasses.replace(panel, probability=said), *report_data.rank[1:]))
     (first,) = [spec for spec in figures.figure_specs(data) if spec.section == "forecast"]
     assert first.name.startswith("rank_forecast")
     upper = first.draw().axes[0]
@@ -402,13 +359,13 @@ def test_the_forecast_of_a_receiver_is_the_first_figure_of_the_rank(report_data)
 
 def test_the_reliability_of_a_detection_is_drawn_where_it_was_scored(report_data):
     panel = report_data.rss[0]
-    score = {
-        "reliability": [[0.1, 0.12, 50], [0.5, 0.45, 80], [0.9, 0.93, 200]], "brier": 0.11, "constant_brier": 0.2,
-        "log_score": 0.3, "constant_log_score": 0.6, "n": 330, "n_detected": 230, "floor_db": -15.0, "rmse_db": 9.0,
-        "detected_rmse_db": 7.0,
-    }  # fmt: skip
+    score = DetectionScore(
+        reliability=((0.1, 0.12, 50), (0.5, 0.45, 80), (0.9, 0.93, 200)), brier=0.11, constant_brier=0.2,
+        log_score=0.3, constant_log_score=0.6, n=330, n_detected=230, floor_db=-15.0, rmse_db=9.0, offset_db=1.0,
+        detected_rmse_db=7.0,
+    )  # fmt: skip
     assert not any("rss_detection" in spec.name for spec in figures.figure_specs(report_data))
-    scored = dataclasses.replace(panel, extra={**panel.extra, "detection": score})
+    scored = with_numbers(panel, detection=score)
     data = dataclasses.replace(report_data, rss=(scored, *report_data.rss[1:]))
     (spec,) = [one for one in figures.figure_specs(data) if "rss_detection" in one.name]
     assert "Brier score 0.110, constant forecast 0.200" in spec.caption

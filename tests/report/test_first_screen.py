@@ -7,11 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
+from aerpaw_cmp.compare.causes import Cause
 from aerpaw_cmp.compare.field_difference import FieldAudit
+from aerpaw_cmp.compare.forecast import score_forecast
+from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
+from aerpaw_cmp.compare.rss import ErrorSpan
 from aerpaw_cmp.compare.statistics import paired_difference
-from aerpaw_cmp.report.data import ErrorSpan
 from aerpaw_cmp.report.first_screen import headlines, pooled_db, verdict
 from aerpaw_cmp.report.words import CAUSES, DIFFERENCE, Judged, first_sentence, pretty, ranking_sentence
+from benchmarks.fabricated import with_numbers
 
 
 def test_pooled_error_is_that_of_all_samples_together():
@@ -24,10 +28,14 @@ def test_pooled_error_is_that_of_all_samples_together():
 def with_errors(data, rmse_db, baseline_db):
     """The report with these errors in every channel."""
     panels = tuple(
-        dataclasses.replace(
+        with_numbers(
             panel,
             rmse_db=rmse_db,
-            baselines=tuple(dataclasses.replace(b, rmse_db=baseline_db + i) for i, b in enumerate(panel.baselines)),
+            rmse_without_outliers_db=rmse_db,
+            baselines={
+                name: dataclasses.replace(b, rmse_db=baseline_db + i)
+                for i, (name, b) in enumerate(panel.baselines.items())
+            },
         )
         for panel in data.rss
     )
@@ -39,14 +47,12 @@ def judged_as(data, verdicts, rmse_db=8.4, baseline_db=7.9):
     data = with_errors(data, rmse_db, baseline_db)
     pair = paired_difference(np.arange(30.0), np.arange(30.0)[::-1])
     panels = tuple(
-        dataclasses.replace(
+        with_numbers(
             panel,
-            baselines=tuple(
-                dataclasses.replace(
-                    b, paired=dataclasses.replace(pair, verdict=verdicts.get(b.name, "not significant"))
-                )
-                for b in panel.baselines
-            ),
+            compared_with={
+                name: dataclasses.replace(pair, verdict=verdicts.get(name, "not significant"))
+                for name in panel.baselines
+            },
         )
         for panel in data.rss
     )
@@ -54,7 +60,7 @@ def judged_as(data, verdicts, rmse_db=8.4, baseline_db=7.9):
 
 
 def test_the_first_sentence_follows_from_the_paired_intervals(report_data):
-    first, second = (b.name for b in report_data.rss[0].baselines[:2])
+    first, second = report_data.rss[0].baselines
     n = len(report_data.rss)
     assert n > 2
     lost = verdict(judged_as(report_data, {first: "worse"}))[0]
@@ -90,15 +96,16 @@ def test_no_sentence_contradicts_its_numbers(better, worse, channels):
 
 
 def test_a_local_error_is_a_stretch_and_names_the_clock(report_data):
-    panel = dataclasses.replace(report_data.rss[0], lag_verdict="cannot tell")
-    at = np.datetime64("2025-06-01T14:00:00")
+    clock = ClockResult(
+        receiver="LW1", radio_minus_telemetry_s=0.1, ci95_s=(-9, 9), verdict="cannot tell", reason="", applied=ESTIMATED
+    )
+    panel = with_numbers(report_data.rss[0], clock=clock)
+    time = panel.time - panel.time[0] + np.datetime64("2025-06-01T14:00:00", "ns")
     spans = [
-        ErrorSpan(
-            start=at, end=at + np.timedelta64(s, "s"), east_m=0, north_m=0, up_m=0, mean_error_db=e, cause="a null"
-        )
+        ErrorSpan(start_s=0, end_s=s, n=9, mean_db=e, worst_db=e, position_m=(0, 0, 0), cause="a null")
         for s, e in ((1, 20.0), (8, -6.5))
     ]
-    data = dataclasses.replace(report_data, rss=(dataclasses.replace(panel, worst=tuple(spans)),))
+    data = dataclasses.replace(report_data, rss=(dataclasses.replace(panel, time=time, spans=tuple(spans)),))
     said = verdict(data)[1]
     assert "measured 6.5 dB below predicted" in said
     assert "14:00:00-14:00:08 UTC" in said
@@ -112,8 +119,8 @@ def test_a_local_error_is_a_stretch_and_names_the_clock(report_data):
     [
         ("clock", -3.0, (-3.5, -2.5), "", "3.0 s behind the telemetry clock (95 %: −3.5 to −2.5 s)", "lag: apply"),
         ("heading", 40.0, (30.0, 50.0), "", "turned clockwise by 40 (95 %: 30 to 50) degrees", "mount"),
-        ("tower", None, (None, None), "LW3", "the log is that of LW3", "node:"),
-        ("pattern", None, (None, None), "", "antenna pattern", "calibrate"),
+        ("tower", np.nan, (np.nan, np.nan), "LW3", "the log is that of LW3", "node:"),
+        ("pattern", np.nan, (np.nan, np.nan), "", "antenna pattern", "calibrate"),
         ("blocked", 12.2, (10.0, 14.4), "30 to 75", "a loss of 12 dB (95 %: 10 to 14 dB) at 30 to 75 degrees", "site"),
         ("floor", -88.4, (-89.0, -88.0), "", "no level below −88", "floor_db: -88"),
         ("gain step", -6.0, (-7.0, -5.0), "90", "steps by −6.0 dB (95 %: −7.0 to −5.0 dB) at 14:01:30 UTC", "gain"),
@@ -121,11 +128,11 @@ def test_a_local_error_is_a_stretch_and_names_the_clock(report_data):
 )
 def test_a_cause_is_said_with_effect_interval_and_action(report_data, name, estimate, ci95, where, said, action):
     first, *others = report_data.rss
-    cause = {
-        "name": name, "estimate": estimate, "ci95": ci95, "where": where, "rmse_db": 6.0, "rmse_with_db": 2.5, "gain": 40.0
-    }  # fmt: skip
+    cause = Cause(
+        name=name, estimate=estimate, ci95=ci95, where=where, rmse_db=6.0, rmse_with_db=2.5, gain=40.0
+    )  # fmt: skip
     time = np.datetime64("2025-06-01T14:00:00") + np.arange(len(first.time)) * np.timedelta64(1, "s")
-    panel = dataclasses.replace(first, time=time.astype("datetime64[ns]"), extra={**first.extra, "likely_cause": cause})
+    panel = with_numbers(first, time=time.astype("datetime64[ns]"), likely_cause=cause)
     text = verdict(dataclasses.replace(report_data, rss=(panel, *others)))[1]
     assert f"Likely cause at {panel.name}: " in text
     assert said in text
@@ -136,16 +143,15 @@ def test_a_cause_is_said_with_effect_interval_and_action(report_data, name, esti
 
 
 def test_one_wild_sample_that_moves_the_error_is_said(report_data):
-    extra = {"n_outliers": 1, "rmse_without_outliers_db": 1.8}
-    panel = dataclasses.replace(report_data.rss[0], rmse_db=12.5, extra={**report_data.rss[0].extra, **extra})
+    panel = with_numbers(report_data.rss[0], rmse_db=12.5, n_outliers=1, rmse_without_outliers_db=1.8)
     said = verdict(dataclasses.replace(report_data, rss=(panel,)))[1]
     assert f"1 outlying sample raises at {panel.name} its RMSE from 1.8 to 12.5 dB" in said
-    calm = dataclasses.replace(panel, rmse_db=1.9)
+    calm = with_numbers(panel, rmse_db=1.9)
     assert "outlying" not in verdict(dataclasses.replace(report_data, rss=(calm,)))[1]
 
 
 def test_a_single_sample_is_no_result(report_data):
-    panels = tuple(dataclasses.replace(panel, n=1, rmse_db=0.01) for panel in report_data.rss)
+    panels = tuple(with_numbers(panel, n=1, rmse_db=0.01) for panel in report_data.rss)
     first, _ = verdict(dataclasses.replace(report_data, rss=panels, rank=()))
     assert first.startswith("Nothing could be compared")
     assert "at most 1" in first
@@ -169,20 +175,19 @@ def test_doubts_are_said(report_data):
 
 
 def test_nothing_to_score(report_data):
-    panels = tuple(dataclasses.replace(panel, n=0, rmse_db=np.nan) for panel in report_data.rss)
+    panels = tuple(with_numbers(panel, n=0, rmse_db=np.nan) for panel in report_data.rss)
     first, _ = verdict(dataclasses.replace(report_data, rss=panels, rank=()))
     assert first.startswith("Nothing could be compared")
 
 
 def test_a_rank_forecast_is_the_headline_where_there_is_one(report_data):
-    found = {
-        "kappa": 0.37,
-        "kappa_ci95": [0.17, 0.61],
-        "log_score_gain": 0.19,
-        "agreement": 0.71,
-        "majority_agreement": 0.66,
-    }
-    panel = dataclasses.replace(report_data.rank[0], extra={**report_data.rank[0].extra, "receiver": found})
+    rng = np.random.default_rng(3)
+    measured = rng.integers(1, 5, 200).astype(float)
+    score = dataclasses.replace(
+        score_forecast(measured, np.full((200, 4), 0.25), measured, np.full(4, 0.25)),
+        kappa=0.37, kappa_ci95=(0.17, 0.61), log_score_gain=0.19, agreement=0.71, majority_agreement=0.66,
+    )  # fmt: skip
+    panel = with_numbers(report_data.rank[0], receiver=score)
     data = dataclasses.replace(report_data, rss=(), rank=(panel,))
     first = verdict(data)[0]
     assert first.startswith(f"Rank forecast at {panel.tower} by the receiver learned on other flights: kappa 0.37")
@@ -190,7 +195,7 @@ def test_a_rank_forecast_is_the_headline_where_there_is_one(report_data):
     assert "agrees in 71 % of samples; always guessing the commonest agrees in 66 %" in first
     (card,) = [line for line in headlines(data) if line.label.startswith("Rank")]
     assert (card.value, card.interval) == ("kappa 0.37", "95 %: 0.17 to 0.61")
-    unscored = dataclasses.replace(panel, extra={**panel.extra, "receiver": {**found, "kappa": None}})
+    unscored = with_numbers(panel, receiver=dataclasses.replace(score, kappa=np.nan))
     assert "Rank forecast" not in verdict(dataclasses.replace(data, rank=(unscored,)))[0]
 
 
@@ -198,7 +203,7 @@ def test_sentence_and_card_of_a_rank_show_the_same_digits(report_data):
     data = dataclasses.replace(report_data, rss=())
     sentence, *_ = verdict(data)
     card = next(one for one in headlines(data) if one.label.startswith("Rank"))
-    best = min(data.rank[0].simulated, key=lambda at: at.total_variation)
+    best = min(data.rank[0].score.simulated.values(), key=lambda at: at.total_variation)
     shown = f"{100 * best.total_variation:.0f} percentage points"
     assert shown in sentence
     assert card.value == shown

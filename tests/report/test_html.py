@@ -13,11 +13,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aerpaw_cmp.compare.rank import CommonestRank, RankRepeat
+from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
 from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report import html, words
 from aerpaw_cmp.report.canvas import Picture
 from aerpaw_cmp.report.data import InputFile, ReportData
+from benchmarks.fabricated import with_numbers
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'&{{ 7*7 }}"
@@ -116,10 +119,10 @@ def test_first_screen_says_what_and_how_well(report_data):
     head = text[: text.index("The flight")]
     panel = report_data.rss[0]
     for piece in (
-        f"{panel.offset_db:.1f}",
-        f"{panel.rmse_db:.2f}",
-        f"{panel.baselines[0].rmse_db:.2f}",
-        f"{panel.baselines[1].rmse_db:.2f}",
+        f"{panel.score.offset_db:.1f}",
+        f"{panel.score.rmse_db:.2f}",
+        f"{panel.baselines['free_space'].rmse_db:.2f}",
+        f"{panel.baselines['two_ray'].rmse_db:.2f}",
         "synthetic",
         "illustrative",
     ):
@@ -141,14 +144,16 @@ def test_not_called_synthetic_or_illustrative_when_it_is_neither(report_data):
 
 def hostile_report(data: ReportData, text: str) -> ReportData:
     site = dataclasses.replace(data.site, name=text, notes=(text,))
-    panel = dataclasses.replace(
+    panel = with_numbers(
         data.rss[0],
         tower=text,
         channel=text,
         unit=text,
-        lag_verdict=text,
-        fitted=(text,),
-        worst=(dataclasses.replace(data.rss[0].worst[0], cause=text),),
+        clock=ClockResult(
+            receiver=text, radio_minus_telemetry_s=0.0, ci95_s=(0, 0), verdict=text, reason=text, applied=ESTIMATED
+        ),
+        fitted_on_scored=(text,),
+        spans=(dataclasses.replace(data.rss[0].spans[0], cause=text),),
     )
     bad_input = InputFile(
         path=text,
@@ -224,12 +229,11 @@ def test_panels_are_said_in_their_own_section(report_data):
 class TestWords:
     def test_the_words_follow_from_the_paired_interval(self, report_data):
         panel = report_data.rss[0]
-        best = min(panel.baselines, key=lambda baseline: baseline.rmse_db)
+        best = min(panel.baselines, key=lambda name: panel.baselines[name].rmse_db)
 
         def said(error_db, other_db):
             paired = paired_difference(error_db, other_db, free_offset=False)
-            beside = dataclasses.replace(best, paired=paired)
-            return words.rss_verdict(dataclasses.replace(panel, baselines=(beside,)))
+            return words.rss_verdict(with_numbers(panel, compared_with={best: paired}))
 
         rng = np.random.default_rng(1)
         small, large = rng.normal(0, 3.0, 500), rng.normal(0, 4.0, 500)
@@ -244,18 +248,19 @@ class TestWords:
         assert "better" not in text
 
     def test_edge_of_the_search(self, report_data):
-        data = dataclasses.replace(report_data, rss=(dataclasses.replace(report_data.rss[0], at_search_edge=True),))
+        data = dataclasses.replace(report_data, rss=(with_numbers(report_data.rss[0], at_edge=True),))
         assert any("edge of the searched span" in w for w in words.warnings(data))
         assert not any("edge of the searched span" in w for w in words.warnings(report_data))
 
     def test_nothing_to_score(self, report_data):
-        panel = dataclasses.replace(report_data.rss[0], n=0, rmse_db=np.nan, offset_db=np.nan)
+        panel = with_numbers(report_data.rss[0], n=0, rmse_db=np.nan, offset_db=np.nan)
         assert "nothing to score" in words.rss_verdict(panel)
 
     def test_kappa_has_its_neighbours(self, report_data):
-        panel = dataclasses.replace(
+        panel = with_numbers(
             report_data.rank[0],
-            extra={"commonest": {"rank": 2, "agreement": 0.71}, "repeat": {"any_heading": {"n": 90, "kappa": 0.42}}},
+            commonest=CommonestRank(rank=2, agreement=0.71, agreement_ci95=(0.6, 0.8)),
+            repeat={"any_heading": RankRepeat(n=90, kappa=0.42, kappa_ci95=(0.3, 0.5), agreement=0.7)},
         )
         text = words.rank_verdict(panel)
         assert "always saying 2 would agree in 71 %" in text
@@ -263,8 +268,8 @@ class TestWords:
 
     def test_best_k_is_the_nearest_distribution(self, report_data):
         panel = report_data.rank[0]
-        best = min(panel.simulated, key=lambda at: at.total_variation)
-        assert f"K = {best.k:g} comes nearest" in words.rank_verdict(panel)
+        best = min(panel.score.simulated, key=lambda k: panel.score.simulated[k].total_variation)
+        assert f"K = {best:g} comes nearest" in words.rank_verdict(panel)
 
 
 def test_a_note_of_site_and_flight_is_said_once(report_data):

@@ -275,7 +275,7 @@ def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[Flo
 
 def of_report(data: ReportData) -> Export:
     """The samples of a flight."""
-    tables = {"rss": rss_tables(list(data.rss)), "rank": rank_tables(list(data.rank))}
+    tables = {"rss": rss_tables(data.rss), "rank": rank_tables(data.rank)}
     sets = [
         points
         for kind, links in tables.items()

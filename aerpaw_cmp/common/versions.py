@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import platform
-from importlib.metadata import PackageNotFoundError, version
+from functools import cache
+from importlib import metadata
 
 from .. import __version__
 
 PACKAGES = ("numpy", "scipy", "pandas", "pyproj", "shapely", "sionna-rt", "mitsuba", "drjit")
 
 
+@cache
+def version(package: str) -> str:
+    """Version of an installed package, "not installed" where it is not; its metadata is read once."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
 def versions() -> dict[str, str]:
     """Versions by name; "not installed" where a package is not."""
-    numbers = {"aerpaw-cmp": __version__, "python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            numbers[name] = version(name)
-        except PackageNotFoundError:
-            numbers[name] = "not installed"
-    return numbers
+    return {"aerpaw-cmp": __version__, "python": platform.python_version()} | {name: version(name) for name in PACKAGES}

@@ -234,7 +234,6 @@ def run_report(
     from ..report.export import metrics as metrics_of
     from ..report.exports.formats import chosen_formats
     from ..report.write import FIGURES, STYLES, write_report
-    from .against import score_against
     from .flight_run import run_flight
     from .ladder import recommended_text
     from .later_audit import refuse_changed, with_later_audit
@@ -259,7 +258,11 @@ def run_report(
         stages = Stages(progress)
         with stages("read"):
             data = load_data(settings, flight.parent, logs_root)
-            before = None if against is None else score_against(data, Path(against))
+            before = None
+            if against is not None:
+                from .against import score_against  # loads what calibration and prediction need
+
+                before = score_against(data, Path(against))
         replays = replay_flight(data, stages)
         flight_run = run_flight(data, stages, replays=replays, ladder=True)
         record = report_record(flight_run, other_inputs(settings, flight, logs_root, learned))

@@ -135,7 +135,7 @@ def version_in_name(name: str) -> tuple[int, ...] | None:
 
 def _library(path: Path) -> Library | None:
     """The file behind a name; links are followed because ``libLLVM.so`` often points to ``libLLVM.so.19.1``."""
-    if not path.is_file():
+    if path.suffix == ".a" or not path.is_file():  # an LLVM to compile against brings two hundred of them
         return None
     versions = [version_in_name(name) for name in (path.resolve().name, path.name)]
     if versions == [None, None]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 from dataclasses import fields
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from .. import __version__
 from ..common.files import read_sealed, write_sealed
 from ..common.units import AnyArray, FloatArray
+from ..common.versions import version
 from .options import Search
 from .paths import PathSet
 from .scene import Scene
@@ -80,7 +80,7 @@ class PathCache:
         digest = hashlib.sha256()
         versions = [__version__, str(LAYOUT)]
         if search.engine == "sionna":
-            versions += [metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
+            versions += [version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
             versions += [str(carrier_hz), *scene.faces.material]
         text = "\n".join([*versions, *(f"{k}={v}" for k, v in sorted(search.deciding.items()))])
         digest.update(text.encode())

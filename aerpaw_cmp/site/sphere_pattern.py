@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from ..common.cf import CONVENTIONS, DB, dataset, netcdf_bytes
 from ..common.errors import InputError, UsageError
 from ..common.provenance import trained_on
-from ..common.units import FloatArray, db_from_power, power_from_db
+from ..common.units import BoolArray, FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern
 from .learned import read_table
 from .pair_gain import PairGain
@@ -176,7 +177,7 @@ def read_sphere_csv(path: str | Path, *, name: str | None = None) -> SpherePatte
             path=path,
             line=numbered[0][0] if numbered else None,
         )
-    values = np.array([_row(line, number, len(header), path) for number, line in numbered[1:]]).reshape(-1, len(header))
+    values = _values(numbered[1:], len(header), path)
     azimuth, elevation = np.unique(np.round(values[:, 0] % 360.0, 6)), np.unique(np.round(values[:, 1], 6))[::-1]
     _check_grid(azimuth, elevation, len(values), path)
     row = np.argmin(np.abs(elevation[None, :] - values[:, 1:2]), axis=1)
@@ -202,13 +203,29 @@ def _flights_in(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in first.partition(", from ")[2].split(",") if name.strip())
 
 
+def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> FloatArray:
+    """Cells (lines, width) of numbered lines; line by line only where that finds the one that is wrong."""
+    with suppress(ValueError):
+        if numbered:
+            values = np.loadtxt([line for _, line in numbered], delimiter=",", comments=None, ndmin=2)
+            if values.shape == (len(numbered), width) and not _refused(values).any():
+                return values
+    return np.array([_row(line, number, width, path) for number, line in numbered]).reshape(-1, width)
+
+
+def _refused(values: FloatArray) -> BoolArray:
+    """Rows (n,) of cells (n, width) that are no gains in a direction."""
+    loud, negative = values[:, 2] > HIGHEST_DBI, (values[:, 3:4] < 0).any(axis=1)
+    return np.asarray(~np.isfinite(values).all(axis=1) | loud | negative)
+
+
 def _row(line: str, number: int, width: int, path: Path) -> list[float]:
     cells = next(csv.reader(io.StringIO(line)))
     try:
         row = [float(cell) for cell in cells]
     except ValueError:
         row = []
-    if len(row) != width or not np.isfinite(row).all() or row[2] > HIGHEST_DBI or (width > 3 and row[3] < 0):
+    if len(row) != width or _refused(np.array([row]))[0]:
         raise InputError(
             f"'{line[:60]}'",
             expected=f"{width} numbers: angles in degrees, gain in dBi (at most {HIGHEST_DBI:g}), standard deviation",

@@ -76,6 +76,18 @@ def test_broken_files_are_told(tmp_path, spoil, message):
         read_sphere_csv(file)
 
 
+def test_spreadsheets_may_quote_and_space_the_cells(tmp_path):
+    """Read line by line, where the whole table at once is not; both give the same numbers."""
+    plain, quoted = tmp_path / "a.csv", tmp_path / "b.csv"
+    text = sphere_csv(*smooth())
+    plain.write_text(text)
+    head, *rows = text.splitlines()
+    quoted.write_text("\n".join([head, *(",".join(f'" {cell}"' for cell in row.split(",")) for row in rows)]))
+    first, second = (read_sphere_csv(file) for file in (plain, quoted))
+    theta, phi = np.meshgrid(np.linspace(0.1, 3.0, 20), np.linspace(-3.0, 3.0, 31))
+    np.testing.assert_array_equal(first.gain_dbi(theta, phi), second.gain_dbi(theta, phi))
+
+
 def test_other_patterns_have_no_standard_deviation():
     assert not hasattr(HalfWaveDipole(), "gain_sd_db")
 

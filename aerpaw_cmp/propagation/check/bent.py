@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.special import fresnel as fresnel_integrals
 
 from ...common.units import ComplexArray, FloatArray
@@ -114,6 +113,8 @@ class _Bend:
 
     def verdict(self) -> bool | None:
         """Whether the path exists; None where that is a matter of rounding."""
+        from scipy.optimize import minimize_scalar  # few audits have edges
+
         c = self.corner
         sides = [max((p - c.start) @ c.out, (p - c.start) @ c.out_n) for p in self.ends]
         if min(sides) < -MARGIN_M:

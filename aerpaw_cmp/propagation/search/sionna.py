@@ -22,13 +22,14 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib import metadata
 from typing import Any, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 
 from ...common.errors import CheckError, UsageError
 from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
+from ...common.versions import version
 from ...machine.llvm import let_sionna_load, prepare_llvm
 from ...site.materials import material
 from ..arrays import Array, Link
@@ -65,6 +66,10 @@ EDGE_TOLERANCE_M = 1e-3
 """A float32 reflection point may lie this far outside its face."""
 
 Taken = TypeVar("Taken")
+
+_ALIVE: WeakSet[Any] = WeakSet()
+"""Scenes in use. Dr.Jit compiles virtual calls for every material that is alive, those of dead scenes included, and may
+then define a function twice and abort the process: no scene may stay when the next is made."""
 
 
 def load_variant(prefer: str | None = None) -> str:
@@ -116,7 +121,7 @@ def free_memory() -> None:
 
 def engine_versions() -> dict[str, str]:
     """Versions of sionna-rt, mitsuba and drjit (from their metadata), the variant and the LLVM in use."""
-    versions = {name: metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
+    versions = {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
     versions["variant"] = load_variant()
     import drjit as dr
 
@@ -153,7 +158,10 @@ def _build(
     import mitsuba as mi
     import sionna.rt as rt
 
+    if _ALIVE:
+        gc.collect()  # an exception may have kept one
     scene = rt.load_scene()
+    _ALIVE.add(scene)
     scene.frequency = carrier_hz
     vertices, triangle, owner = triangles(faces, reach_m) if surfaces is None else surfaces.mesh()
     objects = []
@@ -348,18 +356,12 @@ class _Finder:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Free the scene.
-
-        Dr.Jit compiles virtual calls for every material that is alive, those of dead scenes included, and may then
-        define a function twice and abort the process. Scene and finder refer to each other: collect them now.
-        """
+        """Undo what makes scene and finder refer to each other, so that both are freed with their last user."""
         scene = self.built.scene
         del scene.sources, scene.targets
         for name in (*scene.transmitters, *scene.receivers, *scene.objects):
             scene.remove(name)
         self.built, self.solver = None, None  # type: ignore[assignment]
-        del scene
-        gc.collect()
 
     def trace(self, targets: _Ends, max_depth: int, samples: int) -> Any:
         """Sionna's paths of one batch, padded, searched until there was room for all."""

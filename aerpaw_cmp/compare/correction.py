@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,6 +25,8 @@ Predictor = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
 
 Base = Callable[[Sequence[LinkSamples]], Predictor]
 """Learns from samples whose residual is measured minus free space."""
+
+HeldOut = tuple[FloatArray, FloatArray]
 
 BIN_S = 4.0
 """Residuals are means over this time [s]."""
@@ -75,6 +77,8 @@ class Correction:
     crps_db : mapping of (base, title) to float
         Of what was left out.
     rmse_db : mapping of (base, title) to float
+    held_out : mapping of (base, title) to ((n,), (n,))
+        Errors on what was left out, in one order for all, and the standard deviations stated for them; NaN: no error.
     sd_factor : float
         On all standard deviations: makes the errors of what was left out as large as stated.
     """
@@ -87,6 +91,7 @@ class Correction:
     flights: tuple[str, ...]
     crps_db: Mapping[tuple[str, str], float]
     rmse_db: Mapping[tuple[str, str], float]
+    held_out: Mapping[tuple[str, str], HeldOut] = field(default_factory=dict)
     sd_factor: float = 1.0
 
     @property
@@ -197,42 +202,29 @@ def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
     return out
 
 
-@dataclass(slots=True)
-class _Tally:
-    """Sums of one candidate over all that was left out: CRPS, squared error, squared error over variance."""
-
-    crps: float = 0.0
-    square: float = 0.0
-    ratio: float = 0.0
-    rows: int = 0
-
-    def add(self, error: FloatArray, sd: FloatArray) -> None:
-        self.crps += float(crps_normal(error, sd).sum())
-        self.square += float((error**2).sum())
-        self.ratio += float(((error / sd) ** 2).sum())
-        self.rows += len(error)
-
-
-def _score_fold(fold: _Fold, base: Base, titles: Sequence[str], tallies: Mapping[str, _Tally]) -> None:
+def _score_fold(fold: _Fold, base: Base, titles: Sequence[str], tallies: Mapping[str, list[HeldOut]]) -> None:
     """Add the errors of every residual field of a base; new flights count about their own mean."""
     flights = list(dict.fromkeys(s.flight for s in fold.known))
     predictor = base(fold.known)
     channels = _channels(fold.known, predictor, flights)
-    asked = [s for s in fold.asked if s.antenna in channels and np.isfinite(s.residual_db).any()]
+    asked = [s for s in fold.asked if np.isfinite(s.residual_db).any()]
     own = bool(asked) and asked[0].flight not in flights
     binned = [s.binned(BIN_S) for s in asked]
-    said = [predictor(s) for s in binned]
+    known = [predictor(s) if s.antenna in channels else None for s in binned]
     for title in titles:
         model = _model(title, channels)
         parts: tuple[Part, ...] = ("place", "drift") if own else PARTS
-        for samples, (gain, gain_sd) in zip(binned, said, strict=True):
-            channel = channels[samples.antenna]
+        for samples, gains in zip(binned, known, strict=True):
+            if gains is None:
+                tallies[title].append((np.full(len(samples), np.nan), np.ones(len(samples))))
+                continue
+            channel, (gain, gain_sd) = channels[samples.antenna], gains
             code = NEW_FLIGHT if own else flights.index(samples.flight)
             mean, sd = FieldFit(model, channel.rows, channel.left_db).predict(_rows(samples, code), parts)
             error = samples.residual_db - gain - mean
-            good = np.isfinite(error)
-            error = error[good] - (error[good].mean() if own else 0.0)
-            tallies[title].add(error, np.sqrt(sd[good] ** 2 + gain_sd[good] ** 2 + model.noise_sd_db**2))
+            if own and np.isfinite(error).any():
+                error = error - np.nanmean(error)
+            tallies[title].append((error, np.sqrt(sd**2 + gain_sd**2 + model.noise_sd_db**2)))
 
 
 def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, beyond: bool = False) -> Correction:
@@ -260,14 +252,18 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, beyond: 
     if not series:
         raise InputError("no sample has a level and a pose", expected="RSS with positions")
     titles = [title for title, start in _STARTS.items() if start is not None or not beyond]
-    folds, tallies = _folds(series), {(base, title): _Tally() for base in bases for title in titles}
+    folds = _folds(series)
+    tallies: dict[tuple[str, str], list[HeldOut]] = {(base, title): [] for base in bases for title in titles}
     for name, base in bases.items():
         for fold in folds:
             if fold.known and fold.asked:
                 _score_fold(fold, base, titles, {t: tallies[name, t] for t in titles})
-    crps = {key: one.crps / one.rows if one.rows else math.inf for key, one in tallies.items()}
+    held_out = {key: _joined(parts) for key, parts in tallies.items() if parts}
+    crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*one)) for key, one in held_out.items()}
     best = min(crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
-    one, flights = tallies[best], tuple(dict.fromkeys(s.flight for s in series))
+    ratio = _mean(np.square(held_out[best][0] / held_out[best][1])) if held_out else math.inf
+    factor = min(max(math.sqrt(ratio), 0.8), 1.6) if math.isfinite(ratio) else 1.0
+    flights = tuple(dict.fromkeys(s.flight for s in series))
     predictor = bases[best[0]](series)
     channels = _channels(series, predictor, flights)
     return Correction(
@@ -278,9 +274,22 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, beyond: 
         channels=channels,
         flights=flights,
         crps_db=crps,
-        rmse_db={key: math.sqrt(t.square / t.rows) if t.rows else math.nan for key, t in tallies.items()},
-        sd_factor=min(max(math.sqrt(one.ratio / one.rows), 0.8), 1.6) if one.rows else 1.0,
+        rmse_db=dict.fromkeys(tallies, math.nan)
+        | {key: math.sqrt(_mean(np.square(error))) for key, (error, _) in held_out.items()},
+        held_out={key: (error, factor * sd) for key, (error, sd) in held_out.items()},
+        sd_factor=factor,
     )
+
+
+def _joined(parts: Sequence[HeldOut]) -> HeldOut:
+    error, sd = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return error, sd
+
+
+def _mean(values: FloatArray) -> float:
+    """Mean of the finite values; infinite without any."""
+    good = values[np.isfinite(values)]
+    return float(good.mean()) if len(good) else math.inf
 
 
 def fixed_base(gain: Callable[[LinkSamples], FloatArray]) -> Base:

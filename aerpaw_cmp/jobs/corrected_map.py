@@ -16,7 +16,7 @@ from ..common.stages import Stages
 from ..common.units import FloatArray
 from ..maps.grid import Grid, Layer, class_names
 from ..report import maps_data as page
-from .predict import RANKS, Prediction, Source, predict, sentence
+from .predict import RANKS, Prediction, Source, predict
 from .where import Asked
 
 
@@ -128,7 +128,7 @@ def corrected_maps(
         levels=tuple(one for source in said.sources.values() for one in _levels(said, source, len(grid))),
         ranks=dict(_ranks(said, len(grid))),
         flown_m=tuple(s.position_m[:: max(1, len(s) // 500), :2] for s in said.samples),
-        sentence=sentence(said),
+        sentence=said.sentence,
         warnings=said.warnings,
     )
 

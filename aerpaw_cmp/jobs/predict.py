@@ -15,7 +15,7 @@ from ..common.provenance import union
 from ..common.stages import Progress, Stages
 from ..common.units import BoolArray, FloatArray
 from ..compare.calibration import Observed
-from ..compare.correction import BIN_S, OFF, Base, Correction, Predictor, between_blocks_db, choose, fixed_base
+from ..compare.correction import BIN_S, Base, Correction, Predictor, between_blocks_db, choose, fixed_base
 from ..compare.direction_gain import LinkSamples
 from ..compare.spread import BAND, Spread, fading_of
 from ..flight.data import FlightData, RssSeries, load_data
@@ -26,6 +26,7 @@ from ..flight.track import body_rotation
 from ..flight.training import common, counted_once, flight_logs, learned_patterns
 from ..propagation.arrays import Poses
 from ..propagation.field.baselines import free_space_dbm
+from ..report.prediction_words import first_words
 from ..site.learned import BAND as CARRIER_BAND
 from ..site.learned import folder_of, read_learned
 from ..site.site import Site
@@ -51,13 +52,6 @@ MOST_DIRECTIONS = 5_000
 """Of more targets at a time, learned antennas are evaluated once per degree of direction."""
 
 RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
-
-TITLES = {
-    "learned": "antennas learned from the named flights",
-    "replay": "ray tracing with the flights' own settings",
-    "free space": "free space",
-    "none": "a constant level",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,6 +120,12 @@ class Prediction:
     def key(self) -> tuple[str, str]:
         """Of the base and the residual field that were chosen."""
         return self.correction.base, self.correction.title
+
+    @property
+    def sentence(self) -> str:
+        """First words of terminal and page."""
+        levels = self.table[self.table["channel"] != "rank"]
+        return first_words(self.correction, float((levels["flag"] == "outside_flown").mean()))
 
 
 def predict(
@@ -467,21 +467,3 @@ def _ranks(targets: Targets, known: Sequence[FlightData], site: Site) -> list[pd
 def _columns(table: pd.DataFrame, ranked: bool) -> list[str]:
     names = [name for name in table.columns if name not in ("flag", "slow_sd_db")]
     return [*names, "slow_sd_db", *(RANKS if ranked else ()), "flag"]
-
-
-def sentence(prediction: Prediction) -> str:
-    """What error to expect, and whether the residual field is added: the first line of terminal and page."""
-    correction, key = prediction.correction, prediction.key
-    rmse = correction.rmse_db[key]
-    free = correction.rmse_db.get(("free space", OFF), float("nan"))
-    over = "flights" if len(correction.flights) > 1 else "300 m blocks"
-    expect = f"Expect an RMSE of {rmse:.1f} dB over 4 s means ({over} left out; free space {free:.1f} dB)."
-    raw = correction.crps_db[key[0], OFF]
-    with_field = min(v for (base, title), v in correction.crps_db.items() if base == key[0] and title != OFF)
-    field = (
-        f"The residual field is on: it lowers the CRPS from {raw:.2f} to {with_field:.2f} dB on held-out samples."
-        if correction.on
-        else f"The residual field is off: it does not lower the CRPS on held-out samples "
-        f"({with_field:.2f} against {raw:.2f} dB)."
-    )
-    return f"{expect} Model: {TITLES[correction.base]}. {field}"

@@ -16,7 +16,8 @@ from ..common.stages import Progress, Stages, silent
 from ..common.versions import versions
 from ..flight.settings import load_flight
 from ..report.prediction_html import PredictionPage, prediction_metrics, write_prediction
-from .predict import TITLES, Prediction, predict, sentence
+from ..report.prediction_words import TITLES
+from .predict import Prediction, predict
 from .where import Asked
 
 
@@ -92,7 +93,7 @@ def page_of(prediction: Prediction, seconds: dict[str, float]) -> PredictionPage
         units={a.replace(".", " ", 1): s.series.unit for a, s in prediction.sources.items()},
         shape=None if targets.grid is None else targets.grid.shape,
         heights_m=targets.heights_m,
-        verdict=sentence(prediction),
+        verdict=prediction.sentence,
         candidates=[
             {"base": TITLES[base], "field": name, "rmse_db": correction.rmse_db[base, name], "crps_db": crps}
             for (base, name), crps in sorted(correction.crps_db.items(), key=lambda item: item[1])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..common.units import FloatArray
+from ..compare.verdicts import Verdict, stated_errors
+from .prediction_words import after_flight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,6 +26,14 @@ class AgainstSeries:
     low_db: FloatArray
     high_db: FloatArray
     share_near: float
+    common_db: FloatArray | float = 0.0
+    """Part of ``sd_db`` that the whole flight may share."""
+
+    @property
+    def stated(self) -> Verdict:
+        """Whether the errors are as large as was stated."""
+        found = stated_errors(self.measured_db - self.level_db, self.sd_db, self.common_db)
+        return replace(found, where=f"{self.tower} {self.channel}")
 
     def coverage(self, share: float) -> float:
         """Share of samples inside the interval that is to hold so many."""
@@ -47,13 +57,7 @@ class Against:
     @property
     def words(self) -> str:
         """What the flight says of the prediction."""
-        rows = list(self.scores.values())
-        mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
-        return (
-            f"Predicted before this flight: RMSE {mean['rmse_db']:.1f} dB as predicted "
-            f"({mean['rmse_4s_db']:.1f} dB over 4 s), {mean['own_offset_rmse_db']:.1f} dB after the flight's own "
-            f"offset. The 90 % intervals hold {100 * mean['coverage_90']:.0f} % of the samples."
-        )
+        return after_flight(self.scores, [one.stated for one in self.series])
 
     def metrics(self) -> dict[str, Any]:
         """``against`` of metrics.json."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from ..compare.calibration import BASELINES, Score, mean_rmse
 from ..compare.learning_curve import CurvePoint, with_one_more
 from ..compare.verdicts import Verdict, antenna_or_place, by_flight
-from .words import said_of
+from .phrases import said_of
 
 ONE_FLIGHT = "Nothing is scored: one flight alone. Next: add a second flight."
 

@@ -11,7 +11,8 @@ from ..compare.verdicts import Verdict, campaign_verdict
 from .campaign_data import CampaignData, RankHeldOutFold, RssRow
 from .first_screen import most_telling, pooled_db
 from .names import k_key
-from .words import Judged, first_sentence, pretty, ranking_sentence, said_of
+from .phrases import said_of
+from .words import Judged, first_sentence, pretty, ranking_sentence
 
 FEW = 8
 """Warnings of flights that stand one by one."""

@@ -24,12 +24,7 @@ from .canvas import FigureSpec, Picture
 from .export import write_file
 from .html import by_section, environment, policy
 from .names import safe_name
-
-FLAGS = {
-    "outside_flown": "outside the flown places: the standard deviation is that of the model alone",
-    "out_of_coverage": "no path",
-    "no_position": "no position",
-}
+from .prediction_words import FLAGS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

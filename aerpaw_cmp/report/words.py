@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -14,8 +13,8 @@ from ..compare.ladder import LadderRow
 from ..compare.result import BASELINE_TITLE, AuditResult, RankResult, RssResult
 from ..compare.rss import ErrorSpan
 from ..compare.statistics import Interval
-from ..compare.verdicts import Verdict
 from .data import ReportData
+from .phrases import filled
 
 FEW_SAMPLES = 30
 """Below this a panel is called too short for a verdict."""
@@ -208,32 +207,6 @@ def cause_sentence(panel: RssResult) -> str:
         f"With it the RMSE is {cause.rmse_with_db:.1f} instead of {cause.rmse_db:.1f} dB (means over 1 s). "
         f"Next: {action}."
     )
-
-
-class _Number(float):
-    """A number whose minus is one in print; names that stand beside it keep their hyphens."""
-
-    def __format__(self, form: str) -> str:
-        return super().__format__(form).replace("-", MINUS)
-
-
-def filled(texts: Sequence[str], **facts: Any) -> list[str]:
-    """Texts with numbers and names put in."""
-    known = {name: _Number(fact) if isinstance(fact, float) else fact for name, fact in facts.items()}
-    return [text.format_map(known) for text in texts]
-
-
-def said_of(verdict: Verdict, table: Mapping[str, tuple[str, str]], **facts: Any) -> str:
-    """Sentence and action that a page's table has for the cause of a verdict; nothing where the table has none."""
-    if verdict.cause not in table:
-        return ""
-    low, high = verdict.interval
-    numbers = {"effect": verdict.effect, "size": abs(verdict.effect), "low": low, "high": high}
-    text, action = filled(table[verdict.cause], **numbers, where=verdict.where, **facts)
-    return f"{text} Next: {action}." if action else text
-
-
-MINUS = "\N{MINUS SIGN}"
 
 
 def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetime64]:

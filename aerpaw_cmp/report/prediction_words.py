@@ -1,0 +1,178 @@
+"""Sentences of a prediction, before and after the flight, each with the condition under which it may stand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..common.units import FloatArray
+from ..compare.correction import OFF, Correction
+from ..compare.entries import crps_normal
+from ..compare.statistics import mean_interval, paired_difference, paired_verdict
+from ..compare.verdicts import Verdict, stated_errors
+from .phrases import said_of
+
+TITLES = {
+    "learned": "antennas learned from the named flights",
+    "replay": "ray tracing with the flights' own settings",
+    "free space": "free space",
+    "none": "a constant level",
+}
+
+FLAGS = {
+    "outside_flown": "outside the flown places: the standard deviation is that of the model alone",
+    "out_of_coverage": "no path",
+    "no_position": "no position",
+}
+
+MANY = 0.2
+"""Share of points outside the flown places that the first words name."""
+
+AGAINST_FREE_SPACE = {
+    "better": (
+        "It is significantly better than free space ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
+        "",
+    ),
+    "worse": ("It is significantly worse than free space ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).", ""),
+    "not significant": ("The difference from free space of {effect:+.1f} dB is not significant (95 %).", ""),
+    "no interval": ("Too few samples for an interval of the difference.", ""),
+}
+"""The chosen model on what was left out, by the paired interval."""
+
+FIELD = {
+    "better": (
+        "The residual field is on: it lowers the CRPS by {size:.2f} dB (95 %: {high:+.2f} to {low:+.2f} dB).",
+        "",
+    ),
+    "worse": ("The residual field is off: it raises the CRPS by {size:.2f} dB on held-out samples.", ""),
+    "on": ("The residual field is on: it lowers the CRPS by {size:.2f} dB, not significantly.", ""),
+    "off": ("The residual field is off: the CRPS differs by {size:.2f} dB, not significantly.", ""),
+}
+"""The residual field, by the interval of the difference of the CRPS; ``on`` and ``off`` where it holds zero."""
+
+HELD_OUT = "90 % intervals hold {inside:.0f} % of the held-out samples."
+STATED: dict[str, tuple[str, str]] = {
+    "none": (HELD_OUT, ""),
+    "no interval": ("", ""),
+    "narrow": (
+        HELD_OUT + " They are too narrow: errors are {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) as stated.",
+        "add a flight of this area",
+    ),
+    "wide": (
+        HELD_OUT + " They are too wide: errors are {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) as stated.",
+        "",
+    ),
+    "biased": (
+        HELD_OUT + " Measured lies {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) above predicted.",
+        "check the gain of the flights that were learned from",
+    ),
+}
+"""Stated standard deviations on what was left out, by :func:`~aerpaw_cmp.compare.verdicts.stated_errors`."""
+
+FLOWN: dict[str, tuple[str, str]] = {
+    "none": ("Intervals are as stated.", "`aerpaw-cmp predict` with this flight for the next route"),
+    "no interval": ("Too few samples to judge the intervals.", ""),
+    "narrow": (
+        "Intervals of {where} are too narrow: errors are {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) as stated.",
+        "add this flight to those that are learned from",
+    ),
+    "wide": (
+        "Intervals of {where} are too wide: errors are {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) as stated.",
+        "add this flight to those that are learned from",
+    ),
+    "biased": (
+        "Likely cause at {where}: another offset, measured {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) "
+        "above predicted.",
+        "check transmit power and receiver gain of this flight",
+    ),
+}
+"""The same on the flight that followed."""
+
+
+def first_words(correction: Correction, outside: float) -> str:
+    """Expected error, intervals, where the prediction is a guess, model, next step: first line of terminal and page.
+
+    Parameters
+    ----------
+    correction : Correction
+    outside : float
+        Share of points outside the flown places.
+
+    Returns
+    -------
+    str
+    """
+    key, free = (correction.base, correction.title), ("free space", OFF)
+    over = "flights" if len(correction.flights) > 1 else "300 m blocks"
+    texts = [
+        f"Expect an RMSE of {correction.rmse_db[key]:.1f} dB over 4 s means ({over} left out; free space "
+        f"{correction.rmse_db[free]:.1f} dB)."
+        if free in correction.rmse_db
+        else f"Expect an RMSE of {correction.rmse_db[key]:.1f} dB over 4 s means ({over} left out)."
+    ]
+    if free in correction.rmse_db and key != free:
+        texts.append(said_of(against_free_space(correction), AGAINST_FREE_SPACE))
+    error, sd = correction.held_out[key]
+    inside = 100.0 * inside_share(error, sd)
+    texts.append(said_of(stated_errors(error, sd), STATED, inside=inside))
+    texts.append(f"Model: {TITLES[correction.base]}.")
+    texts.append(said_of(field(correction), FIELD))
+    if outside > MANY:
+        texts.append(
+            f"{100 * outside:.0f} % of the points lie outside the flown places. Next: `aerpaw-cmp plan` names the "
+            "flight that helps most."
+        )
+    return " ".join(text for text in texts if text)
+
+
+def inside_share(error: FloatArray, sd: FloatArray) -> float:
+    """Share of errors inside their 90 % interval."""
+    good = np.isfinite(error)
+    return float(np.mean(np.abs(error[good]) <= 1.6449 * sd[good])) if good.any() else float("nan")
+
+
+def against_free_space(correction: Correction) -> Verdict:
+    """The chosen model and free space on the same samples that were left out."""
+    error, other = (correction.held_out[key][0] for key in ((correction.base, correction.title), ("free space", OFF)))
+    pair = paired_difference(error, other, free_offset=False)
+    return Verdict(cause=pair.verdict, effect=pair.difference_db, interval=pair.difference_ci95_db)
+
+
+def field(correction: Correction) -> Verdict:
+    """CRPS with the best residual field minus that without one."""
+    base = correction.base
+    title = min((t for b, t in correction.crps_db if b == base and t != OFF), key=lambda t: correction.crps_db[base, t])
+    each = [crps_normal(*correction.held_out[base, name]) for name in (title, OFF)]
+    difference = each[0] - each[1]
+    difference = difference[np.isfinite(difference)]
+    ends = mean_interval(difference)
+    word = paired_verdict(*ends)
+    cause = word if word in ("better", "worse") and (word == "better") == correction.on else ""
+    return Verdict(
+        cause=cause or ("on" if correction.on else "off"), effect=float(difference.mean()), interval=ends, where=title
+    )
+
+
+def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Verdict]) -> str:
+    """What a flight says of the prediction made before it.
+
+    Parameters
+    ----------
+    scores : mapping of str to mapping
+        By tower and channel.
+    stated : sequence of Verdict
+        Of each, by :func:`~aerpaw_cmp.compare.verdicts.stated_errors`.
+
+    Returns
+    -------
+    str
+    """
+    rows = list(scores.values())
+    mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+    told = max(stated, key=lambda one: list(FLOWN).index(one.cause))
+    return (
+        f"Predicted before this flight: RMSE {mean['rmse_db']:.1f} dB as predicted ({mean['rmse_4s_db']:.1f} dB over "
+        f"4 s), {mean['own_offset_rmse_db']:.1f} dB after the flight's own offset. The 90 % intervals hold "
+        f"{100 * mean['coverage_90']:.0f} % of the samples. {said_of(told, FLOWN)}"
+    )

@@ -18,7 +18,7 @@ from .shown import number, print_json, say, table
     examples=[
         "aerpaw-cmp campaign campaign.yaml --workers 4",
         "aerpaw-cmp campaign campaign.yaml -o reports/spring --keep outcomes --strict",
-        "aerpaw-cmp campaign campaign.yaml --scheduler tls://scheduler:8786 --keep s3://lab/season",
+        "aerpaw-cmp campaign campaign.yaml --scheduler tls://scheduler:8786 --keep /shared/outcomes",
         "aerpaw-cmp campaign status campaign.yaml",
     ],
 )
@@ -38,8 +38,8 @@ def campaign(
     workers: Workers = 1,
     scheduler: Scheduler = None,
     keep: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Folder or URL for task outcomes; a rerun computes missing outcomes only."),
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder for task outcomes; a rerun computes missing outcomes only."),
     ] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Ignore stored outcomes and store none.")] = False,
     dry_run: Annotated[

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Optional
 import typer
 
 from ..common.errors import one_line
-from .app import DryRun, Export, Force, Json, LogsRoot, Scheduler, Workers, command
+from .app import DryRun, Export, Force, Json, LogsRoot, command
 from .shown import number, print_files, print_json, print_plan, say, table
 
 
@@ -284,8 +284,6 @@ def calibrate(
         Optional[list[Path]],  # noqa: UP045
         typer.Option(help="flight.yaml to score with the learned settings; repeatable."),
     ] = None,
-    workers: Workers = 1,
-    scheduler: Scheduler = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -298,8 +296,6 @@ def calibrate(
         logs_root=logs_root,
         into_site=into_site,
         score=score or (),
-        workers=workers,
-        scheduler=scheduler,
         force=force,
         progress=say,
     )

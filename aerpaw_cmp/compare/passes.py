@@ -8,8 +8,9 @@ searched, links that were sampled together share one search, and intervals come 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -143,9 +144,7 @@ class PassTable:
         for number, one in enumerate(passes):
             self._flights.setdefault(one.flight, []).append((number, _prepare(one, cell_m, self._places)))
 
-    def pairs(
-        self, *, radius_m: float, heading_within_deg: float | None, first_flights: Iterable[str] | None = None
-    ) -> Iterator[PassPair]:
+    def pairs(self, *, radius_m: float, heading_within_deg: float | None) -> Iterator[PassPair]:
         """Every pair of two flights' passes on one link, by first flight, second flight and link.
 
         Parameters
@@ -154,18 +153,13 @@ class PassTable:
             A sample of the first pass pairs with the nearest one of the second within this distance.
         heading_within_deg : float, optional
             Headings of a pair agree within this, where both passes have headings; None: any heading.
-        first_flights : iterable of str, optional
-            Only pairs whose first flight is one of these: shares of the work that can be done side by side.
 
         Yields
         ------
         PassPair
         """
-        names = list(self._flights)
-        chosen = set(names if first_flights is None else first_flights)
         rule = radius_m, heading_within_deg
-        couples = ((first, second) for i, first in enumerate(names) if first in chosen for second in names[i + 1 :])
-        for first, second in couples:
+        for first, second in combinations(self._flights, 2):
             known: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
             shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
             partners: dict[str, list[tuple[int, _Prepared]]] = {}

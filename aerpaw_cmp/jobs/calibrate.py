@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -41,7 +39,6 @@ from ..propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ..report.calibration_words import sentences
 from ..site.learned import Source
 from .calibrate_rank import RankFitSettings
-from .workers import Lost, Workers
 
 ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
 """Heights of roughness that are tried [m]; infinite is no ground ray."""
@@ -145,7 +142,6 @@ def calibrate(
     *,
     logs_root: Path | None = None,
     stages: Stages | None = None,
-    workers: Workers | None = None,
     score: Sequence[Path] = (),
 ) -> Calibration:
     """Read the flights, learn, score.
@@ -157,8 +153,6 @@ def calibrate(
     logs_root : Path, optional
         Folder against which logs resolve.
     stages : Stages, optional
-    workers : Workers, optional
-        Share the scores and the controls.
     score : sequence of Path
         Further flight files, scored with all that was learned.
 
@@ -191,10 +185,9 @@ def calibrate(
     with stages("ground"):
         ground = fit_ground(flights, observed, learned) if settings.fit.ground else None
     with stages("scores"):
-        if workers is not None and workers.count > 1 and len(calibration.flights_of(observed)) > 1:
-            scores, controls = score_on(workers, path, logs_root, recipe)
-        else:
-            scores, controls = score_all(observed, recipe, stages)
+        scores = score_all(observed, recipe, stages)
+        stages.progress("scores: controls")
+        controls = controls_of(observed, recipe)
     with stages("curve"):
         curve = learning_curve(observed, recipe)
     warnings += mount_warnings(learned)
@@ -429,20 +422,11 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
 # --- scores --------------------------------------------------------------------------------------------------------
 
 
-def score_all(
-    observed: Sequence[Observed], recipe: Recipe, stages: Stages
-) -> tuple[dict[str, tuple[Score, ...]], dict[str, tuple[Score, ...]]]:
-    """Every split, and the controls, all on flights that had no part in the fit."""
-    if len(calibration.flights_of(observed)) < 2:
-        return dict.fromkeys(calibration.SPLITS, ()), {}
-    scores = splits_of(observed, recipe, stages)
-    stages.progress("scores: controls")
-    return scores, controls_of(observed, recipe)
-
-
-def splits_of(observed: Sequence[Observed], recipe: Recipe, stages: Stages) -> dict[str, tuple[Score, ...]]:
-    """Every split; fits of one are used by the next."""
+def score_all(observed: Sequence[Observed], recipe: Recipe, stages: Stages) -> dict[str, tuple[Score, ...]]:
+    """Every split, on flights that had no part in the fit; fits of one are used by the next."""
     scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
+    if len(calibration.flights_of(observed)) < 2:
+        return scores
     kept: dict[str, Learned] = {}
     scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, kept)
     for split, parts, own in (
@@ -458,95 +442,22 @@ def splits_of(observed: Sequence[Observed], recipe: Recipe, stages: Stages) -> d
 
 def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple[Score, ...]]:
     """Simpler and wrong models, each flight left out in turn."""
-    return {name: run() for name, run in _controls(observed, recipe).items()}
-
-
-def _controls(observed: Sequence[Observed], recipe: Recipe) -> dict[str, Callable[[], tuple[Score, ...]]]:
-    """What computes each control."""
+    if len(calibration.flights_of(observed)) < 2:
+        return {}
+    left_out, only = calibration.flight_left_out, calibration.only_terms
     bare = dataclasses.replace(recipe, patterns={})
     turned = dataclasses.replace(bare, pairs=None)  # their directions are others
-    out: dict[str, Callable[[], tuple[Score, ...]]] = {
-        "world frame at the UAV": lambda: calibration.flight_left_out(calibration.world_frame(observed), turned),
-        "heading turned the wrong way": lambda: calibration.flight_left_out(calibration.wrong_way(observed), turned),
-        "body frame, no patterns": lambda: calibration.flight_left_out(observed, bare),
-        "UAV end only": lambda: calibration.flight_left_out(observed, calibration.only_terms(bare, UAV_TERMS)),
-        "tower end only": lambda: calibration.flight_left_out(observed, calibration.only_terms(bare, TOWER_TERMS)),
-        "field over places only": lambda: calibration.flight_left_out(
-            observed, calibration.only_terms(bare, (PLACE_TERM,))
-        ),
+    scores = {
+        "world frame at the UAV": left_out(calibration.world_frame(observed), turned),
+        "heading turned the wrong way": left_out(calibration.wrong_way(observed), turned),
+        "body frame, no patterns": left_out(observed, bare),
+        "UAV end only": left_out(observed, only(bare, UAV_TERMS)),
+        "tower end only": left_out(observed, only(bare, TOWER_TERMS)),
+        "field over places only": left_out(observed, only(bare, (PLACE_TERM,))),
     }
-    if recipe.patterns:
-        out["patterns with fitted mounts only"] = lambda: calibration.flight_left_out(
-            observed, calibration.only_terms(recipe, ())
-        )
-    return out
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScoreOrder:
-    """The splits (``control`` empty) or one control of a calibration, for a worker."""
-
-    path: Path
-    logs_root: Path | None
-    control: str
-    stamp: str
-    """Of this run: a worker that lives on reads the flights anew."""
-
-
-def score_on(
-    workers: Workers, path: Path, logs_root: Path | None, recipe: Recipe
-) -> tuple[dict[str, tuple[Score, ...]], dict[str, tuple[Score, ...]]]:
-    """What :func:`score_all` gives, by workers that read the flights themselves.
-
-    Parameters
-    ----------
-    workers : Workers
-    path : Path
-        calibration.yaml, as the workers reach it.
-    logs_root : Path, optional
-        Folder against which logs resolve.
-    recipe : Recipe
-        Says which controls there are.
-
-    Returns
-    -------
-    scores, controls : dict of str to tuple of Score
-        By kind of what is left out, and by control.
-
-    Raises
-    ------
-    InputError
-        A worker was lost, or could not score its part.
-    """
-    stamp = uuid.uuid4().hex
-    names = ["", *_controls((), recipe)]
-    orders = [ScoreOrder(path=path, logs_root=logs_root, control=name, stamp=stamp) for name in names]
-    scored: dict[int, dict[str, tuple[Score, ...]]] = {}
-
-    def done(number: int, result: dict[str, tuple[Score, ...]] | Lost) -> None:
-        if isinstance(result, Lost):
-            raise InputError(f"scores of the calibration: {result.message}")
-        scored[number] = result
-
-    workers.run(score_part, orders, done)
-    controls = {name: scores for number in range(1, len(names)) for name, scores in scored[number].items()}
-    return scored[0], controls
-
-
-def score_part(order: ScoreOrder) -> dict[str, tuple[Score, ...]]:
-    """The splits, or one control by its name."""
-    observed, recipe = _prepared(order.path, order.logs_root, order.stamp)
-    if order.control:
-        return {order.control: _controls(observed, recipe)[order.control]()}
-    return splits_of(observed, recipe, Stages())
-
-
-@lru_cache(maxsize=1)
-def _prepared(path: Path, logs_root: Path | None, _stamp: str) -> tuple[list[Observed], Recipe]:
-    settings = load_calibration(path)
-    flights, _ = read_flights(settings, path.parent, logs_root)
-    observed, _ = observe(flights)
-    return observed, recipe_of(settings, observed, logs_root or path.parent)
+    return scores | (
+        {"patterns with fitted mounts only": left_out(observed, only(recipe, ()))} if recipe.patterns else {}
+    )
 
 
 def mount_warnings(learned: Learned) -> list[str]:

@@ -27,15 +27,11 @@ from ..report.campaign_data import CampaignData, Failure, HeldOutFold, RankHeldO
 from .campaign_fit import fit_all
 from .campaign_plan import compute, kept_outcomes
 from .campaign_rank_fit import K_KEY, fit_rank_all
-from .campaign_tasks import Task, counted_once, flight_data
+from .campaign_tasks import Task, counted_once, flight_data, outcome_store
 from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
-from .place import check_place, open_place
 from .workers import open_workers
 
 Stage = Callable[[str], Any]
-
-MANY_FLIGHTS = 30
-"""From here on pairs of flights are worth workers of their own, even where every outcome is kept."""
 
 AS_WRITTEN = "as written"
 """Label of the only setting of a campaign that names none."""
@@ -68,7 +64,7 @@ class CampaignFile(Settings):
     held_out: HeldOutSettings | None = None
     repeatability: RepeatSettings = RepeatSettings()
     keep: str | None = None
-    """Where outcomes are kept: a folder, against this file's, or a URL such as ``s3://bucket/season``."""
+    """Folder of outcomes, against this file's."""
     export: list[str] = Field(default_factory=list)
     """Formats of the samples: those of ``report.export`` of a flight."""
 
@@ -121,7 +117,7 @@ def run(
     logs_root: Path | None = None,
     workers: int = 1,
     scheduler: str | None = None,
-    keep: str | Path | None = None,
+    keep: Path | None = None,
     stage: Stage = lambda _name: nullcontext(),
     progress: Progress = silent,
 ) -> CampaignData:
@@ -138,8 +134,8 @@ def run(
         On this machine; 1 computes in this process.
     scheduler : str, optional
         Address of a Dask scheduler, in place of workers here.
-    keep : str or Path, optional
-        Folder or URL of outcomes, taken and added to.
+    keep : Path, optional
+        Folder of outcomes, taken and added to.
     stage, progress : callable
         A context manager per named stage; lines of progress.
 
@@ -154,34 +150,32 @@ def run(
         Overrides that no flight file could have, two flights of one name, an unknown flight in ``fit_on``.
     """
     if scheduler is not None:  # workers may stand in another folder
-        folder, logs_root, keep = absolute(folder), absolute(logs_root), absolute(keep)
+        folder, logs_root = folder.absolute(), None if logs_root is None else logs_root.absolute()
     tasks, files, failures = campaign_tasks(campaign, folder, logs_root)
     settings = campaign.settings or {AS_WRITTEN: {}}
-    where = None if keep is None else str(keep)
-    if where is not None:
-        check_place(open_place(where))
+    store = None if keep is None else outcome_store(keep)
+    if store is not None:
+        store.check()
     with stage("flights"):
-        outcomes, orders = kept_outcomes(tasks, where, progress)
-    much = len(orders) > 1 or campaign.held_out is not None or len(files) > MANY_FLIGHTS
+        outcomes, orders = kept_outcomes(tasks, store, progress)
     seen = _inputs_of(files, logs_root)
-    with open_workers(
-        workers if much else 1, scheduler if much else None, paths=seen, keep=where, progress=progress
-    ) as crew:
-        with stage("flights"):
-            compute(tasks, orders, crew, progress, outcomes)
-        results = counted_once(tasks, [outcomes[number] for number in range(len(tasks))])
-        rank = tuple(row for o in results for row in o.rank)
-        flown = tuple(one for o in results for one in o.flown)
-        failures += [o.failure for o in results if o.failure is not None]
-        with stage("pool"):
-            rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
-            reference = [row for row in rows if row.setting == next(iter(settings))]
-            repeated = repeats(reference, campaign.repeatability, crew, where if scheduler else None)
-            ranks_again = rank_repeats(flown, campaign.repeatability.radius_m)
-        held_out = _Folds()
-        if campaign.held_out is not None:
-            with stage("held-out"):
-                held_out = _folds(campaign.held_out, tasks, rows, rank, progress)
+    with (
+        open_workers(workers, scheduler if orders else None, paths=seen, progress=progress) as crew,
+        stage("flights"),
+    ):
+        compute(orders, crew, outcomes, store, progress)
+    results = counted_once(tasks, [outcomes[number] for number in range(len(tasks))])
+    rank = tuple(row for o in results for row in o.rank)
+    flown = tuple(one for o in results for one in o.flown)
+    failures += [o.failure for o in results if o.failure is not None]
+    with stage("pool"):
+        rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
+        repeated = repeats([r for r in rows if r.setting == next(iter(settings))], campaign.repeatability)
+        ranks_again = rank_repeats(flown, campaign.repeatability.radius_m)
+    held_out = _Folds()
+    if campaign.held_out is not None:
+        with stage("held-out"):
+            held_out = _folds(campaign.held_out, tasks, rows, rank, progress)
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
     tracks = {o.track.flight: o.track for o in reversed(results) if o.track is not None}
     return CampaignData(
@@ -211,13 +205,6 @@ def run(
         synthetic=tuple(name for name, (_, f) in files.items() if f.flight.synthetic),
         workers=workers,
     )
-
-
-def absolute(path: Any) -> Any:
-    """A path as every process understands it; URLs stay."""
-    if path is None or "://" in str(path):
-        return path
-    return Path(path).expanduser().absolute()
 
 
 def campaign_tasks(

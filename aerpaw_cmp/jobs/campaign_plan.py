@@ -13,7 +13,8 @@ import numpy as np
 from ..common.errors import AerpawCmpError
 from ..common.stages import Progress, duration
 from ..report.campaign_data import Failure, FlownTrack
-from .campaign_tasks import Done, Order, Outcome, Task, carry_out, fitted_to, outcome_store, task_facts
+from .campaign_tasks import Done, Order, Outcome, Task, carry_out, fitted_to, task_facts
+from .outcomes import OutcomeStore
 from .workers import Lost, Workers
 
 
@@ -21,12 +22,11 @@ from .workers import Lost, Workers
 class TaskState:
     """One task of a campaign before it runs.
 
-    ``key`` is the digest of what it depends on, None where an input cannot be read (``trouble`` says which).
-    ``seconds`` is what it cost, where it is kept; ``failure`` the message of the last run, where that failed.
+    ``seconds`` is what it cost, where it is kept; ``failure`` the message of the last run, where that failed, and
+    ``trouble`` which input cannot be read.
     """
 
     task: Task
-    key: str | None
     kept: bool = False
     seconds: float | None = None
     failure: str = ""
@@ -84,7 +84,7 @@ class CampaignStatus:
 
 
 def campaign_status(
-    name: str, tasks: Sequence[Task], failures: Sequence[Failure], keep: str | None, *, workers: int = 1
+    name: str, tasks: Sequence[Task], failures: Sequence[Failure], store: OutcomeStore | None, *, workers: int = 1
 ) -> CampaignStatus:
     """What of a campaign is kept, what is to do and how long that may take; nothing is computed.
 
@@ -95,8 +95,8 @@ def campaign_status(
     tasks : sequence of Task
     failures : sequence of Failure
         Flights whose files cannot be read.
-    keep : str, optional
-        Folder or URL of the outcomes; None where nothing is kept.
+    store : OutcomeStore, optional
+        None where nothing is kept.
     workers : int
         Tasks side by side, for the time.
 
@@ -105,7 +105,7 @@ def campaign_status(
     CampaignStatus
         A state per task, and the time that what is left may take [s].
     """
-    states = [TaskState(task=task, key=None) for task in tasks] if keep is None else task_states(tasks, keep)
+    states = [TaskState(task=task) if store is None else _state(task, store) for task in tasks]
     by_setting: dict[str, list[float]] = {}
     for state in states:
         if state.seconds is not None:
@@ -117,7 +117,7 @@ def campaign_status(
         estimate = max(sum(costs) / max(workers, 1), max(costs, default=0.0))
     return CampaignStatus(
         name=name,
-        keep="no place (--fresh)" if keep is None else outcome_store(keep).place.url,
+        keep="no place (--fresh)" if store is None else str(store.folder),
         states=tuple(states),
         failures=tuple(failures),
         estimate_s=estimate,
@@ -125,35 +125,19 @@ def campaign_status(
     )
 
 
-def task_states(tasks: Sequence[Task], keep: str) -> list[TaskState]:
-    """Key, outcome and cost of every task, by what the store says of itself."""
-    store = outcome_store(keep)
-    kept, failed = store.keys()
-    keys: list[str | None] = []
-    trouble = {}
-    for number, task in enumerate(tasks):
-        try:
-            keys.append(task_facts(task).key)
-        except (AerpawCmpError, OSError) as error:
-            keys.append(None)
-            trouble[number] = str(error)
-    costs = store.manifests({key for key in keys if key in kept})
-    words = store.manifests({key for key in keys if key in failed}, failed=True)
-    states = []
-    for number, (task, key) in enumerate(zip(tasks, keys, strict=True)):
-        cost, word = costs.get(key or "", {}), words.get(key or "", {})
-        seconds = cost.get("seconds")
-        states.append(
-            TaskState(
-                task=task,
-                key=key,
-                kept=key in kept,
-                seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
-                failure=str(word.get("message", "")),
-                trouble=trouble.get(number, ""),
-            )
-        )
-    return states
+def _state(task: Task, store: OutcomeStore) -> TaskState:
+    """Outcome and cost of a task, by what the store says of itself."""
+    try:
+        key = task_facts(task).key
+    except (AerpawCmpError, OSError) as error:
+        return TaskState(task=task, trouble=str(error))
+    seconds = store.manifest(key).get("seconds")
+    return TaskState(
+        task=task,
+        kept=store.has(key),
+        seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
+        failure=str(store.manifest(key, failed=True).get("message", "")),
+    )
 
 
 class Watch:
@@ -189,10 +173,6 @@ class Watch:
         parts += [f"{min(left, self.workers)} running", f"{self.links / spent:.0f} links/s"]
         parts += [f"{duration(spent / self.done * left)} left"] if left and self.done else []
         return ", ".join(parts)
-
-
-_SEEN_AFTER_S = (0.0, 0.1, 0.5, 2.0, 5.0, 10.0, 20.0)
-"""A file that a worker wrote may be seen later here (network file systems remember for a while that it was not)."""
 
 
 class Outcomes:
@@ -231,71 +211,62 @@ class Outcomes:
         return len(self._found)
 
 
-def kept_outcomes(tasks: Sequence[Task], keep: str | None, progress: Progress) -> tuple[Outcomes, dict[int, Order]]:
+def kept_outcomes(
+    tasks: Sequence[Task], store: OutcomeStore | None, progress: Progress
+) -> tuple[Outcomes, dict[int, Order]]:
     """Outcomes that are there, and what is to be computed, by number."""
     outcomes, orders = Outcomes(tasks), {number: Order(task=task) for number, task in enumerate(tasks)}
-    if keep is None:
+    if store is None:
         return outcomes, orders
-    store = outcome_store(keep)
-    there, _ = store.keys()
     for number, task in enumerate(tasks):
         with suppress(AerpawCmpError, OSError):  # such a task will say itself what is wrong
             key = task_facts(task).key
-            orders[number] = Order(task=task, key=key, keep=keep)
-            outcome = store.load(key) if key in there else None
-            if isinstance(outcome, Outcome):
+            orders[number] = Order(task=task, key=key)
+            if isinstance(outcome := store.load(key), Outcome):
                 outcomes.put(number, outcome)
                 del orders[number]
     for text in store.warnings:
         progress(text)
-    if outcomes:
-        progress(f"{len(outcomes)} of {len(tasks)} outcomes are kept from before in {store.place.url}")
+    if len(outcomes):
+        progress(f"{len(outcomes)} of {len(tasks)} outcomes are kept from before in {store.folder}")
     return outcomes, orders
 
 
 def compute(
-    tasks: Sequence[Task], orders: Mapping[int, Order], workers: Workers, progress: Progress, outcomes: Outcomes
+    orders: Mapping[int, Order], workers: Workers, outcomes: Outcomes, store: OutcomeStore | None, progress: Progress
 ) -> None:
-    """Let the workers do what is to do; each outcome is put into ``outcomes``.
+    """Let the workers do what is to do; each outcome is put into ``outcomes`` and kept as soon as it comes.
 
     Parameters
     ----------
-    tasks : sequence of Task
-        All of the campaign.
     orders : mapping of int to Order
         What is to do, by the number of its task.
     workers : Workers
-    progress : Progress
-        Tasks done, and the time left.
     outcomes : Outcomes
         Gets the new ones.
+    store : OutcomeStore, optional
+        Keeps the new ones, and failures.
+    progress : Progress
+        Tasks done, and the time left.
     """
-    if not orders:
-        return
-    watch = Watch(len(tasks), len(tasks) - len(orders), workers.count, progress)
+    watch = Watch(len(outcomes) + len(orders), len(outcomes), workers.count, progress)
     numbers = list(orders)
 
     def through(place: int, result: Done | Lost) -> None:
-        number = numbers[place]
-        outcome = _outcome(orders[number], result)
-        outcomes.put(number, outcome)
-        watch(outcome, 0 if isinstance(result, Lost) else result.links)
+        order = orders[numbers[place]]
+        if isinstance(result, Lost):
+            task = order.task
+            lost = Failure(flight=task.flight, setting=task.setting, message=result.message)
+            result = Done(outcome=Outcome(failure=lost))
+        failure = result.outcome.failure
+        if store is not None and order.key is not None:
+            if failure is None:
+                store.save(order.key, result.outcome, result.about)
+            else:
+                told = {"message": failure.message, "traceback": failure.traceback}
+                store.save_failure(order.key, {**result.about, **told})
+        outcomes.put(numbers[place], result.outcome)
+        watch(result.outcome, result.links)
 
-    workers.run(carry_out, [orders[number] for number in numbers], through)
-
-
-def _outcome(order: Order, result: Done | Lost) -> Outcome:
-    """What a worker gave back, or put into the store."""
-    task = order.task
-    if isinstance(result, Lost):
-        return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=result.message))
-    if result.outcome is not None:
-        return result.outcome
-    store = outcome_store(str(order.keep))
-    for wait in _SEEN_AFTER_S:
-        time.sleep(wait)
-        outcome: Outcome | None = store.load(str(order.key))
-        if outcome is not None:
-            return outcome
-    message = f"the worker on {result.host} kept the outcome in {order.keep}, but it is not seen here"
-    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message))
+    if orders:
+        workers.run(carry_out, [orders[number] for number in numbers], through)

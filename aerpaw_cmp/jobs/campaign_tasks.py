@@ -8,7 +8,7 @@ import platform
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from functools import cache, lru_cache
@@ -30,7 +30,6 @@ from ..report import campaign_data
 from ..report.campaign_data import Failure, FlownRank, FlownTrack, RankRow, RssRow
 from .flight_run import run_flight
 from .outcomes import OutcomeStore, code_digest, records_of, task_inputs, task_key
-from .place import open_place
 
 _this = sys.modules[__name__]
 
@@ -161,36 +160,30 @@ def _failed(task: Task, message: str, error: BaseException) -> Outcome:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Order:
-    """What a worker is given: paths and hashes, no arrays.
+    """What a worker is given: paths and the digest of what the outcome depends on, as the first process sees it.
 
-    Parameters
-    ----------
-    task : Task
-    key : str, optional
-        Digest of what the outcome depends on, as the first process sees it; None where an input cannot be read.
-    keep : str, optional
-        Folder or URL of the outcomes.
+    ``key`` is None where an input cannot be read, or nothing is kept.
     """
 
     task: Task
     key: str | None = None
-    keep: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Done:
     """What a worker gives back.
 
-    ``outcome`` is None where it lies in the store, under the key of the order. ``seconds`` and ``cpu_s`` are what the
-    task cost (0 where another run had kept it meanwhile), ``links`` its poses times towers and channels.
+    ``about`` is the manifest of the outcome: what was read, where and when it was computed, what it cost.
     """
 
-    outcome: Outcome | None
-    seconds: float = 0.0
-    cpu_s: float = 0.0
-    links: int = 0
-    host: str = ""
-    failed: bool = False
+    outcome: Outcome
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def links(self) -> int:
+        """Poses times towers and channels."""
+        ranks = {row.tower: row.n for row in self.outcome.rank}
+        return sum(len(row.measured_db) for row in self.outcome.rss) + sum(ranks.values())
 
 
 TRIES = 2
@@ -198,49 +191,33 @@ TRIES = 2
 
 
 def carry_out(order: Order) -> Done:
-    """Run a task and keep its outcome; what runs in worker processes of every kind.
+    """Run a task; what runs in worker processes of every kind.
 
     The key is computed anew here: a worker that sees another file or runs other code fails the task instead of
-    keeping a wrong number under a right name.
+    giving a wrong number under a right name.
     """
-    task = order.task
-    store = None if order.keep is None or order.key is None else outcome_store(order.keep)
-    if store is not None and order.key is not None and store.sound(order.key):
-        return Done(outcome=None, host=platform.node())
-    facts, trouble = _checked(order)
+    task, facts = order.task, None
+    try:
+        facts = None if order.key is None else task_facts(task)
+    except (AerpawCmpError, OSError) as error:
+        return Done(outcome=_failed(task, f"an input can no longer be read: {error}", error))
+    if facts is not None and facts.key != order.key:
+        return Done(outcome=_not_the_same(task))
     start, cpu = time.perf_counter(), _cpu_s()
-    tried, outcome = 1, trouble or run_task(task)
-    while trouble is None and outcome.failure is not None and tried < TRIES:
+    tried, outcome = 1, run_task(task)
+    while outcome.failure is not None and tried < TRIES:
         tried, outcome = tried + 1, run_task(task)
-    seconds, cpu_s = time.perf_counter() - start, _cpu_s() - cpu
-    links = sum(len(row.measured_db) for row in outcome.rss) + sum({row.tower: row.n for row in outcome.rank}.values())
-    done = Done(outcome=outcome, seconds=seconds, cpu_s=cpu_s, links=links, host=platform.node())
-    if store is None or order.key is None:
-        return done
-    manifest = {
+    if facts is None:
+        return Done(outcome=outcome)
+    about = {
         "flight": task.flight, "setting": task.setting, "flight_file": str(task.path),
         "logs_root": None if task.logs_root is None else str(task.logs_root), "overrides": dict(task.overrides),
-        "seconds": seconds, "cpu_s": cpu_s, "links": links, "host": platform.node(), "process": os.getpid(),
-        "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"), "versions": _versions(),
-        "code": code_digest(), "inputs": [] if facts is None else facts.inputs,
-        "settings": {} if facts is None else facts.settings.model_dump(mode="json"),
+        "seconds": time.perf_counter() - start, "cpu_s": _cpu_s() - cpu, "tries": tried, "host": platform.node(),
+        "process": os.getpid(), "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "versions": _versions(), "code": code_digest(), "inputs": facts.inputs,
+        "settings": facts.settings.model_dump(mode="json"),
     }  # fmt: skip
-    if outcome.failure is not None:
-        failure = {"message": outcome.failure.message, "traceback": outcome.failure.traceback, "tries": tried}
-        store.save_failure(order.key, {**manifest, **failure})
-        return done
-    return dataclasses.replace(done, outcome=None) if store.save(order.key, outcome, manifest) else done
-
-
-def _checked(order: Order) -> tuple[Facts | None, Outcome | None]:
-    """What the task depends on as this process sees it, and its failure where that is something else."""
-    if order.key is None:
-        return None, None
-    try:
-        facts = task_facts(order.task)
-    except (AerpawCmpError, OSError) as error:
-        return None, _failed(order.task, f"an input can no longer be read: {error}", error)
-    return facts, None if facts.key == order.key else _not_the_same(order.task)
+    return Done(outcome=outcome, about=about)
 
 
 def _cpu_s() -> float:
@@ -285,9 +262,9 @@ def task_facts(task: Task) -> Facts:
     return Facts(settings=settings, inputs=inputs, key=task_key(settings, inputs))
 
 
-def outcome_store(keep: str) -> OutcomeStore:
-    """The outcomes of campaigns in a folder or object store."""
-    return OutcomeStore(open_place(keep), records_of(_this, campaign_data, offset, rank, result, rss, statistics))
+def outcome_store(keep: Path) -> OutcomeStore:
+    """The outcomes of campaigns in a folder."""
+    return OutcomeStore(keep, records_of(_this, campaign_data, offset, rank, result, rss, statistics))
 
 
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:

@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import math
 import os
 import re
 import zipfile
@@ -20,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from ..common.files import seal, unseal
+from ..common.errors import UsageError
+from ..common.files import atomic_path, seal, unseal
 from ..common.units import AnyArray
 from ..flight.settings import FlightFile
 from .manifest import digest_of, other_inputs
-from .place import Place, open_place
 
-LAYOUT = 4
+LAYOUT = 5
 """Raised whenever the form of an entry changes."""
 
 _SEAL = b"aerpaw-cmp outcome"
@@ -42,8 +41,8 @@ class OutcomeStore:
 
     Parameters
     ----------
-    place : Place or Path
-        A folder or an object store.
+    folder : Path
+        Made when the first entry is written.
     types : iterable of type
         Frozen dataclasses that an entry may hold (:func:`records_of`); nothing else is ever built from a file.
 
@@ -53,91 +52,84 @@ class OutcomeStore:
         Damaged entries that were not used.
     """
 
-    def __init__(self, place: Place | Path, types: Iterable[type]) -> None:
-        self.place = open_place(place) if isinstance(place, Path) else place
+    def __init__(self, folder: Path, types: Iterable[type]) -> None:
+        self.folder = folder
         self._types = {kind.__name__: kind for kind in types}
         self.warnings: list[str] = []
 
+    def check(self) -> None:
+        """UsageError where nothing can be kept in the folder, before anything runs."""
+        probe = self.folder / f".probe-{os.getpid()}"
+        try:
+            self._write(probe.name, b"")
+            probe.unlink()
+        except OSError as error:
+            raise UsageError(
+                f"outcomes cannot be kept in {self.folder}: {error.strerror or error}",
+                expected="a folder that may be written",
+                cause="a disk that is full or read-only, or a file in the way",
+            ) from None
+
+    def _write(self, name: str, content: bytes) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with atomic_path(self.folder / name) as part:
+            part.write_bytes(content)
+
     def load(self, key: str) -> Any | None:
         """The outcome of a key, or None where there is no sound entry."""
-        entry = self.place.read(f"{key}.npz")
-        if entry is None:
-            return None
+        file = self.folder / f"{key}.npz"
         try:
-            content = unseal(entry, _SEAL)
+            content = unseal(file.read_bytes(), _SEAL)
+        except OSError:
+            return None
         except ValueError:
-            self.warnings.append(
-                f"a damaged outcome was not used, its task is computed anew: {self.place.url}/{key}.npz"
-            )
+            self.warnings.append(f"a damaged outcome was not used, its task is computed anew: {file}")
             return None
         try:
             with np.load(io.BytesIO(content), allow_pickle=False) as parts:
-                return self._decode(json.loads(parts["content"].tobytes()), _Packed(parts["arrays"]))
+                arrays = {name: parts[name] for name in parts.files}
+            return self._decode(json.loads(arrays["content"].tobytes()), arrays)
         except (ValueError, LookupError, TypeError, ArithmeticError, AttributeError, *_TORN):
-            self.warnings.append(f"an outcome that this tool did not write was not used: {self.place.url}/{key}.npz")
+            self.warnings.append(f"an outcome that this tool did not write was not used: {file}")
             return None
 
-    def _knows(self, value: Any) -> bool:
-        """Whether :meth:`load` could give a record back."""
-        return self._types.get(type(value).__name__) is type(value)
-
-    def save(self, key: str, outcome: Any, manifest: Mapping[str, Any] | None = None) -> bool:
-        """Write an entry whole or not at all, then its manifest; False where the place does not take it."""
-        packed = _Packed()
-        content = np.frombuffer(json.dumps(self._encode(outcome, packed)).encode(), dtype=np.uint8)
+    def save(self, key: str, outcome: Any, manifest: Mapping[str, Any] | None = None) -> None:
+        """Write an entry whole or not at all, then its manifest; nothing where the disk does not take it."""
+        arrays = _Arrays()
+        content = np.frombuffer(json.dumps(self._encode(outcome, arrays)).encode(), dtype=np.uint8)
         entry = io.BytesIO()
-        np.savez(entry, content=content, arrays=packed.bytes())
-        sealed = seal(entry.getvalue(), _SEAL)
-        try:
-            self.place.write(f"{key}.npz", sealed)
-            if manifest is not None:
-                whole = {**manifest, "sha256": hashlib.sha256(sealed).hexdigest(), "bytes": len(sealed)}
-                self.place.write(f"{key}.json", _text(whole))
-        except OSError:
-            return False
-        self.place.remove(f"{key}.failed.json")
-        return True
+        np.savez(entry, content=content, **arrays.by_name)  # type: ignore[arg-type]
+        with contextlib.suppress(OSError):
+            self._write(f"{key}.npz", seal(entry.getvalue(), _SEAL))
+            self._write(f"{key}.json", _text(manifest or {}))
+            (self.folder / f"{key}.failed.json").unlink(missing_ok=True)
 
     def save_failure(self, key: str, manifest: Mapping[str, Any]) -> None:
         """Remember that a task failed, and how; it is never taken for an outcome."""
         with contextlib.suppress(OSError):
-            self.place.write(f"{key}.failed.json", _text(manifest))
+            self._write(f"{key}.failed.json", _text(manifest))
 
-    def manifests(self, keys: Iterable[str], *, failed: bool = False) -> dict[str, dict[str, Any]]:
-        """What stands beside the outcomes (or failures) of some keys, where it can be read."""
-        end = ".failed.json" if failed else ".json"
-        contents = {}
-        for name, content in self.place.read_many(f"{key}{end}" for key in keys).items():
-            with contextlib.suppress(ValueError):
-                contents[name.removesuffix(end)] = json.loads(content)
-        return contents
+    def manifest(self, key: str, *, failed: bool = False) -> dict[str, Any]:
+        """What stands beside an outcome (or a failure); empty where it cannot be read."""
+        try:
+            return dict(json.loads((self.folder / f"{key}{'.failed' if failed else ''}.json").read_bytes()))
+        except (OSError, ValueError, TypeError):
+            return {}
 
-    def keys(self) -> tuple[set[str], set[str]]:
-        """Keys that have an outcome, and keys that failed the last time."""
-        names = self.place.names()
-        kept = {name.removesuffix(".npz") for name in names if name.endswith(".npz")}
-        return kept, {name.removesuffix(".failed.json") for name in names if name.endswith(".failed.json")}
+    def has(self, key: str) -> bool:
+        """Whether there is an entry."""
+        return (self.folder / f"{key}.npz").is_file()
 
-    def sound(self, key: str) -> bool:
-        """Whether there is an outcome that :meth:`load` could take."""
-        entry = self.place.read(f"{key}.npz")
-        if entry is None:
-            return False
-        with contextlib.suppress(ValueError):
-            unseal(entry, _SEAL)
-            return True
-        return False
-
-    def _encode(self, value: Any, arrays: _Packed) -> Any:
+    def _encode(self, value: Any, arrays: _Arrays) -> Any:
         if value is None or type(value) in _AS_THEY_ARE:
             return value
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            if not self._knows(value):
+            if self._types.get(type(value).__name__) is not type(value):
                 raise TypeError(f"{type(value).__name__} is no record that an outcome may hold")
             fields = {name: self._encode(getattr(value, name), arrays) for name in _field_names(type(value))}
             return {"is": type(value).__name__, "of": fields}
         if isinstance(value, np.ndarray):
-            if value.dtype.hasobject:
+            if value.dtype.hasobject:  # these would be pickled
                 raise TypeError("an outcome holds no arrays of objects")
             return {"is": "array", "of": arrays.put(value)}
         if isinstance(value, (tuple, list)):
@@ -147,12 +139,12 @@ class OutcomeStore:
             return {"is": "dict", "of": pairs}
         return value.item() if isinstance(value, np.generic) else value
 
-    def _decode(self, value: Any, arrays: _Packed) -> Any:
+    def _decode(self, value: Any, arrays: Mapping[str, AnyArray]) -> Any:
         if not isinstance(value, dict):
             return value
         kind, content = value["is"], value["of"]
         if kind == "array":
-            return arrays.get(content["from"], content["kind"], tuple(content["shape"]))
+            return arrays[content]
         if kind in ("tuple", "list"):
             items = [self._decode(item, arrays) for item in content]
             return tuple(items) if kind == "tuple" else items
@@ -179,45 +171,18 @@ def _may_be(value: Any, annotation: str) -> bool:
     return None in kinds or any(isinstance(value, kind) for kind in kinds if kind is not None)
 
 
-class _Packed:
-    """Arrays one after the other, each once: channels of a tower share times and places, half of all that is kept.
+class _Arrays:
+    """Arrays by name, each once: channels of a tower share times and places, half of all that is kept."""
 
-    Parameters
-    ----------
-    content : (bytes,) uint8, optional
-        As :meth:`bytes` gave it.
-    """
+    def __init__(self) -> None:
+        self.by_name: dict[str, AnyArray] = {}
+        self._names: dict[tuple[str, tuple[int, ...], bytes], str] = {}
 
-    def __init__(self, content: AnyArray | None = None) -> None:
-        self._content = content
-        self._parts: list[bytes] = []
-        self._size = 0
-        self._known: dict[Any, Any] = {}
-
-    def put(self, array: AnyArray) -> dict[str, Any]:
-        """Where an array lies."""
-        raw = np.ascontiguousarray(array).tobytes()
-        start = self._known.setdefault(raw, self._size)
-        if start == self._size and raw:
-            self._parts.append(raw)
-            self._size += len(raw)
-        return {"from": start, "kind": array.dtype.str, "shape": array.shape}
-
-    def bytes(self) -> AnyArray:
-        """All of them."""
-        return np.frombuffer(b"".join(self._parts), dtype=np.uint8)
-
-    def get(self, start: int, kind: str, shape: tuple[int, ...]) -> AnyArray:
-        """The array that was put; the same one for those that were equal."""
-        count = math.prod(shape)
-        if self._content is None or not count:
-            return np.zeros(shape, dtype=kind)
-        key = (start, kind, shape)
-        if key not in self._known:
-            size = count * np.dtype(kind).itemsize
-            self._known[key] = self._content[start : start + size].copy().view(kind).reshape(shape)
-        array: AnyArray = self._known[key]
-        return array
+    def put(self, array: AnyArray) -> str:
+        """The name of an array."""
+        name = self._names.setdefault((array.dtype.str, array.shape, array.tobytes()), f"a{len(self._names)}")
+        self.by_name[name] = array
+        return name
 
 
 _AS_THEY_ARE = frozenset({str, int, float, bool})
@@ -287,28 +252,15 @@ def _content(path: Path) -> str:
     return digest_of(path, status.st_size, status.st_mtime_ns)
 
 
-_ROOMS_ASIDE = ("cli/", "live/", "maps/", "report/", "__main__.py")
-_BUT = ("report/__init__.py", "report/against.py", "report/campaign_data.py", "report/data.py")
-
-
-def shapes_numbers(module: str) -> bool:
-    """Whether a file of the package (path below it, with /) can change a campaign's outcome.
-
-    Pages, the tap, maps and the command line cannot; ``tests/jobs/test_outcomes.py`` holds that no task loads them.
-    """
-    return module in _BUT or not module.startswith(_ROOMS_ASIDE)
-
-
 @cache
 def code_digest() -> str:
-    """Digest of the source that a task runs and of the versions of what it computes with."""
+    """Digest of the source of this program and of the versions of what it computes with."""
     digest = hashlib.sha256()
     for name in ("aerpaw_cmp", "aerpaw_parsers"):
         with contextlib.suppress(ImportError):
             root = Path(str(import_module(name).__file__)).parent
-            modules = sorted(path.relative_to(root).as_posix() for path in root.rglob("*.py"))
-            for module in filter(shapes_numbers if name == "aerpaw_cmp" else None, modules):
-                digest.update(module.encode() + b"\0" + (root / module).read_bytes())
+            for path in sorted(root.rglob("*.py")):
+                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     for name in ("numpy", "scipy", "sionna-rt"):
         with contextlib.suppress(metadata.PackageNotFoundError):
             digest.update(f"{name} {metadata.version(name)}".encode())

@@ -3,32 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import io
-import json
-import tempfile
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..common.errors import InputError
-from ..common.files import seal, unseal
 from ..common.units import FloatArray
 from ..compare.offset import Pooling, pooled_moments
 from ..compare.passes import Pass, PassPair, PassTable
 from ..compare.rank import repeat_rank
 from ..flight.settings import Positive, Settings
 from ..report.campaign_data import FlownRank, PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
-from .place import open_place
-from .workers import Lost, Workers
-
-_SEAL = b"aerpaw-cmp series"
 
 
 class RepeatSettings(Settings):
@@ -101,30 +87,8 @@ def _mean(values: Any) -> float:
     return float(np.mean(known)) if known else float("nan")
 
 
-WORTH_WORKERS = 2000
-"""Pairs of passes from which on they are shared between workers."""
-
-
-def repeats(
-    rows: Sequence[RssRow], settings: RepeatSettings, workers: Workers | None = None, place: str | None = None
-) -> list[Repeat]:
-    """Every pair of flights that share a tower and channel, in the order of the rows.
-
-    Parameters
-    ----------
-    rows : sequence of RssRow
-        Of one setting.
-    settings : RepeatSettings
-    workers : Workers, optional
-        Share many pairs; the same numbers.
-    place : str, optional
-        Folder or URL that the workers reach, for the series; by default a folder of this machine.
-
-    Returns
-    -------
-    list of Repeat
-        By the rows of the two passes, ascending.
-    """
+def repeats(rows: Sequence[RssRow], settings: RepeatSettings) -> list[Repeat]:
+    """Every pair of flights that share a tower and channel, of the rows of one setting, in their order."""
     passes = [
         Pass(
             flight=row.flight,
@@ -136,111 +100,12 @@ def repeats(
         )
         for row in rows
     ]
-    links = Counter(one.link for one in passes)
-    if workers is not None and workers.count > 1 and sum(n * (n - 1) // 2 for n in links.values()) > WORTH_WORKERS:
-        pairs: Iterable[PassPair] = _shared_pairs(passes, settings, workers, place)
-    else:
-        pairs = PassTable(passes, settings.cell_m).pairs(
-            radius_m=settings.radius_m, heading_within_deg=settings.heading_within_deg
-        )
+    pairs = PassTable(passes, settings.cell_m).pairs(
+        radius_m=settings.radius_m, heading_within_deg=settings.heading_within_deg
+    )
     known = [int(np.isfinite(row.measured_db).sum()) for row in rows]
     ordered = sorted(pairs, key=lambda pair: (pair.first, pair.second))
     return [_repeat(pair, rows[pair.first], rows[pair.second], known[pair.first]) for pair in ordered]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairsOrder:
-    """Pairs whose first flight is one of some, for a worker: where the series lie, and their digest."""
-
-    place: str
-    name: str
-    settings: RepeatSettings
-    first_flights: tuple[str, ...]
-
-
-def _shared_pairs(
-    passes: Sequence[Pass], settings: RepeatSettings, workers: Workers, place: str | None
-) -> list[PassPair]:
-    """The pairs by workers: the series are written once, tasks name them."""
-    flights = list(dict.fromkeys(one.flight for one in passes))
-    pairs: list[PassPair] = []
-    with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-repeats-") as folder:
-        where = open_place(place or Path(folder))
-        content = seal(_packed(passes), _SEAL)
-        name = f"series-{hashlib.sha256(content).hexdigest()}.npz.part"
-        # the first flight has the most partners: every share takes some of both ends
-        shares = [tuple(flights[i :: 8 * workers.count]) for i in range(min(8 * workers.count, len(flights)))]
-        orders = [
-            PairsOrder(place=place or folder, name=name, settings=settings, first_flights=share) for share in shares
-        ]
-
-        def done(_number: int, result: list[PassPair] | Lost) -> None:
-            if isinstance(result, Lost):
-                raise InputError(f"repeatability of the flights: {result.message}")
-            pairs.extend(result)
-
-        try:
-            where.write(name, content)
-            workers.run(pairs_of, orders, done)
-        finally:
-            where.remove(name)
-    return pairs
-
-
-def pairs_of(order: PairsOrder) -> list[PassPair]:
-    """What a worker does for :func:`repeats`."""
-    rule = order.settings
-    return list(
-        _table(order.place, order.name, rule.cell_m).pairs(
-            radius_m=rule.radius_m, heading_within_deg=rule.heading_within_deg, first_flights=order.first_flights
-        )
-    )
-
-
-@lru_cache(maxsize=1)
-def _table(place: str, name: str, cell_m: float) -> PassTable:
-    entry = open_place(place).read(name)
-    if entry is None:
-        raise InputError(f"the series of the flights are not seen in {place}")
-    return PassTable(_unpacked(unseal(entry, _SEAL)), cell_m)
-
-
-def _packed(passes: Sequence[Pass]) -> bytes:
-    """Passes as one file; links that were sampled together share places and headings."""
-    arrays: dict[str, FloatArray] = {}
-    names: dict[str, str] = {}
-
-    def put(array: FloatArray | None) -> str:
-        if array is None:
-            return ""
-        digest = hashlib.sha256(np.ascontiguousarray(array).tobytes() + str(array.shape).encode()).hexdigest()
-        name = names.setdefault(digest, f"a{len(names)}")
-        arrays[name] = array
-        return name
-
-    table = [
-        (one.flight, one.link, put(one.position_m), put(one.level_db), put(one.residual_db), put(one.heading_deg))
-        for one in passes
-    ]
-    content = io.BytesIO()
-    np.savez(content, table=np.array(json.dumps(table)), **arrays)  # type: ignore[arg-type]
-    return content.getvalue()
-
-
-def _unpacked(content: bytes) -> list[Pass]:
-    with np.load(io.BytesIO(content), allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
-    return [
-        Pass(
-            flight=flight,
-            link=link,
-            position_m=arrays[position],
-            level_db=arrays[level],
-            residual_db=arrays[residual],
-            heading_deg=arrays[heading] if heading else None,
-        )
-        for flight, link, position, level, residual, heading in json.loads(str(arrays["table"]))
-    ]
 
 
 def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat:

@@ -753,7 +753,7 @@ def run_campaign(
     logs_root: Path | None = None,
     workers: int = 1,
     scheduler: str | None = None,
-    keep: str | None = None,
+    keep: Path | None = None,
     fresh: bool = False,
     force: bool = False,
     export: Sequence[str] = (),
@@ -773,8 +773,8 @@ def run_campaign(
         On this machine.
     scheduler : str, optional
         Address of a Dask scheduler, in place of workers here.
-    keep : str, optional
-        Folder or URL of the outcomes of single tasks, in place of what campaign.yaml says: a rerun, or one after an
+    keep : Path, optional
+        Folder of the outcomes of single tasks, in place of what campaign.yaml says: a rerun, or one after an
         interruption, computes only what is missing.
     fresh : bool
         Keep nothing and take nothing.
@@ -837,13 +837,13 @@ def run_campaign(
     return CampaignOutcome(folder, metrics, tuple(failed + edges), not (data.rss or data.rank))
 
 
-def campaign_keep(campaign: Any, path: Path, keep: str | None = None) -> str:
-    """Where outcomes are kept: as asked, else as campaign.yaml says, else in the user's cache."""
-    if keep is not None:
-        return keep
-    if campaign.keep is None:
-        return str(outcomes_folder())
-    return str(campaign.keep) if "://" in campaign.keep else str(path.parent / campaign.keep)
+def campaign_keep(campaign: Any, path: Path, keep: Path | None = None) -> Path:
+    """Folder of outcomes: as asked, else as campaign.yaml says, else in the user's cache."""
+    if keep is None:
+        keep = outcomes_folder() if campaign.keep is None else path.parent / Path(campaign.keep).expanduser()
+    if ":/" in str(keep):  # a path has one slash there
+        raise UsageError(f"outcomes in {keep}", expected="a folder", cause="object stores are not written any more")
+    return keep
 
 
 def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
@@ -858,7 +858,7 @@ def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
 
 
 def campaign_status(
-    path: Path, *, logs_root: Path | None = None, keep: str | None = None, fresh: bool = False, workers: int = 1
+    path: Path, *, logs_root: Path | None = None, keep: Path | None = None, fresh: bool = False, workers: int = 1
 ) -> Any:
     """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaign_plan.CampaignStatus`).
 
@@ -868,8 +868,8 @@ def campaign_status(
         campaign.yaml.
     logs_root : Path, optional
         Folder against which logs resolve.
-    keep : str, optional
-        Folder or URL of the outcomes, in place of what campaign.yaml says.
+    keep : Path, optional
+        Folder of the outcomes, in place of what campaign.yaml says.
     fresh : bool
         As though nothing were kept.
     workers : int
@@ -886,11 +886,12 @@ def campaign_status(
     """
     from . import campaign_plan
     from .campaign import campaign_tasks, load_campaign
+    from .campaign_tasks import outcome_store
 
     campaign = load_campaign(path)
     tasks, _, failures = campaign_tasks(campaign, path.parent, logs_root)
-    where = None if fresh else campaign_keep(campaign, path, keep)
-    return campaign_plan.campaign_status(campaign.campaign, tasks, failures, where, workers=workers)
+    store = None if fresh else outcome_store(campaign_keep(campaign, path, keep))
+    return campaign_plan.campaign_status(campaign.campaign, tasks, failures, store, workers=workers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -907,8 +908,6 @@ def run_calibrate(
     *,
     out: Path | None = None,
     logs_root: Path | None = None,
-    workers: int = 1,
-    scheduler: str | None = None,
     into_site: str | None = None,
     score: Sequence[Path] = (),
     force: bool = False,
@@ -924,8 +923,6 @@ def run_calibrate(
         The file to write; the folder lies beside it.
     logs_root : Path, optional
         Where the paths of logs and antennas resolve.
-    workers, scheduler
-        Who computes the scores: workers of this machine, or of a Dask scheduler.
     into_site : str, optional
         Site (site.yaml or packaged) whose memory gets what was learned, as an entry of the calibration's name.
     score : sequence of Path
@@ -949,8 +946,6 @@ def run_calibrate(
     from ..site.learned import remember
     from .calibrate import calibrate, load_calibration
     from .calibration_files import MARK, receiver_entry, site_entry, write_files
-    from .campaign import absolute
-    from .workers import open_workers
 
     settings = load_calibration(path)
     target = out or Path(f"{settings.calibration}.calibrated.yaml")
@@ -978,9 +973,7 @@ def run_calibrate(
                 (place / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
                 (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
         else:
-            path, logs_root = (path, logs_root) if scheduler is None else (absolute(path), absolute(logs_root))
-            with open_workers(workers, scheduler, paths=[path], progress=progress) as crew:
-                calibration = calibrate(path, logs_root=logs_root, stages=stages, workers=crew, score=score)
+            calibration = calibrate(path, logs_root=logs_root, stages=stages, score=score)
             if ranked is not None:
                 calibration = replace(
                     calibration, rank=ranked.metrics(), warnings=(*calibration.warnings, *ranked.warnings)

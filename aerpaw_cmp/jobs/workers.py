@@ -15,12 +15,9 @@ import multiprocessing
 import os
 import pickle
 import platform
-import shutil
 import signal
-import tempfile
 import threading
 import time
-import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -30,10 +27,9 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from ..common.errors import AerpawCmpError, InputError, UsageError
+from ..common.errors import InputError, UsageError
 from ..common.stages import Progress, silent
 from .outcomes import code_digest
-from .place import open_place
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -44,13 +40,11 @@ TRIES = 2
 CONNECT_S = 10.0
 """How long a scheduler may take to answer."""
 
-RECONNECT_S = 60.0
-"""How long a scheduler that went away is waited for."""
-
 NO_WORKER_S = 30.0
 """A scheduler that has had no worker for so long is spoken of, again and again."""
 
-_LOOKED_S = 2.0
+
+LOOK_S = 2.0
 """How often workers are counted."""
 
 
@@ -59,6 +53,9 @@ class Lost:
     """In place of a result: the worker ended, again and again, or the task could not be sent or brought back."""
 
     message: str
+
+
+ENDED = Lost("its worker process ended, time after time: out of memory, or killed")
 
 
 class Workers(Protocol):
@@ -107,31 +104,30 @@ class Processes:
         items: Sequence[Item],
         done: Callable[[int, Result | Lost], None],
     ) -> None:
-        tries: Counter[int] = Counter()
         with contextlib.ExitStack() as stack:
             crew = [stack.enter_context(_Worker(function)) for _ in range(min(self.count, len(items)))]
-            killed = _through(crew, items, range(len(items)), tries, done)
+            tries: Counter[int] = Counter()
+            killed = _through(crew, items, deque(range(len(items))), tries, done)
             for number in killed:  # a last time, so that none pays for its neighbour
-                if _through(crew[:1], items, [number], tries, done):
-                    done(number, Lost("its worker process ended, time after time: out of memory, or killed"))
+                if _through(crew[:1], items, deque([number]), tries, done):
+                    done(number, ENDED)
 
 
 def _through(
     crew: Sequence[_Worker],
     items: Sequence[Any],
-    numbers: Iterable[int],
+    waiting: deque[int],
     tries: Counter[int],
     done: Callable[[int, Any], None],
 ) -> list[int]:
     """Run some tasks; gives those that lost their worker too often."""
-    waiting, killed = deque(numbers), list[int]()
+    killed: list[int] = []
     active: dict[Connection, tuple[_Worker, int]] = {}
     while waiting or active:
-        for worker in crew:
-            if waiting and worker.pipe not in active:
-                number = waiting.popleft()
-                worker.send(items[number])
-                active[worker.pipe] = worker, number
+        for worker in [one for one in crew if one.pipe not in active][: len(waiting)]:
+            number = waiting.popleft()
+            worker.send(items[number])
+            active[worker.pipe] = worker, number
         for pipe in wait(list(active)):
             assert isinstance(pipe, Connection)
             worker, number = active.pop(pipe)
@@ -141,8 +137,8 @@ def _through(
                 worker.start_anew()
                 tries[number] += 1
                 (waiting if tries[number] < TRIES else killed).append(number)
-                continue
-            done(number, content if succeeded else Lost(f"its worker process ended: {content}"))
+            else:
+                done(number, content if succeeded else Lost(f"its worker process ended: {content}"))
     return killed
 
 
@@ -207,47 +203,27 @@ def _follow_parent() -> None:
         os._exit(1)
 
 
-def _ended(error: BaseException) -> Lost:
-    if type(error).__name__ == "KilledWorker":
-        return Lost("its worker process ended, time after time: out of memory, or killed")
-    return Lost(f"its worker process ended: {str(error).strip() or type(error).__name__}")
-
-
 # --- Dask -----------------------------------------------------------------------------------------------------------
 
 
-_CUT = object()
-"""In place of a result: the task ended, and the way back was cut."""
-
-
-def _outcome(future: Any) -> tuple[BaseException | None, Any]:
-    """The error and the result of a task that is done; its ``status`` may say so later than ``done()`` does."""
-    try:
-        return None, future.result()
-    except (CancelledError, OSError, TimeoutError) as error:
-        return (error, None) if future.status == "error" else (None, _CUT)
-    except Exception as error:
-        return error, None
-
-
 class Cluster:
-    """Workers of a Dask scheduler; a window of tasks is with it at a time, so that its memory does not grow.
+    """Workers of a Dask scheduler.
 
     Parameters
     ----------
     client : distributed.Client
-    address : str, optional
-        Of a scheduler that can be reached again after it went away; without it, its end is the end.
     progress : Progress
+        Told when no worker is there.
     """
 
-    def __init__(self, client: Any, address: str | None = None, progress: Progress = silent) -> None:
-        self._client, self._address, self._progress = client, address, progress
+    def __init__(self, client: Any, progress: Progress = silent) -> None:
+        self._client, self._progress = client, progress
+        self._looked_s = self._seen_s = time.monotonic()
 
     @property
     def count(self) -> int:
         """Threads of all workers that are there now."""
-        return max(1, sum(self._client.nthreads().values())) if self._client.status == "running" else 1
+        return max(1, int(sum(self._client.nthreads().values())))
 
     def run(  # noqa: D102
         self,
@@ -255,9 +231,10 @@ class Cluster:
         items: Sequence[Item],
         done: Callable[[int, Result | Lost], None],
     ) -> None:
-        killed = self._through(function, items, range(len(items)), done, alone=False)
+        killed = self._through(function, items, range(len(items)), done)
         for number in killed:  # a last time, so that none pays for its neighbour
-            self._through(function, items, [number], done, alone=True)
+            if self._through(function, items, [number], done):
+                done(number, ENDED)
 
     def _through(
         self,
@@ -265,86 +242,54 @@ class Cluster:
         items: Sequence[Item],
         numbers: Iterable[int],
         done: Callable[[int, Result | Lost], None],
-        *,
-        alone: bool,
     ) -> list[int]:
-        """Run some; gives those that lost their worker too often."""
-        waiting = deque(numbers)
-        active: dict[Any, int] = {}
+        """Run some; gives those that lost their worker too often, as Dask counts."""
         killed: list[int] = []
-        came = threading.Event()
-        window, looked, seen = self.count, time.monotonic(), time.monotonic()
-        while waiting or active:
-            if time.monotonic() - looked > _LOOKED_S:  # workers may join and leave
-                window, looked = self.count, time.monotonic()
-                seen = self._looked_for_workers(seen)
-            try:
-                while waiting and len(active) < 2 * window + 2:
-                    number = waiting.popleft()
-                    future = self._client.submit(function, items[number], pure=False)
-                    active[future] = number
-                    future.add_done_callback(lambda _future: came.set())
-            except Exception:
-                if self._client.status == "running":
-                    raise
-                waiting.appendleft(number)
-            came.wait(0.5)
-            came.clear()
-            for future in [f for f in active if f.done()]:
-                number = active.pop(future)
-                error, result = _outcome(future)
-                if error is None and result is _CUT:
-                    waiting.appendleft(number)
-                    continue
-                if error is None:
-                    done(number, result)
-                elif type(error).__name__ == "KilledWorker" and not alone:
+        active = {self._client.submit(function, items[number], pure=False): number for number in numbers}
+        while active:
+            ready = [future for future in active if future.done()]
+            if not ready:
+                self._check_scheduler()
+                time.sleep(0.05)
+            for future in ready:
+                number, result = active.pop(future), self._result(future)
+                if result is None:
                     killed.append(number)
                 else:
-                    done(number, _ended(error))
+                    done(number, result[0])
                 future.release()
-            if self._client.status != "running":
-                waiting.extendleft(sorted(active.values(), reverse=True))
-                active.clear()
-                self._reconnect()
         return killed
 
-    def _looked_for_workers(self, seen_s: float) -> float:
-        """When a worker was last there, or its absence was last told [s]."""
-        if self._client.status == "running" and not self._client.nthreads():
-            if time.monotonic() - seen_s < NO_WORKER_S:
-                return seen_s
-            place = f" at {self._address}" if self._address else ""
-            self._progress(
-                f"no worker is with the scheduler{place} since {NO_WORKER_S:.0f} s: waiting; what was finished is kept"
-            )
-        return time.monotonic()
+    def _result(self, future: Any) -> tuple[Any] | None:
+        """What a task that is done gave, or how it was lost; None where its workers were, again and again."""
+        try:
+            return (future.result(),)
+        except CancelledError:  # with its scheduler
+            raise self._gone() from None
+        except Exception as error:
+            if type(error).__name__ == "KilledWorker":
+                return None
+            return (Lost(f"its worker process ended: {str(error).strip() or type(error).__name__}"),)
 
-    def _reconnect(self) -> None:
-        """Wait for the scheduler to come back; InputError where it does not."""
-        from distributed import Client
+    def _check_scheduler(self) -> None:
+        """InputError where it is gone; where it has had no worker for a while, that is said."""
+        if self._client.status != "running":
+            raise self._gone()
+        now = time.monotonic()
+        if now - self._looked_s < LOOK_S:
+            return
+        self._looked_s = now
+        if self._client.nthreads():
+            self._seen_s = now
+        elif now - self._seen_s > NO_WORKER_S:
+            self._progress(f"the scheduler has had no worker for {NO_WORKER_S:.0f} s; finished tasks are kept")
+            self._seen_s = now
 
-        with contextlib.suppress(Exception):
-            self._client.close(timeout=1)
-        if self._address is None:
-            raise InputError("the scheduler of the workers has ended", cause="out of memory, or it was killed")
-        self._progress(f"the scheduler {self._address} went away: waiting up to {RECONNECT_S:.0f} s for it")
-        end = time.monotonic() + RECONNECT_S
-        while time.monotonic() < end:
-            with contextlib.suppress(OSError, ValueError):
-                self._client = Client(self._address, timeout="3s", set_as_default=False)
-                self._progress(f"the scheduler {self._address} is there again")
-                return
-            time.sleep(1.0)
-        raise InputError(
-            f"the scheduler {self._address} went away and did not come back within {RECONNECT_S:.0f} s",
+    def _gone(self) -> InputError:
+        return InputError(
+            "the scheduler of the workers went away",
             cause="it was stopped; what was finished is kept, run the same command again",
         )
-
-    def close(self) -> None:
-        """Leave the scheduler."""
-        with contextlib.suppress(Exception):
-            self._client.close(timeout=5)
 
 
 @contextlib.contextmanager
@@ -353,7 +298,6 @@ def open_workers(
     scheduler: str | None = None,
     *,
     paths: Sequence[Path] = (),
-    keep: str | None = None,
     progress: Progress = silent,
 ) -> Iterator[Workers]:
     """Workers for the tasks of a job.
@@ -366,8 +310,6 @@ def open_workers(
         Address of a Dask scheduler (``tls://``), in place of workers here.
     paths : sequence of Path
         Files and folders that every worker of a scheduler has to see.
-    keep : str, optional
-        Folder or URL of outcomes that it has to reach.
     progress : Progress
         How many workers a scheduler has, and the address of its dashboard.
 
@@ -382,52 +324,12 @@ def open_workers(
         No scheduler answers, ``distributed`` is missing, or workers run other code or do not see the files.
     """
     if scheduler is not None:
-        with _scheduler(scheduler, paths, keep, progress) as cluster:
+        with _scheduler(scheduler, paths, progress) as cluster:
             yield cluster
     elif workers <= 1:
         yield Here()
     else:
-        remove_left_folders(Path(tempfile.gettempdir()))
         yield Processes(workers)
-
-
-def remove_left_folders(root: Path) -> list[Path]:
-    """Remove folders that local clusters of 0.3 left where they were killed.
-
-    Parameters
-    ----------
-    root : Path
-        The folder of temporary files.
-
-    Returns
-    -------
-    list of Path
-        The removed ones: of this user, no links, and no process works in them or has a file of them open. None where
-        the system does not tell (no ``/proc``).
-    """
-    if not Path("/proc/self/fd").is_dir() or not hasattr(os, "getuid"):
-        return []
-    mine = [
-        folder
-        for folder in root.glob("aerpaw-cmp-dask-*")
-        if folder.is_dir() and not folder.is_symlink() and folder.stat().st_uid == os.getuid()
-    ]
-    used = _places_in_use() if mine else set()
-    left = [folder for folder in mine if not any(place.is_relative_to(folder.resolve()) for place in used)]
-    for folder in left:
-        shutil.rmtree(folder, ignore_errors=True)
-    return left
-
-
-def _places_in_use() -> set[Path]:
-    """Working folders and open files of the processes that this user may look at."""
-    places = set()
-    for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            for link in (process / "cwd", *(process / "fd").iterdir()):
-                with contextlib.suppress(OSError):
-                    places.add(link.readlink())
-    return places
 
 
 def _quiet() -> None:
@@ -438,7 +340,7 @@ def _quiet() -> None:
 
 
 @contextlib.contextmanager
-def _scheduler(address: str, paths: Sequence[Path], keep: str | None, progress: Progress) -> Iterator[Cluster]:
+def _scheduler(address: str, paths: Sequence[Path], progress: Progress) -> Iterator[Cluster]:
     """Workers of a running scheduler."""
     try:
         from distributed import Client
@@ -462,15 +364,16 @@ def _scheduler(address: str, paths: Sequence[Path], keep: str | None, progress: 
             if isinstance(error, TypeError)
             else None,
         ) from error
-    cluster = Cluster(client, address, progress)
+    cluster = Cluster(client, progress)
     try:
-        check_workers(client, paths, keep)
+        check_workers(client, paths)
         there = client.scheduler_info().get("services", {}).get("dashboard")
         page = f"; dashboard {client.dashboard_link}" if there else ""
         progress(f"{len(client.nthreads())} workers, {cluster.count} tasks at a time{page}")
         yield cluster
     finally:
-        cluster.close()
+        with contextlib.suppress(Exception):
+            client.close(timeout=5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -484,27 +387,20 @@ class WorkerFacts:
     missing: tuple[str, ...]
 
 
-def worker_facts(paths: Sequence[str], keep: str | None = None, probe: str = "") -> WorkerFacts:
+def worker_facts(paths: Sequence[str]) -> WorkerFacts:
     """Of the process that this runs in."""
     from .. import __version__
 
-    missing = [path for path in paths if not os.access(path, os.R_OK)]
-    if keep is not None:
-        try:
-            if open_place(keep).read(probe) is None:
-                missing.append(f"what is kept in {keep}")
-        except AerpawCmpError as error:
-            missing.append(str(error))
     return WorkerFacts(
         host=platform.node(),
         python=platform.python_version(),
         version=__version__,
         code=code_digest(),
-        missing=tuple(missing),
+        missing=tuple(path for path in paths if not os.access(path, os.R_OK)),
     )
 
 
-def check_workers(client: Any, paths: Sequence[Path], keep: str | None = None) -> None:
+def check_workers(client: Any, paths: Sequence[Path]) -> None:
     """One message for all workers that run other code or do not see the files.
 
     Raises
@@ -512,14 +408,7 @@ def check_workers(client: Any, paths: Sequence[Path], keep: str | None = None) -
     UsageError
         Naming worker, host and what is wrong.
     """
-    texts, probe = [str(path.absolute()) for path in paths], f"probe-{uuid.uuid4().hex}"
-    if keep is not None:
-        open_place(keep).write(probe, b"seen?")
-    try:
-        answers = client.run(worker_facts, texts, keep, probe, on_error="return")
-    finally:
-        if keep is not None:
-            open_place(keep).remove(probe)
+    answers = client.run(worker_facts, [str(path.absolute()) for path in paths], on_error="return")
     here = worker_facts([])
     wrong = [f"{worker}: {text}" for worker, facts in answers.items() if (text := _trouble(facts, here))]
     if wrong:

@@ -31,7 +31,7 @@ def main() -> int:
         walltime=asked.get("SLURM_CAMPAIGN_TIME", "04:00:00"),
         interface=asked.get("SLURM_CAMPAIGN_INTERFACE"),  # the network that nodes and login node share, e.g. ib0
         python=sys.executable,
-        # the nodes get this environment: PATH, PYTHONPATH and the keys of an object store
+        # the nodes get this environment: PATH, PYTHONPATH
         job_extra_directives=["--export=ALL"],
         job_script_prologue=["export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1"],
         scheduler_options={"dashboard_address": ":0"},

@@ -101,14 +101,3 @@ def test_the_pairs_are_those_of_brute_force() -> None:
         assert pair.place_correlation == pytest.approx(correlation(table[:, 0], table[:, 2]), nan_ok=True)
         assert pair.place_rmse_db == pytest.approx((table[:, 2] - table[:, 0]).std())
         assert pair.height_difference_m == pytest.approx(np.median(table[:, 3] - table[:, 1]))
-
-
-def test_shares_of_the_work_make_the_whole() -> None:
-    table, rule = PassTable(season(1), CELL_M), {"radius_m": RADIUS_M, "heading_within_deg": None}
-    whole = list(table.pairs(**rule))
-    parts = [
-        p
-        for share in (["f0", "f3"], ["f1"], ["f2", "f4", "f5", "f6"])
-        for p in table.pairs(first_flights=share, **rule)
-    ]
-    assert sorted(map(repr, parts)) == sorted(map(repr, whole))

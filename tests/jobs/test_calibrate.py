@@ -12,10 +12,9 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.calibration import BASELINES, SPLITS, mean_rmse
-from aerpaw_cmp.jobs.calibrate import calibrate, load_calibration, observe, read_flights, recipe_of, score_on
+from aerpaw_cmp.jobs.calibrate import calibrate, load_calibration, observe, read_flights, recipe_of
 from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
-from tests.jobs.sent_by_pickle import SentByPickle
 from tests.json_page import unlisted
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -209,7 +208,7 @@ ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
 def test_dataset12_each_way(tmp_path: Path) -> None:
     """Everything but the offset learned on the other flight: 3.53 dB here; free space 6.37."""
     from aerpaw_cmp.compare import calibration
-    from aerpaw_cmp.jobs.calibrate import load_calibration, observe, read_flights, recipe_of
+    from aerpaw_cmp.jobs.calibrate import load_calibration, observe, read_flights
 
     flights = [str(Path(__file__).parents[1] / "field" / f"dataset12_{h}m.yaml") for h in (40, 70)]
     grid = {"model": "gain_grid", "file": "antennas/rad_pat.mat"}
@@ -222,17 +221,3 @@ def test_dataset12_each_way(tmp_path: Path) -> None:
     assert mean_rmse(scores) < 3.75
     assert mean_rmse(scores, "rmse_4s_db") < 3.0
     assert mean_rmse(scores, "free_space_rmse_db") == pytest.approx(6.37, abs=0.05)
-
-
-def test_workers_score_to_the_same_digit(folder: Path, metrics: dict) -> None:
-    """They read the flights themselves; splits and controls are those of one process, in its order."""
-    path = folder / "calibration.yaml"
-    flights, _ = read_flights(load_calibration(path), folder, None)
-    observed, _ = observe(flights)
-    crew = SentByPickle()
-    scores, controls = score_on(crew, path, None, recipe_of(load_calibration(path), observed, folder))
-    assert max(crew.sizes) < 2000
-    for found, expected in ((scores, metrics["scores"]), (controls, metrics["controls"])):
-        assert list(found) == list(expected)
-        for name, rows in found.items():
-            assert [row.rmse_db for row in rows] == [row["rmse_db"] for row in expected[name]]

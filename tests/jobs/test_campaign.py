@@ -352,6 +352,7 @@ def test_json_is_alone_on_standard_output(folder: Path, capsys: pytest.CaptureFi
         ({"held_out": {"fit": {"link.rss.towr.yaw_deg": [0, 10]}}}, "tower"),
         ({"flights": ["first.yaml", "first.yaml"]}, "two flights are named 'first'"),
         ({"calibratoin": "all"}, "calibration"),
+        ({"keep": "s3://lab/season"}, "object stores are not written any more"),
     ],
 )
 def test_mistakes_in_the_file_are_usage_errors(

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.files import seal
 from aerpaw_cmp.common.stages import silent
 from aerpaw_cmp.flight.overrides import overridden
@@ -22,7 +23,7 @@ from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import campaign_tasks, sample
 from aerpaw_cmp.jobs.campaign_plan import campaign_status, compute, kept_outcomes
 from aerpaw_cmp.jobs.campaign_tasks import Done, Order, Outcome, Task, carry_out, outcome_store, task_facts
-from aerpaw_cmp.jobs.outcomes import OutcomeStore, shapes_numbers, task_inputs, task_key
+from aerpaw_cmp.jobs.outcomes import OutcomeStore, task_inputs, task_key
 from aerpaw_cmp.jobs.workers import Here, Processes, Workers
 from aerpaw_cmp.report.campaign_data import Failure, FlownTrack, RankRow, RssRow
 
@@ -36,10 +37,11 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sample.write_sample(tmp_path_factory.mktemp("season") / "flight")
 
 
-def run_tasks(tasks: list[Task], workers: Workers, keep: str | None = None) -> list[Outcome]:
+def run_tasks(tasks: list[Task], workers: Workers, keep: Path | None = None) -> list[Outcome]:
     """All tasks in order, as a campaign runs them."""
-    outcomes, orders = kept_outcomes(tasks, keep, silent)
-    compute(tasks, orders, workers, silent, outcomes)
+    store = None if keep is None else outcome_store(keep)
+    outcomes, orders = kept_outcomes(tasks, store, silent)
+    compute(orders, workers, outcomes, store, silent)
     return [outcomes[number] for number in range(len(tasks))]
 
 
@@ -100,14 +102,14 @@ def test_a_damaged_entry_is_told_and_not_used(tmp_path: Path, place: int) -> Non
     [
         b"",
         b"no archive",
-        {"content": b"[", "arrays": b""},
-        {"content": b'{"is": "NoSuchRecord", "of": {}}', "arrays": b""},
-        {"content": b'{"is": "FlownTrack", "of": {"flight": 3, "time_s": 1, "position_m": 2}}', "arrays": b""},
-        {"content": b'{"is": "FlownTrack", "of": {"nothing": 3}}', "arrays": b""},
-        {"content": b'{"is": "array", "of": {"from": 0, "kind": "f8", "shape": [1000000]}}', "arrays": b"12345678"},
-        {"content": b'{"is": "array", "of": {"from": 0, "kind": "O", "shape": [1]}}', "arrays": b"12345678"},
-        {"content": b'{"is": "tuple"}', "arrays": b""},
-        {"content": b"[" * 100_000 + b"]" * 100_000, "arrays": b""},
+        {"content": b"["},
+        {"content": b'{"is": "NoSuchRecord", "of": {}}'},
+        {"content": b'{"is": "FlownTrack", "of": {"flight": 3, "time_s": 1, "position_m": 2}}'},
+        {"content": b'{"is": "FlownTrack", "of": {"nothing": 3}}'},
+        {"content": b'{"is": "array", "of": "a7"}', "a0": b"12345678"},
+        {"content": b'{"is": "array", "of": ["a0"]}', "a0": b"12345678"},
+        {"content": b'{"is": "tuple"}'},
+        {"content": b"[" * 100_000 + b"]" * 100_000},
     ],
 )
 def test_a_forged_entry_is_told_and_not_used(tmp_path: Path, forged: bytes | dict[str, bytes]) -> None:
@@ -119,6 +121,36 @@ def test_a_forged_entry_is_told_and_not_used(tmp_path: Path, forged: bytes | dic
     store = OutcomeStore(tmp_path, TYPES)
     assert store.load("a") is None
     assert "that this tool did not write was not used" in store.warnings[0]
+
+
+def test_a_pickled_array_in_a_forged_entry_is_not_loaded(tmp_path: Path) -> None:
+    entry = io.BytesIO()
+    np.savez(
+        entry, content=np.frombuffer(b'{"is": "array", "of": "a0"}', dtype=np.uint8), a0=np.array([{}], dtype=object)
+    )
+    (tmp_path / "a.npz").write_bytes(seal(entry.getvalue(), b"aerpaw-cmp outcome"))
+    store = OutcomeStore(tmp_path, TYPES)
+    assert store.load("a") is None
+    assert "that this tool did not write was not used" in store.warnings[0]
+
+
+@pytest.mark.parametrize("place", ["a_file", "/proc/nowhere"])
+def test_a_place_that_takes_nothing_is_a_usage_error(tmp_path: Path, place: str) -> None:
+    (tmp_path / "a_file").touch()
+    with pytest.raises(UsageError, match="outcomes cannot be kept in"):
+        OutcomeStore(tmp_path / place, TYPES).check()
+    OutcomeStore(tmp_path / "new", TYPES).check()
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_equal_arrays_are_kept_and_held_once(tmp_path: Path) -> None:
+    """Channels of a tower share times and places: half of all that a campaign keeps."""
+    store, place = OutcomeStore(tmp_path, TYPES), np.arange(3000.0).reshape(-1, 3)
+    track = FlownTrack(flight="f", time_s=place, position_m=place.copy())
+    store.save("a", Outcome(track=track))
+    assert (tmp_path / "a.npz").stat().st_size < 1.5 * place.nbytes
+    found = store.load("a").track
+    assert found.time_s is found.position_m
 
 
 def key_of(settings: FlightFile, flight: Path) -> str:
@@ -134,10 +166,10 @@ def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path
         {"rss.lag": "off", "rss.advanced.lag_window_s": 10, "rank.advanced.bootstrap": 10},
         None,
     )
-    (first,) = run_tasks([task], Here(), keep=str(tmp_path))
+    (first,) = run_tasks([task], Here(), keep=tmp_path)
     assert first.failure is None
     key = task_facts(task).key
-    again = outcome_store(str(tmp_path)).load(key)
+    again = outcome_store(tmp_path).load(key)
     assert repr(again.rank) == repr(first.rank)
     assert [row.rmse_db for row in again.rss] == [row.rmse_db for row in first.rss]
     assert np.array_equal(again.rss[0].measured_db, first.rss[0].measured_db, equal_nan=True)
@@ -148,7 +180,6 @@ def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path
     assert {one["role"] for one in manifest["inputs"]} >= {"log", "site file (packaged)"}
     assert manifest["settings"]["rss"]["advanced"]["lag_window_s"] == 10
     assert manifest["seconds"] > 0
-    assert manifest["links"] > 100
 
 
 def test_a_key_is_of_everything_that_matters_and_of_nothing_else(flight: Path) -> None:
@@ -169,27 +200,6 @@ def test_a_key_is_of_everything_that_matters_and_of_nothing_else(flight: Path) -
     assert key == key_of(settings, flight)
 
 
-LOADED = """
-import sys
-from pathlib import Path
-from aerpaw_cmp.jobs.campaign_tasks import Task, run_task
-task = Task(Path(sys.argv[1]), "f", "s", {"rss.advanced.lag_window_s": 10, "rank.advanced.bootstrap": 10, "rss.lag": "off"}, None)
-assert run_task(task).failure is None
-root = Path(sys.modules["aerpaw_cmp"].__file__).parent
-for module in list(sys.modules.values()):
-    file = getattr(module, "__file__", None) or ""
-    if file.startswith(str(root)):
-        print(Path(file).relative_to(root).as_posix())
-"""
-
-
-def test_no_task_loads_code_that_its_key_leaves_out(flight: Path) -> None:
-    done = subprocess.run([sys.executable, "-c", LOADED, str(flight)], capture_output=True, text=True, check=True)
-    modules = done.stdout.split()
-    assert "compare/rss.py" in modules
-    assert [module for module in modules if not shapes_numbers(module)] == []
-
-
 def tasks_of(flight: Path, count: int = 4) -> list[Task]:
     return [Task(flight, f"f{i}", "as written", {"rss.advanced.lag_window_s": 10.0 + i}, None) for i in range(count)]
 
@@ -205,18 +215,18 @@ def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkey
 
     monkeypatch.setattr(campaign_tasks, "run_task", one)
     tasks = tasks_of(flight)
-    first = run_tasks(tasks, Here(), keep=str(tmp_path))
+    first = run_tasks(tasks, Here(), keep=tmp_path)
     assert asked == ["f0", "f1", "f2", "f3", "f3"], "a failed task is tried once more"
     assert first[3].failure is not None
-    status = campaign_status("c", tasks, [], str(tmp_path), workers=2)
+    status = campaign_status("c", tasks, [], outcome_store(tmp_path), workers=2)
     assert (status.kept, status.failed, status.to_do) == (3, 1, 1)
     assert status.estimate_s == pytest.approx(np.mean([s.seconds for s in status.states if s.kept]))
     assert [s.failure for s in status.states] == ["", "", "", "no luck"]
     assert "line 1" in next(tmp_path.glob("*.failed.json")).read_text()
-    again = run_tasks(tasks, Here(), keep=str(tmp_path))
+    again = run_tasks(tasks, Here(), keep=tmp_path)
     assert asked[5:] == ["f3", "f3"], "only the failure is tried again"
     assert all(equal(a, b) for a, b in zip(first[:3], again[:3], strict=True))
-    run_tasks(tasks, Here(), keep=str(tmp_path))
+    run_tasks(tasks, Here(), keep=tmp_path)
     assert len(asked) == 7
     assert not list(tmp_path.glob("*.failed.json")), "what succeeds is no failure any more"
     run_tasks(tasks, Here())
@@ -229,23 +239,21 @@ def test_a_new_name_or_place_in_the_list_computes_nothing(
     """A setting put before the first, a label that is another: the outcomes are those that were kept, renamed."""
     asked: list[str] = []
     monkeypatch.setattr(campaign_tasks, "run_task", lambda task: asked.append(task.setting) or track(1.0))
-    run_tasks([Task(flight, "f", "a", {}, None, True)], Here(), keep=str(tmp_path))
+    run_tasks([Task(flight, "f", "a", {}, None, True)], Here(), keep=tmp_path)
     new = [
         Task(flight, "g", "first", {"rss.advanced.lag_window_s": 3}, None, True),
         Task(flight, "g", "b", {}, None, False),
     ]
-    found = run_tasks(new, Here(), keep=str(tmp_path))
+    found = run_tasks(new, Here(), keep=tmp_path)
     assert asked == ["a", "first"]
     assert [one.track.flight for one in found if one.track is not None] == ["g", "g"]
 
 
-def test_a_worker_that_sees_other_files_fails_the_task(flight: Path, tmp_path: Path) -> None:
+def test_a_worker_that_sees_other_files_fails_the_task(flight: Path) -> None:
     task = Task(flight, "f", "a", {}, None)
-    done = carry_out(Order(task=task, key="0" * 64, keep=str(tmp_path)))
-    assert done.outcome is not None
+    done = carry_out(Order(task=task, key="0" * 64))
     assert done.outcome.failure is not None
     assert "sees other inputs" in done.outcome.failure.message
-    assert not list(tmp_path.glob("*.npz"))
 
 
 def test_a_log_that_changes_is_read_again_by_a_worker_that_lives_on(flight: Path, tmp_path: Path) -> None:
@@ -281,8 +289,9 @@ def one(task):
 campaign_tasks.run_task = one
 flight = Path(sys.argv[1])
 tasks = [campaign_tasks.Task(flight, f"f{i}", "as written", {"rss.advanced.lag_window_s": 10.0 + i}, None) for i in range(4)]
-outcomes, orders = kept_outcomes(tasks, sys.argv[2], print)
-compute(tasks, orders, Here(), print, outcomes)
+store = campaign_tasks.outcome_store(Path(sys.argv[2]))
+outcomes, orders = kept_outcomes(tasks, store, print)
+compute(orders, Here(), outcomes, store, print)
 """
 
 
@@ -295,7 +304,7 @@ def test_after_sigkill_only_what_is_missing_is_computed(
     monkeypatch.setattr(
         campaign_tasks, "run_task", lambda task: asked.append(task.flight) or track(float(task.flight[1:]))
     )
-    found = run_tasks(tasks_of(flight), Here(), keep=str(tmp_path))
+    found = run_tasks(tasks_of(flight), Here(), keep=tmp_path)
     assert asked == ["f2", "f3"]
     assert all(equal(one, track(float(i))) for i, one in enumerate(found))
 

@@ -1,4 +1,4 @@
-"""What is said of several flights, computed by workers: the same numbers, from series that lie in a file."""
+"""What is said of several flights: which pairs are searched, and what a campaign holds in memory."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import pytest
 from aerpaw_cmp.jobs import over_flights
 from aerpaw_cmp.jobs.campaign_plan import Outcomes
 from aerpaw_cmp.jobs.campaign_tasks import Outcome, Task
-from aerpaw_cmp.jobs.over_flights import PairsOrder, RepeatSettings, pairs_of, pool_offsets, rank_repeats, repeats
+from aerpaw_cmp.jobs.over_flights import pool_offsets, rank_repeats
 from aerpaw_cmp.report.campaign_data import FlownRank, FlownTrack, RssRow
-from tests.jobs.sent_by_pickle import SentByPickle
 
 
 def rows(flights: int = 6, links: int = 2, samples: int = 120) -> list[RssRow]:
@@ -37,27 +36,6 @@ def rows(flights: int = 6, links: int = 2, samples: int = 120) -> list[RssRow]:
                 )
             )  # fmt: skip
     return out
-
-
-@pytest.mark.parametrize("shared", [False, True])
-def test_workers_find_the_pairs_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared: bool) -> None:
-    monkeypatch.setattr(over_flights, "WORTH_WORKERS", 0)
-    series, settings, crew = rows(), RepeatSettings(), SentByPickle()
-    alone = repeats(series, settings)
-    spread = repeats(series, settings, crew, str(tmp_path) if shared else None)
-    assert len(alone) == 30
-    assert any(pair.n > 50 for pair in alone)
-    assert repr(spread) == repr(alone)
-    assert len(crew.sizes) > 1
-    assert max(crew.sizes) < 2000, "orders carry names, not series"
-    assert not list(tmp_path.iterdir()), "what was written for the workers is gone"
-
-
-def test_series_that_were_damaged_are_not_used(tmp_path: Path) -> None:
-    (tmp_path / "x").write_bytes(b"no series")
-    order = PairsOrder(place=str(tmp_path), name="x", settings=RepeatSettings(), first_flights=("f0",))
-    with pytest.raises(ValueError, match="seal"):
-        pairs_of(order)
 
 
 def test_flights_of_ranks_that_lie_apart_are_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:

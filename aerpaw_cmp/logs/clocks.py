@@ -257,55 +257,8 @@ def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolAr
         Does the text carry an offset?
     """
     count = len(column)
-    wall, offset = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-    valid, zoned = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-    if count == 0:
-        return wall, valid, offset, zoned
-    left = np.arange(count)
-    if (end := _end_of_digits(bytes(column[0]))) is not None:
-        # most logs write one layout: that of the first time, whose valid rows need no second look
-        tail = bytes(column[0])[end:]
-        seconds = _zone_s(tail)
-        alike = _alike(column, end)
-        if seconds is not None and alike is not None:
-            wall, valid = parse_digits(alike[0][:, :end], max(end - 20, 0))
-            valid &= alike[1]
-            wall[~valid] = 0
-            if tail:
-                offset[valid], zoned[valid] = seconds, True
-            left = np.flatnonzero(~valid)
-            if not len(left):
-                return wall, valid, offset, zoned
-    wall[left], valid[left], offset[left], zoned[left] = _any_layout(column[left])
-    return wall, valid, offset, zoned
-
-
-def _end_of_digits(text: bytes) -> int | None:
-    """Where the seconds of a time end, None where it is none."""
-    found = _SECONDS.match(text)
-    return None if found is None else found.end()
-
-
-_SECONDS = re.compile(TIME)
-
-
-def _alike(column: AnyArray, end: int) -> tuple[AnyArray, BoolArray] | None:
-    """Texts as bytes, uint8 of shape (n, width), and which end as the first one does behind its seconds."""
-    width = column.dtype.itemsize
-    if width < end:
-        return None
-    cells = np.ascontiguousarray(column).view(np.uint8).reshape(len(column), width)
-    alike = np.ones(len(column), dtype=bool)
-    for i in range(end, width):
-        alike &= cells[:, i] == cells[0, i]
-    return cells, alike
-
-
-def _any_layout(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolArray]:
-    """:func:`parse_texts` of times of several layouts."""
-    count = len(column)
-    wall, offset = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-    valid, zoned = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    wall, offset = np.zeros((2, count), dtype=np.int64)
+    valid, zoned = np.zeros((2, count), dtype=bool)
     width = max(column.dtype.itemsize, 30)
     cells = column.astype(f"S{width}").view(np.uint8).reshape(count, width)
     digits = (cells[:, 20:29] >= 48) & (cells[:, 20:29] <= 57)
@@ -317,13 +270,12 @@ def _any_layout(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolAr
         wall[rows], valid[rows] = parse_digits(cells[rows, :end], int(length))
         tail = column[rows].astype(f"S{width}").view(f"S{1}").reshape(len(rows), width)[:, end:]
         tails = np.ascontiguousarray(tail).view(f"S{width - end}").ravel()
-        for text in np.unique(tails):  # one entry per distinct offset
-            seconds = _zone_s(bytes(text))
+        for text in set(tails.tolist()):  # one entry per distinct offset
+            seconds = _zone_s(text)
             here = rows[tails == text]
-            if seconds is None:
-                valid[here] = False
-            elif text:
-                offset[here], zoned[here] = seconds, True
+            valid[here] &= seconds is not None
+            offset[here], zoned[here] = seconds or 0, bool(text) and seconds is not None
+    wall[~valid] = 0
     return wall, valid, offset, zoned
 
 

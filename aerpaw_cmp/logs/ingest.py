@@ -127,30 +127,30 @@ def ingest(
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
-        place = Path(path)
-        if _is_folder(place):
-            inside, left = _folder(place, options, chosen)
-        elif _is_archive(place):
-            inside, left = _archive(place, options, chosen)
-        elif _head(place).startswith(_HDF5):
-            files += [replace(_of_kind(one, chosen, place), holder=str(place)) for one in read_flight(place)]
-            continue
-        else:
-            files.append(read_file(place, options=options, reader=chosen))
-            continue
-        files += join(inside)
+        inside, left = _below(Path(path), options, chosen)
+        files += inside
         skipped += left
-        if not inside:
-            known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
-            looked = "1 file" if len(left) == 1 else f"{len(left)} files"
-            first = f"; {one_line(Path(left[0].path).name)}: {left[0].reason}" if left else ""
-            what = "folder" if _is_folder(place) else "archive"
-            raise InputError(
-                f"the {what} holds no log that {known} ({looked} looked at){first}",
-                expected="one of the formats of 'aerpaw-cmp formats'",
-                path=place,
-            )
     return Ingested(files, skipped)
+
+
+def _below(place: Path, options: OptionsFor | None, chosen: Reader | None) -> tuple[list[IngestedFile], list[Skipped]]:
+    """Logs of a file, a folder, an archive or a flight file, and the files that are none."""
+    if (is_folder := _is_folder(place)) or _is_archive(place):
+        inside, left = (_folder if is_folder else _archive)(place, options, chosen)
+    elif _head(place).startswith(_HDF5):
+        return [replace(_of_kind(one, chosen, place), holder=str(place)) for one in read_flight(place)], []
+    else:
+        return [read_file(place, options=options, reader=chosen)], []
+    if not inside:
+        known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
+        looked = "1 file" if len(left) == 1 else f"{len(left)} files"
+        first = f"; {one_line(Path(left[0].path).name)}: {left[0].reason}" if left else ""
+        raise InputError(
+            f"the {'folder' if is_folder else 'archive'} holds no log that {known} ({looked} looked at){first}",
+            expected="one of the formats of 'aerpaw-cmp formats'",
+            path=place,
+        )
+    return join(inside), left
 
 
 def as_utf8(data: bytes) -> bytes:

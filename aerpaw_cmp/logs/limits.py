@@ -95,9 +95,10 @@ def check(result: ReadResult) -> ReadResult:
 
 
 def _checked(stream: Stream, warnings: list[str]) -> Stream:
-    frame = stream.frame
+    frame, present = stream.frame, set(stream.frame.columns)
     for limit in _limits_of(stream):
-        frame = _apply(stream, frame, limit, warnings)
+        if not present.isdisjoint(limit.columns):
+            frame = _apply(stream, frame, limit, warnings)
     if stream.kind == "rank":
         frame = _within_ports(stream, frame, warnings)
     frame = _near_in_time(stream, frame, warnings)

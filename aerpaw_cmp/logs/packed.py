@@ -86,39 +86,34 @@ def pieces(chunks: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
     InputError
         If it is damaged or cut, or unpacks to more than a log can.
     """
-    name, make, machine = None, None, None
-    taken = given = 0
-    for chunk in chunks:
-        if name is None:
-            name = form(chunk)
-            make = _machine(name or "bzip2", path)
-        taken += len(chunk)
-        rest = chunk
-        while True:
-            if machine is None:
-                rest = rest.lstrip(b"\0")  # padding between streams
-                if not rest:
-                    break
-                assert make is not None
-                machine = make()
-            try:
-                piece = machine.decompress(rest, _PIECE)
-            except MemoryError:
-                raise
-            except Exception as error:  # bz2 raises OSError and ValueError, lzma an exception of its own
-                raise InputError(f"a damaged {name} file ({error})", cause="a cut download", path=path) from error
-            given += len(piece)
-            if given > _MOST_RATIO * taken + _PIECE:
-                raise InputError(f"the {name} file unpacks to more than {_MOST_RATIO} times its size", cause="no log",
-                                 path=path)  # fmt: skip
-            if piece:
-                yield piece
-            if machine.eof:
-                rest, machine = machine.unused_data, None
-            elif machine.needs_input:
+    chunks = iter(chunks)
+    rest = next(chunks, b"")
+    name = form(rest) or "bzip2"
+    make, machine = _machine(name, path), None
+    taken, given = len(rest), 0
+    while True:
+        rest = rest if machine is not None else rest.lstrip(b"\0")  # padding between streams
+        if not rest and (machine is None or machine.needs_input):
+            rest = next(chunks, b"")
+            taken += len(rest)
+            if not rest:
                 break
-            else:
-                rest = b""
+            continue
+        machine = make() if machine is None else machine
+        try:
+            piece = machine.decompress(rest, _PIECE)
+        except MemoryError:
+            raise
+        except Exception as error:  # bz2 raises OSError and ValueError, lzma an exception of its own
+            raise InputError(f"a damaged {name} file ({error})", cause="a cut download", path=path) from error
+        given += len(piece)
+        if given > _MOST_RATIO * taken + _PIECE:
+            raise InputError(f"the {name} file unpacks to more than {_MOST_RATIO} times its size", cause="no log",
+                             path=path)  # fmt: skip
+        if piece:
+            yield piece
+        rest = machine.unused_data if machine.eof else b""
+        machine = None if machine.eof else machine
     if machine is not None:
         raise InputError(f"the {name} file ends too early", cause="a cut download", path=path)
 

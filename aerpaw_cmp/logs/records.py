@@ -87,7 +87,8 @@ class Stream:
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        missing = [c for c in ("time", "line", "flag", *COLUMNS[self.kind]) if c not in self.frame.columns]
+        present = set(self.frame.columns)
+        missing = [c for c in ("time", "line", "flag", *COLUMNS[self.kind]) if c not in present]
         if missing:
             raise ValueError(f"stream {self.name!r} of kind {self.kind!r} lacks columns {missing}")
 

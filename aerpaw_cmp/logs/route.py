@@ -239,16 +239,15 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
         latitude, longitude, height = item.numbers[4:7]
         if item.command == _TURN and route.points:
             _turn(route, item)
-        elif item.command == _RETURN:
+        if item.command == _RETURN:
             route.remark("The return to the take-off at the end is left out.")
-        elif item.command in (*_WAYPOINTS, *_TAKEOFFS, *_LANDINGS):
-            if not (latitude or longitude) or math.isnan(latitude):  # 0, 0 and null: where the aircraft is
-                latitude, longitude = here
-            if math.isnan(latitude):
-                continue
-            here = latitude, longitude
-            yaw = item.numbers[3] if named_yaw else math.nan
-            route.add(latitude, longitude, _height(route, item, height, home), yaw)
+        if not (latitude or longitude) or math.isnan(latitude):  # 0, 0 and null: where the aircraft is
+            latitude, longitude = here
+        if item.command not in (*_WAYPOINTS, *_TAKEOFFS, *_LANDINGS) or math.isnan(latitude):
+            continue
+        here = latitude, longitude
+        yaw = item.numbers[3] if named_yaw else math.nan
+        route.add(latitude, longitude, _height(route, item, height, home), yaw)
 
 
 def _turn(route: _Route, item: _Item) -> None:

@@ -12,10 +12,9 @@ import numpy as np
 from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
 from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import make_frames as _frames
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
 NEAR_S = 0.5
 """An attitude farther in time than this from a position is not that of the position."""
@@ -59,64 +58,72 @@ def offset_s(utc_s: FloatArray, time_s: FloatArray) -> float | None:
     return float(np.median(utc_s[known] - time_s[known])) if known.any() else None
 
 
-def result(
-    reader: str, options: ReadOptions, position: Series, attitude: Series, velocity: Series, fix: Series, *,
-    utc_minus_clock_s: float | None, messages: int, damaged: list[RejectedLine], source: str,
-) -> ReadResult:  # fmt: skip
-    """Telemetry stream ``vehicle``; the lines of the account are messages, all but positions count as comments.
+@dataclass
+class Flight:
+    """What a log of an autopilot holds.
 
     Parameters
     ----------
     position : Series
-        Columns ``latitude_deg longitude_deg altitude_m``.
+        Columns ``latitude_deg longitude_deg altitude_m``, or none at all.
     attitude : Series
         ``roll_deg pitch_deg yaw_deg``.
     velocity : Series
         ``velocity_north_mps`` and so on.
     fix : Series
         ``fix satellites``.
+    utc_minus_clock_s : float or None
+        See :func:`offset_s`.
     messages : int
         Sound messages; each of ``damaged`` comes on top.
+    damaged : list of RejectedLine
+    source : str
+        The program, for people.
     """
-    warnings: list[str] = []
-    origin = _time.origin_ns(options, needed_by=reader)
-    if utc_minus_clock_s is not None:
-        zero_ns = round(utc_minus_clock_s * 1e6) * 1000  # autopilots count microseconds
-    else:
-        zero_ns = origin or 0
-        warnings += [] if origin is not None else ["no message carries UTC: " + _rows.RELATIVE]
-    broken = len(damaged)
-    beyond = ~(np.abs(position.time_s) < _MOST_S) | ~np.isfinite(position.time_s)
-    damaged = [*damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in position.number[beyond])]
-    kept = np.flatnonzero(~beyond)
-    columns = {name: column[kept] for name, column in position.columns.items()}
-    position = Series(position.time_s[kept], position.number[kept], columns)
-    time: AnyArray = (np.round(position.time_s * 1e6).astype(np.int64) * 1000 + zero_ns).astype("datetime64[ns]")
-    flag = _lines.flags(len(time))
-    values: dict[str, AnyArray] = dict(position.columns)
+
+    position: Series
+    attitude: Series
+    velocity: Series
+    fix: Series
+    utc_minus_clock_s: float | None
+    messages: int
+    damaged: list[RejectedLine]
+    source: str
+
+
+def result(reader: str, options: ReadOptions, flight: Flight) -> ReadResult:
+    """Telemetry stream ``vehicle``; the lines of the account are messages, all but positions count as comments."""
+    zero_ns, offset = _time.origin_ns(options, needed_by=reader), flight.utc_minus_clock_s
+    if offset is not None:
+        zero_ns = round(offset * 1e6) * 1000  # autopilots count microseconds
+    time_s, number = flight.position.time_s, flight.position.number
+    kept = np.abs(time_s) < _MOST_S
+    rejected = [*flight.damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in number[~kept])]
+    time_s, number = time_s[kept], number[kept]
+    lines = flight.messages + len(flight.damaged)
+    rows = _rows.Rows(
+        reader=reader,
+        options=options,
+        lines=lines,
+        row=number,
+        time=(np.round(time_s * 1e6).astype(np.int64) * 1000 + (zero_ns or 0)).astype("datetime64[ns]"),
+        flag=_lines.flags(len(number)),
+        blank=lines - len(number) - len(rejected),
+        rejected=rejected,
+        relative=zero_ns is None,
+    )
+    if not len(rows):
+        return rows.result([])
+    rows.warnings += ["no message carries UTC: " + _rows.RELATIVE] if rows.relative else []
+    values: dict[str, AnyArray] = {name: column[kept] for name, column in flight.position.columns.items()}
     lost = (np.abs(values["latitude_deg"]) < 1e-6) & (np.abs(values["longitude_deg"]) < 1e-6)
-    _lines.add_flag(flag, lost, "no_fix")
+    rows.mark(lost, "no_fix")
     for name in ("latitude_deg", "longitude_deg", "altitude_m"):
         values[name] = np.where(lost, np.nan, values[name])
     for name in ("roll_deg", "pitch_deg", "yaw_deg"):
-        values[name] = attitude.near(name, position.time_s)
+        values[name] = flight.attitude.near(name, time_s)
     for name in ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps"):
-        values[name] = velocity.near(name, position.time_s)
+        values[name] = flight.velocity.near(name, time_s)
     for name in ("fix", "satellites"):
-        values[name] = np.nan_to_num(fix.near(name, position.time_s), nan=-1).clip(-1, 255).astype(np.int64)
-    about: dict[str, Attribute] = {"source": source}
-    if utc_minus_clock_s is None and origin is None:
-        about["clock"] = "relative"
-    frame = _frames.frame("telemetry", time, position.number + 1, flag, values)
-    warnings += _frames.steps_back(frame)
-    stream = Stream("telemetry", "vehicle", frame, _frames.attributes(options, **about))
-    accepted = len(frame)
-    return ReadResult(
-        reader=reader,
-        streams=(stream,) if accepted else (),
-        lines=messages + broken,
-        accepted=accepted,
-        blank=messages + broken - accepted - len(damaged),
-        rejected=tuple(sorted(damaged, key=lambda line: line.number)),
-        warnings=tuple(warnings),
-    )
+        values[name] = np.nan_to_num(flight.fix.near(name, time_s), nan=-1).clip(-1, 255).astype(np.int64)
+    return rows.result([rows.stream("telemetry", "vehicle", values, source=flight.source)])

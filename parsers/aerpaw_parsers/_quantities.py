@@ -81,17 +81,13 @@ _CELLMAPPER = {r"signal": "rsrp", r"psc or pci": "pci"}
 def in_common_words(names: list[str]) -> list[str]:
     """Plain names, those that only one program uses in the words of all: G-NetTrack Pro's, srsUE's metrics file's."""
     given = set(names)
-    if {"level", "qual"} <= given and not given.isdisjoint(OF_GNETTRACK):
-        table = _GNETTRACK
-    elif given >= SRSUE:
-        table = _SRSUE
-    elif {"signal", "psc or pci"} <= given:
-        table = _CELLMAPPER
-    elif "rank" in given and any(is_level(name) for name in names):
-        table = _BARE
-    else:
-        return names
-    for pattern, word in table.items():
+    programs = (
+        (_GNETTRACK, {"level", "qual"} <= given and not given.isdisjoint(OF_GNETTRACK)),
+        (_SRSUE, given >= SRSUE),
+        (_CELLMAPPER, {"signal", "psc or pci"} <= given),
+        (_BARE, "rank" in given and any(is_level(name) for name in names)),
+    )
+    for pattern, word in next((table for table, here in programs if here), {}).items():
         names = [re.sub(f"^{pattern}$", word, name) for name in names]
     return names
 

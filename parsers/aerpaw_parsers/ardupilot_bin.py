@@ -23,28 +23,11 @@ from . import _autopilot
 _MARK = b"\xa3\x95"
 _FMT = 128
 _TYPES = {
-    "b": ("b", 1.0),
-    "B": ("B", 1.0),
-    "h": ("h", 1.0),
-    "H": ("H", 1.0),
-    "i": ("i", 1.0),
-    "I": ("I", 1.0),
-    "f": ("f", 1.0),
-    "d": ("d", 1.0),
-    "c": ("h", 0.01),
-    "C": ("H", 0.01),
-    "e": ("i", 0.01),
-    "E": ("I", 0.01),
-    "L": ("i", 1e-7),
-    "M": ("B", 1.0),
-    "q": ("q", 1.0),
-    "Q": ("Q", 1.0),
-    "g": ("e", 1.0),
-    "n": ("4s", 0.0),
-    "N": ("16s", 0.0),
-    "Z": ("64s", 0.0),
-    "a": ("64s", 0.0),
-}
+    "b": ("b", 1.0), "B": ("B", 1.0), "h": ("h", 1.0), "H": ("H", 1.0), "i": ("i", 1.0), "I": ("I", 1.0),
+    "f": ("f", 1.0), "d": ("d", 1.0), "c": ("h", 0.01), "C": ("H", 0.01), "e": ("i", 0.01), "E": ("I", 0.01),
+    "L": ("i", 1e-7), "M": ("B", 1.0), "q": ("q", 1.0), "Q": ("Q", 1.0), "g": ("e", 1.0),
+    "n": ("4s", 0.0), "N": ("16s", 0.0), "Z": ("64s", 0.0), "a": ("64s", 0.0),
+}  # fmt: skip
 _WANTED = ("POS", "GPS", "ATT", "XKF1", "NKF1", "EKF1")
 
 
@@ -119,12 +102,12 @@ def _text_messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
         name, *cells = (cell.strip() for cell in line.split(","))
         if name == "FMT" and len(cells) > 4:
             columns[cells[2]] = tuple(cells[4:])
-        elif name in found:
-            values = [_number(cell) for cell in cells]
-            if name in columns and len(values) == len(columns[name]):
-                found[name].setdefault(columns[name], []).append((number, tuple(values)))
-            else:
-                damaged.append(RejectedLine(number + 1, "a message without the fields of its FMT line", line[:500]))
+        if name not in found:
+            continue
+        if len(cells) == len(columns.get(name, ())):
+            found[name].setdefault(columns[name], []).append((number, tuple(map(_number, cells))))
+        else:
+            damaged.append(RejectedLine(number + 1, "a message without the fields of its FMT line", line[:500]))
     return found, len(lines) - len(damaged), damaged
 
 
@@ -160,14 +143,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     place = series["POS"] if len(series["POS"].time_s) else gps
     column = place.columns
     if "Lat" not in column or "Lng" not in column:
-        return ReadResult(
-            reader="ardupilot_bin",
-            streams=(),
-            lines=count + len(damaged),
-            accepted=0,
-            blank=count,
-            rejected=tuple(damaged),
-        )
+        place, column = _autopilot.NONE, {"Lat": _autopilot.NONE.time_s, "Lng": _autopilot.NONE.time_s}
     altitude = column.get("RelHomeAlt", column.get("Alt", np.full(len(place.time_s), np.nan)))
     if "RelHomeAlt" not in column and len(altitude):
         altitude = altitude - altitude[0]
@@ -177,18 +153,17 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         {"latitude_deg": column["Lat"], "longitude_deg": column["Lng"], "altitude_m": altitude},
     )
     filters = next((series[name] for name in ("XKF1", "NKF1", "EKF1") if len(series[name].time_s)), _autopilot.NONE)
-    return _autopilot.result(
-        "ardupilot_bin",
-        options,
-        position,
-        _renamed(series["ATT"], {"Roll": "roll_deg", "Pitch": "pitch_deg", "Yaw": "yaw_deg"}),
-        _renamed(filters, {"VN": "velocity_north_mps", "VE": "velocity_east_mps", "VD": "velocity_down_mps"}),
-        _renamed(gps, {"Status": "fix", "NSats": "satellites"}),
+    flight = _autopilot.Flight(
+        position=position,
+        attitude=_renamed(series["ATT"], {"Roll": "roll_deg", "Pitch": "pitch_deg", "Yaw": "yaw_deg"}),
+        velocity=_renamed(filters, {"VN": "velocity_north_mps", "VE": "velocity_east_mps", "VD": "velocity_down_mps"}),
+        fix=_renamed(gps, {"Status": "fix", "NSats": "satellites"}),
         utc_minus_clock_s=_offset(gps),
         messages=count,
         damaged=damaged,
         source="ArduPilot dataflash log",
     )
+    return _autopilot.result("ardupilot_bin", options, flight)
 
 
 def _renamed(series: _autopilot.Series, names: dict[str, str]) -> _autopilot.Series:

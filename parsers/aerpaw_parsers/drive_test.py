@@ -94,14 +94,14 @@ def _put(
     cell: _Cell, i: int, meaning: _quantities.Quantity | None, *, is_pci: bool, is_arfcn: bool, others: list[int]
 ) -> None:
     """Column ``i`` to its place; a second column of one quantity is kept as a KPI."""
-    if meaning is None and is_pci:
-        cell.pci = i if cell.pci is None else cell.pci
-    elif meaning is None and is_arfcn:
-        cell.arfcn = i if cell.arfcn is None else cell.arfcn
+    name = "" if meaning is None else _BESIDE.get(meaning.name, "")
+    if meaning is None and (is_pci or is_arfcn):
+        part = "pci" if is_pci else "arfcn"
+        setattr(cell, part, i if getattr(cell, part) is None else getattr(cell, part))
     elif meaning is not None and meaning.name == "RSRP" and cell.rsrp is None:
         cell.rsrp = i
-    elif meaning is not None and meaning.name in _BESIDE and _BESIDE[meaning.name] not in cell.beside:
-        cell.beside[_BESIDE[meaning.name]] = i
+    elif name and name not in cell.beside:
+        cell.beside[name] = i
     else:
         others.append(i)
 

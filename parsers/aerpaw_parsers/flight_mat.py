@@ -15,6 +15,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -22,11 +23,11 @@ from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import make_frames as _frames
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.matfile import MAGIC as _MAGIC
 from aerpaw_cmp.logs.matfile import MAGIC_73, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
 TELEMETRY = {
     "mX": "longitude_deg",
@@ -210,65 +211,51 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     keep = np.flatnonzero(valid)
     kept = {name: column[keep] for name, column in table.items()}
     instants, warnings = _instants(kept, wall[keep], clock, options)
-    rejected = tuple(RejectedLine(int(i) + 1, "the row has no time", "") for i in np.flatnonzero(~valid))
-    warnings += instants.warnings
-    streams = _streams(kept, keep, instants, options, clock)
-    return ReadResult(
+    rows = _rows.Rows(
         reader="flight_mat",
-        streams=streams,
+        options=options,
         lines=count,
-        accepted=len(keep),
-        blank=0,
-        rejected=rejected,
-        warnings=tuple(warnings),
+        row=keep,
+        time=instants.time,
+        flag=_lines.flags(len(keep)),
+        rejected=[RejectedLine(int(i) + 1, "the row has no time", "") for i in np.flatnonzero(~valid)],
+        warnings=[*warnings, *instants.warnings],
+        relative=clock == COUNTED and options.time_origin is None,
     )
+    instants.flag(rows.flag)
+    return rows.result([_track(rows, kept, clock), *_measured(rows, kept)])
 
 
-def _streams(
-    table: dict[str, AnyArray], keep: AnyArray, instants: _time.Instants, options: ReadOptions, clock: str
-) -> tuple[Stream, ...]:
-    streams: list[Stream] = []
+def _track(rows: _rows.Rows, table: dict[str, AnyArray], clock: str) -> Stream | None:
     values = {column: _numeric(table[name], name) for name, column in TELEMETRY.items() if name in table}
+    if not values:
+        return None
     if "ori_s" in table:  # radians, reckoned from the track
         values["yaw_deg"] = np.degrees(values["yaw_deg"])
     if "height_s" not in table and "lat_s" in table:
-        values["altitude_m"] = np.full(len(keep), np.nan)
-    about: dict[str, Attribute] = {"clock": "relative"} if clock == COUNTED and options.time_origin is None else {}
-    if values:
-        flag = _lines.flags(len(keep))
-        instants.flag(flag)
-        position = [values[c] for c in ("latitude_deg", "longitude_deg", "altitude_m") if c in values]
-        lost = np.any(
-            [~(np.abs(column) < 900) if i < 2 else ~np.isfinite(column) for i, column in enumerate(position)], axis=0
-        )
-        if position and lost.any():
-            _lines.add_flag(flag, lost, "no_fix")
-            for column in position:
-                column[lost] = np.nan
-        frame = _frames.frame("telemetry", instants.time, keep + 1, flag, values)
-        streams.append(Stream("telemetry", "vehicle", frame, _frames.attributes(options, source=clock) | about))
+        values["altitude_m"] = np.full(len(rows), np.nan)
+    flag, lost = rows.flag.copy(), np.zeros(len(rows), dtype=bool)
+    place = [name for name in ("latitude_deg", "longitude_deg", "altitude_m") if name in values]
+    for i, name in enumerate(place):
+        lost |= ~(np.abs(values[name]) < 900) if i < 2 else ~np.isfinite(values[name])
+    _lines.add_flag(flag, lost, "no_fix")
+    values |= {name: np.where(lost, np.nan, values[name]) for name in place}
+    return rows.stream("telemetry", "vehicle", values, flag=flag, source=clock)
+
+
+def _measured(rows: _rows.Rows, table: dict[str, AnyArray]) -> Iterator[Stream | None]:
     for name, channel in LEVELS.items():
-        if name not in table:
-            continue
-        level = _numeric(table[name], name)
-        flag = _lines.flags(len(keep))
-        instants.flag(flag)
-        silent = ~(level > options.floor_db) | ~np.isfinite(level)
-        _lines.add_flag(flag, silent, "out_of_coverage")
-        level[silent] = np.nan
-        frame = _frames.frame("rss", instants.time, keep + 1, flag, {"rss_db": level})
-        unit = "dB" if name == "mquality" else options.unit or ("dBm" if name == "RSRP_s" else "dB re full scale")
-        quantity = channel.rstrip("2") if channel.startswith("RS") else None
-        attributes = _frames.attributes(options, channel=channel, unit=unit, quantity=quantity)
-        streams.append(Stream("rss", channel, frame, attributes | about))
+        if name in table:
+            level, flag = rows.level(_numeric(table[name], name))
+            unit = (
+                "dB" if name == "mquality" else rows.options.unit or ("dBm" if name == "RSRP_s" else "dB re full scale")
+            )
+            quantity = channel.rstrip("2") if channel.startswith("RS") else None
+            about = {"channel": channel, "unit": unit, "quantity": quantity}
+            yield rows.stream("rss", channel, {"rss_db": level}, flag=flag, about=about)
     for name, (quantity, unit) in KPIS.items():
         if name in table:
-            flag = _lines.flags(len(keep))
-            instants.flag(flag)
-            frame = _frames.frame("kpi", instants.time, keep + 1, flag, {"value": _numeric(table[name], name)})
-            attributes = _frames.attributes(options, quantity=quantity, unit=unit)
-            streams.append(Stream("kpi", name, frame, attributes | about))
-    return tuple(streams)
+            yield rows.stream("kpi", name, {"value": _numeric(table[name], name)}, quantity=quantity, unit=unit)
 
 
 READER = Reader(

@@ -12,13 +12,11 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 import numpy as np
-import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import make_frames as _frames
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
@@ -121,15 +119,13 @@ def _number(cell: bytes) -> float:
     return np.nan if cell.lower() in _NONE else np.inf
 
 
-def _times(cells: list[str], options: ReadOptions) -> tuple[_time.Instants, AnyArray]:
+def _times(cells: list[str], options: ReadOptions) -> tuple[str, AnyArray]:
+    """Kind of clock and times, as :func:`aerpaw_cmp.logs.rows.times` takes them."""
     texts = [_bare(cell) for cell in cells]
     if not _counts(texts):
-        written = np.array([cell if _TEXT.fullmatch(cell) else b"-" for cell in texts] or [b"-"], dtype=np.bytes_)
-        return _time.texts_to_utc(written[: len(texts)], options, needed_by="generic_csv")
+        return "wall", np.array([cell if _TEXT.fullmatch(cell) else b"-" for cell in texts], dtype=np.bytes_)
     seconds = np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in texts], dtype=np.float64)
-    clock = "epoch_s" if options.time_origin is None else "relative_s"
-    _, instants, valid = _rows.times(seconds, options, clock=clock, reader="generic_csv")
-    return instants, valid
+    return "epoch_s" if options.time_origin is None else "relative_s", seconds
 
 
 def _bare(cell: str) -> bytes:
@@ -161,43 +157,68 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     first, separator, header = top
     kind, where = _checked(options, header)
     lines = _lines.split(data)
-    rows, cells, rejected = _cells(lines, first, separator, len(header))
+    row, cells, rejected = _cells(lines, first, separator, len(header))
     column = {name: [fields[i] for fields in cells] for name, i in where.items()}
-    instants, valid = _times(column.pop("time"), options)
+    clock, time = _times(column.pop("time"), options)
     # a decimal comma, where the separator leaves room for one
     numbers = {name: _numbers(texts, comma=separator != ",") for name, texts in column.items()}
-    rejected += [lines.reject(int(i), "the time is of another form") for i in rows[~valid]]
-    flag = _lines.flags(len(rows))
-    instants.flag(flag)
-    odd = np.any([np.isposinf(numbers[name]) for name in _VALUE[kind]], axis=0)
-    _lines.add_flag(flag, odd, "no_number")
-    numbers = {k: np.where(np.isposinf(v), np.nan, v) if np.isposinf(v).any() else v for k, v in numbers.items()}
-    values, extra = _values(kind, numbers, flag, options)
-    if lines.unterminated:
-        _lines.add_flag(flag, rows == len(lines) - 1, _lines.UNTERMINATED)
-    frame = _frames.frame(kind, instants.time, rows + 1, flag, values)
-    if not valid.all():
-        frame = frame[valid].reset_index(drop=True)
-    stream = Stream(kind, options.channel or kind, frame, _frames.attributes(options, **extra))
-    warnings = [*instants.warnings, *_frames.steps_back(frame)]
-    words = np.flatnonzero(odd[valid])
-    if len(words):
-        rows_are = "1 row is" if len(words) == 1 else f"{len(words)} rows are"
-        first_line = int(frame["line"].iloc[words[0]])
-        warnings.append(
-            f"{rows_are} flagged no_number; the first: line {first_line}, a word or an infinity; not scored"
-        )
+    rows = _rows.built(
+        lines, row, {"time": time, **numbers}, options, reader="generic_csv", reason=lambda _line: None, clock=clock,
+        extra=rejected, markup=np.array([first]),
+    )  # fmt: skip
     if kind == "rss" and options.unit is None:
-        warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
-    return ReadResult(
-        reader="generic_csv",
-        streams=(stream, *_track(kind, frame, options)) if len(frame) else (),
-        lines=len(lines),
-        accepted=len(frame),
-        blank=int(lines.blank.sum()) + 1,
-        rejected=tuple(sorted(rejected, key=lambda line: line.number)),
-        warnings=tuple(warnings),
-    )
+        rows.warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
+    return rows.result([_stream(rows, kind, list(numbers)), _track(rows, kind)])
+
+
+def _stream(rows: _rows.Rows, kind: Kind, names: list[str]) -> Stream | None:
+    """Columns by the rules of the kind, and the attributes that go with them; words in place of numbers are flagged."""
+    options, flag = rows.options, rows.flag.copy()
+    odd = np.any([np.isposinf(rows.columns[name]) for name in _VALUE[kind]], axis=0)
+    _lines.add_flag(flag, odd, "no_number")
+    if odd.any():
+        lines = "1 row is" if odd.sum() == 1 else f"{odd.sum()} rows are"
+        first = int(rows.row[odd][0]) + 1
+        rows.warnings.append(f"{lines} flagged no_number; the first: line {first}, a word or an infinity; not scored")
+    values: dict[str, AnyArray] = {name: _finite(rows, name) for name in names}
+    attributes: dict[str, str | None] = {}
+    if kind == "rss":
+        silent = ~(values["rss_db"] > options.floor_db)
+        _lines.add_flag(flag, silent & ~odd, "out_of_coverage")
+        values["rss_db"] = np.where(silent, np.nan, values["rss_db"])
+        attributes = {"unit": options.unit or "dB re full scale"}
+    elif kind == "rank":
+        base, ri = int(options.ri_base == "one"), values["ri_raw"]
+        good = (ri >= base) & (ri <= 7 + base) & (ri == np.round(ri))
+        none = np.isnan(ri) | ((ri == 0) & (base == 1))
+        _lines.add_flag(flag, none & ~odd, "no_csi")
+        _lines.add_flag(flag, ~good & ~none, "ri_out_of_range")
+        values["rank"] = np.where(good, ri + 1 - base, np.nan)
+        attributes = {"ri_base": options.ri_base}
+    else:
+        place = ("latitude_deg", "longitude_deg", "altitude_m")
+        latitude, longitude, altitude = (values[name] for name in place)
+        lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (altitude > -998.5))
+        _lines.add_flag(flag, lost, "no_fix")
+        values |= {name: np.where(lost, np.nan, values[name]) for name in place}
+        for name in {"fix", "satellites"} & set(values):
+            values[name] = np.where(np.isnan(values[name]), -1, values[name]).clip(-1, 255).astype(np.int64)
+    return rows.stream(kind, options.channel or kind, values, flag=flag, about=attributes)
+
+
+def _finite(rows: _rows.Rows, name: str) -> FloatArray:
+    """A column, words as NaN."""
+    values: FloatArray = rows.columns[name]
+    return np.where(np.isposinf(values), np.nan, values)
+
+
+def _track(rows: _rows.Rows, kind: Kind) -> Stream | None:
+    """Positions that stand beside levels, as the track of the flight: a table merged by hand holds both."""
+    names = [name for name in COLUMNS["telemetry"][:-2] if name in rows.columns]
+    if kind != "rss" or not {"latitude_deg", "longitude_deg"} <= set(names):
+        return None
+    values = {name: _finite(rows, name) for name in names}
+    return rows.stream("telemetry", "vehicle", values, flag=_lines.flags(len(rows)), source="mapped columns")
 
 
 def _cells(
@@ -221,54 +242,6 @@ def _cells(
         else:
             rejected.append(lines.reject(i, f"{len(fields)} fields where the header has {width} (torn line?)"))
     return np.array(numbers, dtype=np.int64), cells, rejected
-
-
-def _track(kind: Kind, frame: pd.DataFrame, options: ReadOptions) -> list[Stream]:
-    """Positions that stand beside levels, as the track of the flight: a table merged by hand holds both."""
-    names = [name for name in COLUMNS["telemetry"] if name in frame and name not in ("fix", "satellites")]
-    if kind != "rss" or not {"latitude_deg", "longitude_deg"} <= set(names):
-        return []
-    values = {name: frame[name].to_numpy() for name in names}
-    flag = _lines.flags(len(frame))
-    track = _frames.frame("telemetry", frame["time"].to_numpy(), frame["line"].to_numpy(), flag, values)
-    return [Stream("telemetry", "vehicle", track, _frames.attributes(options, source="mapped columns"))]
-
-
-def _values(
-    kind: Kind, values: dict[str, AnyArray], flag: AnyArray, options: ReadOptions
-) -> tuple[dict[str, AnyArray], dict[str, str | None]]:
-    """Columns by the rules of the kind, and the attributes that go with them."""
-    if kind == "rss":
-        silent = ~(values["rss_db"] > options.floor_db)
-        _lines.add_flag(flag, _no_words(silent, flag), "out_of_coverage")
-        values["rss_db"] = np.where(silent, np.nan, values["rss_db"])
-        return values, {"unit": options.unit or "dB re full scale"}
-    if kind == "rank":
-        ri = values["ri_raw"]
-        rank = ri + 1 if options.ri_base == "zero" else ri
-        good = (rank >= 1) & (rank <= 8)
-        none = np.isnan(ri) | ((ri == 0) & (options.ri_base == "one"))
-        _lines.add_flag(flag, _no_words(none, flag), "no_csi")
-        _lines.add_flag(flag, ~good & ~none, "ri_out_of_range")
-        values["rank"] = np.where(good, rank, np.nan)
-        return values, {"ri_base": options.ri_base}
-    latitude, longitude, altitude = (values[name] for name in ("latitude_deg", "longitude_deg", "altitude_m"))
-    lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (altitude > -998.5))
-    _lines.add_flag(flag, lost, "no_fix")
-    for name in ("latitude_deg", "longitude_deg", "altitude_m"):
-        values[name] = np.where(lost, np.nan, values[name])
-    for name in ("fix", "satellites"):
-        if name in values:
-            values[name] = np.where(np.isnan(values[name]), -1, values[name]).clip(-1, 255).astype(np.int64)
-    return values, {}
-
-
-def _no_words(mask: BoolArray, flag: AnyArray) -> BoolArray:
-    """Rows of the mask whose flag is not that of a word alone."""
-    out: BoolArray = mask.copy()
-    rows = np.flatnonzero(mask)
-    out[rows] = flag[rows] != "no_number"
-    return out
 
 
 READER = Reader(

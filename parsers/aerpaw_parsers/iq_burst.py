@@ -14,10 +14,10 @@ import numpy as np
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import make_frames as _frames
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.matfile import MAGIC, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.logs.records import Attribute, ReadResult
 
 from . import flight_mat
 
@@ -58,18 +58,21 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         )
     with np.errstate(all="ignore"):  # damaged samples may be any number
         power = np.mean(np.abs(np.atleast_2d(samples)) ** 2, axis=1)
+    rows = _rows.Rows(
+        reader="iq_burst", options=options, lines=1, row=np.zeros(1, dtype=np.int64), time=instants.time,
+        flag=_lines.flags(1), warnings=list(instants.warnings),
+    )  # fmt: skip
+    instants.flag(rows.flag)
     streams = []
-    for i, one in enumerate(power.tolist()):
-        level = np.array([10 * np.log10(one) if 0 < one < np.inf else np.nan])
-        flag = _lines.flags(1)
-        instants.flag(flag)
-        _lines.add_flag(flag, ~(level > options.floor_db), "out_of_coverage")
-        frame = _frames.frame("rss", instants.time, np.array([1]), flag, {"rss_db": level})
-        attributes = _frames.attributes(options, channel=f"USRP{i + 1}", unit=options.unit or "dB re full scale")
-        streams.append(Stream("rss", f"USRP{i + 1}", frame, {"frequency_hz": float(named[1]), **attributes}))
-    return ReadResult(
-        reader="iq_burst", streams=tuple(streams), lines=1, accepted=1, blank=0, rejected=(), warnings=instants.warnings
-    )
+    about: dict[str, Attribute | None] = {
+        "frequency_hz": options.frequency_hz or float(named[1]),
+        "unit": options.unit or "dB re full scale",
+    }
+    for channel, one in enumerate(power.tolist(), start=1):
+        level, flag = rows.level(np.array([10 * np.log10(one) if 0 < one < np.inf else np.nan]))
+        name = f"USRP{channel}"
+        streams.append(rows.stream("rss", name, {"rss_db": level}, flag=flag, channel=name, about=about))
+    return rows.result(streams)
 
 
 READER = Reader(

@@ -100,18 +100,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         count += 1
         at += whole
     position, attitude, gps = _of_vehicle(found)
-    return _autopilot.result(
-        "mavlink_tlog",
-        options,
-        position,
-        attitude,
-        position,
-        gps,
-        utc_minus_clock_s=0.0,
-        messages=count,
-        damaged=damaged,
-        source="MAVLink telemetry log",
-    )
+    flight = _autopilot.Flight(
+        position=position, attitude=attitude, velocity=position, fix=gps,
+        utc_minus_clock_s=0.0, messages=count, damaged=damaged, source="MAVLink telemetry log",
+    )  # fmt: skip
+    return _autopilot.result("mavlink_tlog", options, flight)
 
 
 def _next_mark(data: bytes, at: int) -> int:

@@ -89,13 +89,12 @@ def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int
         if kind == ord("F"):
             name, _, text = body.decode("ascii", "replace").partition(":")
             forms[name] = text
-        elif kind == ord("A") and size > 3 and body[0] == 0:
+        if kind == ord("A") and size > 3 and body[0] == 0:
             names[struct.unpack_from("<H", body, 1)[0]] = body[3:].decode("ascii", "replace")
-        elif kind == ord("D") and size > 2:
-            topic = names.get(struct.unpack_from("<H", body)[0], "")
-            if topic in bodies:
-                bodies[topic].append(body[2:])
-                numbers[topic].append(count)
+        topic = names.get(struct.unpack_from("<H", body)[0], "") if kind == ord("D") and size > 2 else ""
+        if topic in bodies:
+            bodies[topic].append(body[2:])
+            numbers[topic].append(count)
         count += 1
         at += 3 + size
     return {name: _table(bodies[name], forms.get(name, "")) for name in _WANTED}, numbers, count, damaged
@@ -129,14 +128,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     position = _position(tables[place_name])
     if position is None:
         position, place_name = _position(gps), gps_name
-    if position is None:
-        return ReadResult(
-            reader="px4_ulog", streams=(), lines=count + len(damaged), accepted=0, blank=count, rejected=tuple(damaged)
-        )
-    altitude = position["altitude_m"]
-    known = altitude[(position["latitude_deg"] != 0) & np.isfinite(altitude)]  # before the fix all is zero
-    position["altitude_m"] = altitude - _home(tables["home_position"], known)
-    track = _series(tables[place_name], numbers[place_name], position)
+    track = _autopilot.NONE
+    if position is not None:
+        altitude = position["altitude_m"]
+        known = altitude[(position["latitude_deg"] != 0) & np.isfinite(altitude)]  # before the fix all is zero
+        position["altitude_m"] = altitude - _home(tables["home_position"], known)
+        track = _series(tables[place_name], numbers[place_name], position)
     local, attitude = tables["vehicle_local_position"], tables["vehicle_attitude"]
     velocity = {
         f"velocity_{way}_mps": _column(local, name) for way, name in (("north", "vx"), ("east", "vy"), ("down", "vz"))
@@ -144,18 +141,17 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     fix = {"fix": _column(gps, "fix_type"), "satellites": _column(gps, "satellites_used")}
     utc = _column(gps, "time_utc_usec")
     offset = None if utc is None else _autopilot.offset_s(utc / 1e6, gps["timestamp"].astype(np.float64) / 1e6)
-    return _autopilot.result(
-        "px4_ulog",
-        options,
-        track,
-        _series(attitude, numbers["vehicle_attitude"], _angles(attitude)),
-        _series(local, numbers["vehicle_local_position"], velocity),
-        _series(gps, numbers[gps_name], fix),
+    flight = _autopilot.Flight(
+        position=track,
+        attitude=_series(attitude, numbers["vehicle_attitude"], _angles(attitude)),
+        velocity=_series(local, numbers["vehicle_local_position"], velocity),
+        fix=_series(gps, numbers[gps_name], fix),
         utc_minus_clock_s=offset,
         messages=count,
         damaged=damaged,
         source="PX4 ULog" if place_name == "vehicle_global_position" else f"PX4 ULog, {place_name}",
     )
+    return _autopilot.result("px4_ulog", options, flight)
 
 
 def _position(table: AnyArray) -> dict[str, FloatArray] | None:

@@ -22,20 +22,16 @@ Writer: AERPAW ``QuectelLogger`` (``no_pandas_at_rm500q.py``, ``at_rm500q2.py``)
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
 from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import make_frames as _frames
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
-
-if TYPE_CHECKING:
-    import pandas as pd
+from aerpaw_cmp.logs.records import Attribute, ReadResult, Stream
 
 _C = rb"[^,\n]{0,80}"
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
@@ -50,61 +46,34 @@ def _skip(count: int) -> bytes:
     return (_C + rb",") * count
 
 
+_END = rb"[ \t]*\r?$"
+_VALUES = rb",".join([_V] * 4)
 _CSI = re.compile(
-    _T
-    + rb"(?:"
-    + _skip(4)
-    + rb")?"
-    + _token(b"QNWCFG", b"lte_csi")
-    + (rb"," + _V) * 4
-    + rb","
-    + _token(b"QNWCFG", b"nr5g_csi")
-    + (rb"," + _V) * 4
+    _T + rb"(?:" + _skip(4) + rb")?" + _token(b"QNWCFG", b"lte_csi") + rb"," + _VALUES
+    + rb"," + _token(b"QNWCFG", b"nr5g_csi") + rb"," + _VALUES
     # a fifth value of newer firmware, then the four +QNWINFO columns of the first generation
-    + rb"(?:,-?\d{1,7})?(?:(?:,"
-    + _C
-    + rb"){4})?[ \t]*\r?$",
+    + rb"(?:,-?\d{1,7})?(?:(?:," + _C + rb"){4})?" + _END,
     re.MULTILINE,
-)
+)  # fmt: skip
 _SERVING = _T + _token(b"QENG", b"servingcell") + rb"," + _C + rb","
-_CELL = _V + rb"," + _V + rb","  # PCI and carrier
-_LTE_BODY = (
-    _token(b"QENG", b"LTE") + rb"," + _skip(4) + _CELL + _skip(4) + rb",".join([_V] * 4) + rb"," + rb",".join([_C] * 3)
-)
 _LTE = re.compile(
-    _SERVING
-    + _LTE_BODY
-    + rb"(?:,"
-    + _token(b"QENG", b"NR5G-NSA")
-    + rb","
-    + _skip(2)
-    + rb",".join([_V] * 4)
-    + rb"(?:,"
-    + _V
-    + rb"(?:,"
-    + _C
-    + rb"){3})?)?[ \t]*\r?$",
+    _SERVING + _token(b"QENG", b"LTE") + rb"," + _skip(4) + _V + rb"," + _V + rb"," + _skip(4) + _VALUES
+    + (rb"," + _C) * 3
+    + rb"(?:," + _token(b"QENG", b"NR5G-NSA") + rb"," + _skip(2) + _VALUES
+    + rb"(?:," + _V + rb"(?:," + _C + rb"){3})?)?" + _END,
     re.MULTILINE,
-)
+)  # fmt: skip
 _SA = re.compile(
-    _SERVING
-    + _token(b"QENG", b"NR5G-SA")
-    + rb","
-    + _skip(4)
-    + _V
-    + rb","
-    + _skip(1)
-    + _V
-    + rb","
-    + _skip(2)
-    + rb",".join([_V] * 3)
-    + rb","
-    + _C
-    + rb","
-    + _C
-    + rb"[ \t]*\r?$",
+    _SERVING + _token(b"QENG", b"NR5G-SA") + rb"," + _skip(4) + _V + rb"," + _skip(1) + _V + rb"," + _skip(2)
+    + rb",".join([_V] * 3) + rb"," + _C + rb"," + _C + _END,
     re.MULTILINE,
+)  # fmt: skip
+_FORMS = (
+    (_CSI, "time lte_mcs lte_ri lte_cqi lte_pmi nr5g_mcs nr5g_ri nr5g_cqi nr5g_pmi"),
+    (_LTE, "time lte_pci lte_arfcn lte_rsrp . . . nr_pci nr_rsrp nr_sinr . nr_arfcn"),
+    (_SA, "time nr_pci nr_arfcn nr_rsrp . nr_sinr"),
 )
+"""Kinds of row, and the quantities of their groups; a dot stands for one that is not read."""
 _ANY = re.compile(rb"^" + _time.TIME + _time.ZONE + rb',"?\+(?:QNWCFG|QENG|QENDC)')
 _RSRP_RANGE = (-156.0, -31.0)
 """3GPP TS 38.133 table 10.1.6.1-1: reported SS-RSRP lies between -156 and -31 dBm."""
@@ -134,49 +103,32 @@ def _reason(line: bytes) -> str | None:
     return "not a row of the logger's CSVs, or one with another number of columns"
 
 
-@dataclass
-class _Rows:
-    """Matching rows with valid times, sorted columns of text, and their times."""
-
-    number: IntArray
-    instants: _time.Instants
-    column: list[AnyArray]
-
-
-def _rows(
-    lines: _lines.Lines, pattern: re.Pattern[bytes], options: ReadOptions, rejected: list[RejectedLine]
-) -> _Rows | None:
-    number, groups = _lines.match(lines, pattern)
-    if not len(number):
-        return None
-    column = _lines.columns(groups, pattern.groups)
-    _, valid, _, _ = _time.parse_texts(column[0])
-    rejected += lines.reject_all(number[~valid], "the time stamp is no date of the calendar")
-    kept = [cells[valid] for cells in column]
-    instants, _ = _time.texts_to_utc(kept[0], options, needed_by="quectel_csv")
-    return _Rows(number[valid], instants, kept)
+def _table(lines: _lines.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
+    """Lines of all kinds of row, and their columns of text; ``form`` is the kind, an index into ``_FORMS``."""
+    serving = b"servingcell" in lines.data  # a search of a whole log of CSI would find nothing, slowly
+    found: list[tuple[IntArray, dict[str, AnyArray]]] = []
+    for i, (pattern, names) in enumerate(_FORMS if serving else _FORMS[:1]):
+        row, groups = _lines.match(lines, pattern)
+        column = dict(zip(names.split(), _lines.columns(groups, pattern.groups), strict=True))
+        found.append((row, {**column, "form": np.full(len(row), float(i))}))
+    row = np.concatenate([row for row, _ in found])
+    order = np.argsort(row, kind="stable")
+    every = dict.fromkeys(name for _, names in _FORMS for name in ("form", *names.split()) if name != ".")
+    table = {
+        name: np.concatenate([column.get(name, np.zeros(len(row), dtype="S1")) for row, column in found])[order]
+        for name in every
+    }
+    return row[order], table
 
 
-def _values(cells: AnyArray) -> FloatArray:
-    """Numbers of one column; ``-`` and nothing mean 'not valid now'."""
-    return np.asarray(_lines.numbers(np.where(cells == b"-", b"", cells)))
-
-
-def _flag_column(rows: _Rows, lines: _lines.Lines) -> AnyArray:
-    flag = _lines.flags(len(rows.number))
-    rows.instants.flag(flag)
-    if lines.unterminated:
-        _lines.add_flag(flag, rows.number == len(lines) - 1, _lines.UNTERMINATED)
-    return flag
-
-
-def _rank(rows: _Rows, first: int, name: str, lines: _lines.Lines, options: ReadOptions) -> Stream:
-    """Rank stream of one RAT; ``first`` is the column of its MCS."""
-    mcs, ri, cqi, pmi = (_values(rows.column[first + i]) for i in range(4))
-    flag = _flag_column(rows, lines)
+def _rank(rows: _rows.Rows, rat: str) -> Stream | None:
+    """Rank stream of one radio access."""
+    mcs, ri, cqi, pmi = (rows.number(f"{rat}_{name}") for name in ("mcs", "ri", "cqi", "pmi"))
+    flag = rows.flag.copy()
+    none = (ri == 0) | np.isnan(ri)
     good = (ri >= 1) & (ri <= 8) & (ri == np.round(ri))
-    _lines.add_flag(flag, (ri == 0) | np.isnan(ri), "no_csi")
-    _lines.add_flag(flag, ~good & ~(ri == 0) & ~np.isnan(ri), "ri_out_of_range")
+    _lines.add_flag(flag, none, "no_csi")
+    _lines.add_flag(flag, ~good & ~none, "ri_out_of_range")
     idle = (mcs == 0) & (ri == 0) & (cqi == 0) & (pmi == 0)
     values = {
         "rank": np.where(good, ri, np.nan),
@@ -184,73 +136,40 @@ def _rank(rows: _Rows, first: int, name: str, lines: _lines.Lines, options: Read
         "mcs": np.where(idle | ~((mcs >= 0) & (mcs <= 31)), np.nan, mcs),
         "cqi": np.where(idle | ~((cqi >= 0) & (cqi <= 15)), np.nan, cqi),
     }
-    frame = _frames.frame("rank", rows.instants.time, rows.number + 1, flag, values)
-    return Stream("rank", name, frame, _frames.attributes(options, channel=name, ri_base="one", source="CSI report"))
+    name, where = f"{rat}_csi", rows.columns["form"] == 0
+    return rows.stream("rank", name, values, where=where, flag=flag, channel=name, ri_base="one", source="CSI report")
 
 
-@dataclass
-class _Part:
-    """Levels of one kind of row: rows, and their texts of PCI, carrier, RSRP and SINR (None: not printed)."""
-
-    rows: _Rows
-    pci: AnyArray
-    arfcn: AnyArray
-    rsrp: AnyArray
-    sinr: AnyArray | None
-
-
-def _levels(rat: str, parts: list[_Part], lines: _lines.Lines, options: ReadOptions) -> list[Stream]:
-    """RSRP of one RAT, a stream per cell where the log has several; a log of one cell gives one stream."""
-    import pandas as pd
-
-    frames = [_level(part, lines) for part in parts]
-    if not any(len(frame) for frame in frames):
-        return []
-    frame = frames[0] if len(frames) == 1 else pd.concat(frames).sort_values("line").reset_index(drop=True)
-    pci, arfcn = frame.pop("pci"), frame.pop("arfcn")
-    cells = (
-        pd.DataFrame({"pci": pci, "arfcn": arfcn}).dropna(subset="pci").drop_duplicates().sort_values(["pci", "arfcn"])
-    )
-    common: dict[str, Attribute] = {"unit": options.unit or "dBm", "quantity": "RSRP", "rat": rat}
-    whole = f"{rat}_rsrp"
-    found: list[Stream] = []
-    for one in cells.itertuples() if len(cells) > 1 else ():
-        mine = (pci == one.pci) & ((arfcn == one.arfcn) | (np.isnan(one.arfcn) & arfcn.isna()))
-        twice = (cells["pci"] == one.pci).sum() > 1 and not np.isnan(one.arfcn)
-        name = f"{rat}_pci{int(one.pci)}" + (f"_arfcn{int(one.arfcn)}" if twice else "")
-        about = common | _identity(one.pci, one.arfcn)
-        attributes = _frames.attributes(options, channel=name, **about)
-        found.append(Stream("rss", name, frame[mine].reset_index(drop=True), attributes))
-    if len(cells) == 1:
-        common |= _identity(*cells.iloc[0])
-    rest = frame[pci.isna()] if len(cells) > 1 else frame
-    if len(rest):
-        attributes = _frames.attributes(options, channel=whole, **common)
-        found.append(Stream("rss", whole, rest.reset_index(drop=True), attributes))
-    return found
-
-
-def _identity(pci: float, arfcn: float) -> dict[str, Attribute]:
-    return {"pci": int(pci), **({} if np.isnan(arfcn) else {"arfcn": int(arfcn)})}
-
-
-def _level(part: _Part, lines: _lines.Lines) -> pd.DataFrame:
-    """Records of some rows, with their cells beside."""
-    rsrp = _values(part.rsrp)
-    flag = _flag_column(part.rows, lines)
+def _levels(rows: _rows.Rows, rat: str, where: BoolArray) -> Iterator[Stream | None]:
+    """RSRP of one radio access, a stream per cell where the log has several; a log of one cell gives one stream."""
+    rsrp, pci, arfcn = (rows.number(f"{rat}_{name}") for name in ("rsrp", "pci", "arfcn"))
+    flag = rows.flag.copy()
     good = (rsrp >= _RSRP_RANGE[0]) & (rsrp <= _RSRP_RANGE[1])
     _lines.add_flag(flag, ~good, "out_of_coverage")
     values = {"rss_db": np.where(good, rsrp, np.nan)}
-    if part.sinr is not None:
-        sinr = _values(part.sinr)
+    if rat == "nr":
+        sinr = rows.number("nr_sinr")
         fits = (sinr >= _SINR_RANGE[0]) & (sinr <= _SINR_RANGE[1])
         # tenths of a decibel on 2020 firmware look like this: never divided silently
         _lines.add_flag(flag, good & ~fits & ~np.isnan(sinr), "sinr_out_of_range")
         values["sinr_db"] = np.where(fits, sinr, np.nan)
-    pci, arfcn = _values(part.pci), _values(part.arfcn)
-    known = (pci >= 0) & (pci <= _MOST_PCI)
-    values |= {"pci": np.where(known, pci, np.nan), "arfcn": np.where(known & (arfcn > 0), arfcn, np.nan)}
-    return _frames.frame("rss", part.rows.instants.time, part.rows.number + 1, flag, values)
+    named = where & (pci >= 0) & (pci <= _MOST_PCI)
+    carrier = np.where(arfcn > 0, arfcn, np.inf)
+    cells = sorted(set(zip(pci[named].tolist(), carrier[named].tolist(), strict=True)))
+    common: dict[str, Attribute | None] = {"unit": rows.options.unit or "dBm", "quantity": "RSRP", "rat": rat}
+    for one, its_carrier in cells if len(cells) > 1 else ():
+        twice = sum(other == one for other, _ in cells) > 1 and its_carrier < np.inf
+        name = f"{rat}_pci{int(one)}" + (f"_arfcn{int(its_carrier)}" if twice else "")
+        mine = named & (pci == one) & (carrier == its_carrier)
+        about = common | _identity(one, its_carrier)
+        yield rows.stream("rss", name, values, where=mine, flag=flag, channel=name, about=about)
+    rest = where & ~named if len(cells) > 1 else where
+    common |= _identity(*cells[0]) if len(cells) == 1 else {}
+    yield rows.stream("rss", f"{rat}_rsrp", values, where=rest, flag=flag, channel=f"{rat}_rsrp", about=common)
+
+
+def _identity(pci: float, arfcn: float) -> dict[str, Attribute | None]:
+    return {"pci": int(pci), "arfcn": int(arfcn) if arfcn < np.inf else None}
 
 
 _MOST_PCI = 1007
@@ -265,39 +184,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         If no time zone is given.
     """
     lines = _lines.split(data)
-    rejected: list[RejectedLine] = []
-    csi = _rows(lines, _CSI, options, rejected)
-    serving = b"servingcell" in data  # a search of a whole log of CSI would find nothing, slowly
-    lte = _rows(lines, _LTE, options, rejected) if serving else None
-    sa = _rows(lines, _SA, options, rejected) if serving else None
-    streams: list[Stream | None] = []
-    if csi is not None and len(csi.number):
-        streams += [_rank(csi, 5, "nr5g_csi", lines, options), _rank(csi, 1, "lte_csi", lines, options)]
-    nr_parts: list[_Part] = []
-    if lte is not None:
-        streams += _levels("lte", [_Part(lte, lte.column[1], lte.column[2], lte.column[3], None)], lines, options)
-        with_nr = np.flatnonzero(lte.column[8] != b"")
-        instants = lte.instants.take(with_nr)
-        nsa = _Rows(lte.number[with_nr], instants, [cells[with_nr] for cells in lte.column])
-        nr_parts.append(_Part(nsa, nsa.column[7], nsa.column[11], nsa.column[8], nsa.column[9]))
-    if sa is not None:
-        nr_parts.append(_Part(sa, sa.column[1], sa.column[2], sa.column[3], sa.column[5]))
-    streams += _levels("nr", nr_parts, lines, options)
-    found = [part for part in (csi, lte, sa) if part is not None]
-    numbers = [part.number for part in found]
-    wrong = np.array([line.number - 1 for line in rejected], dtype=np.int64)
-    blank, others = _lines.remainder(lines, np.concatenate([*numbers, wrong]).astype(np.int64), _reason)
-    warnings = [text for part in found for text in part.instants.warnings]
-    kept = tuple(stream for stream in streams if stream is not None)
-    warnings += [text for stream in kept[:1] for text in _frames.steps_back(stream.frame)]
-    return ReadResult(
-        reader="quectel_csv",
-        streams=kept,
-        lines=len(lines),
-        accepted=sum(len(number) for number in numbers),
-        blank=blank,
-        rejected=tuple(sorted(rejected + others, key=lambda line: line.number)),
-        warnings=tuple(dict.fromkeys(warnings)),
+    row, table = _table(lines)
+    rows = _rows.built(lines, row, table, options, reader="quectel_csv", reason=_reason)
+    form = rows.columns["form"]
+    nr = (form == 2) | ((form == 1) & (rows.columns["nr_rsrp"] != b""))
+    return rows.result(
+        [_rank(rows, "nr5g"), _rank(rows, "lte"), *_levels(rows, "lte", form == 1), *_levels(rows, "nr", nr)]
     )
 
 

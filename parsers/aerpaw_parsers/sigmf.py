@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ import numpy as np
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import make_frames as _frames
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
@@ -75,34 +75,30 @@ def _times(captures: list[dict[str, Any]], *fields: str) -> list[str]:
     return found
 
 
-def _stream(
-    kind: str,
-    name: str,
-    texts: list[str],
-    values: dict[str, AnyArray],
-    options: ReadOptions,
-    warnings: list[str],
-    counts: list[int],
-    **about: Any,
-) -> Stream | None:
-    """A stream of values with times; how many there are goes to ``counts``."""
-    counts.append(len(texts))
-    if not texts:
-        return None
-    clock, cells, clock_warnings = _stamps.read(texts, options)
+def _rows_of(texts: list[str], options: ReadOptions) -> _rows.Rows:
+    """Values with times; the lines of the account are the values."""
+    clock, cells, warnings = _stamps.read(texts, options)
     relative, instants, valid = _rows.times(cells, options, clock=clock, reader="sigmf")
-    warnings += [*clock_warnings, *instants.warnings, *([_rows.RELATIVE] if relative else [])]
+    keep = np.flatnonzero(valid)
     flag = _lines.flags(len(texts))
     instants.flag(flag)
-    if "rss_db" in values:
-        silent = ~(values["rss_db"] > options.floor_db) | ~np.isfinite(values["rss_db"])
-        _lines.add_flag(flag, silent, "out_of_coverage")
-        values["rss_db"] = np.where(silent, np.nan, values["rss_db"])
-    keep = np.flatnonzero(valid)
-    kept = {key: np.asarray(column)[keep] for key, column in values.items()}
-    frame = _frames.frame(kind, instants.time[keep], keep + 1, flag[keep], kept)  # type: ignore[arg-type]
-    attributes = _frames.attributes(options, **({"clock": "relative"} if relative else {}), **about)
-    return Stream(kind, name, frame, attributes) if len(frame) else None  # type: ignore[arg-type]
+    return _rows.Rows(
+        reader="sigmf",
+        options=options,
+        lines=len(texts),
+        row=keep,
+        at=keep,
+        time=instants.time[keep],
+        flag=flag[keep],
+        warnings=[*warnings, *instants.warnings, *([_rows.RELATIVE] if relative else [])],
+        relative=relative,
+    )
+
+
+def _level(rows: _rows.Rows, channel: str, values: FloatArray) -> Stream | None:
+    level, flag = rows.level(np.where(np.isfinite(values), values, np.nan)[rows.at])
+    unit = rows.options.unit or "dB re full scale"
+    return rows.stream("rss", channel, {"rss_db": level}, flag=flag, channel=channel, unit=unit)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -120,52 +116,44 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         raise InputError(
             f"the SigMF meta file is no JSON ({error})", expected="a whole file", cause="a cut download"
         ) from None
+    tables = [*_track(captures, options), *_levels(captures, options)]
     warnings: list[str] = []
-    counts: list[int] = []
-    streams = [_track(captures, options, warnings, counts), *_levels(captures, options, warnings, counts)]
-    if not any(stream is not None and stream.kind == "rss" for stream in streams):
-        streams += _powers(meta, captures, options, warnings, counts)
-    kept = tuple(stream for stream in streams if stream is not None)
-    if not kept:
+    if not any(stream.kind == "rss" for _, stream in tables):
+        tables += _powers(meta, captures, options, warnings)
+    if not tables:
         raise InputError(
             "the SigMF meta file holds neither values nor positions, and its samples cannot be read",
             expected=f"measurement:values, core:rx_location, or {_data_name(options)!r} in the same folder",
         )
-    count = max(counts)
-    read_lines = np.unique(np.concatenate([stream.frame["line"].to_numpy() for stream in kept]))
+    count = max(rows.lines for rows, _ in tables)
+    read_lines = np.unique(np.concatenate([rows.row for rows, _ in tables])) + 1
     lost = np.setdiff1d(np.arange(1, count + 1), read_lines)
-    rejected = tuple(RejectedLine(int(i), "a value without a time", "") for i in lost)
+    warnings = [*(text for rows, _ in tables for text in rows.warnings), *warnings]
     return ReadResult(
         reader="sigmf",
-        streams=kept,
+        streams=tuple(stream for _, stream in tables),
         lines=count,
         accepted=len(read_lines),
         blank=0,
-        rejected=rejected,
+        rejected=tuple(RejectedLine(int(i), "a value without a time", "") for i in lost),
         warnings=tuple(dict.fromkeys(warnings)),
     )
 
 
-def _levels(
-    captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str], counts: list[int]
-) -> list[Stream | None]:
+def _levels(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tuple[_rows.Rows, Stream]]:
     texts = _times(captures, "measurement:time_stamp", "core:datetime", "core:timestamp")
-    made: list[Stream | None] = []
     for name, channel in _LEVELS.items():
         values = _column(captures, "measurement:values", name)
         if not len(values):
             continue
         if len(values) != len(texts):
             raise InputError(f"{len(values)} values of {name} and {len(texts)} times", expected="as many of each")
-        unit = options.unit or "dB re full scale"
-        level = {"rss_db": values}
-        made.append(_stream("rss", channel, texts, level, options, warnings, counts, channel=channel, unit=unit))
-    return made
+        rows = _rows_of(texts, options)
+        if (stream := _level(rows, channel, values)) is not None:
+            yield rows, stream
 
 
-def _track(
-    captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str], counts: list[int]
-) -> Stream | None:
+def _track(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tuple[_rows.Rows, Stream]]:
     """Positions: of the measurements, of the GPS, or of the receiver."""
     for field, times in (
         ("measurement:values", ("measurement:time_stamp", "core:datetime", "core:timestamp")),
@@ -173,16 +161,16 @@ def _track(
         ("core:rx_location", ("core:timestamp", "core:datetime", "core:time")),
     ):
         texts = _times(captures, *times)
-        values = {name: _column(captures, field, *names) for name, names in _PLACE}
-        if not texts or len(values["latitude_deg"]) != len(texts) or len(values["longitude_deg"]) != len(texts):
+        columns = {name: _column(captures, field, *names) for name, names in _PLACE}
+        if not texts or len(columns["latitude_deg"]) != len(texts) or len(columns["longitude_deg"]) != len(texts):
             continue
-        values = {name: column for name, column in values.items() if len(column) == len(texts)}
-        for name, key in (("roll_deg", "roll"), ("pitch_deg", "pitch"), ("yaw_deg", "yaw")):
-            column = _column(captures, "core:rotation", key)
-            if len(column) == len(texts):
-                values[name] = column
-        return _stream("telemetry", "vehicle", texts, dict(values), options, warnings, counts, source=field)
-    return None
+        turns = (("roll_deg", "roll"), ("pitch_deg", "pitch"), ("yaw_deg", "yaw"))
+        columns |= {name: _column(captures, "core:rotation", key) for name, key in turns}
+        rows = _rows_of(texts, options)
+        values = {name: column[rows.at] for name, column in columns.items() if len(column) == len(texts)}
+        if (stream := rows.stream("telemetry", "vehicle", values, source=field)) is not None:
+            yield rows, stream
+        return
 
 
 def _data_name(options: ReadOptions) -> str:
@@ -190,49 +178,69 @@ def _data_name(options: ReadOptions) -> str:
 
 
 def _powers(
-    meta: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str], counts: list[int]
-) -> list[Stream | None]:
-    """Power of each burst of the samples beside the meta file."""
-    common = _json.inside(meta, "global")
-    data = options.beside(_data_name(options)) if options.beside else None
-    kind = _SAMPLES.get(str(common.get("core:datatype", "")).split("_")[0])
-    rate = _json.number(common.get("core:sample_rate"))
-    if data is None or kind is None or not rate > 0:
-        return []
-    order = ">" if str(common.get("core:datatype")).endswith("_be") else "<"
-    parts = 2 if str(common.get("core:datatype")).startswith("c") else 1
-    channels = min(max(_whole(common.get("core:num_channels"), 1), 1), 64)
-    frame_bytes = np.dtype(kind[0]).itemsize * parts * channels
-    usable = len(data) // frame_bytes * frame_bytes
-    samples = np.frombuffer(data[:usable], dtype=order + kind[0]).reshape(-1, channels, parts)
+    meta: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str]
+) -> Iterator[tuple[_rows.Rows, Stream]]:
+    """Power of each burst of the samples beside the meta file.
+
+    Parameters
+    ----------
+    meta : dict
+        Of the file.
+    captures : list of dict
+        With the global fields that they lack.
+    options : ReadOptions
+    warnings : list of str
+        Gets what the user should know.
+
+    Yields
+    ------
+    tuple of Rows and Stream
+        Of each channel.
+    """
+    samples = _samples(_json.inside(meta, "global"), options)
+    rate = _json.number(_json.inside(meta, "global").get("core:sample_rate"))
+    if samples is None or not rate > 0:
+        return
     size = max(1, round(BURST_S * rate))
     texts: list[str] = []
     powers: list[FloatArray] = []
     starts = [min(max(_whole(one.get("core:sample_start"), 0), 0), len(samples)) for one in captures]
-    for i, capture in enumerate(captures):
-        end = starts[i + 1] if i + 1 < len(starts) else len(samples)
-        stamp = next(
-            (str(capture[key]) for key in ("core:datetime", "core:timestamp", "core:time") if key in capture), None
-        )
+    for capture, start, end in zip(captures, starts, [*starts[1:], len(samples)], strict=True):
+        stamp = next((capture[key] for key in ("core:datetime", "core:timestamp", "core:time") if key in capture), None)
         if stamp is None:
             warnings.append("captures without core:datetime are left out")
             continue
-        for at in range(starts[i], end - size // 2, size):
-            piece = samples[at : min(at + size, end)].astype(np.float64) / kind[1]
-            if len(piece):
-                texts.append(_later(stamp, (at - starts[i]) / rate))
-                with np.errstate(all="ignore"):  # damaged samples may be any number
-                    powers.append((piece**2).sum(axis=2).mean(axis=0))
+        for at in range(start, end - size // 2, size):
+            piece = samples[at : min(at + size, end)].astype(np.float64)
+            texts.append(_later(str(stamp), (at - start) / rate))
+            with np.errstate(all="ignore"):  # damaged samples may be any number
+                powers.append((piece**2).sum(axis=2).mean(axis=0))
     if not texts:
-        return []
+        return
     with np.errstate(all="ignore"):
-        level = 10 * np.log10(np.array(powers))
-    unit = options.unit or "dB re full scale"
-    made: list[Stream | None] = []
-    for i in range(channels):
-        name, values = f"USRP{i + 1}", {"rss_db": level[:, i]}
-        made.append(_stream("rss", name, texts, values, options, warnings, counts, channel=name, unit=unit))
-    return made
+        level = 10 * np.log10(np.array(powers)) - _full_scale_db(meta)
+    rows = _rows_of(texts, options)
+    for i in range(level.shape[1]):
+        if (stream := _level(rows, f"USRP{i + 1}", level[:, i])) is not None:
+            yield rows, stream
+
+
+def _samples(common: dict[str, Any], options: ReadOptions) -> AnyArray | None:
+    """The samples beside the meta file as they are stored, shape (n, channels, 1 or 2); None where there are none."""
+    kind = str(common.get("core:datatype", ""))
+    data = options.beside(_data_name(options)) if options.beside else None
+    if data is None or kind.split("_")[0] not in _SAMPLES:
+        return None
+    stored = np.dtype((">" if kind.endswith("_be") else "<") + _SAMPLES[kind.split("_")[0]][0])
+    shape = (min(max(_whole(common.get("core:num_channels"), 1), 1), 64), 2 if kind.startswith("c") else 1)
+    frame_bytes = stored.itemsize * shape[0] * shape[1]
+    return np.frombuffer(data[: len(data) // frame_bytes * frame_bytes], dtype=stored).reshape(-1, *shape)
+
+
+def _full_scale_db(meta: dict[str, Any]) -> float:
+    """Level of the largest sample of the data type, as stored [dB]."""
+    kind = str(_json.inside(meta, "global").get("core:datatype", "")).split("_")[0]
+    return float(20 * np.log10(_SAMPLES[kind][1]))
 
 
 def _whole(value: Any, default: int) -> int:

@@ -133,23 +133,19 @@ def _piece(lines: _lines.Lines, rejects: _lines.Rejects) -> _Piece:
     left[fixed.line] = left[wrong] = False
     samples: list[tuple[int, bytes, bytes, float]] = []
     marks: list[tuple[int, bytes, bytes, float]] = []
-    blank = 0
+    blank, torn = 0, len(lines) - 1 if lines.unterminated else -1
     for i in np.flatnonzero(left).tolist():
         line = lines.raw(i)
-        if found := _ODD.match(line):
-            short = len(line) < _STAMP + 1 + len(found[2]) + _VALUE
-            if short and i == len(lines) - 1 and lines.unterminated:
-                rejects.add(lines, [i], "torn last line: the value is cut short")
-            else:
-                samples.append((i, found[1], found[2], float(found[3])))
-        elif found := _STAR.match(line):
-            marks.append((i, found[1], b"-1", np.nan))
-        elif found := _FOOT.match(line):
-            marks.append((i, found[1], found[2], np.nan))
-        elif not line.strip():
-            blank += 1
-        else:
+        sample, star, foot = (form.match(line) for form in (_ODD, _STAR, _FOOT))
+        if sample is not None and i == torn and len(line) < _STAMP + 1 + len(sample[2]) + _VALUE:
+            rejects.add(lines, [i], "torn last line: the value is cut short")
+        elif sample is not None:
+            samples.append((i, sample[1], sample[2], float(sample[3])))
+        if mark := star or foot:
+            marks.append((i, mark[1], b"-1" if star else mark[2], np.nan))
+        elif sample is None and line.strip():
             rejects.add(lines, [i], _reason(line))
+        blank += not line.strip()
     odd, wrong_dates = _collect(samples)
     marked, wrong_marks = _collect(marks)
     rejects.add(lines, wrong_dates + wrong_marks, "the time stamp is no date of the calendar")

@@ -162,24 +162,21 @@ class _Log:
             self.numbers.add(int(record["n"]))
         if kind == "header" and self.header is None:
             self.header = record
-            if record.get("schema") != SCHEMA:
-                raise InputError(
-                    f"the log has schema {record.get('schema')!r}",
-                    expected=SCHEMA,
-                    cause="it was written by another version",
-                )
-        elif kind == "gap" and record.get("state") == "closed":
+            found = record.get("schema")
+            if found != SCHEMA:
+                cause = "it was written by another version"
+                raise InputError(f"the log has schema {found!r}", expected=SCHEMA, cause=cause)
+        closed = record.get("state") == "closed"
+        if kind == "gap":
+            self.open_gap = None if closed else record
+        if kind == "gap" and closed:
             seconds = _int(record.get("duration_ns")) / 1e9
             self.events.append(f"gap of {seconds:.1f} s: {record.get('reason', '')}")
-            self.open_gap = None
-        elif kind == "gap":
-            self.open_gap = record
-        elif kind == "clock":
+        if kind == "clock":
             self.events.append(f"the wall clock stepped by {_int(record.get('step_ns')) / 1e9:+.3f} s")
-        elif kind == "disk":
+        if kind == "disk":
             self.events.append(f"the disk failed ({record.get('reason')}); {record.get('lost')} records were lost")
-        elif kind in ("end", "rotate"):
-            self.ended = True
+        self.ended |= kind in ("end", "rotate")
 
     def warnings(self) -> tuple[str, ...]:
         """Gaps, clock steps, lost and missing records, torn tail, missing end."""

@@ -19,11 +19,15 @@ from .shown import print_files, print_json, print_plan, say, table
         "aerpaw-cmp site import farm.osm -o site.yaml",
         "aerpaw-cmp site import munich.xml --origin 48.1372,11.5755 --tower BS=8.5,21,27 -o munich.yaml",
         "aerpaw-cmp site import fields.kml barns.geojson --base my_towers.yaml --untagged building -o site.yaml",
+        "aerpaw-cmp site import farm.osm --canopy chm.tif --buildings dsm.tif -o site.yaml",
     ],
 )
 def site_import(
-    files: Annotated[list[Path], typer.Argument(help="Map files, or one Mitsuba XML.")],
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The site.yaml to write.")],
+    files: Annotated[
+        Optional[list[Path]],  # noqa: UP045
+        typer.Argument(help="Map files, or one Mitsuba XML  [default: none; with --canopy or --buildings]"),
+    ] = None,
     base: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(help="Site that gives towers and settings  [default: lake_wheeler; none for a scene]"),
@@ -48,12 +52,21 @@ def site_import(
         Optional[Literal["building", "forest", "geofence"]],  # noqa: UP045
         typer.Option(help="Kind of the areas without a tag."),
     ] = None,
+    canopy: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(metavar="FILE", help="Canopy heights (GeoTIFF): stands and trees in place of all others."),
+    ] = None,
+    buildings: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(metavar="FILE", help="Surface model (GeoTIFF) that gives the buildings their heights."),
+    ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Import footprints, or a scene."""
     from ..jobs import run, site_scene
 
+    files = files or []
     if len(files) == 1 and site_scene.is_scene(files[0]):
         actions = site_scene.run_scene_import(
             files[0],
@@ -68,7 +81,9 @@ def site_import(
         )
     else:
         base = base or "lake_wheeler"
-        actions = run.run_site_import(files, out, base=base, untagged=untagged, force=force)
+        actions = run.run_site_import(
+            files, out, base=base, untagged=untagged, canopy=canopy, surface=buildings, force=force
+        )
     if as_json:
         print_json({"file": str(out), "base": base, "actions": actions})
         return

@@ -7,6 +7,7 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.units import FloatArray, wavelength_m
 from ..propagation.field.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
+from ..propagation.field.stands import stand_loss_db
 from ..propagation.options import Loss
 from ..propagation.paths import PathSet
 from ..propagation.search.crowns import Crowns
@@ -32,7 +33,7 @@ def path_loss(
     Parameters
     ----------
     site : Site
-        Its crowns and trunks, and how high its ground lies.
+        Its trees and stands, and how high its ground lies.
     rt : RtSettings
         ``foliage``, ``foliage_model``, ``gamma_db_per_m``, ``maximum_loss_db``, ``leaves``, ``reflection_loss_db``,
         ``ground_roughness_m``.
@@ -51,7 +52,7 @@ def path_loss(
     UsageError
         ``rt.ground_roughness_m`` with a scene of triangles.
     """
-    through = _foliage_loss(site.trees, rt, carrier_hz, foliage or rt.foliage, leaves or rt.leaves)
+    through = _foliage_loss(site, rt, carrier_hz, foliage or rt.foliage, leaves or rt.leaves)
     per_reflection, rough = rt.reflection_loss_db, roughness_loss(site, rt, carrier_hz)
     if per_reflection == 0.0 and rough is None:
         return through
@@ -127,8 +128,8 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
     return loss
 
 
-def _foliage_loss(trees: Trees, rt: RtSettings, carrier_hz: float, foliage: str, leaves: str) -> Loss | None:
-    if len(trees) == 0 or (foliage == "none" and rt.foliage != "opaque"):
+def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float, foliage: str, leaves: str) -> Loss | None:
+    if not site.wooded or (foliage == "none" and rt.foliage != "opaque"):
         return None  # where opaque crowns reflect, a run without trees has to lose those paths
     name = rt.foliage_model if foliage == "attenuating" else foliage
     own = leaves == rt.leaves  # numbers of the flight file belong to its own season
@@ -139,11 +140,12 @@ def _foliage_loss(trees: Trees, rt: RtSettings, carrier_hz: float, foliage: str,
         gamma_db_per_m=rt.advanced.gamma_db_per_m if own else None,
         maximum_db=rt.advanced.maximum_loss_db if own else None,
     )
-    index = crown_index(trees)
+    index, wavelength = crown_index(site.trees), wavelength_m(carrier_hz)
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
         source, target = sources_m[paths.tower], targets_m[paths.pose]
-        return foliage_loss_db(source, paths.vertices_m, target, index, model, paths.tree)
+        trees_db = foliage_loss_db(source, paths.vertices_m, target, index, model, paths.tree)
+        return trees_db + stand_loss_db(site, source, paths.vertices_m, target, model, wavelength)
 
     return loss
 

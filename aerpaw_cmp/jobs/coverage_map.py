@@ -52,6 +52,7 @@ from ..maps.study import HeldOutStudy, Study, held_out_study, interpolation_stud
 from ..maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ..propagation.arrays import Link, Poses, linear_array, single_element
 from ..propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
+from ..propagation.field.stands import stand_loss_db
 from ..propagation.field.sum import channel_matrices, rss_dbm
 from ..propagation.options import Engine, Search
 from ..propagation.paths import PathSet
@@ -259,11 +260,13 @@ class SiteChannels:
         return np.column_stack([position_m[:, :2], position_m[:, 2] + ground])
 
     def _loss_db(self, mode: str, paths: PathSet, poses: Poses) -> FloatArray | None:
-        if mode == "none" or not len(self.site.trees):
+        if mode == "none" or not self.site.wooded:
             return None
         model = foliage_model(mode, self.settings.carrier_hz)
         source, target = self.sources_m[paths.tower], poses.position_m[paths.pose]
-        return foliage_loss_db(source, paths.vertices_m, target, self.crowns, model)
+        trees_db = foliage_loss_db(source, paths.vertices_m, target, self.crowns, model)
+        wavelength = wavelength_m(self.settings.carrier_hz)
+        return trees_db + stand_loss_db(self.site, source, paths.vertices_m, target, model, wavelength)
 
     def _matrices(
         self, replayed: Replay, paths: PathSet, poses: Poses, link: Link, loss_db: FloatArray | None

@@ -257,7 +257,7 @@ class _Climber:
         return [dataclasses.replace(best, buildings=True, diffraction=True)]
 
     def _trees(self, best: Model) -> list[Model]:
-        if not len(self._data.site.trees):
+        if not self._data.site.wooded:
             return []
         kinds: tuple[Trees, ...] = ("p833", "weissberger", "opaque")
         return [dataclasses.replace(best, trees=kind) for kind in kinds]

@@ -433,7 +433,14 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
 
 
 def run_site_import(
-    files: list[Path], out: Path, *, base: str = "lake_wheeler", untagged: str | None = None, force: bool = False
+    files: list[Path],
+    out: Path,
+    *,
+    base: str = "lake_wheeler",
+    untagged: str | None = None,
+    canopy: Path | None = None,
+    surface: Path | None = None,
+    force: bool = False,
 ) -> list[str]:
     """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them.
 
@@ -447,6 +454,8 @@ def run_site_import(
         Site whose towers and settings are kept.
     untagged : str, optional
         What areas without a tag are: building, forest or geofence.
+    canopy, surface : Path, optional
+        Canopy-height model that gives stands and trees; surface model that gives buildings their heights.
     force : bool
         Replace a file that this tool did not write.
 
@@ -460,10 +469,16 @@ def run_site_import(
     UsageError, InputError
         With what was found, expected, and the likely cause.
     """
+    from ..site.canopy import with_canopy, with_heights
     from ..site.footprints import import_site, site_yaml
 
-    with OutputFile(out, own=is_sealed, inputs=[*files, Path(base)], force=force) as output:
-        model, actions = import_site(files, base=base, untagged=untagged)
+    rasters = [path for path in (canopy, surface) if path is not None]
+    with OutputFile(out, own=is_sealed, inputs=[*files, *rasters, Path(base)], force=force) as output:
+        model, actions = import_site(files, base=base, untagged=untagged, maps_needed=not rasters)
+        for path, made in ((canopy, with_canopy), (surface, with_heights)):
+            if path is not None:
+                model, more = made(model, path)
+                actions += more
         text = site_yaml(model, header=["made by 'aerpaw-cmp site import' from map data", *actions])
         output.write(sealed(text))
     return actions

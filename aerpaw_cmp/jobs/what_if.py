@@ -118,7 +118,7 @@ def _alone(pattern: Any) -> Any:
 
 def foliage_alternatives(site: Site, rt: RtSettings, replayed: Replayed) -> dict[str, Fields]:
     """Fields without trees, in leaf and out of leaf, where ``paired_foliage`` asks and the site has trees."""
-    if not rt.advanced.paired_foliage or not len(site.trees):
+    if not rt.advanced.paired_foliage or not site.wooded:
         return {}
 
     def with_trees(foliage: str, leaves: str | None = None) -> Fields:

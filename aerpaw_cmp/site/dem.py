@@ -44,6 +44,8 @@ class Dem:
         Any that pyproj knows, such as ``EPSG:4326`` (degrees), or ``local`` for metres of the site frame.
     frame : SiteFrame
         Of the site.
+    anchored : bool
+        Up counts from the ground at the origin, which the grid must cover; else heights are taken as they are.
     """
 
     height_m: FloatArray
@@ -53,6 +55,7 @@ class Dem:
     step_y: float
     crs: str
     frame: SiteFrame
+    anchored: bool = True
     _to_grid: Any = field(init=False, repr=False, compare=False, default=None)
 
     def __post_init__(self) -> None:
@@ -72,7 +75,7 @@ class Dem:
                     expected=f"coordinates of {self.crs}",
                     cause="they are metres or feet: another crs",
                 )
-        if np.isnan(self.absolute_m(0.0, 0.0)):
+        if self.anchored and np.isnan(self.absolute_m(0.0, 0.0)):
             gap = self._covers_origin()
             raise InputError(
                 "the elevation model has no height at the site's origin",
@@ -113,7 +116,16 @@ class Dem:
 
     def ground_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
         """Up of the ground [m]: 0 at the origin of the site; NaN outside the grid."""
-        return self.absolute_m(east_m, north_m) - self.absolute_m(0.0, 0.0)
+        return self.absolute_m(east_m, north_m) - (self.absolute_m(0.0, 0.0) if self.anchored else 0.0)
+
+    def place(self, column: ArrayLike, row: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """East and north [m] of places in the grid, counted in cells from the first."""
+        x = self.west + self.step_x * np.asarray(column, dtype=np.float64)
+        y = self.south + self.step_y * np.asarray(row, dtype=np.float64)
+        if self._to_grid is None:
+            return x, y
+        longitude, latitude = self._to_grid.transform(x, y, direction="INVERSE")
+        return self.frame.to_local(latitude, longitude)
 
     def slope(self, east_m: FloatArray, north_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rise of the ground per metre to the east and to the north, from points 1/64 of a cell apart."""
@@ -209,7 +221,7 @@ def above_line(source_m: FloatArray, target_m: FloatArray, share: FloatArray, gr
     return np.asarray(ground_m + share * (1 - share) * length**2 / (2 * EARTH_RADIUS_M) - line)
 
 
-def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> Dem:
+def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None, anchored: bool = True) -> Dem:
     """An elevation model: ESRI ASCII grid (``.asc``), or GeoTIFF with the extra ``aerpaw-cmp[geo]``.
 
     Parameters
@@ -220,6 +232,12 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> D
         Of the site.
     crs : str, optional
         Needed for ASCII grids, which name none; ``local`` means metres of the site frame.
+    anchored : bool
+        As of :class:`Dem`.
+
+    Returns
+    -------
+    Dem
 
     Raises
     ------
@@ -238,13 +256,13 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> D
     if size > MAX_BYTES:
         raise InputError(f"the file has {size} bytes", expected=f"at most {MAX_BYTES}; cut the site out", path=path)
     if start[:2] in (b"II", b"MM"):
-        return _read_geotiff(path, frame)
+        return _read_geotiff(path, frame, anchored)
     if crs is None:
         raise UsageError("an ASCII grid names no coordinate system", expected="crs, such as EPSG:4326", path=path)
-    return _read_ascii(path, frame, crs)
+    return _read_ascii(path, frame, crs, anchored)
 
 
-def _read_ascii(path: Path, frame: SiteFrame, crs: str) -> Dem:
+def _read_ascii(path: Path, frame: SiteFrame, crs: str, anchored: bool) -> Dem:
     try:
         lines = read_bounded(path, MAX_BYTES).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
@@ -267,7 +285,7 @@ def _read_ascii(path: Path, frame: SiteFrame, crs: str) -> Dem:
         )
     west = header.get("xllcenter", header.get("xllcorner", 0.0) + step / 2)
     south = header.get("yllcenter", header.get("yllcorner", 0.0) + step / 2)
-    return _placed(path, Dem, flat.reshape(rows, columns)[::-1], west, south, step, step, crs, frame)
+    return _placed(path, Dem, flat.reshape(rows, columns)[::-1], west, south, step, step, crs, frame, anchored)
 
 
 def _ascii_header(lines: list[str], path: Path) -> tuple[dict[str, float], int]:
@@ -316,7 +334,7 @@ def _plausible(height_m: FloatArray, path: Path, line: int | None = None) -> Flo
     return height_m
 
 
-def _read_geotiff(path: Path, frame: SiteFrame) -> Dem:
+def _read_geotiff(path: Path, frame: SiteFrame, anchored: bool) -> Dem:
     from ..common.native import read
 
     if importlib.util.find_spec("rasterio") is None:
@@ -338,7 +356,7 @@ def _read_geotiff(path: Path, frame: SiteFrame) -> Dem:
     band = _plausible(band, path)
     west += step_east / 2
     south = north + step_north * (band.shape[0] - 0.5)
-    return _placed(path, Dem, band[::-1], west, south, step_east, -step_north, notes["crs"], frame)
+    return _placed(path, Dem, band[::-1], west, south, step_east, -step_north, notes["crs"], frame, anchored)
 
 
 def _placed(path: Path, make: type[Dem], *arguments: Any) -> Dem:

@@ -564,7 +564,11 @@ def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, 
 
 
 def import_site(
-    files: Sequence[str | Path], *, base: str | Path = "lake_wheeler", **options: Any
+    files: Sequence[str | Path],
+    *,
+    base: str | Path = "lake_wheeler",
+    maps_needed: bool = True,
+    **options: Any,
 ) -> tuple[SiteModel, list[str]]:
     """A site with the towers and settings of ``base`` and everything else from map files.
 
@@ -574,6 +578,8 @@ def import_site(
         Map files.
     base : str or path
         Packaged site or site.yaml.
+    maps_needed : bool
+        Without files the base alone is an error.
     **options
         For :func:`import_footprints`.
 
@@ -582,35 +588,49 @@ def import_site(
     SiteModel, list of str
         The settings (see :func:`site_yaml`), and what was done.
     """
-    if not files:
-        raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
+    if not files and maps_needed:
+        raise UsageError(
+            "no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files, --canopy or --buildings"
+        )
     model = site_model(base)
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
-    imports = import_footprints(files, frame, area_m=extent_m(model, frame), **options)
     content = model.model_dump()
     if model.dem is not None:  # the new file may lie in another folder
         content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
+    actions: list[str] = []
+    if files:
+        actions = _from_maps(content, import_footprints(files, frame, area_m=extent_m(model, frame), **options))
+    imported = SiteModel.model_validate(content)
+    return imported, [_kept_of_base(imported, base), *actions]
+
+
+def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
+    """Outlines and trees of maps in place of those of the base."""
     content |= {
         "buildings": [
-            {**_outline_dict(b.name, b.footprint), "height_m": b.height_m, "material": b.material, "source": b.source}
+            {**outline_dict(b.name, b.footprint), "height_m": b.height_m, "material": b.material, "source": b.source}
             for b in imports.buildings
         ],
         "forests": [
             {
-                **_outline_dict(f.name, f.area),
+                **outline_dict(f.name, f.area),
                 "trees_per_hectare": f.trees_per_hectare,
                 "minimum_spacing_m": f.minimum_spacing_m,
                 "source": f.source,
             }
             for f in imports.forests
         ],
-        "geofences": [_outline_dict(g.name, g.area) for g in imports.geofences],
+        "geofences": [outline_dict(g.name, g.area) for g in imports.geofences],
         "illustrative": False,
-        "notes": [*(note for note in model.notes if "illustrative" not in note.lower()), *imports.credits],
+        "notes": [*(note for note in content["notes"] if "illustrative" not in note.lower()), *imports.credits],
     }
-    content["trees"] |= {"points_m": [], "points_deg": [], "single": [_tree_dict(tree) for tree in imports.trees]}
-    imported = SiteModel.model_validate(content)
-    return imported, [_kept_of_base(imported, base), *imports.actions]
+    content["trees"] |= only_trees(imports.trees)
+    return imports.actions
+
+
+def only_trees(trees: Sequence[SingleTree]) -> dict[str, Any]:
+    """Keys of ``trees`` in site.yaml with these single trees and no others."""
+    return {"points_m": [], "points_deg": [], "single": [_tree_dict(tree) for tree in trees]}
 
 
 def _kept_of_base(model: SiteModel, base: str | Path) -> str:
@@ -630,7 +650,9 @@ def _tree_dict(tree: SingleTree) -> dict[str, Any]:
     return {"at_m": (round(tree.east_m, 2), round(tree.north_m, 2)), **known}
 
 
-def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:
+def outline_dict(name: str, area: Polygon) -> dict[str, Any]:
+    """Name and polygon as site.yaml writes them."""
+
     def ring(line: Any) -> list[tuple[float, float]]:
         return [(round(float(x), 3), round(float(y), 3)) for x, y in list(line.coords)[:-1]]
 

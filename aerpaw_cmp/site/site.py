@@ -69,9 +69,19 @@ class Building:
 
 @dataclass(frozen=True, slots=True)
 class Forest:
-    """A wooded area (east, north) [m] in which trees are placed at random.
+    """A wooded area (east, north) [m]: single trees placed at random, or with a height a medium (a stand).
 
-    ``trees_per_hectare`` and ``minimum_spacing_m`` rule the placement.
+    Parameters
+    ----------
+    name : str
+    area : Polygon
+    trees_per_hectare, minimum_spacing_m : float
+        Of the placement.
+    source : str
+    height_m : float, optional
+        Of the canopy above the ground; then no trees are placed.
+    crown_base_fraction : float
+        Height of the crowns' base as a share of the canopy's.
     """
 
     name: str
@@ -79,6 +89,8 @@ class Forest:
     trees_per_hectare: float = 100.0
     minimum_spacing_m: float = 4.0
     source: str = ""
+    height_m: float | None = None
+    crown_base_fraction: float = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +184,11 @@ class Site:
     dem: Dem | None = None
     scene: TriangleScene | None = None
     merge_m: float = 1e-3
+
+    @property
+    def wooded(self) -> bool:
+        """Whether trees or stands can shade a path."""
+        return len(self.trees) > 0 or any(forest.height_m is not None for forest in self.forests)
 
     def _repr_html_(self) -> str:
         """Towers and their places, for notebooks."""

@@ -196,11 +196,12 @@ class BuildingModel(PolygonModel):
 
 
 class ForestModel(PolygonModel):
-    """A wooded area."""
+    """A wooded area; with a height a medium in place of single trees."""
 
     trees_per_hectare: NotNegative = 100.0
     minimum_spacing_m: NotNegative = 4.0
     source: str = ""
+    height_m: Structure | None = None
 
 
 OutlineT = TypeVar("OutlineT", bound=PolygonModel)
@@ -408,7 +409,15 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     buildings = tuple(_building(item, outline, dem) for item, outline in _outlines(model.buildings, "buildings", frame))
     notes += _buried(towers, buildings) + _overlaps(buildings)
     forests = tuple(
-        Forest(item.name, outline, item.trees_per_hectare, item.minimum_spacing_m, item.source)
+        Forest(
+            name=item.name,
+            area=outline,
+            trees_per_hectare=item.trees_per_hectare,
+            minimum_spacing_m=item.minimum_spacing_m,
+            source=item.source,
+            height_m=item.height_m,
+            crown_base_fraction=model.trees.crown_base_fraction,
+        )
         for item, outline in _outlines(model.forests, "forests", frame)
     )
     with _at("trees"):
@@ -633,6 +642,8 @@ def _trees(
     )
     sizes, parts = model.sizes(), []
     for index, forest in enumerate(forests):
+        if forest.height_m is not None:
+            continue
         with _at("forests", index):
             placed = place_trees(forest, sizes, seed=model.seed, keep_clear=clear)
         wanted = wanted_trees(forest, clear)

@@ -130,13 +130,14 @@ def against_reference(
     -------
     FieldAudit
     """
+    stands = expected.loss.model != "none" and any(forest.height_m is not None for forest in site.forests)
     total, beyond = FieldAudit(reference_links=len(chosen) * len(replay.towers)), _over_terrain(replay)
     for number, name in enumerate(replay.towers):
         reference = Reference(site, name, expected.link, expected.loss)
         for row in chosen:
             mine = np.flatnonzero((replay.paths.pose == row) & (replay.paths.tower == number))
-            if beyond[mine].any():
-                total += FieldAudit(not_covered=(ON_TERRAIN,))
+            if beyond[mine].any() or stands:
+                total += FieldAudit(not_covered=(STANDS if stands else ON_TERRAIN,))
                 continue
             link = _OneLink(reference=reference, replay=replay, poses=poses, row=int(row), tower=number, mine=mine)
             total += link.paths_checked(max_depth, complete and site.dem is None)
@@ -184,6 +185,7 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
     return FieldAudit(phantom_paths=count, failures=failures)
 
 
+STANDS = "paths at forests that are a medium"
 ON_TERRAIN = "reflections off shaped ground, and paths over ridges of the terrain"
 
 

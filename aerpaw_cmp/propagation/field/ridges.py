@@ -91,7 +91,7 @@ def deygout_db(length_m: FloatArray, share: FloatArray, intrusion_m: FloatArray,
         height = intrusion_m - top * way / place
         side = _parameter(height, way * length_m, (place - way) * length_m, wavelength_m)
         edge = side.argmax(axis=0)
-        s = np.minimum(way[edge, link], place)
+        s = np.clip(way[edge, link], 0.0, place)
         cosine = np.sqrt(s * (1.0 - place) / (place * (1.0 - s)))
         correction = np.maximum(6.0 - first + knife_edge_db(nu[edge, link]), 0.0) * cosine
         total = total + np.maximum(knife_edge_db(side[edge, link]) - correction, 0.0)

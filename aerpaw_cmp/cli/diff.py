@@ -55,7 +55,7 @@ _SHOWN = 20
 
 
 def _print_diff(comparison: Any) -> None:
-    from ..report.diff_data import verdict
+    from ..report.diff_words import verdict
 
     print(verdict(comparison))
     for text in comparison.remarks:

@@ -14,7 +14,6 @@ import numpy as np
 
 from ..common.units import BoolArray, FloatArray
 from .memory import FEWEST
-from .report_difference import LevelDifference
 from .season import mean_of_flights
 from .statistics import NO_INTERVAL, Interval, PairedDifference, mean_interval, paired_verdict, spread_interval
 
@@ -316,10 +315,7 @@ def _fraction(value: float) -> float:
 
 
 def changed_verdict(
-    pooled: PairedDifference | None,
-    levels: Sequence[LevelDifference],
-    changed: Mapping[str, int],
-    tolerance_db: float,
+    pooled: PairedDifference | None, differs: bool, measured_moved: bool, changed: Mapping[str, int]
 ) -> Verdict:
     """What a difference between two reports comes from.
 
@@ -327,25 +323,23 @@ def changed_verdict(
     ----------
     pooled : PairedDifference, optional
         RMSE over all links, second minus first report.
-    levels : sequence of LevelDifference
+    differs, measured_moved : bool
+        Any number, and the measured levels, by more than the tolerance.
     changed : mapping of str to int
-        Settings, inputs and versions that differ.
-    tolerance_db : float
-        Differences up to it count as none.
+        How many settings, inputs and versions differ.
 
     Returns
     -------
     Verdict
-        ``measured`` (the logs' levels differ), ``setting``, ``input``, ``version`` (the only kind that differs),
-        ``several``, ``unexplained`` (numbers differ, nothing else does), or ``none``; effect and interval of the RMSE.
+        ``measured``, the only kind of ``changed`` that differs, ``several``, ``unexplained`` (numbers differ, nothing
+        else does) or ``none``; effect and interval of the RMSE, ``where``: the word of that interval.
     """
-    moved = [x for one in levels for x in (one.measured_max_db, one.simulated_max_db, abs(one.rmse.difference_db))]
-    if not any(value > tolerance_db for value in moved):
+    kinds = [name for name, n in changed.items() if n]
+    if not differs:
         cause = NONE
-    elif any(one.measured_max_db > tolerance_db for one in levels):
+    elif measured_moved:
         cause = "measured"
     else:
-        kinds = [name for name, n in changed.items() if n]
         cause = kinds[0] if len(kinds) == 1 else "several" if kinds else "unexplained"
     if pooled is None or not pooled.n:
         return Verdict(cause=cause)

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ..compare.report_difference import Changed, LevelDifference, Overlap, RankDifference
+from ..compare.report_difference import LevelDifference, Overlap, RankDifference
 from ..compare.statistics import PairedDifference
-from .words import DIFFERENCE, count
-
-LEAST_RANK = 1e-6
-"""Differences of agreement and kappa below this are rounding."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,75 +138,3 @@ def _rank_clauses(one: RankDifference) -> Iterator[str]:
         yield f"{one.n_reported_changed} of {one.samples.common} reported ranks"
     if one.samples.only_first or one.samples.only_second:
         yield _alone(one.samples)
-
-
-# --- words ----------------------------------------------------------------------------------------------------------
-
-
-def verdict(diff: ReportDiff) -> str:
-    """The result in one or two sentences."""
-    common = sum(one.samples.common for one in diff.levels)
-    ranked = max((one.samples.common for one in diff.ranks), default=0)
-    if not diff.differences:
-        seen = [f"{count(common)} RSS samples"] * bool(common) + [f"{count(ranked)} rank samples"] * bool(ranked)
-        on = f" on {' and '.join(seen)}" if seen else " in metrics.json (no samples were compared)"
-        return f"No difference: the numbers agree within {diff.tolerance_db:g} dB{on}.{_causes(diff)}"
-    parts = [text for text in (_level_verdict(diff), _rank_verdict(diff)) if text]
-    return " ".join(parts or ["The reported numbers differ."]) + _causes(diff)
-
-
-def _causes(diff: ReportDiff) -> str:
-    """What else differs, which may be the reason."""
-    kinds = ((diff.settings, "setting"), (diff.inputs, "input"), (diff.versions, "version"))
-    causes = [f"{len(items)} {name}{'' if len(items) == 1 else 's'}" for items, name in kinds if items]
-    if not causes:
-        return " Settings, inputs and versions are the same." if diff.differences else ""
-    verb = "differs" if len(causes) == 1 and causes[0].startswith("1 ") else "differ"
-    return f" {' and '.join(causes)} {verb}."
-
-
-def _level_verdict(diff: ReportDiff) -> str:
-    scored = [one for one in diff.levels if one.rmse.n]
-    if not scored or diff.pooled is None:
-        return ""
-    if all(abs(one.rmse.difference_db) <= diff.tolerance_db for one in scored):
-        moved = max((one.simulated_max_db for one in scored if math.isfinite(one.simulated_max_db)), default=0.0)
-        though = f", though the replay moved by up to {moved:.2g} dB" if moved > diff.tolerance_db else ""
-        return f"RSS errors agree on the common samples{though}."
-    pooled = diff.pooled
-    text = (
-        f"RSS over all links: RMSE {pooled.other_rmse_db:.2f} dB in the first, {pooled.rmse_db:.2f} dB in the second. "
-    )
-    text += DIFFERENCE[pooled.verdict].format(
-        difference=pooled.difference_db, interval=_bounds(pooled.difference_ci95_db, 2)
-    )
-    if len(scored) > 1:
-        verdicts = [(word, sum(one.rmse.verdict == word for one in scored)) for word in ("better", "worse")]
-        rest = len(scored) - sum(n for _, n in verdicts)
-        text += f" Links: {verdicts[0][1]} better, {verdicts[1][1]} worse, {rest} not significant."
-    return text
-
-
-def _bounds(value: tuple[float, float], decimals: int) -> str:
-    low, high = value
-    return f"[{low:+.{decimals}f}, {high:+.{decimals}f}]" if math.isfinite(low) else ""
-
-
-def _rank_verdict(diff: ReportDiff) -> str:
-    moved = [one for one in diff.ranks if one.n_changed or abs(one.kappa.difference) > LEAST_RANK]
-    if not diff.ranks:
-        return ""
-    if not moved:
-        return "Simulated ranks agree on the common samples."
-    most = max(moved, key=lambda one: abs(one.agreement.difference) if math.isfinite(one.agreement.difference) else -1)
-    return (
-        f"Rank at {most.tower}, K = {most.k}: {count(most.n_changed)} of {count(most.samples.common)} simulated ranks "
-        f"differ, agreement {_arrow(most.agreement)}, kappa {_arrow(most.kappa)}."
-    )
-
-
-def _arrow(value: Changed) -> str:
-    if not math.isfinite(value.difference):
-        return "not known"
-    bounds = _bounds(value.ci95, 3)
-    return f"{value.first:.3f} to {value.second:.3f}" + (f" (change {bounds})" if bounds else "")

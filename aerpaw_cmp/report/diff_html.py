@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ..common.jsonable import fields_of, json_safe
-from .diff_data import ReportDiff, verdict
+from .diff_data import ReportDiff
+from .diff_words import verdict
 from .export import write_file
 from .html import environment, policy
 

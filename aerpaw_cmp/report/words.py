@@ -108,14 +108,6 @@ SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
 )  # fmt: skip
 """What may follow the two errors, and when: the first whose condition holds. No other sentence says better or worse."""
 
-DIFFERENCE = {
-    "better": "The second is significantly better: {difference:+.2f} dB {interval} (95 %).",
-    "worse": "The second is significantly worse: {difference:+.2f} dB {interval} (95 %).",
-    "not significant": "The difference of {difference:+.2f} dB {interval} is not significant (95 %).",
-    "no interval": "The difference is {difference:+.2f} dB; too few independent samples for an interval.",
-}
-"""Sentence on two reports, by the verdict of the paired interval. No other sentence of a diff says better or worse."""
-
 RANKING: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
     (lambda said: said == {"no interval"}, "Too few flights for an interval of the difference to another setting."),
     (lambda said: said == {"worse"}, "Every other setting is significantly worse (95 %)."),

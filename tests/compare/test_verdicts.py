@@ -122,7 +122,9 @@ def difference(trouble: str, draw: Generator) -> Verdict:
     overlap = Overlap(first=n, second=n, common=n)
     sides = ((measured, simulated, first), (other, measured - second, second))
     level = level_difference("LW1", "USRP1", overlap, *sides, scored=(n, n), offsets_db=(0.0, 0.0))
-    return changed_verdict(pooled_difference([(time, first, second)]), [level], changed, 0.05)
+    moved = (level.measured_max_db, level.simulated_max_db, abs(level.rmse.difference_db))
+    pooled = pooled_difference([(time, first, second)])
+    return changed_verdict(pooled, any(value > 0.01 for value in moved), level.measured_max_db > 0.01, changed)
 
 
 KINDS: dict[Callable[[str, Generator], Verdict], tuple[str, ...]] = {

@@ -16,8 +16,8 @@ from aerpaw_cmp.common.outputs import OutputFolder
 from aerpaw_cmp.compare.report_difference import mae_difference, pooled_difference
 from aerpaw_cmp.compare.statistics import autocorrelation
 from aerpaw_cmp.jobs.diff_reports import run_diff
-from aerpaw_cmp.report.diff_data import verdict
 from aerpaw_cmp.report.diff_html import diff_page, whiskers
+from aerpaw_cmp.report.diff_words import verdict
 from aerpaw_cmp.report.write import write_report
 from tests.json_page import unlisted
 

@@ -1,0 +1,111 @@
+"""Sentences on two reports, each with the condition under which it may stand."""
+
+from __future__ import annotations
+
+import math
+
+from ..compare.report_difference import Changed
+from ..compare.verdicts import changed_verdict
+from .diff_data import ReportDiff
+from .phrases import said_of
+from .words import count
+
+LEAST_RANK = 1e-6
+"""Differences of agreement and kappa below this are rounding."""
+
+DIFFERENCE = {
+    "better": "The second is significantly better: {difference:+.2f} dB {interval} (95 %).",
+    "worse": "The second is significantly worse: {difference:+.2f} dB {interval} (95 %).",
+    "not significant": "The difference of {difference:+.2f} dB {interval} is not significant (95 %).",
+    "no interval": "The difference is {difference:+.2f} dB; too few independent samples for an interval.",
+}
+"""Sentence on two reports, by the verdict of the paired interval. No other sentence of a diff says better or worse."""
+
+CAUSES: dict[str, tuple[str, str]] = {
+    "none": ("{listed} {verb}.", ""),
+    "measured": (
+        "The measured levels differ by up to {moved:.2g} dB.",
+        "compare reports of the same logs to judge a model",
+    ),
+    "setting": ("Likely cause: {listed} {verb}.", ""),
+    "input": ("Likely cause: {listed} {verb}.", ""),
+    "version": ("Likely cause: {listed} {verb}.", "make both reports with one version to judge a setting"),
+    "several": ("{listed} {verb}, so no single cause is shown.", "change one of them at a time"),
+    "unexplained": (
+        "Settings, inputs and versions are the same.",
+        "run both reports again; numbers that still differ are a fault of the program",
+    ),
+}
+"""Cause and next step, by :func:`~aerpaw_cmp.compare.verdicts.changed_verdict`."""
+
+
+def verdict(diff: ReportDiff) -> str:
+    """The result in one or two sentences."""
+    common = sum(one.samples.common for one in diff.levels)
+    ranked = max((one.samples.common for one in diff.ranks), default=0)
+    if not diff.differences:
+        seen = [f"{count(common)} RSS samples"] * bool(common) + [f"{count(ranked)} rank samples"] * bool(ranked)
+        on = f" on {' and '.join(seen)}" if seen else " in metrics.json (no samples were compared)"
+        return f"No difference: the numbers agree within {diff.tolerance_db:g} dB{on}.{_cause(diff)}"
+    parts = [text for text in (_level_verdict(diff), _rank_verdict(diff)) if text]
+    return " ".join(parts or ["The reported numbers differ."]) + _cause(diff)
+
+
+def _cause(diff: ReportDiff) -> str:
+    """What else differs, which may be the reason."""
+    kinds = {"setting": diff.settings, "input": diff.inputs, "version": diff.versions}
+    changed = {name: len(items) for name, items in kinds.items()}
+    moved = max((one.measured_max_db for one in diff.levels if math.isfinite(one.measured_max_db)), default=0.0)
+    found = changed_verdict(diff.pooled, bool(diff.differences), moved > diff.tolerance_db, changed)
+    listed = " and ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in changed.items() if n)
+    verb = "differs" if sum(changed.values()) == 1 else "differ"
+    if found.cause == "none" and not listed:
+        return ""
+    return " " + said_of(found, CAUSES, listed=listed, verb=verb, moved=moved)
+
+
+def _level_verdict(diff: ReportDiff) -> str:
+    scored = [one for one in diff.levels if one.rmse.n]
+    if not scored or diff.pooled is None:
+        return ""
+    if all(abs(one.rmse.difference_db) <= diff.tolerance_db for one in scored):
+        moved = max((one.simulated_max_db for one in scored if math.isfinite(one.simulated_max_db)), default=0.0)
+        though = f", though the replay moved by up to {moved:.2g} dB" if moved > diff.tolerance_db else ""
+        return f"RSS errors agree on the common samples{though}."
+    pooled = diff.pooled
+    text = (
+        f"RSS over all links: RMSE {pooled.other_rmse_db:.2f} dB in the first, {pooled.rmse_db:.2f} dB in the second. "
+    )
+    text += DIFFERENCE[pooled.verdict].format(
+        difference=pooled.difference_db, interval=_bounds(pooled.difference_ci95_db, 2)
+    )
+    if len(scored) > 1:
+        verdicts = [(word, sum(one.rmse.verdict == word for one in scored)) for word in ("better", "worse")]
+        rest = len(scored) - sum(n for _, n in verdicts)
+        text += f" Links: {verdicts[0][1]} better, {verdicts[1][1]} worse, {rest} not significant."
+    return text
+
+
+def _bounds(value: tuple[float, float], decimals: int) -> str:
+    low, high = value
+    return f"[{low:+.{decimals}f}, {high:+.{decimals}f}]" if math.isfinite(low) else ""
+
+
+def _rank_verdict(diff: ReportDiff) -> str:
+    moved = [one for one in diff.ranks if one.n_changed or abs(one.kappa.difference) > LEAST_RANK]
+    if not diff.ranks:
+        return ""
+    if not moved:
+        return "Simulated ranks agree on the common samples."
+    most = max(moved, key=lambda one: abs(one.agreement.difference) if math.isfinite(one.agreement.difference) else -1)
+    return (
+        f"Rank at {most.tower}, K = {most.k}: {count(most.n_changed)} of {count(most.samples.common)} simulated ranks "
+        f"differ, agreement {_arrow(most.agreement)}, kappa {_arrow(most.kappa)}."
+    )
+
+
+def _arrow(value: Changed) -> str:
+    if not math.isfinite(value.difference):
+        return "not known"
+    bounds = _bounds(value.ci95, 3)
+    return f"{value.first:.3f} to {value.second:.3f}" + (f" (change {bounds})" if bounds else "")

@@ -39,6 +39,8 @@ class CorrectedMaps:
     ranks: dict[tuple[str, float], FloatArray]
     flown_m: tuple[FloatArray, ...]
     sentence: str
+    outside: float
+    """Share of positions beyond the flown places."""
     warnings: tuple[str, ...]
 
     def layers(self) -> list[Layer]:
@@ -129,6 +131,7 @@ def corrected_maps(
         ranks=dict(_ranks(said, len(grid))),
         flown_m=tuple(s.position_m[:: max(1, len(s) // 500), :2] for s in said.samples),
         sentence=said.sentence,
+        outside=said.outside,
         warnings=said.warnings,
     )
 

@@ -493,6 +493,8 @@ def maps_record(
         rss=rss,
         corrected=() if flown is None else tuple(flown.rss_maps(result.grid)),
         flown_m=() if flown is None else flown.flown_m,
+        outside_flown=0.0 if flown is None else flown.outside,
+        corrected_words="" if flown is None else flown.sentence,
         rank=rank,
         rank_by_tower=tuple(one for mode, maps in outcome.ordered() for one in _tower_rank_maps(maps, mode)),
         layers=tuple(_further_layers(outcome)),
@@ -501,7 +503,7 @@ def maps_record(
         errors=tuple(_errors(outcome)),
         learning=tuple(_learning(outcome)),
         paper=tuple(paper),
-        warnings=tuple(_warnings(outcome)),
+        warnings=() if flown is None else flown.warnings,
         notes=_notes(outcome),
         versions=versions,
         settings=asdict(s),
@@ -675,42 +677,10 @@ def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
         yield page.LearningCurve(method=f"{name}, mean over heights and K", samples=sizes, mae=mean)
 
 
-def _warnings(outcome: MapOutcome) -> Iterator[str]:
-    if outcome.corrected is not None:
-        yield f"Corrected by flights: {outcome.corrected.sentence}"
-        yield from outcome.corrected.warnings
-    for key in ("zero", "missing"):
-        if key in outcome.studies and (study := outcome.studies[key]).fit.degenerate:
-            yield f"Correlation fit (Z {key}): {study.fit.message}"
-    if outcome.settings.spacing_m > cells.PAPER_SPACING_M:
-        yield (
-            f"A spacing of {outcome.settings.spacing_m:g} m is coarser than the paper's 30 m: errors of interpolation "
-            "and correlation are not comparable with it."
-        )
-
-
 def _notes(outcome: MapOutcome) -> tuple[str, ...]:
-    s = outcome.settings
-    modes = ", ".join(s.foliage)
-    return (
-        f"Foliage {modes}: opaque stops whatever touches a crown or a trunk (the paper); attenuating takes "
-        "ITU-R P.833 over the path's length in crowns; none leaves the trees out.",
-        *_crown_note(outcome),
-        *([note] if "attenuating" in modes and (note := p833_note(s.carrier_hz)) else []),
-        "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element.",
-        "No receiver bandwidth is assumed: a link is in coverage where a path arrives above the thermal noise of 1 Hz "
-        "(-174 dBm)" + (f", in maps of RSS above {s.threshold_dbm:g} dBm." if np.isfinite(s.threshold_dbm) else "."),
-        f"Spread, condition number, correlation and interpolation are those of foliage {s.shown}.",
-    )
-
-
-def _crown_note(outcome: MapOutcome) -> Iterator[str]:
-    s = outcome.settings
-    if "opaque" in s.foliage and len(outcome.site.trees):
-        if s.crown_reflections:
-            yield f"Opaque crowns reflect: {outcome.paths_off_crowns:,} paths bounce off one, beside {outcome.paths:,}."
-        else:
-            yield "Opaque crowns do not reflect: crown_reflections is off."
+    """Where the loss in crowns is continued beyond its table."""
+    note = p833_note(outcome.settings.carrier_hz) if "attenuating" in outcome.settings.foliage else None
+    return () if note is None else (note,)
 
 
 def _metrics(outcome: MapOutcome) -> dict[str, Any]:

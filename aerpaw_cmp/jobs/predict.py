@@ -124,8 +124,13 @@ class Prediction:
     @property
     def sentence(self) -> str:
         """First words of terminal and page."""
+        return first_words(self.correction, self.outside)
+
+    @property
+    def outside(self) -> float:
+        """Share of the points beyond the flown places."""
         levels = self.table[self.table["channel"] != "rank"]
-        return first_words(self.correction, float((levels["flag"] == "outside_flown").mean()))
+        return float((levels["flag"] == "outside_flown").mean())
 
 
 def predict(

@@ -152,6 +152,10 @@ class MapsData:
         Of each link, raw and corrected by flights (``antennas``): for figures; the linked map has them in ``further``.
     flown_m : tuple of (n, 2)
         Tracks of those flights, east and north [m].
+    outside_flown : float
+        Share of positions further from those flights than a correction reaches.
+    corrected_words : str
+        First words of the prediction that corrected the levels.
     further : tuple of MapLayer
         Layers of the linked map that have no static figure.
     metrics : mapping
@@ -168,6 +172,8 @@ class MapsData:
     rss: tuple[RssMap, ...] = ()
     corrected: tuple[RssMap, ...] = ()
     flown_m: tuple[FloatArray, ...] = ()
+    outside_flown: float = 0.0
+    corrected_words: str = ""
     rank: tuple[RankMap, ...] = ()
     rank_by_tower: tuple[RankMap, ...] = ()
     layers: tuple[Layer, ...] = ()

@@ -17,6 +17,7 @@ from .explorer import as_json
 from .export import merge, write_file
 from .html import by_section, environment, policy, script
 from .map_explorer import layer_numbers, page_layers, payload
+from .map_words import first_words, notes, warnings
 from .maps_data import MapError, MapsData
 from .names import k_key
 
@@ -47,7 +48,7 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
         "mae": [picked(e, "evaluation", "method", "k", "altitude_m", "mae", "mae_ci95", "n") for e in data.errors],
         "paper": [picked(p, "where", "what", "paper", "ours") for p in data.paper],
         "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
-        "warnings": list(data.warnings),
+        "warnings": warnings(data),
     }
     safe: dict[str, Any] = json_safe(result)
     merge(safe, json_safe(data.metrics))
@@ -86,6 +87,9 @@ def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str])
     code = script("common.js", "map_explorer.js") if linked else ""
     text: str = environment().get_template("map.html.jinja").render(
         data=data,
+        verdict=first_words(data),
+        warnings=warnings(data),
+        notes=notes(data),
         sections=by_section(pictures),
         coverage=coverage_table(data),
         errors=error_tables(data.errors),

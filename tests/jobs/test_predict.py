@@ -195,7 +195,7 @@ def test_corrected_levels_are_brought_to_the_raw_replay_by_the_planted_offset(pr
     np.testing.assert_allclose((one.corrected_dbm - level)[[0, 2, 3]], 12.3, atol=0.7)
     raw = trace("lake_wheeler", Link(3.3e9, {"LW1": single_element()}, single_element()), [[-300.0, 150.0, 45.0]])
     assert one.raw_dbm[0] == pytest.approx(raw.rss_dbm[0, 0], abs=1e-6)
-    maps = corrected_map.CorrectedMaps(levels=(one,), ranks={}, flown_m=(), sentence="", warnings=())
+    maps = corrected_map.CorrectedMaps(levels=(one,), ranks={}, flown_m=(), sentence="", outside=0.0, warnings=())
     assert [layer.name for layer in maps.layers()] == [
         f"rss_{kind}_h045m_LW1_USRP1" for kind in ("raw", "corrected", "sd")
     ]

@@ -1,0 +1,132 @@
+"""Sentences of a map's page, each with the condition under which it may stand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..compare.verdicts import Coverage, coverage_verdict
+from ..maps.grid import PAPER_SPACING_M
+from .maps_data import JOINT, MapsData, RssMap
+from .phrases import said_of
+from .words import count
+
+LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
+
+CAUSES: dict[str, tuple[str, str]] = {
+    "none": (LEAST + ".", ""),
+    "trees": (LEAST + "; trees take most of the rest.", "fly higher, or map `--foliage attenuating` beside it"),
+    "level": (
+        LEAST + "; levels below {threshold:g} dBm take most of the rest.",
+        "raise the transmit power, or lower `--threshold-dbm`",
+    ),
+    "blocked": (LEAST + "; buildings and terrain take most of the rest.", "fly higher, or add a tower"),
+    "threshold": (
+        "No position reaches {threshold:g} dBm at {where}, though paths arrive at {reached:.1f} % of them.",
+        "raise the transmit power, or lower `--threshold-dbm`",
+    ),
+    "no path": ("No path arrives at any position at {where}.", "check the towers and the area of the site"),
+    "extrapolated": (
+        LEAST + ". {outside:.0f} % of the positions lie outside the flown places: there the correction is a guess.",
+        "`aerpaw-cmp plan` names the flight that helps most",
+    ),
+}
+"""Sentence and next step by :func:`~aerpaw_cmp.compare.verdicts.coverage_verdict`."""
+
+
+def first_words(data: MapsData) -> str:
+    """Coverage at the best and at the worst height, what takes the rest, and what to do next."""
+    heights = coverage(data)
+    if not heights:
+        return ""
+    worst = min(heights, key=lambda one: one.covered)
+    said = said_of(
+        coverage_verdict(heights),
+        CAUSES,
+        percent=100.0 * worst.covered,
+        reached=100.0 * worst.reached,
+        outside=100.0 * worst.outside,
+        threshold=float(data.settings.get("threshold_dbm", -np.inf)),
+    )
+    best = max(heights, key=lambda one: one.covered)
+    more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if len(heights) > 1 else ""
+    measured = "" if data.corrected else " Nothing here was measured."
+    return f"{more}{said}{measured}"
+
+
+def coverage(data: MapsData) -> list[Coverage]:
+    """Each height of the map of the nearest tower, with the most trees that were mapped."""
+    shown = [one for one in data.rss if one.tower == JOINT] or list(data.rss)
+    if not shown:
+        return []
+    first = shown[0]
+    kept = [one for one in shown if (one.tower, one.antennas) == (first.tower, first.antennas)]
+    clear = {one.altitude_m: one.coverage for one in kept if one.foliage == "none" != first.foliage}
+    return [
+        Coverage(
+            height_m=one.altitude_m,
+            covered=one.coverage,
+            clear=clear.get(one.altitude_m, np.nan),
+            reached=_reached(data, one),
+            outside=data.outside_flown,
+        )
+        for one in kept
+        if one.foliage == first.foliage
+    ]
+
+
+def _reached(data: MapsData, one: RssMap) -> float:
+    """Share of positions that any path reaches: those with a rank."""
+    share = [1.0 - m.share[0] for m in data.rank if (m.altitude_m, m.foliage) == (one.altitude_m, one.foliage)]
+    return float(share[0]) if share else np.nan
+
+
+def warnings(data: MapsData) -> list[str]:
+    """What must be known before the maps are believed."""
+    out = []
+    if data.site.illustrative:
+        out.append(
+            f"Buildings and forests of {data.site.name} are illustrative, not surveyed: blockage and reflections show "
+            "the method, not the place."
+        )
+    if data.corrected_words:
+        out.append(f"Corrected by flights: {data.corrected_words}")
+    for key, fit in data.metrics.get("correlation", {}).items():
+        if fit["degenerate"]:
+            out.append(f"Correlation fit ({key.replace('z_', 'Z ')}): {fit['message']}")
+    spacing = data.settings.get("spacing_m", 0.0)
+    if spacing > PAPER_SPACING_M:
+        out.append(
+            f"A spacing of {spacing:g} m is coarser than the paper's {PAPER_SPACING_M:g} m: errors of interpolation "
+            "and correlation are not comparable with it."
+        )
+    return [*out, *data.warnings]
+
+
+def notes(data: MapsData) -> list[str]:
+    """How the maps were made."""
+    made = list(_made(data)) if "foliage" in data.settings else []
+    return [*data.site.notes, *made, *data.notes]
+
+
+def _made(data: MapsData) -> Iterator[str]:
+    s = data.settings
+    yield (
+        f"Foliage {', '.join(s['foliage'])}: opaque stops whatever touches a crown or a trunk (the paper); attenuating "
+        "takes ITU-R P.833 over the path's length in crowns; none leaves the trees out."
+    )
+    if "opaque" in s["foliage"] and len(data.site.trees):
+        yield (
+            f"Opaque crowns reflect: {count(data.metrics['paths_off_crowns'])} paths bounce off one, beside "
+            f"{count(data.metrics['paths'])}."
+            if s["crown_reflections"]
+            else "Opaque crowns do not reflect: crown_reflections is off."
+        )
+    yield "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element."
+    threshold = f", in maps of RSS above {s['threshold_dbm']:g} dBm" if np.isfinite(s["threshold_dbm"]) else ""
+    yield (
+        "No receiver bandwidth is assumed: a link is in coverage where a path arrives above the thermal noise of 1 Hz "
+        f"(-174 dBm){threshold}."
+    )
+    yield f"Spread, condition number, correlation and interpolation are those of foliage {data.rss[0].foliage}."

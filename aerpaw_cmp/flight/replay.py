@@ -433,6 +433,7 @@ def replay_poses(
             crowns=reflecting_crowns(site.trees, rt),
             diffraction=rt.diffraction,
             ridges=rt.advanced.ridges,
+            refraction=rt.refraction,
         )
         field = Field(path_loss(site, rt, link.carrier_hz))
         return replay_moving(site, link, poses, towers_m, search, field, run, each=each)
@@ -445,6 +446,7 @@ def replay_poses(
         power_cut_db=rt.advanced.power_cut_db,
         diffraction=rt.diffraction,
         ridges=rt.advanced.ridges,
+        refraction=rt.refraction,
         interactions=rt.advanced.interactions if others else ("reflection",),
         scattering_coefficient=rt.advanced.scattering_coefficient if others else None,
         device=rt.advanced.device,

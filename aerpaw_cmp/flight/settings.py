@@ -434,6 +434,8 @@ class RtSettings(GroupedSettings):
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
     diffraction: Literal["none", "edges", "all"] = "none"
     """Paths over one edge of a building, in H, levels and ranks; ``all``: also with a wall or roof on one side."""
+    refraction: bool = False
+    """Paths straight through walls and roofs of buildings, in H, levels and ranks."""
     attitude: Literal["logged", "level", "ignored"] = "ignored"
     """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
@@ -455,6 +457,8 @@ class RtSettings(GroupedSettings):
             raise ValueError("interactions besides reflection need max_depth of 1 or more: each counts in it")
         if self.diffraction != "none" and (self.advanced.visibility == "pairs" or "diffraction" in asked):
             raise ValueError("diffraction goes with visibility: centre, and without interactions: diffraction")
+        if self.refraction and (self.advanced.visibility == "pairs" or "refraction" in asked):
+            raise ValueError("refraction goes with visibility: centre, and without interactions: refraction")
         if "scattering" in asked and scattered is None:
             raise ValueError("interactions: scattering needs scattering_coefficient (materials of P.2040 state none)")
         if "scattering" not in asked and scattered is not None:

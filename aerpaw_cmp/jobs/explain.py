@@ -27,6 +27,7 @@ from ..propagation.check.explain import (
     near_an_edge,
     power_sum_dbm,
     simple_paths,
+    wall_path_lines,
     why_not,
 )
 from ..propagation.drivers.moving import site_with_tower_at
@@ -188,6 +189,7 @@ def run_explain(
             "each element pair has its own paths (rt.advanced.visibility: pairs); these are those of the array centres"
         )
     notes += edge_path_lines(replayed, np.asarray(source), pose, link)
+    notes += wall_path_lines(replayed, np.asarray(source), pose, link)
     measured = float(series.measured_db[at]) if isinstance(series, RssSeries) else None
     return Explanation(
         flight=settings.flight.name,

@@ -52,6 +52,8 @@ class Search:
     ridges : {"deygout", "bullington"}
         With diffraction, what the straight path loses over terrain that blocks it: up to three knife edges, or the one
         where the horizons meet.
+    refraction : bool
+        Paths straight through walls and roofs, in H, levels and ranks.
     interactions : sequence of {"reflection", "diffraction", "scattering", "refraction"}
         ``sionna`` only, but for reflections: the others' power is added to RSS, never to H
         (:mod:`aerpaw_cmp.propagation.search.interactions`).
@@ -72,6 +74,7 @@ class Search:
     check_power_cut: bool = True
     diffraction: Diffraction = "none"
     ridges: Ridges = "deygout"
+    refraction: bool = False
     interactions: Sequence[str] = ("reflection",)
     scattering_coefficient: float | None = None
     device: Device = "auto"
@@ -109,6 +112,10 @@ class Search:
         if self.diffraction != "none" and "diffraction" in self.interactions:
             raise UsageError(
                 "diffraction by edges and by Sionna", expected="one of them: its power would be added twice"
+            )
+        if self.refraction and "refraction" in self.interactions:
+            raise UsageError(
+                "refraction by slabs and by Sionna", expected="one of them: its power would be added twice"
             )
         _check_positive("power_cut_db", self.power_cut_db)
         searches = other_searches(self.interactions, self.scattering_coefficient)

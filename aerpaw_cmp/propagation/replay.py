@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -29,6 +30,7 @@ from .search.interactions import OtherInteractions, OtherSearch, path_powers
 from .search.power_cut import CHECKED_POSES, loss_in_words, within_cut
 from .search.samples import spread
 from .search.terrain import on_terrain
+from .search.walls import ThroughWalls, paths_through
 from .surfaces import Surfaces
 
 LEVELS_AT_ONCE = 1024
@@ -73,6 +75,8 @@ class Replay:
         What the faces are made of, where the site is a scene of triangles.
     edge_paths : EdgePaths, optional
         Paths over edges, where diffraction was asked for; they are in H and both levels.
+    through : ThroughWalls, optional
+        Paths through walls, where refraction was asked for; they are in H and both levels.
     other : OtherInteractions, optional
         What diffraction, scattering and refraction add to both levels and to ``has_path``, where they were asked for;
         ``h`` and ``paths`` are of reflections alone.
@@ -95,6 +99,7 @@ class Replay:
     pairs_differ: BoolArray | None = None
     surfaces: Surfaces | None = None
     edge_paths: EdgePaths | None = None
+    through: ThroughWalls | None = None
     other: OtherInteractions | None = None
 
     def of_reflections(self) -> Replay:
@@ -198,9 +203,12 @@ def replay(
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
     notes += cache.warnings if cache else []
     notes += _checked_cut(site, scene, link, poses, search, field, cache)
-    bent, unmodelled = _bent(site, scene, link, poses, search, field, run)
+    bent, over, unmodelled = _bent(site, scene, link, poses, search, field, run)
+    through, added = _passing(site, scene, link, poses, search, field, run)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
-    result, idle = _evaluated(scene, link, poses, paths, search, field, run, bent)
+    more = [one for one in (over, added) if one is not None]
+    result, idle = _evaluated(scene, link, poses, paths, search, field, run, more)
+    result = replace(result, edge_paths=bent, through=through)
     notes += [*stopped, *unmodelled]
     if searches:
         power = _other_powers(site, scene, link, poses, search, searches, field, cache)
@@ -325,21 +333,12 @@ def _checked_cut(
     return [loss_in_words(cut_db, len(full), len(full) - len(left), len(some), level[1][both] - level[0][both], lost)]
 
 
-@dataclass(frozen=True, slots=True)
-class _Bent:
-    """Paths over edges, and what they add: ``h`` (poses, towers, n_rx, n_tx), ``power`` (poses, towers)."""
-
-    paths: EdgePaths
-    h: ComplexArray
-    power: FloatArray
-
-
 def _bent(
     site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, run: Run
-) -> tuple[_Bent | None, list[str]]:
-    """What diffraction adds, and what of it is not modelled."""
+) -> tuple[EdgePaths | None, Fields | None, list[str]]:
+    """Paths over edges, what they add, and what of diffraction is not modelled."""
     if search.diffraction == "none":
-        return None, []
+        return None, None, []
     edges = edges_of(scene)
     paths = find_edge_paths(
         edges,
@@ -360,7 +359,31 @@ def _bent(
         paths, loss_db = paths.select(clear), None if loss_db is None else loss_db[clear]
     h, power = edge_channels(paths, edges, scene.faces, scene.sources_m, poses, link, loss_db, threads=run.threads)
     missing = "three edges" if search.diffraction == "all" else "two edges, after a reflection off a wall,"
-    return _Bent(paths, h, power), [f"diffraction over {missing} and with more than one reflection on a side"]
+    return paths, Fields(h, power, power), [f"diffraction over {missing} and with more than one reflection on a side"]
+
+
+def _passing(
+    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, run: Run
+) -> tuple[ThroughWalls | None, Fields | None]:
+    """Paths through walls, and what they add."""
+    if not search.refraction:
+        return None, None
+    if scene.surfaces is not None:
+        raise UsageError(
+            "refraction in a scene of triangles",
+            expected="buildings with footprints, or interactions: [reflection, refraction] with engine sionna",
+            cause="a triangle does not say where its wall ends",
+        )
+    through = paths_through(scene.faces, scene.links_to(poses), search.max_depth)
+    lines = through.reflections()
+    clear = _clear_of_terrain(site, scene, poses, lines)
+    loss_db = field.loss_db(lines, scene.sources_m, poses.position_m)
+    if loss_db is not None:
+        clear &= np.isfinite(loss_db)
+        loss_db = loss_db[clear]
+    through = through.select(clear)
+    fields = channel_matrices(through.paths, through.faces, scene.sources_m, poses, link, loss_db, threads=run.threads)
+    return through, fields
 
 
 def edges_of(scene: Scene | Replay) -> Edges:
@@ -379,7 +402,7 @@ def _evaluated(
     search: Search,
     field: Field,
     run: Run,
-    bent: _Bent | None = None,
+    more: Sequence[Fields] = (),
 ) -> tuple[Replay, list[str]]:
     """Fields of the paths, and which buildings hardly matter to them; times are the caller's."""
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
@@ -388,9 +411,9 @@ def _evaluated(
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True
-    if bent is not None:
-        fields = Fields(fields.h + bent.h, fields.path_power, fields.power + bent.power)
-        has_path |= bent.power > 0.0
+    for one in more:
+        fields = Fields(fields.h + one.h, fields.path_power, fields.power + one.power)
+        has_path |= one.power > 0.0
     idle: list[str] = []
     if field.relevance_db is not None:
         power = mean_pair_power(fields.h)
@@ -409,7 +432,6 @@ def _evaluated(
         engine=search.engine,
         towers=tuple(link.tower_arrays),
         surfaces=scene.surfaces,
-        edge_paths=None if bent is None else bent.paths,
     ), idle
 
 

@@ -27,7 +27,7 @@ from ..field.edges import Tables
 from ..field.edges import amplitudes as edge_amplitudes
 from ..field.fresnel import FaceMaterials, reflection_coefficients
 from ..field.geometry import Elements, geometry
-from ..field.sum import amplitudes, pattern_ends
+from ..field.sum import amplitudes, channel_matrices, pattern_ends
 from ..paths import Faces, PathSet
 from ..replay import Replay, edges_of
 from ..search.mirror import images_of, scene_tolerance_m, trace_back
@@ -170,6 +170,35 @@ def edge_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Li
         before, after = ([replay.faces.label[face]] if face >= 0 else [] for face in paths.ground[row])
         lines.append(f"diffracted path {level[row]:.2f} dBm: {', '.join([*before, *steps, *after])}")
     return lines
+
+
+def wall_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Link) -> list[str]:
+    """Paths through walls of a replay of one link in words, strongest first, with their levels before foliage.
+
+    Parameters
+    ----------
+    replay : Replay
+    source_m : (3,)
+    poses : Poses
+        The pose.
+    link : Link
+        With that tower alone.
+
+    Returns
+    -------
+    list of str
+    """
+    through = replay.through
+    if through is None or not len(through.paths):
+        return []
+    paths, label = through.paths, through.faces.label
+    level = link.transmit_power_dbm + db_from_power(
+        channel_matrices(paths, through.faces, source_m[None], poses, link).path_power
+    )
+    return [
+        f"path {level[row]:.2f} dBm: {', '.join(label[face] for face in paths.faces[row] if face >= 0)}"
+        for row in np.argsort(-level, kind="stable")
+    ]
 
 
 def _explained(

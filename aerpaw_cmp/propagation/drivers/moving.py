@@ -183,7 +183,9 @@ def _scene_of(
 
 def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     """Replay of a block as of one tower, which had its own place at each pose."""
-    row, bent = np.arange(len(block.rows)), replayed.edge_paths
+    row, bent, through = np.arange(len(block.rows)), replayed.edge_paths, replayed.through
+    if through is not None:
+        through = replace(through, paths=replace(through.paths, tower=np.zeros_like(through.paths.tower)))
 
     def own(values: AnyArray) -> AnyArray:
         return np.ascontiguousarray(values[row, block.own][:, None])
@@ -196,6 +198,7 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
         has_path=own(replayed.has_path),
         pairs_differ=None if replayed.pairs_differ is None else own(replayed.pairs_differ),
         paths=replace(replayed.paths, tower=np.zeros_like(replayed.paths.tower)),
+        through=through,
         edge_paths=None if bent is None else replace(bent, tower=np.zeros_like(bent.tower)),
         towers=(name,),
         left_out=[re.sub(re.escape(name) + "@[0-9]+", name, text) for text in replayed.left_out],

@@ -16,6 +16,7 @@ from ..edges import EdgePaths
 from ..options import Field, Run, Search, Whole
 from ..paths import Faces, PathSet, joined
 from ..replay import Replay, replay
+from ..search.walls import ThroughWalls
 
 Each = Callable[[Site, Link, Poses, Search, Field, Run], Replay]
 """How a part is replayed: :func:`replay`, or :func:`aerpaw_cmp.propagation.drivers.pairs.replay_pairs`."""
@@ -68,6 +69,7 @@ def put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
         "seconds": sum(part.seconds for part in parts),
         "search_seconds": sum(part.search_seconds for part in parts),
         "left_out": _counted(parts),
+        "through": _through([part.through for part in parts if part.through is not None], rows),
         "edge_paths": None if first.edge_paths is None else _edge_paths([b for b in bent if b is not None], rows),
     }
     names = ["rss_dbm", "rss_power_dbm", "h", "has_path", *(["pairs_differ"] if first.pairs_differ is not None else [])]
@@ -90,6 +92,15 @@ def _edge_paths(parts: list[EdgePaths], rows: list[IntArray]) -> EdgePaths:
     moved = [replace(part, pose=at[part.pose]) for at, part in zip(rows, parts, strict=True)]
     whole = EdgePaths(**{f.name: np.concatenate([getattr(p, f.name) for p in moved]) for f in fields(EdgePaths)})
     return whole.select(np.argsort(whole.pose, kind="stable"))
+
+
+def _through(parts: list[ThroughWalls], rows: list[IntArray]) -> ThroughWalls | None:
+    """Paths through walls of all blocks, whose buildings are the same."""
+    if not parts:
+        return None
+    moved = [replace(part.paths, pose=at[part.paths.pose]) for at, part in zip(rows, parts, strict=True)]
+    paths = PathSet.one_after_another(moved)
+    return replace(parts[0], paths=paths.select(np.argsort(paths.pose, kind="stable")))
 
 
 def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:

@@ -92,8 +92,10 @@ def geometry(
     mounts = np.stack([array.mount.T for array in link.tower_arrays.values()])
     image, frame = sources_m[paths.tower], mounts[paths.tower]
     normals = np.where((sequence >= 0)[..., None], faces.normal[sequence], 0.0)
+    passed = table[sequence, 2] < 0.0
     for step in range(depth):
-        normal = normals[:, step].copy()  # zero where there is no face: nothing is mirrored
+        # zero where there is no face, or one that the path passes: nothing is mirrored
+        normal = np.where(passed[:, step, None], 0.0, normals[:, step])
         offset = np.where(sequence[:, step] >= 0, faces.offset_m[sequence[:, step]], 0.0)
         image = image - 2.0 * ((image * normal).sum(axis=1) - offset)[:, None] * normal
         for vectors in (frame, normals[:, :step]):

@@ -55,6 +55,7 @@ def find_paths(
     budget: int = SEQUENCE_BUDGET,
     extent_m: FloatArray | None = None,
     progress: Progress | None = None,
+    hidden: bool = True,
 ) -> PathSet:
     """All paths with at most ``max_depth`` reflections.
 
@@ -71,6 +72,8 @@ def find_paths(
         Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
     progress : callable, optional
         Called with the share done.
+    hidden : bool
+        Solids stop paths.
 
     Returns
     -------
@@ -88,6 +91,8 @@ def find_paths(
     known = targets_m[np.isfinite(targets_m).all(axis=1)] if extent_m is None else extent_m
     tolerance_m = scene_tolerance_m(faces, sources_m, known)
     hiding = Occlusion(faces, tolerance_m)
+    if not hidden:
+        hiding.pieces = []
     box = _Bounds.of(faces, float(max(1.0, *(np.abs(p).max(initial=0.0) for p in (known, sources_m)))))
     # without a second reflection nobody asks
     facing = _facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)

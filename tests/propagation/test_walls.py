@@ -1,0 +1,174 @@
+"""Paths through walls: laws of the slab, closed forms, reciprocity."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from shapely.affinity import rotate
+from shapely.geometry import Polygon, box
+
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.propagation import compiled
+from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
+from aerpaw_cmp.propagation.drivers.moving import replay_moving
+from aerpaw_cmp.propagation.drivers.parts import replay_in_parts
+from aerpaw_cmp.propagation.field.fresnel import coefficients, transmission
+from aerpaw_cmp.propagation.options import Field, Run, Search
+from aerpaw_cmp.propagation.replay import Replay, replay
+from aerpaw_cmp.site.materials import material
+from aerpaw_cmp.site.site import Building, Site, Tower
+
+CARRIER = 3.4e9
+WAVELENGTH = wavelength_m(CARRIER)
+RANDOM = np.random.default_rng(11)
+COSINE, PERMITTIVITY, LOSS, THICKNESS = (
+    RANDOM.uniform(*limits, 400) for limits in ((0.02, 1.0), (1.0, 9.0), (-3.0, 0.0), (0.0, 4.0))
+)
+
+
+def through(cosine: Any, eta: Any, thickness: Any) -> tuple[Any, Any]:
+    te_re, te_im, tm_re, tm_im = transmission(cosine, np.real(eta), np.imag(eta), thickness)
+    return te_re + 1j * te_im, -(tm_re + 1j * tm_im)
+
+
+def back(cosine: Any, eta: Any, thickness: Any) -> tuple[Any, Any]:
+    te_re, te_im, tm_re, tm_im = coefficients(cosine, np.real(eta), np.imag(eta), thickness)
+    return te_re + 1j * te_im, tm_re + 1j * tm_im
+
+
+def test_a_slab_without_loss_keeps_the_energy() -> None:
+    for r, t in zip(back(COSINE, PERMITTIVITY, THICKNESS), through(COSINE, PERMITTIVITY, THICKNESS), strict=True):
+        assert np.abs(r) ** 2 + np.abs(t) ** 2 == pytest.approx(np.ones(400), abs=1e-12)
+    lossy = PERMITTIVITY + 1j * LOSS
+    for r, t in zip(back(COSINE, lossy, THICKNESS), through(COSINE, lossy, THICKNESS), strict=True):
+        assert (np.abs(r) ** 2 + np.abs(t) ** 2 <= 1.0 + 1e-12).all()
+
+
+def test_no_thickness_and_air_are_no_wall_and_half_waves_are_windows() -> None:
+    for t in through(COSINE, PERMITTIVITY + 1j * LOSS, np.zeros(400)):
+        assert t == pytest.approx(np.ones(400), abs=1e-12)
+    for t in through(COSINE, np.ones(400), THICKNESS):
+        assert t == pytest.approx(np.ones(400), abs=1e-12)
+    windows = 0.5 * RANDOM.integers(1, 5, 400) / np.sqrt(PERMITTIVITY - 1 + COSINE**2)
+    for t in through(COSINE, PERMITTIVITY, windows):
+        assert np.abs(t) == pytest.approx(np.ones(400), abs=1e-9)
+
+
+def test_transmission_is_that_of_the_transfer_matrix() -> None:
+    """Abeles' matrices of both faces and the layer, tangential fields and admittances: no Fresnel coefficient."""
+    eta = PERMITTIVITY + 1j * LOSS
+    root = np.sqrt(eta - 1 + COSINE**2)
+    delta = 2 * np.pi * THICKNESS * root
+    free = np.exp(2j * np.pi * THICKNESS * COSINE)
+    for t, outside, within in zip(
+        through(COSINE, eta, THICKNESS), (COSINE, 1 / COSINE), (root, eta / root), strict=True
+    ):
+        front = np.cos(delta) + 1j * np.sin(delta) / within * outside
+        behind = 1j * np.sin(delta) * within + np.cos(delta) * outside
+        # E at the front for E = 1 at the back, as forward wave and echo; TM in E along the layer on both sides
+        assert t == pytest.approx(2 * outside / (outside * front + behind) * free, abs=1e-10)
+
+
+def house(footprint: Polygon, wall: str = "concrete with thickness=0.2", height: float = 30.0) -> Site:
+    building = (Building("house", footprint, height, material=wall),)
+    return Site("s", SiteFrame(35.7, -78.7), {"T": Tower("T", 35.7, -78.7, 0.0, 0.0)}, buildings=building)
+
+
+def run(site: Site, places: Any, array: Any = None, **search: Any) -> Replay:
+    place = np.atleast_2d(np.asarray(places, dtype=np.float64))
+    link = Link(CARRIER, {"T": array or single_element()}, array or single_element())
+    poses = Poses(place, np.tile(np.eye(3), (len(place), 1, 1)))
+    return replay(site, link, poses, Search(**{"max_depth": 0, "refraction": True, **search}))
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 35.0])
+def test_behind_a_house_the_line_of_sight_is_that_of_free_space_times_two_walls(turn_deg: float) -> None:
+    site = house(rotate(box(40.0, -30.0, 60.0, 30.0), turn_deg))
+    dark, lit = run(site, [100.0, 0.0, 10.0], refraction=False), run(site, [100.0, 0.0, 10.0])
+    open_ = run(dataclasses.replace(site, buildings=()), [100.0, 0.0, 10.0])
+    assert not dark.has_path.any()
+    cosine = np.array([np.cos(np.radians(turn_deg))])
+    concrete = material("concrete with thickness=0.2")
+    te, _ = through(cosine, np.array([concrete.relative_permittivity(CARRIER)]), np.array([0.2 / WAVELENGTH]))
+    # upright elements, level ray, upright walls: the field lies across the plane of incidence
+    assert (lit.h / open_.h).item() == pytest.approx(te.item() ** 2, rel=1e-9)
+    assert lit.rss_dbm[0, 0] == pytest.approx(open_.rss_dbm[0, 0] + 40 * np.log10(abs(te.item())), abs=1e-9)
+
+
+SCENE = (
+    Building("a", box(20.0, -15.0, 35.0, 10.0), 14.0, material="brick"),
+    Building("b", Polygon([(50, -5), (75, -5), (75, 30), (62, 30), (62, 12), (50, 12)]), 9.0, material="wood"),
+)
+PLACES = np.random.default_rng(3).uniform([80, -60, 1.5], [140, 60, 30], (60, 3))
+
+
+def town() -> Site:
+    return dataclasses.replace(house(box(0, 0, 1, 1)), buildings=SCENE)
+
+
+def test_turned_round_the_channel_is_the_same() -> None:
+    for place in PLACES[:12]:
+        there = run(town(), place, max_depth=2)
+        tower = Tower("T", 35.7, -78.7, float(place[0]), float(place[1]), antenna_height_m=float(place[2]))
+        back_ = run(dataclasses.replace(town(), towers={"T": tower}), [0.0, 0.0, 10.0], max_depth=2)
+        assert there.h.item() == pytest.approx(back_.h.item(), rel=1e-9)
+
+
+def test_walls_of_air_and_thin_walls_are_not_there() -> None:
+    empty = run(dataclasses.replace(town(), buildings=()), PLACES, max_depth=1)
+    air = "constant with permittivity=1 conductivity=0 thickness=0.3"
+    thin = "concrete with thickness=0"
+    for wall in (air, thin):
+        site = dataclasses.replace(town(), buildings=tuple(dataclasses.replace(b, material=wall) for b in SCENE))
+        same = run(site, PLACES, max_depth=1)
+        assert same.through is not None
+        assert len(same.through.paths) > 20
+        assert same.h == pytest.approx(empty.h, rel=1e-5)
+
+
+def test_off_by_default_and_nothing_changes_where_nothing_is_hidden() -> None:
+    places = np.concatenate([PLACES, PLACES * [-1.0, 1.0, 1.0]])
+    plain, asked = run(town(), places, refraction=False), run(town(), places)
+    assert not Search().refraction
+    assert asked.through is not None
+    lit = np.zeros(len(places), dtype=bool)
+    lit[asked.through.paths.pose] = True
+    assert 10 < lit.sum() <= len(PLACES)
+    assert np.array_equal(asked.h[~lit], plain.h[~lit])
+    assert np.array_equal(asked.paths.faces, plain.paths.faces)
+    half_space = dataclasses.replace(SCENE[0], material="medium_dry_ground")
+    dark = run(dataclasses.replace(town(), buildings=(half_space,)), [100.0, 0.0, 8.0])
+    assert not dark.has_path.any()
+
+
+@pytest.mark.skipif(not compiled.beams().kernels, reason="numba is not here")
+def test_compiled_code_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    array = linear_array(3, 0.04)
+    fields = []
+    for switch in ("never", "always"):
+        monkeypatch.setenv(compiled.SWITCH, switch)
+        fields.append(run(town(), PLACES, array, max_depth=2).h)
+    assert fields[0] == pytest.approx(fields[1], abs=1e-12 * np.abs(fields[0]).max())
+
+
+def test_refraction_twice_is_refused() -> None:
+    with pytest.raises(UsageError, match="added twice"):
+        run(town(), PLACES[0], engine="sionna", max_depth=1, interactions=("reflection", "refraction"))
+
+
+def test_parts_and_moving_towers_keep_the_paths() -> None:
+    whole = run(town(), PLACES, max_depth=1)
+    link = Link(CARRIER, {"T": single_element()}, single_element())
+    poses, search = Poses(PLACES, np.tile(np.eye(3), (len(PLACES), 1, 1))), Search(max_depth=1, refraction=True)
+    parted = replay_in_parts(town(), link, poses, search, Field(), Run(), size=17)
+    moving = replay_moving(town(), link, poses, np.tile([0.0, 0.0, 10.0], (len(PLACES), 1)), search)
+    assert whole.through is not None
+    for other in (parted, moving):
+        assert other.h == pytest.approx(whole.h, rel=1e-9)
+        assert other.through is not None
+        assert np.array_equal(np.bincount(other.through.paths.pose), np.bincount(whole.through.paths.pose))

@@ -9,10 +9,14 @@ import numpy as np
 from ..common.units import FloatArray
 from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.replay import FlightReplay, Replayed
-from ..report.data import PosePaths
+from ..propagation.paths import PathSet
+from ..report.data import DIFFRACTED, PASSING, PosePaths
 
 POSES = 300
 """Poses per tower whose paths are drawn."""
+
+SHORTEST = 8
+"""Paths over edges, and through walls, that are drawn of a pose."""
 
 
 def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> tuple[PosePaths, ...]:
@@ -30,9 +34,22 @@ def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> t
 
 
 def _lines(replayed: Replayed, pose: int, tower_m: FloatArray) -> Iterator[tuple[FloatArray, int]]:
-    paths = replayed.replay.paths
-    start, stop = np.searchsorted(paths.pose, [pose, pose + 1])
-    for row in range(start, stop):
-        depth = int(paths.depth[row])
-        points = [tower_m[None], paths.vertices_m[row, :depth], replayed.poses.position_m[pose][None]]
-        yield np.concatenate(points), depth
+    """Polylines of a pose with their kind: number of reflections, DIFFRACTED or PASSING."""
+    replay, target_m = replayed.replay, replayed.poses.position_m[pose]
+    kinds: list[tuple[PathSet, int | None]] = [(replay.paths, None)]
+    if replay.edge_paths is not None:
+        kinds.append((replay.edge_paths.as_path_set(), DIFFRACTED))
+    if replay.through is not None:
+        kinds.append((replay.through.paths, PASSING))
+    for paths, kind in kinds:
+        start, stop = np.searchsorted(paths.pose, [pose, pose + 1])
+        found = [
+            np.concatenate([tower_m[None], paths.vertices_m[row, : paths.depth[row]], target_m[None]])
+            for row in range(start, stop)
+        ]
+        if kind is not None:
+            found = sorted(found, key=lambda line: float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))[
+                :SHORTEST
+            ]
+        for line in found:
+            yield line, len(line) - 2 if kind is None else kind

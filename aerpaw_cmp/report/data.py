@@ -87,6 +87,10 @@ class Source:
     line: IntArray
 
 
+DIFFRACTED, PASSING = -1, -2
+"""Kinds of drawn paths beside a number of reflections: over edges, and through walls."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PosePaths:
     """Propagation paths of some poses of a tower, to be drawn.
@@ -97,7 +101,7 @@ class PosePaths:
     time : (poses,) datetime64[ns]
         Samples of the tower's first channel.
     lines : tuple of tuples
-        Per pose its paths: points (depth + 2, 3) [m] from tower to UAV, and the number of reflections.
+        Per pose its paths: points (corners, 3) [m] from tower to UAV, and the number of reflections or another kind.
     """
 
     tower: str

@@ -1,0 +1,45 @@
+"""Paths that the report's 3-D view draws."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from shapely.geometry import box
+
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.jobs.pose_paths import SHORTEST, pose_paths
+from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.report.data import DIFFRACTED, PASSING
+from aerpaw_cmp.site.site import Building, Site, Tower
+
+
+@pytest.mark.parametrize("asked", [{}, {"diffraction": "edges", "refraction": True}])
+def test_bent_and_passing_paths_are_drawn_from_tower_to_uav_where_they_were_asked_for(asked: dict[str, object]) -> None:
+    house = Building("house", box(40.0, -10.0, 60.0, 10.0), 12.0, material="brick")
+    site = Site("s", SiteFrame(35.7, -78.7), {"T": Tower("T", 35.7, -78.7, 0.0, 0.0)}, buildings=(house,))
+    link = Link(3.4e9, {"T": single_element()}, single_element())
+    poses = Poses(np.array([[100.0, 14.0, 5.0], [100.0, 20.0, 40.0]]), np.tile(np.eye(3), (2, 1, 1)))
+    replayed = SimpleNamespace(
+        replay=replay(site, link, poses, Search(**asked)), poses=poses, valid=np.ones(2, dtype=bool),
+        source_m=lambda _: np.array([0.0, 0.0, 10.0]),
+    )  # fmt: skip
+    series = SimpleNamespace(tower="T", time=np.arange(2).astype("datetime64[s]"))
+    data, replays = SimpleNamespace(site=site, rss=[series], rank=[]), SimpleNamespace(all=[replayed])
+    (paths,) = pose_paths(data, replays)  # type: ignore[arg-type]
+    kinds = [[kind for _, kind in lines] for lines in paths.lines]
+    behind = set(kinds[0])
+    if not asked:
+        assert behind <= {0, 1, 2}
+        return
+    assert {DIFFRACTED, PASSING} <= behind
+    assert 0 < kinds[0].count(DIFFRACTED) <= SHORTEST
+    assert PASSING not in kinds[1] or 0 in kinds[1]
+    for lines, place in zip(paths.lines, poses.position_m, strict=True):
+        for line, _ in lines:
+            assert np.isfinite(line).all()
+            assert line[0].tolist() == [0.0, 0.0, 10.0]
+            assert line[-1].tolist() == place.tolist()

@@ -1,4 +1,6 @@
-"""Chords against sampling of the solids themselves, models against tabulated values."""
+"""Chords by sampling and bisection of the solids themselves, tangents and grid edges; models against their tables."""
+
+from __future__ import annotations
 
 import itertools
 import math
@@ -130,23 +132,6 @@ def test_reversal_splitting_and_turning_change_nothing(seed: int, shape: str, cu
     assert depth(turn @ start, turn @ end, other, shape) == pytest.approx(whole, abs=1e-6)
 
 
-def test_grid_finds_every_crown(monkeypatch: pytest.MonkeyPatch) -> None:
-    stand = grove(300, seed=8)
-    random = np.random.default_rng(9)
-    start = np.column_stack([random.uniform(-90, 90, (500, 2)), random.uniform(0, 30, 500)])
-    end = np.column_stack([random.uniform(-90, 90, (500, 2)), random.uniform(0, 30, 500)])
-    end[:20, :2] = start[:20, :2]  # vertical ones too
-    found = CrownIndex(stand).chords_m(start, end)
-    one_by_one = np.zeros(500)
-    bodies = CrownIndex(stand)._bodies
-    for body in bodies:
-        share = foliage._chord_share(start, end - start, np.broadcast_to(body, (500, 5)), "cone")
-        one_by_one += share * np.linalg.norm(end - start, axis=1)
-    np.testing.assert_allclose(found, one_by_one, rtol=1e-9, atol=1e-9)
-    monkeypatch.setattr(foliage, "_PAIRS_AT_ONCE", 70)  # small batches give the same sums
-    np.testing.assert_allclose(CrownIndex(stand).chords_m(start, end), found, rtol=1e-12, atol=1e-12)
-
-
 def test_reflected_path_adds_its_segments() -> None:
     stand = trees((0, 0, 0, 20, 10, 5), (100, 0, 0, 20, 10, 5))
     source, target = np.array([[-20.0, 0, 21], [-20, 0, 21]]), np.array([[120.0, 0, 21], [120, 0, 21]])
@@ -166,9 +151,6 @@ def test_no_trees_and_a_tree_that_is_not_a_number() -> None:
     assert depth([0, 0, 0], [9, 9, 9], Trees.none()) == 0
     with pytest.raises(UsageError, match="not a number"):
         CrownIndex(trees((math.nan, 0, 0, 20, 10, 5)))
-
-
-# ---------------------------------------------------------------- models
 
 
 @pytest.mark.parametrize(
@@ -240,3 +222,191 @@ def test_the_index_of_equal_trees_is_made_once_and_of_others_anew():
     taller.height_m[7] += 1e-9
     assert crown_index(taller).trees is taller
     assert crown_index(grove(19, 3)).trees.east_m.shape == (19,)
+
+
+SHAPES = ("cone", "ellipsoid", "cylinder")
+
+
+def forest(*rows: tuple[float, ...]) -> Trees:
+    """Rows of east, north, ground, height, diameter, base, trunk."""
+    return Trees(*np.array(rows, dtype=float).reshape(-1, 7).T)
+
+
+def inside(point, tree, shape):
+    """Whether points (n, 3) lie in a crown: the definition of each solid."""
+    east, north, ground, height, diameter, base, _ = tree
+    h = (point[:, 2] - ground - base) / (height - base)
+    r = np.hypot(point[:, 0] - east, point[:, 1] - north) / (diameter / 2)
+    wide = {"cone": 1 - h, "cylinder": np.ones_like(h), "ellipsoid": 2 * np.sqrt(np.clip(h * (1 - h), 0, None))}[shape]
+    return (h >= 0) & (h <= 1) & (r <= wide)
+
+
+def chord(start, end, tree, shape):
+    """Length inside, its ends found by bisection between points a thousandth of the line apart."""
+    start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    share = np.linspace(0, 1, 4001)
+    within = inside(start + share[:, None] * (end - start), tree, shape)
+    if not within.any():
+        return 0.0
+    ends = []
+    for first, step in ((np.argmax(within), -1), (len(within) - 1 - np.argmax(within[::-1]), 1)):
+        low, high = share[first], share[min(max(first + step, 0), 4000)]
+        for _ in range(60):
+            middle = (low + high) / 2
+            if inside((start + middle * (end - start))[None], tree, shape)[0]:
+                low = middle
+            else:
+                high = middle
+        ends.append(low)
+    return (ends[1] - ends[0]) * float(np.linalg.norm(end - start))
+
+
+LINES = [
+    ([-30, 0, 8], [30, 0, 8]), ([-30, 2, 12], [30, 2, 6]), ([-30, 1, 6], [30, -1, 14]),  # through, falling, rising
+    ([0, 0, -5], [0, 0, 40]), ([1, 1, 40], [1, 1, 0]), ([2, -1, 7], [2, -1, 9]),  # plumb, either way, and within
+    ([0.5, 0.3, 9], [0.5, 30, 9]), ([0.5, 0.3, 9], [20, 0, 30]), ([-20, 0, 30], [0.2, 0.1, 7]),  # an end inside
+    ([3.9, -30, 5.01], [3.9, 30, 5.01]), ([-30, 0, 4.99], [30, 0, 4.99]), ([-30, 0, 17.01], [30, 0, 17.01]),
+    ([-4.2, 0, 5], [-4.2 + 24, 0, 77]), ([5, 0, 5], [5 - 4.25, 0, 17]), ([-3, 0, 5], [0, 0, 17 + 1e-3]),
+    ([0.1, 0, 10], [0.1, 0, 10.5]), ([0.1, 0, 16.6], [0.15, 0, 17.3]),  # plumb or steep, and shorter than a metre
+    ([2, 0, 11], [2, 5, 11]), ([2, -5, 11], [2, 0, 11]),  # touching the cone's side where the line begins or ends
+    ([0, -4, 5], [0, 4, 5]), ([0, -4, 17], [0, 4, 17]), ([-2, -2, 16.9], [2, 2, 16.9]),
+    ([-1, 0, 16], [1, 0, 18]), ([-1, 0, 18], [1, 0, 16]), ([0, 0, 20], [0.1, 0, 16.5]), ([0, 0, 60], [40, 0, 20]),
+]  # fmt: skip
+
+TREE = (0.0, 0.0, 1.0, 16.0, 8.0, 4.0, 0.5)  # crown from 5 m to 17 m, 4 m in radius
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(("start", "end"), LINES)
+def test_a_chord_is_what_lies_between_the_surfaces(start, end, shape):
+    start, end = np.array(start, dtype=float), np.array(end, dtype=float)
+    index = CrownIndex(forest(TREE), shape)
+    expected = chord(start, end, TREE, shape)
+    found = index.chords_m(start[None], end[None])[0]
+    assert found == pytest.approx(expected, abs=2e-3 if expected else 1e-9)
+    assert index.chords_m(end[None], start[None])[0] == pytest.approx(found, abs=1e-9)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("seed", range(3))
+def test_random_lines_through_one_crown(seed, shape):
+    rng = np.random.default_rng(seed)
+    start, end = rng.uniform([-6, -6, 2], [6, 6, 20], (2, 60, 3))
+    end[:10, 2] = start[:10, 2]  # level
+    end[10:20, :2] = start[10:20, :2]  # plumb
+    found = CrownIndex(forest(TREE), shape).chords_m(start, end)
+    expected = [chord(a, b, TREE, shape) for a, b in zip(start, end, strict=True)]
+    np.testing.assert_allclose(found, expected, atol=1e-2)  # a graze shorter than the sampling may be missed by hand
+    assert np.quantile(np.abs(found - expected), 0.9) < 1e-8
+
+
+def test_crowns_at_the_edges_of_the_grid_are_found_from_all_sides(monkeypatch):
+    """A row of trees apart, lines that begin and end beyond the grid, near its first and last cells, in small batches."""
+    rows = [(x, y, 0.0, 10.0, 4.0, 2.0, 0.4) for x in (-90.0, 0.0, 90.0) for y in (-60.0, 0.0, 60.0)]
+    stand = forest(*rows)
+    rng = np.random.default_rng(5)
+    start, end = rng.uniform([-150, -120, 0], [150, 120, 12], (2, 400, 3))
+    for i, row in enumerate(rows):  # through each tree, from outside to outside, and just past it
+        start[i], end[i] = [row[0] - 200, row[1], 5.0], [row[0] + 200, row[1], 5.0]
+        start[9 + i], end[9 + i] = [row[0], row[1] - 200, 3.0], [row[0], row[1] + 200, 3.0]
+        start[18 + i], end[18 + i] = [row[0] + 1.99, row[1] - 1.0, 2.1], [row[0] + 1.99, row[1] + 1.0, 2.1]
+    expected = np.zeros(400)
+    bodies = CrownIndex(stand)._bodies
+    for body in bodies:
+        share = foliage._chord_share(start, end - start, np.broadcast_to(body, (400, 5)), "cylinder")
+        expected += share * np.linalg.norm(end - start, axis=1)
+    for cell, piece, pairs in ((None, None, None), (4.0, 3.0, 5), (1000.0, 2.0, 40), (7.0, 1000.0, 1)):
+        for name, value in (("_CELL_M", cell), ("_PIECE_M", piece), ("_PAIRS_AT_ONCE", pairs)):
+            if value is not None:
+                monkeypatch.setattr(foliage, name, value)
+        np.testing.assert_allclose(CrownIndex(stand, "cylinder").chords_m(start, end), expected, atol=1e-9)
+    assert (expected[:9] >= 12.0 - 1e-9).all()  # three crowns of 4 m in a row
+    assert (expected[18:27] > 0.3).all()
+
+
+def test_a_crown_that_reflects_does_not_shade_its_own_path():
+    """Two trees on the way; each vertex may stand on the crown of one of them."""
+    stand = forest((0.0, 0.0, 0.0, 10.0, 6.0, 0.0, 0.4), (40.0, 0.0, 0.0, 10.0, 6.0, 0.0, 0.4))
+    source, target = np.array([[-50.0, 0.0, 3.0]] * 3), np.array([[90.0, 0.0, 3.0]] * 3)
+    vertices = np.tile([[[0.0, 0.0, 3.0], [40.0, 0.0, 3.0]]], (3, 1, 1))
+    bounced = np.array([[-1, -1], [0, -1], [-1, 1]])  # a path has one reflection off a crown at most
+    whole = float(CrownIndex(stand).chords_m(source[:1], target[:1])[0])
+    each = whole / 2
+    free = foliage_depth_m(source, vertices, target, stand, bounced)
+    np.testing.assert_allclose(free, [whole, each, each], atol=1e-9)
+    none = foliage_depth_m(source, vertices, target, stand)
+    np.testing.assert_allclose(none, whole, atol=1e-9)
+    # an unused vertex is the next one; one bounce, its segments alone
+    one = vertices.copy()
+    one[:, 1] = np.nan
+    np.testing.assert_allclose(
+        foliage_depth_m(source, one, target, stand, np.array([[0, -1], [1, -1], [-1, -1]])),
+        [each, each, whole], atol=1e-9,
+    )  # fmt: skip
+    # a model that is not opaque knows no reflection off crowns
+    for model in (foliage.P833(), foliage.NoFoliage()):
+        assert np.isinf(foliage_loss_db(source, vertices, target, stand, model, bounced)).tolist() == [
+            False,
+            True,
+            True,
+        ]
+    assert np.isfinite(foliage_loss_db(source, vertices, target, stand, foliage.P833())).all()
+
+
+def test_only_the_segments_at_a_vertex_leave_out_its_crown():
+    """The third segment passes the crown of the first vertex again: there it shades."""
+    stand = forest((0.0, 0.0, 0.0, 10.0, 6.0, 0.0, 0.4))
+    source, target = np.array([[-50.0, 0.0, 3.0]]), np.array([[-50.0, 0.5, 3.0]])
+    vertices = np.array([[[-3.0 + 0.9, 0.0, 3.0], [-40.0, 30.0, 3.0], [50.0, 0.5, 3.0]]])
+    bounced = np.array([[0, -1, -1]])
+    far = float(CrownIndex(stand).chords_m(vertices[:, 1], vertices[:, 2])[0])
+    back = float(CrownIndex(stand).chords_m(vertices[:, 2], target)[0])
+    assert back > 3.0
+    found = float(foliage_depth_m(source, vertices, target, stand, bounced)[0])
+    assert found == pytest.approx(far + back, abs=1e-9)
+    last = float(foliage_depth_m(target, vertices[:, ::-1], source, stand, bounced[:, ::-1])[0])
+    assert last == pytest.approx(far + back, abs=1e-9)  # and the way back
+
+
+@pytest.mark.parametrize("low", [2.0, 5.0])
+def test_a_level_line_lies_within_a_slab_up_to_its_faces(low):
+    at, step = np.array([low - 1e-12, low, low + 1.0, low + 3.0, low + 3.0 + 1e-12]), np.zeros(5)
+    first, last = foliage._slab(at, step, low, low + 3.0)
+    assert (last >= first).tolist() == [False, True, True, True, False]
+    first, last = foliage._slab(np.array([0.0, 10.0, 0.0, 3.0]), np.array([10.0, -10.0, 1.0, 1.0]), 2.0, 5.0)
+    np.testing.assert_allclose(first, [0.2, 0.5, 1.0 + 1.0, 0.0])
+    np.testing.assert_allclose(last, [0.5, 0.8, 1.0, 1.0])
+
+
+def test_models_are_their_formulas_to_the_last_digits():
+    metres = np.array([0.0, 3.0, 14.0, 14.5, 200.0])
+    for ghz, leaf in ((3.4, True), (0.23, False), (95.0, True)):
+        scale = ghz**0.284 * (1.0 if leaf else foliage.LEAFLESS_FACTOR)
+        expected = [scale * (0.45 * d if d <= 14 else 1.33 * d**0.588) for d in metres]
+        np.testing.assert_allclose(foliage.Weissberger(ghz * 1e9, leaf).loss_db(metres), expected, rtol=1e-12)
+    found = foliage.P833(0.2, 0.5).loss_db(metres)  # less than a decibel either
+    np.testing.assert_allclose(found, 0.5 * (1 - np.exp(-0.2 * metres / 0.5)), rtol=1e-12)
+    assert foliage.P833(0.0, 10.0).loss_db(metres).tolist() == [0.0] * 5
+    for gamma, most in ((-0.1, 10.0), (0.5, 0.0), (np.nan, 1.0), (0.5, np.inf), (np.inf, 1.0)):
+        with pytest.raises(UsageError, match="gamma >= 0 and A_m > 0"):
+            foliage.P833(gamma, most)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8])
+def test_batches_of_one_segment_come_to_the_last(count, monkeypatch):
+    monkeypatch.setattr(foliage, "_PAIRS_AT_ONCE", 1)
+    start = np.column_stack([np.full(count, -9.0), np.linspace(-3, 3, count), np.full(count, 8.0)])
+    end = start + np.array([18.0, 0.0, 0.0])
+    found = CrownIndex(forest(TREE), "cylinder").chords_m(start, end)
+    np.testing.assert_allclose(found, 2 * np.sqrt(16.0 - start[:, 1] ** 2), rtol=1e-12)
+
+
+def test_p833_is_refused_outside_of_its_scope_and_taken_at_its_ends():
+    for hz in (30e6, 100e9):
+        assert np.isfinite(foliage.P833.at(hz).loss_db(np.array([10.0]))).all()
+        with pytest.raises(UsageError, match="30 MHz to 100 GHz"):
+            foliage.P833.at(float(np.nextafter(hz, 0.0 if hz < 1e9 else np.inf)))
+    for hz in (0.23e9, 95e9):
+        assert foliage.Weissberger(hz).frequency_hz == hz
+        with pytest.raises(UsageError, match=r"0\.23 to 95 GHz"):
+            foliage.Weissberger(float(np.nextafter(hz, 0.0 if hz < 1e9 else np.inf)))

@@ -7,7 +7,10 @@ that change nothing that can be seen. Mutants are drawn at random over all modul
 of them would take weeks.
 
     python benchmarks/mutation.py record MAP [--tests tests/compare]   # which test reaches which line (some minutes)
-    python benchmarks/mutation.py draw MAP --count 60 --seed 7 [--part 1/2] [--account FILE] [--only compare/rss.py]
+    python benchmarks/mutation.py draw MAP --count 60 --seed 7 [--part 1/2] [--account FILE] [--only compare/ maps/]
+
+A line that hundreds of tests reach is tried on the shortest of them, up to `--budget` seconds of the processor: what
+only a longer test would notice counts as survived, so that the score is a lower bound.
 """
 
 from __future__ import annotations
@@ -32,6 +35,7 @@ import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -352,8 +356,10 @@ class Trials:
     What is no body of a function (constants, defaults, fields), and what is compiled, is planted by a new import.
     """
 
-    def __init__(self, chosen: list[Mutant], reach: Reach, answer: Callable[[Mutant, str, float], None]) -> None:
-        self.chosen, self.reach, self.answer = chosen, reach, answer
+    def __init__(
+        self, chosen: list[Mutant], reach: Reach, answer: Callable[[Mutant, str, float], None], budget_s: float
+    ) -> None:
+        self.chosen, self.reach, self.answer, self.budget_s = chosen, reach, answer, budget_s
 
     def pytest_runtestloop(self, session: Any) -> bool:
         """In place of pytest's own."""
@@ -362,7 +368,7 @@ class Trials:
             begin = time.monotonic()
             tree = ast.parse((ROOT / mutant.path).read_text(encoding="utf-8"))
             place = place_of(tree, of_code(tree)[mutant.node])
-            near = near_tests(self.reach, mutant.path, None if place is None else place.lines)
+            near = within(self.budget_s, self.reach, mutant.path, None if place is None else place.lines)
             limit = 30 + 10 * sum(self.reach[name]["seconds"] for name in near)
             if place is None or not near:
                 tests = COMPILED.get(mutant.path) or tuple(near_tests(self.reach, mutant.path, None)[:MOST_ANEW])
@@ -406,6 +412,13 @@ def near_tests(reach: Reach, path: str, lines: tuple[int, int] | None) -> list[s
         if any(lines is None or lines[0] <= number <= lines[1] for number in reached):
             met.append((one["seconds"], name))
     return [name for _, name in sorted(met)]
+
+
+def within(budget_s: float, reach: Reach, path: str, lines: tuple[int, int] | None) -> list[str]:
+    """The shortest tests that reach lines of a module, as many as take so long together, one at least."""
+    near = near_tests(reach, path, lines)
+    spent = list(accumulate(reach[name]["seconds"] for name in near))
+    return near[: max(sum(seconds <= budget_s for seconds in spent), 1)]
 
 
 def planted(mutant: Mutant, source: str, tests: tuple[str, ...]) -> str:
@@ -522,15 +535,15 @@ def record(target: Path, tests: tuple[str, ...]) -> None:
         print(f"fails without any change: {name}")
 
 
-def drawn(count: int, seed: int, only: str, part: str) -> list[Mutant]:
+def drawn(count: int, seed: int, only: list[str], part: str) -> list[Mutant]:
     """Mutants at random over the modules, each mutant as likely as any other."""
-    every = [one for path in modules() if path.endswith(only) for one in mutants(path)]
+    every = [one for path in modules() if any(some in path for some in only) for one in mutants(path)]
     chosen = random.Random(seed).sample(every, min(count, len(every)))
     number, parts = (int(text) for text in part.split("/"))
     return chosen[number - 1 :: parts]
 
 
-def draw(chosen: list[Mutant], reach: Reach, account: Path | None) -> None:
+def draw(chosen: list[Mutant], reach: Reach, account: Path | None, budget_s: float) -> None:
     """Try mutants; one line for each, and the shares."""
     known = equivalents()
     counts: dict[str, dict[str, int]] = {}
@@ -548,7 +561,7 @@ def draw(chosen: list[Mutant], reach: Reach, account: Path | None) -> None:
                 file.write(json.dumps(row) + "\n")
 
     tests = tuple(sorted({name.partition("::")[0] for name in reach}))
-    pytest_on(tests, [Trials(chosen, reach, answer)])
+    pytest_on(tests, [Trials(chosen, reach, answer, budget_s)])
     counts["all"] = {kind: sum(row[kind] for row in counts.values()) for kind in KINDS}
     for name, row in counts.items():
         tried = max(row["killed"] + row["survived"], 1)
@@ -565,7 +578,8 @@ def main() -> None:
     of_draw.add_argument("--count", type=int, default=60)
     of_draw.add_argument("--seed", type=int, default=1)
     of_draw.add_argument("--part", default="1/1", help="one of several runs that share a draw")
-    of_draw.add_argument("--only", default="", help="modules whose path ends so")
+    of_draw.add_argument("--only", nargs="+", default=["/"], help="modules whose path holds one of these")
+    of_draw.add_argument("--budget", type=float, default=40.0, help="of tests for one mutant [s of the processor]")
     of_draw.add_argument("--account", type=Path, help="a line of JSON per mutant is added here")
     for one in (of_map, of_draw):
         one.add_argument("map", type=Path)
@@ -583,7 +597,8 @@ def main() -> None:
         record(arguments.map, tuple(arguments.tests))
         return
     reach = json.loads(arguments.map.read_text(encoding="utf-8"))
-    draw(drawn(arguments.count, arguments.seed, arguments.only, arguments.part), reach, arguments.account)
+    chosen = drawn(arguments.count, arguments.seed, arguments.only, arguments.part)
+    draw(chosen, reach, arguments.account, arguments.budget)
 
 
 if __name__ == "__main__":

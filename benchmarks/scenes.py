@@ -115,7 +115,7 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
     surfaces = merged(scene)
     setup = clock.since()
     clock = Clock()
-    paths, effort = grow_paths(
+    paths = grow_paths(
         surfaces, Links(sources, targets), max_depth=task["depth"], shadows=task["shadows"], beams=task["beams"]
     )
     search = clock.since()
@@ -129,18 +129,13 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
         "search_s": search,
         "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "paths": np.bincount(paths.depth, minlength=task["depth"] + 1).tolist(),
-        "sequences": effort.sequences,
-        "candidates": effort.candidates,
-        "estimate_s": effort.estimate_s,
         "duplicates": len(paths) - len(plane_keys(paths, surfaces.plane)),
     }
     if task.get("check"):
-        other, _ = grow_paths(surfaces, Links(sources, targets), max_depth=task["depth"], shadows=False)
+        other = grow_paths(surfaces, Links(sources, targets), max_depth=task["depth"], shadows=False)
         row["differ_without_shadows"] = len(keys(paths) ^ keys(other))
         small = merged(crop(scene, sources[0], 600))
-        on, off = (
-            grow_paths(small, Links(sources, targets), max_depth=task["depth"], beams=b)[0] for b in (True, False)
-        )
+        on, off = (grow_paths(small, Links(sources, targets), max_depth=task["depth"], beams=b) for b in (True, False))
         row["differ_without_beams_on_600_triangles"] = len(keys(on) ^ keys(off))
     return row
 
@@ -170,7 +165,7 @@ def prism_row(task: dict[str, Any]) -> dict[str, Any]:
     scene = Scene.of(site, Link(CARRIER_HZ, {"T": single_element()}, single_element()), poses)
     setup = clock.since()
     clock = Clock()
-    paths, effort = prisms.find_paths(scene.faces, scene.links_to(poses), max_depth=task["depth"])
+    paths = prisms.find_paths(scene.faces, scene.links_to(poses), max_depth=task["depth"])
     return {
         **task,
         "scene": f"{count} prisms",
@@ -181,8 +176,6 @@ def prism_row(task: dict[str, Any]) -> dict[str, Any]:
         "search_s": clock.since(),
         "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "paths": np.bincount(paths.depth, minlength=task["depth"] + 1).tolist(),
-        "sequences": effort.sequences,
-        "candidates": effort.candidates,
         "duplicates": len(paths) - len(keys(paths)),
     }
 
@@ -193,12 +186,12 @@ def sionna_row(task: dict[str, Any]) -> dict[str, Any]:
 
     if task.get("limit"):
         sionna.MAXIMUM_PATHS = task["limit"]
-        sionna.RAISE_LIMITS = False
+        sionna._Finder._more_room = lambda _: False
     if task.get("slots"):
         sionna.SPECULAR_TABLE_SLOTS = 2 ** task["slots"]
     surfaces = merged(read_scene(shipped(task["scene"])))
     sources, targets = ends(task["scene"], task["receivers"])
-    ours, _ = grow_paths(surfaces, Links(sources, targets), max_depth=task["depth"])
+    ours = grow_paths(surfaces, Links(sources, targets), max_depth=task["depth"])
     sionna.load_variant()
     clock = Clock()
     theirs = sionna.find_paths(
@@ -217,7 +210,6 @@ def sionna_row(task: dict[str, Any]) -> dict[str, Any]:
         "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "paths": np.bincount(theirs.depth, minlength=task["depth"] + 1).tolist(),
         "exact": np.bincount(ours.depth, minlength=task["depth"] + 1).tolist(),
-        "candidates": int(getattr(sionna, "LAST_CANDIDATES", 0)),
         "missing": len(other - mine),
         "extra": len(mine - other),
         "duplicates": len(theirs) - len(other),
@@ -326,7 +318,6 @@ def table(rows: list[dict[str, Any]]) -> None:
         engine = row["engine"]
         if engine == "sionna":
             engine += f", {row['samples']:g} rays, limit {row['limit']:g}, table 2^{row['slots']}"
-            engine += f", {row['candidates']} candidates"
         setup = "{:.1f} / {:.1f}".format(*row["setup_s"]) if "setup_s" in row else ""
         compared = f"/ / {row['duplicates']}"
         if "missing" in row:

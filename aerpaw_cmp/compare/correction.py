@@ -102,7 +102,7 @@ class Correction:
     def rows_of(self, samples: LinkSamples, flight: str | None = None) -> Rows:
         """Samples as targets; of a flight that is not known they are a new one."""
         code = self.flights.index(flight) if flight in self.flights else NEW_FLIGHT
-        return _rows(samples, code)
+        return Rows.of(samples, code)
 
     def predict(
         self, samples: LinkSamples, flight: str | None = None, *, own_mean: bool = False
@@ -136,15 +136,6 @@ def between_blocks_db(channel: Channel) -> float:
     return float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
 
 
-def _rows(samples: LinkSamples, code: int) -> Rows:
-    return Rows(
-        position_m=samples.position_m,
-        direction=samples.at_uav,
-        time_s=samples.time_s,
-        flight=np.full(len(samples), code),
-    )
-
-
 def _channels(series: Sequence[LinkSamples], predictor: Predictor, flights: Sequence[str]) -> dict[str, Channel]:
     """Residuals of a base, by antenna."""
     parts: dict[str, list[Channel]] = {}
@@ -153,7 +144,7 @@ def _channels(series: Sequence[LinkSamples], predictor: Predictor, flights: Sequ
         gain, sd = predictor(binned)
         good = np.isfinite(gain)
         one = Channel(
-            rows=_rows(binned, flights.index(samples.flight)).part(good),
+            rows=Rows.of(binned, flights.index(samples.flight)).part(good),
             left_db=(binned.residual_db - gain)[good],
             base_sd_db=sd[good],
         )
@@ -220,7 +211,7 @@ def _score_fold(fold: _Fold, base: Base, titles: Sequence[str], tallies: Mapping
                 continue
             channel, (gain, gain_sd) = channels[samples.antenna], gains
             code = NEW_FLIGHT if own else flights.index(samples.flight)
-            mean, sd = FieldFit(model, channel.rows, channel.left_db).predict(_rows(samples, code), parts)
+            mean, sd = FieldFit(model, channel.rows, channel.left_db).predict(Rows.of(samples, code), parts)
             error = samples.residual_db - gain - mean
             if own and np.isfinite(error).any():
                 error = error - np.nanmean(error)

@@ -16,7 +16,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -253,20 +253,56 @@ def _features(block: _Block, argument: FloatArray, *, keep: bool = False) -> Flo
     return np.asarray(solve_triangular(lower, gaussian_kernel(block.knots, argument, block.term.length), lower=True).T)
 
 
+T = TypeVar("T")
+
+
+class Store(OrderedDict[bytes, T]):
+    """Values by their content; those used longest ago go first.
+
+    Parameters
+    ----------
+    most : float
+        Sum of the sizes that is held, one value at least.
+    size : callable
+        Of a value.
+    """
+
+    def __init__(self, most: float, size: Callable[[T], float] = lambda _: 1.0) -> None:
+        super().__init__()
+        self.most, self.size = most, size
+
+    def made(self, key: bytes, make: Callable[[], T]) -> T:
+        """The value of a key, made where it is not held."""
+        if key not in self:
+            self[key] = make()
+            while len(self) > 1 and sum(map(self.size, self.values())) > self.most:
+                self.popitem(last=False)
+        self.move_to_end(key)
+        return self[key]
+
+
+def _digest(about: object, *arrays: FloatArray) -> bytes:
+    """Key of some arrays and what else decides."""
+    digest = hashlib.blake2b(repr((about, *(array.shape for array in arrays))).encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.digest()
+
+
 NUGGET = 1e-6
 """Share of the variance that keeps the kernel between knots positive definite."""
 
-_kept_knots: OrderedDict[bytes, FloatArray] = OrderedDict()
+_knot_factors: Store[FloatArray] = Store(8)
+"""Of the last eight terms."""
 
 
 def _knot_factor(knots: FloatArray, length: float) -> FloatArray:
-    """Cholesky factor of the kernel between the knots of a term; those of the last eight terms are kept."""
-    key = repr(length).encode() + knots.tobytes()
-    if key not in _kept_knots:
-        _kept_knots[key] = factor_of(gaussian_kernel(knots, knots, length) + NUGGET * np.eye(len(knots)))
-        while len(_kept_knots) > 8:
-            _kept_knots.popitem(last=False)
-    return _kept_knots[key]
+    """Cholesky factor of the kernel between the knots of a term."""
+
+    def make() -> FloatArray:
+        return factor_of(gaussian_kernel(knots, knots, length) + NUGGET * np.eye(len(knots)))
+
+    return _knot_factors.made(_digest(length, knots), make)
 
 
 def _block_values(block: _Block, argument: FloatArray, weights: FloatArray) -> FloatArray:
@@ -283,26 +319,18 @@ def _block_values(block: _Block, argument: FloatArray, weights: FloatArray) -> F
 FEATURES_MIB = 320
 """Features of directions that are kept at most: the same samples are predicted by one fit after the other."""
 
-_kept_features: OrderedDict[bytes, FloatArray] = OrderedDict()
+_features_of_directions: Store[FloatArray] = Store(FEATURES_MIB << 20, lambda features: features.nbytes)
 
 
 def _direction_features(direction: FloatArray, length: float) -> FloatArray:
     """:func:`.sphere.gaussian_features`, kept."""
-    digest = hashlib.blake2b(repr((length, direction.shape)).encode())
-    digest.update(np.ascontiguousarray(direction).tobytes())
-    key = digest.digest()
-    if key not in _kept_features:
-        _kept_features[key] = gaussian_features(direction, length)
-        while len(_kept_features) > 1 and sum(f.nbytes for f in _kept_features.values()) > FEATURES_MIB << 20:
-            _kept_features.popitem(last=False)
-    _kept_features.move_to_end(key)
-    return _kept_features[key]
+    return _features_of_directions.made(_digest(length, direction), lambda: gaussian_features(direction, length))
 
 
 MEANS = 4096
 """Mean features that are kept at most, some kilobytes each."""
 
-_kept_means: OrderedDict[bytes, FloatArray] = OrderedDict()
+_mean_features_of_directions: Store[FloatArray] = Store(MEANS)
 
 
 def _mean_features(block: _Block, argument: FloatArray) -> FloatArray:
@@ -312,15 +340,8 @@ def _mean_features(block: _Block, argument: FloatArray) -> FloatArray:
 
         at_knots = gaussian_kernel(block.knots, argument, block.term.length).mean(axis=1)
         return np.asarray(solve_triangular(_knot_factor(block.knots, block.term.length), at_knots, lower=True))
-    digest = hashlib.blake2b(repr((block.term.length, argument.shape)).encode())
-    digest.update(np.ascontiguousarray(argument).tobytes())
-    key = digest.digest()
-    if key not in _kept_means:
-        _kept_means[key] = _features(block, argument).mean(axis=0)
-        while len(_kept_means) > MEANS:
-            _kept_means.popitem(last=False)
-    _kept_means.move_to_end(key)
-    return _kept_means[key]
+    key = _digest(block.term.length, argument)
+    return _mean_features_of_directions.made(key, lambda: _features(block, argument).mean(axis=0))
 
 
 Pairs = Mapping[str, FloatArray]
@@ -407,7 +428,7 @@ class _SeriesEquations:
 KEPT_MIB = 512
 """Equations that are kept at most; those that were used longest ago go first."""
 
-_kept: OrderedDict[bytes, _SeriesEquations] = OrderedDict()
+_equations: Store[_SeriesEquations] = Store(KEPT_MIB << 20, lambda equations: equations.gram.nbytes)
 """Of series by their content. A flight left out, a factor of the spread, a common scale: each is another sum of the
 same equations, since nuisance and noise keep their ratio and whitening is linear in their scale."""
 
@@ -425,26 +446,15 @@ def _ratio(model: GainModel) -> float:
 
 def _key(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> bytes:
     """What the equations of a series depend on."""
-    digest = hashlib.blake2b(repr((_ratio(model), model.own_length_m, len(samples))).encode())
-    for name in _ARRAYS:
-        digest.update(np.ascontiguousarray(getattr(samples, name)).tobytes())
-    for block in own:
-        digest.update(repr((block.term.frame, block.term.length)).encode())
-        digest.update(b"" if block.knots is None else np.ascontiguousarray(block.knots).tobytes())
-    return digest.digest()
+    terms = [(block.term.frame, block.term.length, block.knots is None) for block in own]
+    knots = [block.knots for block in own if block.knots is not None]
+    return _digest((_ratio(model), model.own_length_m, terms), *(getattr(samples, n) for n in _ARRAYS), *knots)
 
 
 def _series_equations(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> _SeriesEquations:
     """Equations of one series, kept or made."""
-    key = _key(model, own, samples)
-    if key in _kept:
-        _kept.move_to_end(key)
-        return _kept[key]
-    equations = _made_equations(dataclasses.replace(model, own_sd_db=_ratio(model), noise_sd_db=1.0), own, samples)
-    _kept[key] = equations
-    while len(_kept) > 1 and sum(one.gram.nbytes for one in _kept.values()) > KEPT_MIB << 20:
-        _kept.popitem(last=False)
-    return equations
+    unit = dataclasses.replace(model, own_sd_db=_ratio(model), noise_sd_db=1.0)
+    return _equations.made(_key(model, own, samples), lambda: _made_equations(unit, own, samples))
 
 
 def _made_equations(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> _SeriesEquations:

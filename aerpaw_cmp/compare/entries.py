@@ -119,17 +119,19 @@ def _series_scores(one: LevelSeries) -> dict[str, float]:
     return scores
 
 
-def rmse_replicates(series: Sequence[LevelSeries], replicates: int = 2000, seed: int = 20240715) -> FloatArray:
+REPLICATES, SEED = 2000, 20240715
+
+
+def rmse_replicates(series: Sequence[LevelSeries]) -> FloatArray:
     """Mean RMSE (replicates,) over series whose blocks of :data:`BLOCK_S` are drawn anew [dB].
 
     Blocks of one series are the same for every entrant, so differences of replicates are paired.
     """
-    total = np.zeros(replicates)
+    total = np.zeros(REPLICATES)
     for number, one in enumerate(series):
         error = one.error_db
-        drawn = bootstrap_means(
-            np.column_stack([error**2, error]), one.block, replicates=replicates, seed=seed + number
-        )
+        columns = np.column_stack([error**2, error])
+        drawn = bootstrap_means(columns, one.block, replicates=REPLICATES, seed=SEED + number)
         offset = drawn[:, 1] ** 2 if one.own_offset else 0.0
         total += np.sqrt(np.maximum(drawn[:, 0] - offset, 0.0))
     return total / len(series)

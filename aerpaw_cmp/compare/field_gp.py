@@ -21,7 +21,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.units import FloatArray, IntArray
-from .direction_gain import factor_of
+from .direction_gain import LinkSamples, factor_of
 
 Part = Literal["mean", "place", "offset", "drift"]
 PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
@@ -115,6 +115,12 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    @classmethod
+    def of(cls, samples: LinkSamples, flight: int) -> Rows:
+        """Places of the samples of one flight, as the UAV sees the tower; ``flight`` is its code."""
+        codes = np.full(len(samples), flight)
+        return cls(position_m=samples.position_m, direction=samples.at_uav, time_s=samples.time_s, flight=codes)
 
     def part(self, keep: Any) -> Rows:
         """Some of the rows; an index of two dimensions gives rows of rows."""

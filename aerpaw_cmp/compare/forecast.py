@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.units import FloatArray, IntArray
-from .rank import MAX_RANK, cohen_kappa, total_variation
-from .statistics import NO_INTERVAL, REPLICATES, SEED, Interval, autocorrelation, bootstrap_means, interval, plain
+from .rank import MAX_RANK, cohen_kappa, kappa_of_means, one_hot, total_variation, variation_of_means
+from .statistics import NO_INTERVAL, REPLICATES, Interval, autocorrelation, bootstrap_means, interval, plain
 
 LEAST_PROBABILITY = 1e-6
 """What a rank counts in the log score that a forecast held impossible."""
@@ -58,11 +58,6 @@ def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
     return np.asarray(((probability - one_hot(rank, probability.shape[1])) ** 2).sum(axis=1))
 
 
-def one_hot(rank: IntArray, ranks: int = MAX_RANK) -> FloatArray:
-    """1 in the column of each rank (n, ranks)."""
-    return np.asarray(np.asarray(rank)[:, None] == np.arange(1, ranks + 1), dtype=np.float64)
-
-
 def constant_forecast(rank: ArrayLike, ranks: int = MAX_RANK) -> FloatArray:
     """Histogram of training ranks (ranks,), each rank counted once more, so that none is impossible."""
     values = np.asarray(rank, dtype=np.float64)
@@ -98,20 +93,20 @@ class ForecastScore:
     """
 
     n: int
-    kappa: float
-    kappa_ci95: Interval
-    agreement: float
-    majority_agreement: float
-    log_score: float
-    log_score_ci95: Interval
-    constant_log_score: float
-    log_score_gain: float
-    log_score_difference_ci95: Interval
-    brier_score: float
-    constant_brier_score: float
-    total_variation_expected: float
-    total_variation_ci95: Interval
-    constant_total_variation: float
+    kappa: float = np.nan
+    kappa_ci95: Interval = NO_INTERVAL
+    agreement: float = np.nan
+    majority_agreement: float = np.nan
+    log_score: float = np.nan
+    log_score_ci95: Interval = NO_INTERVAL
+    constant_log_score: float = np.nan
+    log_score_gain: float = np.nan
+    log_score_difference_ci95: Interval = NO_INTERVAL
+    brier_score: float = np.nan
+    constant_brier_score: float = np.nan
+    total_variation_expected: float = np.nan
+    total_variation_ci95: Interval = NO_INTERVAL
+    constant_total_variation: float = np.nan
     expected_histogram: FloatArray
     expected_histogram_ci95: tuple[Interval, ...]
     measured_histogram: FloatArray
@@ -128,7 +123,6 @@ def score_forecast(
     constant: FloatArray,
     *,
     replicates: int = REPLICATES,
-    seed: int = SEED,
 ) -> ForecastScore:
     """Score a forecast on samples in time order.
 
@@ -161,66 +155,42 @@ def score_forecast(
     good = (ri >= 1) & (said >= 1) & np.isfinite(probability).all(axis=1)
     rank, choice, p = ri[good].astype(np.int64), said[good].astype(np.int64), probability[good]
     if not len(rank):
-        return _no_score(probability.shape[1])
-    ranks = p.shape[1]
+        none = np.full(MAX_RANK, np.nan)
+        return ForecastScore(
+            n=0, expected_histogram=none, expected_histogram_ci95=(NO_INTERVAL,) * MAX_RANK, measured_histogram=none
+        )
     flat = np.broadcast_to(constant, p.shape)
-    reported, chosen = one_hot(rank, ranks), one_hot(choice, ranks)
+    reported, chosen = one_hot(rank), one_hot(choice)
     log, log_constant = log_losses(p, rank), log_losses(flat, rank)
-    columns = np.column_stack([rank == choice, log, log - log_constant, reported, chosen, p]).astype(np.float64)
-    known = max((autocorrelation(c) for c in columns[:, :3].T), key=lambda m: m.block_length)
-    drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
+    columns = np.column_stack([log, log - log_constant, p, rank == choice, reported, chosen]).astype(np.float64)
+    paired = columns[:, -1 - 2 * MAX_RANK :]  # agreement and the two ranks, as kappa takes them
+    known = max((autocorrelation(c) for c in (paired[:, 0], *columns[:, :2].T)), key=lambda m: m.block_length)
+    drawn = bootstrap_means(columns, known.block_length, replicates=replicates)
+    drawn_p, drawn_pair = drawn[:, 2 : 2 + MAX_RANK], drawn[:, 2 + MAX_RANK :]
     mean = columns.mean(axis=0)
-    share, expected = mean[3 : 3 + ranks], mean[3 + 2 * ranks :]
+    expected, share = mean[2 : 2 + MAX_RANK], paired.mean(axis=0)[1 : 1 + MAX_RANK]
     kappa = cohen_kappa(rank, choice)
     spread = total_variation(share, expected)
+    varied = variation_of_means(np.column_stack([drawn_pair[:, : 1 + MAX_RANK], drawn_p]))
     return ForecastScore(
         n=len(rank),
         kappa=kappa,
-        kappa_ci95=interval(kappa, _kappa_of(drawn, ranks), known, bounds=(-1.0, 1.0)),
-        agreement=float(mean[0]),
+        kappa_ci95=interval(kappa, kappa_of_means(drawn_pair), known, bounds=(-1.0, 1.0)),
+        agreement=float(np.mean(rank == choice)),
         majority_agreement=float(share.max()),
-        log_score=float(mean[1]),
-        log_score_ci95=interval(float(mean[1]), drawn[:, 1], known, bounds=(0.0, np.inf)),
+        log_score=float(mean[0]),
+        log_score_ci95=interval(float(mean[0]), drawn[:, 0], known, bounds=(0.0, np.inf)),
         constant_log_score=float(log_constant.mean()),
-        log_score_gain=float(1.0 - mean[1] / log_constant.mean()),
-        log_score_difference_ci95=interval(float(mean[2]), drawn[:, 2], known),
+        log_score_gain=float(1.0 - mean[0] / log_constant.mean()),
+        log_score_difference_ci95=interval(float(mean[1]), drawn[:, 1], known),
         brier_score=float(brier_losses(p, rank).mean()),
         constant_brier_score=float(brier_losses(flat, rank).mean()),
         total_variation_expected=spread,
-        total_variation_ci95=interval(spread, _variation_of(drawn, ranks), known, bounds=(0.0, 1.0)),
+        total_variation_ci95=interval(spread, varied, known, bounds=(0.0, 1.0)),
         constant_total_variation=total_variation(share, constant),
         expected_histogram=expected,
         expected_histogram_ci95=tuple(
-            interval(float(expected[r]), drawn[:, 3 + 2 * ranks + r], known, bounds=(0.0, 1.0)) for r in range(ranks)
+            interval(float(expected[r]), drawn_p[:, r], known, bounds=(0.0, 1.0)) for r in range(MAX_RANK)
         ),
         measured_histogram=share,
-    )
-
-
-def _kappa_of(drawn: FloatArray, ranks: int) -> FloatArray:
-    chance = (drawn[:, 3 : 3 + ranks] * drawn[:, 3 + ranks : 3 + 2 * ranks]).sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.where(chance < 1.0 - 1e-12, (drawn[:, 0] - chance) / (1.0 - chance), np.nan))
-
-
-def _variation_of(drawn: FloatArray, ranks: int) -> FloatArray:
-    return np.asarray(0.5 * np.abs(drawn[:, 3 : 3 + ranks] - drawn[:, 3 + 2 * ranks :]).sum(axis=1))
-
-
-def _no_score(ranks: int) -> ForecastScore:
-    nan, nothing = float("nan"), np.full(ranks, np.nan)
-    numbers = dict.fromkeys(
-        ("kappa", "agreement", "majority_agreement", "log_score", "constant_log_score", "log_score_gain", "brier_score",
-         "constant_brier_score", "total_variation_expected", "constant_total_variation"), nan
-    )  # fmt: skip
-    intervals = dict.fromkeys(
-        ("kappa_ci95", "log_score_ci95", "log_score_difference_ci95", "total_variation_ci95"), NO_INTERVAL
-    )
-    return ForecastScore(
-        n=0,
-        expected_histogram=nothing,
-        expected_histogram_ci95=(NO_INTERVAL,) * ranks,
-        measured_histogram=nothing,
-        **numbers,  # type: ignore[arg-type]
-        **intervals,  # type: ignore[arg-type]
     )

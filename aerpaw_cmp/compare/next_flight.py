@@ -72,19 +72,10 @@ class Known:
         mine = [(i, s.binned(self.model.bin_s)) for i, s in enumerate(rows) if s.antenna == antenna]
         if not mine:
             return np.asarray(np.hypot(gain, self.field.place_sd_db))
-        known = Rows.joined([_rows(s, i) for i, s in mine])
+        known = Rows.joined([Rows.of(s, i) for i, s in mine])
         place: tuple[Part, ...] = ("place",)
-        _, beside = FieldFit(self.field, known).predict(_rows(target, NEW_FLIGHT), place)
+        _, beside = FieldFit(self.field, known).predict(Rows.of(target, NEW_FLIGHT), place)
         return np.asarray(np.hypot(gain, beside))
-
-
-def _rows(samples: LinkSamples, flight: int) -> Rows:
-    return Rows(
-        position_m=samples.position_m,
-        direction=samples.at_uav,
-        time_s=samples.time_s,
-        flight=np.full(len(samples), flight),
-    )
 
 
 def rms_db(sd_db: Mapping[str, FloatArray]) -> float:

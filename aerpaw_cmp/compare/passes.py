@@ -1,8 +1,8 @@
-"""Many flights over the same places: what each pair of passes differs by, every pair of a season at once.
+"""Passes over the same places: what two differ by, and every pair of a season at once.
 
-One pair by itself is :func:`~aerpaw_cmp.compare.statistics.repeatability`; of 200 flights with ten links there are
-199 000, so here each flight's places are put into one k-d tree, pairs of flights whose boxes lie apart are not
-searched, links that were sampled together share one search, and intervals come in closed form.
+Of 200 flights with ten links there are 199 000 pairs, so each flight's places are put into one k-d tree, pairs of
+flights whose boxes lie apart are not searched, links that were sampled together share one search, and intervals come
+in closed form.
 """
 
 from __future__ import annotations
@@ -16,7 +16,52 @@ from typing import Any
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray, IntArray, wrap_degrees
-from .statistics import Interval, correlation, spread_interval
+from .statistics import NO_INTERVAL, Interval, correlation, error_intervals, spread_interval
+
+SAME_PLACE_M = 2.0
+"""Samples of two passes nearer than this were taken at the same place."""
+
+HEADING_WITHIN_DEG = 20.0
+"""Largest difference of the headings of such samples, where headings count."""
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """One pass by itself: places (n, 3) [m], values (n,), NaN where there is none, headings (n,) where they count."""
+
+    position_m: FloatArray
+    value: FloatArray
+    heading_deg: FloatArray | None = None
+
+    @property
+    def places(self) -> _Places:
+        """Of the samples that have a place and a value."""
+        known = np.isfinite(self.position_m).all(axis=1) & np.isfinite(self.value)
+        return _Places(self.position_m, self.heading_deg, np.flatnonzero(known))
+
+
+def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> tuple[IntArray, IntArray]:
+    """Indices into both passes: samples with a value, and the nearest ones of the other pass within a radius [m]."""
+    return first.places.partners(second.places, radius_m, HEADING_WITHIN_DEG)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Repeated:
+    """What two passes of the same places differ by [dB], over ``n`` pairs: no model can be expected to do better."""
+
+    rmse_db: float
+    rmse_ci95_db: Interval
+    n: int
+
+
+def repeatability(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> Repeated:
+    """Standard deviation of the difference of levels of two passes: two flights, or two parts of one."""
+    here, there = same_places(first, second, radius_m)
+    if not len(here):
+        return Repeated(rmse_db=float("nan"), rmse_ci95_db=NO_INTERVAL, n=0)
+    level, other = first.value[here], second.value[there]
+    bounds = error_intervals(level, other).rmse_db
+    return Repeated(rmse_db=float((other - level).std()), rmse_ci95_db=bounds, n=len(here))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,7 +7,7 @@ a float with NaN where the modem gave no CSI; it is never 0.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, power_from_db
 from .inertia import LANES, LARGEST, certain_rank
+from .passes import SAME_PLACE_M, Visit, same_places
 from .statistics import (
     NO_INTERVAL,
     REPLICATES,
@@ -25,7 +26,6 @@ from .statistics import (
     bootstrap_means,
     interval,
     plain,
-    same_places,
     share_interval,
 )
 
@@ -160,21 +160,17 @@ def _ranks(rank: ArrayLike) -> FloatArray:
     return np.asarray(rank, dtype=np.float64).ravel()
 
 
-def histogram(rank: ArrayLike, *, max_rank: int = MAX_RANK, weights: ArrayLike | None = None) -> FloatArray:
-    """Shares of rank 1 .. ``max_rank``; 0 (no channel) and NaN (no CSI) do not take part.
+def histogram(rank: ArrayLike) -> FloatArray:
+    """Shares of rank 1 .. :data:`MAX_RANK`; 0 (no channel) and NaN (no CSI) do not take part.
 
     Parameters
     ----------
     rank : array_like
-        Ranks, any shape.
-    max_rank : int
-        Higher ranks are an error.
-    weights : array_like, optional
-        One per rank, e.g. how long it held.
+        Ranks, any shape; higher ones are an error.
 
     Returns
     -------
-    ndarray, (max_rank,)
+    ndarray, (ranks,)
         Sums to one; all NaN when nothing counts.
 
     Examples
@@ -183,13 +179,16 @@ def histogram(rank: ArrayLike, *, max_rank: int = MAX_RANK, weights: ArrayLike |
     [0.333, 0.667, 0.0, 0.0]
     """
     values = _ranks(rank)
-    weight = np.ones(len(values)) if weights is None else _ranks(weights)
-    counts = np.isfinite(values) & (values >= 1)
-    if np.any(values[counts] > max_rank) or np.any(values[counts] != np.round(values[counts])):
-        raise ValueError(f"ranks must be whole numbers up to {max_rank}")
-    bars = np.bincount(values[counts].astype(np.int64), weights=weight[counts], minlength=max_rank + 1)[1:]
-    total = bars.sum()
-    return np.asarray(bars / total) if total > 0 else np.full(max_rank, np.nan)
+    some = values[np.isfinite(values) & (values >= 1)]
+    if np.any(some > MAX_RANK) or np.any(some != np.round(some)):
+        raise ValueError(f"ranks must be whole numbers up to {MAX_RANK}")
+    bars = np.bincount(some.astype(np.int64), minlength=MAX_RANK + 1)[1:]
+    return np.asarray(bars / len(some)) if len(some) else np.full(MAX_RANK, np.nan)
+
+
+def one_hot(rank: IntArray | FloatArray, ranks: int = MAX_RANK) -> FloatArray:
+    """1 in the column of each rank (n, ranks)."""
+    return np.asarray(np.asarray(rank)[:, None] == np.arange(1, ranks + 1), dtype=np.float64)
 
 
 def agreement(measured: ArrayLike, simulated: ArrayLike) -> float:
@@ -200,13 +199,8 @@ def agreement(measured: ArrayLike, simulated: ArrayLike) -> float:
     >>> agreement([1, 2, 2, float("nan")], [1, 2, 3, 1])
     0.6666666666666666
     """
-    measured_rank, simulated_rank = _ranks(measured), _ranks(simulated)
-    if measured_rank.shape != simulated_rank.shape:
-        raise ValueError(
-            f"measured has {measured_rank.size} ranks, simulated {simulated_rank.size}: they must be pairs"
-        )
-    both = (measured_rank >= 1) & (simulated_rank >= 1)
-    return float(np.mean(measured_rank[both] == simulated_rank[both])) if both.any() else float("nan")
+    measured_rank, simulated_rank = _pairs(measured, simulated)
+    return float(np.mean(measured_rank == simulated_rank)) if len(measured_rank) else float("nan")
 
 
 def total_variation(first: ArrayLike, second: ArrayLike) -> float:
@@ -232,35 +226,34 @@ def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
     return float(np.abs(step[:-1]).sum())
 
 
+def _both(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
+    """Both ranks as integers, 0 where there is none."""
+    ranks = _ranks(measured), _ranks(simulated)
+    if ranks[0].shape != ranks[1].shape:
+        raise ValueError(f"measured has {ranks[0].size} ranks, simulated {ranks[1].size}: they must be pairs")
+    first, second = (np.where(rank >= 1, rank, 0).astype(np.int64) for rank in ranks)
+    return first, second
+
+
 def _pairs(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
     """Both ranks as integers, where both exist (not NaN, not 0)."""
-    measured_rank, simulated_rank = _ranks(measured), _ranks(simulated)
-    if measured_rank.shape != simulated_rank.shape:
-        raise ValueError(
-            f"measured has {measured_rank.size} ranks, simulated {simulated_rank.size}: they must be pairs"
-        )
-    both = (measured_rank >= 1) & (simulated_rank >= 1)
-    return measured_rank[both].astype(np.int64), simulated_rank[both].astype(np.int64)
+    first, second = _both(measured, simulated)
+    both = (first > 0) & (second > 0)
+    return first[both], second[both]
 
 
-def confusion_matrix(measured: ArrayLike, simulated: ArrayLike, *, max_rank: int = MAX_RANK) -> IntArray:
-    """Counts of (measured rank, simulated rank), each 0 .. ``max_rank``; 0 collects what does not exist.
+def confusion_matrix(measured: ArrayLike, simulated: ArrayLike) -> IntArray:
+    """Counts of (measured rank, simulated rank), each 0 .. :data:`MAX_RANK`; 0 collects what does not exist.
 
     Returns
     -------
     ndarray of int, (max_rank + 1, max_rank + 1)
         Row: measured (0: NaN, no CSI). Column: simulated (0: no channel). All samples are in it.
     """
-    measured_rank, simulated_rank = _ranks(measured), _ranks(simulated)
-    if measured_rank.shape != simulated_rank.shape:
-        raise ValueError(
-            f"measured has {measured_rank.size} ranks, simulated {simulated_rank.size}: they must be pairs"
-        )
-    row = np.where(measured_rank >= 1, measured_rank, 0).astype(np.int64)
-    column = np.where(simulated_rank >= 1, simulated_rank, 0).astype(np.int64)
-    if len(row) and max(row.max(), column.max()) > max_rank:
-        raise ValueError(f"ranks must be at most {max_rank}")
-    size = max_rank + 1
+    row, column = _both(measured, simulated)
+    size = MAX_RANK + 1
+    if len(row) and max(row.max(), column.max()) >= size:
+        raise ValueError(f"ranks must be at most {MAX_RANK}")
     return np.bincount(row * size + column, minlength=size * size).reshape(size, size).astype(np.int64)
 
 
@@ -331,9 +324,7 @@ def shift_test(measured: ArrayLike, simulated: ArrayLike, *, minimum_shift: int 
     return float((1 + np.sum(apart >= count[0])) / (1 + len(apart)))
 
 
-def histogram_test(
-    measured: ArrayLike, simulated: ArrayLike, *, replicates: int = REPLICATES, seed: int = SEED
-) -> float:
+def histogram_test(measured: ArrayLike, simulated: ArrayLike, *, replicates: int = REPLICATES) -> float:
     """p-value of the total variation between both histograms, when blocks of the pair are swapped at random.
 
     If measured and simulated ranks came from one distribution, exchanging them over whole blocks (as long as the
@@ -343,8 +334,8 @@ def histogram_test(
     ----------
     measured, simulated : array_like, (n,)
         Ranks of the same samples; NaN and 0 take no part.
-    replicates, seed : int
-        Random exchanges, and of their generator.
+    replicates : int
+        Random exchanges.
 
     Returns
     -------
@@ -354,17 +345,12 @@ def histogram_test(
     measured_rank, simulated_rank = _pairs(measured, simulated)
     if not len(measured_rank):
         return float("nan")
-    difference = _indicators(measured_rank) - _indicators(simulated_rank)
+    difference = one_hot(measured_rank) - one_hot(simulated_rank)
     length = max(autocorrelation(measured_rank).block_length, autocorrelation(simulated_rank).block_length, 1)
     sums = np.add.reduceat(difference, np.arange(0, len(measured_rank), length), axis=0)
-    signs = np.random.default_rng(seed).integers(0, 2, (replicates, len(sums))) * 2.0 - 1.0
+    signs = np.random.default_rng(SEED).integers(0, 2, (replicates, len(sums))) * 2.0 - 1.0
     swapped = np.abs(signs @ sums).sum(axis=1)
     return float((1 + np.sum(swapped >= np.abs(sums.sum(axis=0)).sum() - 1e-9)) / (1 + replicates))
-
-
-def _indicators(rank: IntArray | FloatArray, max_rank: int = MAX_RANK) -> FloatArray:
-    """One column per rank 1 .. max_rank, 1 where the rank is it; (n, max_rank)."""
-    return np.asarray(np.asarray(rank)[:, None] == np.arange(1, max_rank + 1), dtype=np.float64)
 
 
 # --- what explains the modem's decision ----------------------------------------------------------------------------
@@ -416,7 +402,6 @@ def k_curve(
     *,
     k: ArrayLike | None = None,
     replicates: int = REPLICATES,
-    seed: int = SEED,
 ) -> KCurve:
     """Agreement for every K, and the K that explains the measured ranks best.
 
@@ -428,7 +413,7 @@ def k_curve(
         Singular values of the simulated channel at the same poses (any scale; see :func:`singular_values`).
     k : array_like, optional
         Grid of K, by default :func:`k_grid`.
-    replicates, seed : int
+    replicates : int
         Block bootstrap for the intervals of the best K.
 
     Returns
@@ -461,7 +446,7 @@ def k_curve(
     width = max(1, _CELLS_AT_ONCE // len(ri))
 
     def resampled(columns: BoolArray | IntArray) -> FloatArray:  # the same seed draws the same blocks each time
-        return bootstrap_means(columns.astype(np.float64), known.block_length, replicates=replicates, seed=seed)
+        return bootstrap_means(columns.astype(np.float64), known.block_length, replicates=replicates)
 
     for some in (slice(start, start + width) for start in range(0, len(grid), width)):
         drawn[:, some] = resampled(equal[:, some])
@@ -500,17 +485,21 @@ def _central(values: FloatArray, k: FloatArray) -> Interval:
     return float(min(k[first], low)), float(max(k[last], high))
 
 
-def condition_number_rank(sigma: ArrayLike, *, limit_db: float = 17.0) -> IntArray:
-    """Rank by the condition-number rule of an open UE: singular values (..., n) within ``limit_db`` of the strongest.
+LIMIT_DB = 17.0
+"""Of the condition number at which srsUE reports two layers."""
+
+
+def condition_number_rank(sigma: ArrayLike) -> IntArray:
+    """Rank by the condition-number rule of an open UE: singular values (..., n) within a limit of the strongest.
 
     srsUE reports two layers when the condition number of its 2 x 2 channel is below 17 dB (``srsran_ue_dl_select_ri``
     in ``lib/src/phy/ue/ue_dl.c``); for more ports the same limit is put on each singular value, 20 log10 of the
     ratio. In terms of K that is 10^(17/20) = 7.08.
     """
-    return rank_from_singular_values(sigma, float(amplitude_from_db(limit_db)))
+    return rank_from_singular_values(sigma, float(amplitude_from_db(LIMIT_DB)))
 
 
-def capacity_rank(h: ArrayLike, sinr_db: ArrayLike, *, penalty_bits: float = 0.0) -> IntArray:
+def capacity_rank(h: ArrayLike, sinr_db: ArrayLike) -> IntArray:
     """Number of layers that maximises rate at the reported SINR.
 
     Parameters
@@ -519,8 +508,6 @@ def capacity_rank(h: ArrayLike, sinr_db: ArrayLike, *, penalty_bits: float = 0.0
         Channel matrices, any scale.
     sinr_db : array_like, (...)
         Mean SINR per receive port with the whole transmit power spread over all ports [dB]; NaN gives rank 0.
-    penalty_bits : float
-        Rate that each layer after the first must bring beyond the best lower rank [bit/s/Hz].
 
     Returns
     -------
@@ -550,7 +537,7 @@ def capacity_rank(h: ArrayLike, sinr_db: ArrayLike, *, penalty_bits: float = 0.0
     rates = []
     for layers in range(1, gain.shape[-1] + 1):
         rate = np.log2(1.0 + snr[..., None] * gain[..., :layers] / layers).sum(axis=-1)
-        rates.append(np.broadcast_to(rate - penalty_bits * (layers - 1), shape))
+        rates.append(np.broadcast_to(rate, shape))
     stacked = np.stack(rates, axis=-1)
     alive = np.isfinite(stacked).all(axis=-1)
     best = np.argmax(np.where(alive[..., None], stacked, 0.0), axis=-1) + 1
@@ -674,23 +661,9 @@ class RankFit:
 
     def as_dict(self) -> dict[str, Any]:
         """The entry ``simulated.<K>`` of metrics.json."""
-        names = {
-            "histogram": _bars(self.histogram),
-            "histogram_ci95": _bars(self.histogram_ci95),
-            "out_of_coverage": self.out_of_coverage,
-            "agreement": self.agreement,
-            "agreement_ci95": self.agreement_ci95,
-            "kappa": self.kappa,
-            "kappa_ci95": self.kappa_ci95,
-            "total_variation": self.total_variation,
-            "total_variation_ci95": self.total_variation_ci95,
-            "wasserstein": self.wasserstein,
-            "wasserstein_ci95": self.wasserstein_ci95,
-            "confusion": self.confusion,
-            "p_agreement": self.p_agreement,
-            "p_histogram": self.p_histogram,
-        }
-        return dict(plain(names))
+        names = {name: getattr(self, name) for name in self.__slots__}
+        bars = {name: _bars(names[name]) for name in ("histogram", "histogram_ci95")}
+        return dict(plain(names | bars))
 
 
 def _bars(values: Sequence[Any] | FloatArray) -> dict[str, Any]:
@@ -764,9 +737,7 @@ def compare_rank(
     *,
     time_s: ArrayLike | None = None,
     sinr_db: ArrayLike | None = None,
-    others: Mapping[str, ArrayLike] | None = None,
     replicates: int = REPLICATES,
-    seed: int = SEED,
 ) -> RankComparison:
     """Compare measured RI with the ranks of simulated channels.
 
@@ -782,9 +753,7 @@ def compare_rank(
         Instants [s], for the hold time of stale RI; by default the row number.
     sinr_db : array_like, (n,), optional
         Reported SINR [dB], for the capacity rule.
-    others : mapping of str to array_like (n,), optional
-        Further numbers of the report, to recognise stale RI (``sinr_db`` takes part by itself).
-    replicates, seed : int
+    replicates : int
         Bootstrap.
 
     Returns
@@ -806,7 +775,7 @@ def compare_rank(
     sigma = singular_values(matrix)
     simulated = {float(k): rank_from_singular_values(sigma, k) for k in ks}
     rules = {"condition_number": condition_number_rank(sigma)}
-    report = dict(others or {})
+    report: dict[str, ArrayLike] = {}
     if sinr_db is not None:
         rules["capacity"] = capacity_rank(matrix, sinr_db)
         report["sinr_db"] = sinr_db
@@ -817,28 +786,26 @@ def compare_rank(
         n_effective=known.n_effective,
         n_no_csi=int((~np.isfinite(ri)).sum()),
         histogram=histogram(ri),
-        histogram_ci95=_histogram_intervals(ri[np.isfinite(ri)], replicates, seed),
-        simulated={k: compare_ranks(ri, rank, replicates=replicates, seed=seed) for k, rank in simulated.items()},
-        rules={name: compare_ranks(ri, rank, replicates=replicates, seed=seed) for name, rank in rules.items()},
-        curve=k_curve(ri, sigma, replicates=replicates, seed=seed),
+        histogram_ci95=_histogram_intervals(ri[np.isfinite(ri)], replicates),
+        simulated={k: compare_ranks(ri, rank, replicates=replicates) for k, rank in simulated.items()},
+        rules={name: compare_ranks(ri, rank, replicates=replicates) for name, rank in rules.items()},
+        curve=k_curve(ri, sigma, replicates=replicates),
         staleness=stale_reports(time, ri, report),
     )
 
 
-def _histogram_intervals(rank: FloatArray, replicates: int, seed: int) -> list[Interval]:
+def _histogram_intervals(rank: FloatArray, replicates: int) -> list[Interval]:
     if len(rank) < 2:
         return [NO_INTERVAL] * MAX_RANK
     intervals, whole = [], autocorrelation(rank)
-    for bar in _indicators(rank).T:
+    for bar in one_hot(rank).T:
         known = autocorrelation(bar) if np.ptp(bar) else whole  # a rank never seen says nothing about its own memory
-        drawn = bootstrap_means(bar[:, None], known.block_length, replicates=replicates, seed=seed)
+        drawn = bootstrap_means(bar[:, None], known.block_length, replicates=replicates)
         intervals.append(share_interval(float(bar.mean()), float(drawn.std()), known))
     return intervals
 
 
-def compare_ranks(
-    measured: ArrayLike, simulated: ArrayLike, *, replicates: int = REPLICATES, seed: int = SEED
-) -> RankFit:
+def compare_ranks(measured: ArrayLike, simulated: ArrayLike, *, replicates: int = REPLICATES) -> RankFit:
     """Compare two sequences of ranks by pose and by histogram; arguments as in :func:`agreement`.
 
     The histogram distances compare all measured with all simulated ranks; their intervals come from poses at which
@@ -848,7 +815,7 @@ def compare_ranks(
     ----------
     measured, simulated : array_like, (n,)
         Ranks of the same samples: NaN unknown, 0 no channel.
-    replicates, seed : int
+    replicates : int
         Of the bootstrap and the permutation test.
 
     Returns
@@ -859,16 +826,12 @@ def compare_ranks(
     measured_rank, simulated_rank = _ranks(measured), _ranks(simulated)
     bars_one, bars_two = histogram(measured_rank), histogram(simulated_rank)
     a, b = _pairs(measured_rank, simulated_rank)
-    agree, tv, move = (
-        agreement(measured_rank, simulated_rank),
-        total_variation(bars_one, bars_two),
-        wasserstein(bars_one, bars_two),
-    )
-    kappa = cohen_kappa(measured_rank, simulated_rank)
-    bounds = _pair_intervals(a, b, (agree, kappa, tv, move), replicates, seed)
+    agree, kappa = agreement(a, b), cohen_kappa(a, b)
+    tv, move = total_variation(bars_one, bars_two), wasserstein(bars_one, bars_two)
+    bounds = _pair_intervals(a, b, (agree, kappa, tv, move), replicates)
     return RankFit(
         histogram=bars_two,
-        histogram_ci95=_histogram_intervals(simulated_rank[simulated_rank >= 1], replicates, seed),
+        histogram_ci95=_histogram_intervals(simulated_rank[simulated_rank >= 1], replicates),
         out_of_coverage=int((simulated_rank == 0).sum()),
         agreement=agree,
         agreement_ci95=bounds[0],
@@ -880,7 +843,7 @@ def compare_ranks(
         wasserstein_ci95=bounds[3],
         confusion=confusion_matrix(measured_rank, simulated_rank),
         p_agreement=shift_test(measured_rank, simulated_rank),
-        p_histogram=histogram_test(measured_rank, simulated_rank, replicates=replicates, seed=seed),
+        p_histogram=histogram_test(measured_rank, simulated_rank, replicates=replicates),
     )
 
 
@@ -910,7 +873,7 @@ def commonest_rank(measured: ArrayLike) -> CommonestRank:
     if not np.isfinite(bars).all():
         return CommonestRank(rank=0, agreement=float("nan"), agreement_ci95=NO_INTERVAL)
     best = int(np.argmax(bars))
-    bounds = _histogram_intervals(ri[np.isfinite(ri)], REPLICATES, SEED)[best]
+    bounds = _histogram_intervals(ri[np.isfinite(ri)], REPLICATES)[best]
     return CommonestRank(rank=best + 1, agreement=float(bars[best]), agreement_ci95=bounds)
 
 
@@ -934,62 +897,42 @@ class RankRepeat:
 
 
 def repeat_rank(
-    position_m: FloatArray,
-    rank: ArrayLike,
-    other_position_m: FloatArray,
-    other_rank: ArrayLike,
-    *,
-    radius_m: float = 2.0,
-    heading_deg: FloatArray | None = None,
-    other_heading_deg: FloatArray | None = None,
-    replicates: int = REPLICATES,
-    seed: int = SEED,
+    first: Visit, second: Visit, radius_m: float = SAME_PLACE_M, *, replicates: int = REPLICATES
 ) -> RankRepeat:
     """Kappa of the ranks that two passes report at the same places (two flights, or two parts of one).
 
     Parameters
     ----------
-    position_m, other_position_m : (n, 3), (m, 3)
-        Places [m].
-    rank, other_rank : array_like, (n,), (m,)
-        RI; NaN where none.
-    radius_m, heading_deg, other_heading_deg
-        As in :func:`~aerpaw_cmp.compare.statistics.same_places`.
-    replicates, seed : int
+    first, second : Visit
+        Their values are ranks; 0 and NaN are left out.
+    radius_m : float
+        A sample pairs with the nearest one of the other pass within this distance.
+    replicates : int
         Bootstrap; with 0 replicates the interval is in closed form, to first order.
 
     Returns
     -------
     RankRepeat
-        Kappa, its interval, agreement and the number of pairs; NaN without pairs.
+        NaN without a pair.
     """
-    ranks, other_ranks = _ranks(rank), _ranks(other_rank)
-    known, other_known = np.flatnonzero(ranks >= 1), np.flatnonzero(other_ranks >= 1)
-    here, there = same_places(
-        np.asarray(position_m)[known],
-        np.asarray(other_position_m)[other_known],
-        radius_m=radius_m,
-        heading_deg=None if heading_deg is None else heading_deg[known],
-        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_known],
-    )
-    first, second = ranks[known[here]], other_ranks[other_known[there]]
-    if not len(first):
+    ranks = [np.where(visit.value >= 1, visit.value, np.nan) for visit in (first, second)]
+    here, there = same_places(replace(first, value=ranks[0]), replace(second, value=ranks[1]), radius_m)
+    if not len(here):
         return RankRepeat(kappa=float("nan"), kappa_ci95=NO_INTERVAL, agreement=float("nan"), n=0)
-    agree, kappa = agreement(first, second), cohen_kappa(first, second)
+    a, b = _pairs(ranks[0][here], ranks[1][there])
+    agree, kappa = agreement(a, b), cohen_kappa(a, b)
     if replicates:
-        a, b = _pairs(first, second)
-        bounds = _pair_intervals(a, b, (agree, kappa, float("nan"), float("nan")), replicates, seed)[1]
+        bounds = _pair_intervals(a, b, (agree, kappa, float("nan"), float("nan")), replicates)[1]
     else:
-        bounds = _kappa_interval(first, second, kappa)
-    return RankRepeat(kappa=kappa, kappa_ci95=bounds, agreement=agree, n=len(first))
+        bounds = _kappa_interval(a, b, kappa)
+    return RankRepeat(kappa=kappa, kappa_ci95=bounds, agreement=agree, n=len(a))
 
 
-def _kappa_interval(first: FloatArray, second: FloatArray, kappa: float) -> Interval:
+def _kappa_interval(a: IntArray, b: IntArray, kappa: float) -> Interval:
     """95 % interval of kappa to first order: block variance of what each pair adds to it, without resamples."""
-    a, b = _pairs(first, second)
     if len(a) < 2 or not np.isfinite(kappa):
         return NO_INTERVAL
-    influence, _, (low, high) = _pair_statistics((a == b).astype(np.float64), _indicators(a), _indicators(b))[1]
+    influence, _, (low, high) = _pair_statistics((a == b).astype(np.float64), one_hot(a), one_hot(b))[1]
     known = autocorrelation(influence)
     if not known.enough or not _explored(a, b):
         return NO_INTERVAL
@@ -1006,17 +949,17 @@ def _explored(a: IntArray, b: IntArray) -> bool:
 
 
 def _pair_intervals(
-    a: IntArray, b: IntArray, values: tuple[float, float, float, float], replicates: int, seed: int
+    a: IntArray, b: IntArray, values: tuple[float, float, float, float], replicates: int
 ) -> list[Interval]:
     """Intervals of agreement, kappa, total variation and Wasserstein from one bootstrap of the pairs."""
     if len(a) < 2 or not _explored(a, b):
         return [NO_INTERVAL] * 4
-    equal, first, second = (a == b).astype(np.float64), _indicators(a), _indicators(b)
+    equal, first, second = (a == b).astype(np.float64), one_hot(a), one_hot(b)
     columns = np.column_stack([equal, first, second])
     intervals: list[Interval] = []
     for influence, statistic, bounds in _pair_statistics(equal, first, second):
         known = autocorrelation(influence)
-        drawn = statistic(bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed))
+        drawn = statistic(bootstrap_means(columns, known.block_length, replicates=replicates))
         value = values[len(intervals)]
         intervals.append(
             share_interval(value, float(drawn.std()), known)
@@ -1040,43 +983,43 @@ def _pair_statistics(
     left = max(1.0 - chance, 1e-12)
     apart = np.sign(np.cumsum(p - q))
 
-    def bars(means: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return means[:, 1 : MAX_RANK + 1], means[:, MAX_RANK + 1 :]
-
-    def kappa(means: FloatArray) -> FloatArray:
-        by_luck = np.prod(bars(means), axis=0).sum(axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(by_luck < 1 - 1e-12, (means[:, 0] - by_luck) / (1 - by_luck), np.nan)
-
-    def distance(means: FloatArray) -> FloatArray:
-        return np.asarray(0.5 * np.abs(np.subtract(*bars(means))).sum(axis=1))
-
     def move(means: FloatArray) -> FloatArray:
-        return np.asarray(np.abs(np.cumsum(np.subtract(*bars(means)), axis=1))[:, :-1].sum(axis=1))
+        return np.asarray(np.abs(np.cumsum(np.subtract(*_halves(means)), axis=1))[:, :-1].sum(axis=1))
 
     return [
         (equal, lambda means: means[:, 0], (0.0, 1.0)),
-        (equal / left + (agree - 1.0) / left**2 * by_chance, kappa, (-1.0, 1.0)),
-        ((first - second) @ np.sign(p - q), distance, (0.0, 1.0)),
+        (equal / left + (agree - 1.0) / left**2 * by_chance, kappa_of_means, (-1.0, 1.0)),
+        ((first - second) @ np.sign(p - q), variation_of_means, (0.0, 1.0)),
         (np.cumsum(first - second, axis=1) @ apart, move, (0.0, MAX_RANK - 1.0)),
     ]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KappaParts:
-    """Kappa of paired ranks as a function of column means, for a bootstrap.
+def _halves(means: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Both histograms (m, ranks) of column means (m, 1 + 2 ranks), whose first column is the agreement."""
+    return means[:, 1 : MAX_RANK + 1], means[:, MAX_RANK + 1 :]
 
-    ``columns`` (n, 1 + 2 MAX_RANK): agreement, indicators of either rank; ``influence`` (n,): what a pose adds to
-    kappa, to first order; ``kappa`` takes means (r, 1 + 2 MAX_RANK).
+
+def kappa_of_means(means: FloatArray) -> FloatArray:
+    """Cohen's kappa (m,) of means of columns: agreement, indicators of the one rank, of the other."""
+    by_luck = np.prod(_halves(means), axis=0).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(by_luck < 1 - 1e-12, (means[:, 0] - by_luck) / (1 - by_luck), np.nan)
+
+
+def variation_of_means(means: FloatArray) -> FloatArray:
+    """Total variation distance (m,) of the two histograms in means of columns."""
+    return np.asarray(0.5 * np.abs(np.subtract(*_halves(means))).sum(axis=1))
+
+
+def kappa_parts(measured: IntArray, simulated: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Columns of paired ranks (n,), each 1 .. ``MAX_RANK``, whose means give kappa (:func:`kappa_of_means`).
+
+    Returns
+    -------
+    columns : (n, 1 + 2 MAX_RANK)
+        Agreement, indicators of either rank.
+    influence : (n,)
+        What a pose adds to kappa, to first order.
     """
-
-    columns: FloatArray
-    influence: FloatArray
-    kappa: Callable[[FloatArray], FloatArray]
-
-
-def kappa_parts(measured: IntArray, simulated: IntArray) -> KappaParts:
-    """Parts of kappa of paired ranks (n,), each 1 .. ``MAX_RANK``."""
-    equal, first, second = (measured == simulated).astype(np.float64), _indicators(measured), _indicators(simulated)
-    influence, kappa, _ = _pair_statistics(equal, first, second)[1]
-    return KappaParts(columns=np.column_stack([equal, first, second]), influence=influence, kappa=kappa)
+    equal, first, second = (measured == simulated).astype(np.float64), one_hot(measured), one_hot(simulated)
+    return np.column_stack([equal, first, second]), _pair_statistics(equal, first, second)[1][0]

@@ -20,15 +20,18 @@ from numpy.typing import ArrayLike
 
 from ..common.errors import InputError
 from ..common.units import FloatArray, IntArray
-from .forecast import constant_forecast, log_losses, one_hot
-from .rank import MAX_RANK, cohen_kappa
-from .statistics import REPLICATES, SEED, autocorrelation, bootstrap_means, interval, plain
+from .forecast import constant_forecast, log_losses
+from .rank import MAX_RANK, cohen_kappa, one_hot
+from .statistics import REPLICATES, autocorrelation, bootstrap_means, interval, plain
 
 FLOOR_DB = -40.0
 """Ratios of singular values below this are as good as zero to any receiver."""
 
 PENALTIES = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Ridge penalties to choose from, on coefficients of standardised features (log likelihood of the whole flight)."""
+
+CHOICE_PENALTY = 10.0
+"""Ridge penalty while geometries are chosen."""
 
 FEWEST = 50
 """Training samples below which nothing is fitted."""
@@ -208,17 +211,19 @@ def _fitted(x: FloatArray, rank: IntArray, penalty: float) -> Receiver:
 
 
 def _training(features: FloatArray, rank: ArrayLike, groups: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
+    """Features (geometries, n, features), ranks and groups of the samples that have a rank and all features."""
     ri = np.asarray(rank, dtype=np.float64)
-    if not len(ri) == len(features) == len(groups):
-        raise ValueError(f"{len(ri)} ranks, {len(features)} rows of features, {len(groups)} groups: not of one length")
-    good = np.asarray((ri >= 1) & np.isfinite(features).all(axis=1))
+    if not len(ri) == features.shape[1] == len(groups):
+        counts = f"{len(ri)} ranks, {features.shape[1]} rows of features, {len(groups)} groups"
+        raise ValueError(f"{counts}: not of one length")
+    good = np.asarray((ri >= 1) & np.isfinite(features).all(axis=(0, 2)))
     y = ri[good].astype(np.int64)
     if len(y) < FEWEST or np.ptp(y) == 0:
         what = f"{len(y)} samples with rank and channel" if len(y) < FEWEST else f"rank {y[0]} throughout"
         raise InputError(what, expected=f"at least {FEWEST} samples of at least two ranks to fit a receiver")
     if len(np.unique(groups[good])) < 2:
         raise InputError("all training samples are in one sector", expected="samples in at least two sectors")
-    return features[good], y, groups[good]
+    return features[:, good], y, groups[good]
 
 
 def _standard(x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -437,9 +442,7 @@ def fit_mixture(
     InputError
         Fewer than :data:`FEWEST` samples, or one rank only: nothing to learn from.
     """
-    alive = np.asarray(np.isfinite(features).all(axis=(0, 2)))
-    _, y, group = _training(np.where(alive[:, None], features[0], np.nan), rank, groups)
-    x = features[:, alive & (np.nan_to_num(np.asarray(rank, dtype=np.float64)) >= 1)]
+    x, y, group = _training(features, rank, groups)
     means = [np.mean([out_of_group(one, y, group, penalty) for one in x], axis=0) for penalty in penalties]
     best = int(np.argmin([log_losses(p, y).mean() for p in means]))
     return ReceiverMixture(
@@ -482,10 +485,8 @@ def choose_features(
     rank: ArrayLike,
     groups: IntArray,
     *,
-    penalty: float = 10.0,
     finalists: int = 60,
     replicates: int = REPLICATES,
-    seed: int = SEED,
 ) -> FeatureChoice:
     """Choose between candidate geometries by groups left out within the training flights.
 
@@ -496,12 +497,10 @@ def choose_features(
     rank : array_like, (n,)
     groups : (n,) int
         Each is left out once.
-    penalty : float
-        The same for all.
     finalists : int
         Only those with the best likelihood on the training samples themselves are cross-validated: all candidates have
         equally many coefficients, and a fit costs a tenth of a cross-validation.
-    replicates, seed : int
+    replicates : int
         Of the bootstrap that says which candidates are no worse than the best.
 
     Returns
@@ -514,24 +513,20 @@ def choose_features(
     InputError
         As :func:`fit_mixture`.
     """
-    alive = np.asarray(np.isfinite(features).all(axis=(0, 2)))
-    _, y, group = _training(np.where(alive[:, None], features[0], np.nan), rank, groups)
-    x = features[:, alive & (np.nan_to_num(np.asarray(rank, dtype=np.float64)) >= 1)]
+    x, y, group = _training(features, rank, groups)
     step = max(1, _HELD // (x.shape[1] * (x.shape[2] + 1) * MAX_RANK))
-    rough = np.concatenate([_own_losses(x[i : i + step], y, penalty) for i in range(0, len(x), step)])
+    rough = np.concatenate([_own_losses(x[i : i + step], y) for i in range(0, len(x), step)])
     final = np.argsort(rough, kind="stable")[:finalists]
-    losses = np.concatenate(
-        [_left_out_losses(x[final[i : i + step]], y, group, penalty) for i in range(0, len(final), step)]
-    )
+    losses = np.concatenate([_left_out_losses(x[final[i : i + step]], y, group) for i in range(0, len(final), step)])
     score = losses.mean(axis=1)
     rows = np.argsort(score, kind="stable")
-    tied = tuple(int(final[r]) for r in rows if _not_worse(losses[r] - losses[rows[0]], replicates, seed))
+    tied = tuple(int(final[r]) for r in rows if _not_worse(losses[r] - losses[rows[0]], replicates))
     return FeatureChoice(
         best=int(final[rows[0]]), order=final[rows], log_score=score[rows], tied=tied, candidates=len(features)
     )
 
 
-def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray, penalty: float = 10.0) -> float:
+def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> float:
     """Log score of the mean forecast of several geometries on groups left out.
 
     Parameters
@@ -539,36 +534,33 @@ def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray, penalt
     features : (geometries, n, features)
     rank, groups : (n,)
         As :func:`fit_mixture`.
-    penalty : float
-        The same for all.
 
     Returns
     -------
     float
         [nat].
     """
-    alive = np.asarray(np.isfinite(features).all(axis=(0, 2)))
-    _, y, group = _training(np.where(alive[:, None], features[0], np.nan), rank, groups)
-    x = features[:, alive & (np.nan_to_num(np.asarray(rank, dtype=np.float64)) >= 1)]
-    return float(log_losses(out_of_group(x, y, group, penalty).mean(axis=0), y).mean())
+    x, y, group = _training(features, rank, groups)
+    return float(log_losses(out_of_group(x, y, group, CHOICE_PENALTY).mean(axis=0), y).mean())
 
 
-def _own_losses(x: FloatArray, rank: IntArray, penalty: float) -> FloatArray:
+def _own_losses(x: FloatArray, rank: IntArray) -> FloatArray:
     mean, scale = _standard(x)
     z = (x - mean[..., None, :]) / scale[..., None, :]
-    p = _softmax(_design(z) @ np.swapaxes(_fit_multinomial(z, rank, np.ones(len(rank)), penalty, steps=6), -1, -2))
+    weights = _fit_multinomial(z, rank, np.ones(len(rank)), CHOICE_PENALTY, steps=6)
+    p = _softmax(_design(z) @ np.swapaxes(weights, -1, -2))
     return np.array([log_losses(one, rank).mean() for one in p])
 
 
-def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray, penalty: float) -> FloatArray:
-    return np.stack([log_losses(one, rank) for one in out_of_group(x, rank, groups, penalty)])
+def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray) -> FloatArray:
+    return np.stack([log_losses(one, rank) for one in out_of_group(x, rank, groups, CHOICE_PENALTY)])
 
 
-def _not_worse(difference: FloatArray, replicates: int, seed: int) -> bool:
+def _not_worse(difference: FloatArray, replicates: int) -> bool:
     if np.abs(difference).max() < 1e-9:  # the same channel by another name
         return True
     known = autocorrelation(difference)
     mean = float(difference.mean())
-    drawn = bootstrap_means(difference[:, None], known.block_length, replicates=replicates, seed=seed)[:, 0]
+    drawn = bootstrap_means(difference[:, None], known.block_length, replicates=replicates)[:, 0]
     low, _ = interval(mean, drawn, known)
     return not low > 0.0

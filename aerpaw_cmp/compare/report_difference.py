@@ -6,17 +6,15 @@ better. Errors of both share the measurement and most of the model, so they are 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..common.units import FloatArray, IntArray
-from .rank import MAX_RANK, agreement, cohen_kappa, kappa_parts
+from .rank import MAX_RANK, agreement, cohen_kappa, kappa_of_means, kappa_parts
 from .statistics import (
     NO_INTERVAL,
-    REPLICATES,
-    SEED,
     Interval,
     PairedDifference,
     autocorrelation,
@@ -225,9 +223,6 @@ def rank_difference(
     samples: Overlap,
     first: tuple[FloatArray, FloatArray],
     second: tuple[FloatArray, FloatArray],
-    *,
-    replicates: int = REPLICATES,
-    seed: int = SEED,
 ) -> RankDifference:
     """Compare the rank of one tower at one K.
 
@@ -249,7 +244,7 @@ def rank_difference(
     usable = np.column_stack([*pairs])
     both = (usable >= 1).all(axis=1) & (usable <= MAX_RANK).all(axis=1)
     first_rank, second_rank = (pair[both].astype(np.int64) for pair in pairs)
-    agree, kappa = _agreement_change(first_rank, second_rank, replicates, seed)
+    agree, kappa = _agreement_change(first_rank, second_rank)
     return RankDifference(
         tower=tower,
         k=k,
@@ -261,31 +256,22 @@ def rank_difference(
     )
 
 
-def _agreement_change(first: IntArray, second: IntArray, replicates: int, seed: int) -> tuple[Changed, Changed]:
+def _agreement_change(first: IntArray, second: IntArray) -> tuple[Changed, Changed]:
     """Agreement and kappa of two reports on the same poses, each (n, 2): measured and simulated rank."""
     agree = [agreement(*pairs.T) for pairs in (first, second)]
     kappa = [cohen_kappa(*pairs.T) for pairs in (first, second)]
     if len(first) < 2:
         return _changed(*agree), _changed(*kappa)
-    parts = [kappa_parts(*pairs.T) for pairs in (first, second)]
-    width = parts[0].columns.shape[1]
-    columns = np.column_stack([part.columns for part in parts])
+    (columns, influence), (other_columns, other_influence) = (kappa_parts(*pairs.T) for pairs in (first, second))
+    both, width = np.column_stack([columns, other_columns]), columns.shape[1]
 
-    def bounds(influence: FloatArray, change: float, statistic: int) -> Interval:
+    def change(of: list[float], influence: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -> Changed:
         known = autocorrelation(influence)
-        drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
-        of = [p.kappa(drawn[:, i * width : (i + 1) * width]) if statistic else drawn[:, i * width]
-              for i, p in enumerate(parts)]  # fmt: skip
-        return interval(change, of[1] - of[0], known)
+        drawn = bootstrap_means(both, known.block_length)
+        shift = statistic(drawn[:, width:]) - statistic(drawn[:, :width])
+        return replace(_changed(*of), ci95=interval(of[1] - of[0], shift, known))
 
-    shift, turn = agree[1] - agree[0], kappa[1] - kappa[0]
     return (
-        Changed(
-            first=agree[0], second=agree[1], difference=shift,
-            ci95=bounds(parts[1].columns[:, 0] - parts[0].columns[:, 0], shift, 0),
-        ),
-        Changed(
-            first=kappa[0], second=kappa[1], difference=turn,
-            ci95=bounds(parts[1].influence - parts[0].influence, turn, 1),
-        ),
-    )  # fmt: skip
+        change(agree, other_columns[:, 0] - columns[:, 0], lambda means: means[:, 0]),
+        change(kappa, other_influence - influence, kappa_of_means),
+    )

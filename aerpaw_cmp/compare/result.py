@@ -20,6 +20,7 @@ from .detection import DetectionScore
 from .field_difference import FieldAudit
 from .forecast import ForecastScore
 from .ladder import LadderRow
+from .passes import Repeated
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import LEARNED_HERE, ChannelDifference, ErrorSpan, ResidualBins, RssComparison
 from .serving import ServingComparison
@@ -109,15 +110,6 @@ class SnrScore:
     noise_dbm: float
     rmse_db: float
     mean_error_db: float
-    n: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Repeated:
-    """What two passes of the same places differ by [dB], over ``n`` pairs."""
-
-    rmse_db: float
-    rmse_ci95_db: Interval
     n: int
 
 

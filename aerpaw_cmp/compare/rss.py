@@ -6,7 +6,7 @@ files, sites or engines.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -28,6 +28,8 @@ from .statistics import (
 
 PART_DB = 10.0
 """Two channels of one receiver "part" where they differ by more than this [dB]."""
+PART_S = 1.0
+"""Over means of so long [s]."""
 
 
 def seconds(time: ArrayLike) -> FloatArray:
@@ -91,9 +93,9 @@ class RssComparison:
     trimmed: OffsetFit
     baselines: Mapping[str, OffsetFit]
     baseline_intervals: Mapping[str, Interval]
-    lag_s: float
-    fitted_on_scored: tuple[str, ...]
     residual_db: FloatArray = field(repr=False)
+    lag_s: float = float("nan")
+    fitted_on_scored: tuple[str, ...] = ("offset_db",)
 
     @property
     def rmse_ci95_db(self) -> Interval:
@@ -102,14 +104,9 @@ class RssComparison:
 
     def as_dict(self) -> dict[str, Any]:
         """The entry ``rss.<tower>.<channel>`` of metrics.json; what does not exist is None."""
-        names = {
-            "offset_db": self.offset_db,
-            "rmse_db": self.rmse_db,
-            "n": self.n,
-            "n_out_of_coverage": self.n_out_of_coverage,
-            "n_measured_out": self.n_measured_out,
-            "n_simulated_out": self.n_simulated_out,
-            "n_no_pose": self.n_no_pose,
+        before = ("offset_db", "rmse_db", "n", "n_out_of_coverage", "n_measured_out", "n_simulated_out", "n_no_pose")
+        names: dict[str, Any] = {name: getattr(self, name) for name in before}
+        names |= {
             "at_search_edge": self.at_edge,
             "correlation": self.correlation,
             "rmse_ci95_db": self.intervals.rmse_db,
@@ -141,9 +138,6 @@ def compare_rss(
     *,
     baselines: Mapping[str, ArrayLike] | None = None,
     posed: ArrayLike | None = None,
-    lag_s: float = float("nan"),
-    offset_db: float | None = None,
-    fitted_on_scored: Sequence[str] = (),
     step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> RssComparison:
@@ -161,12 +155,6 @@ def compare_rss(
         Levels of simpler models at the same poses [dB].
     posed : array_like of bool, (n,), optional
         Whether the pose of the sample is known. A sample without a pose is not out of coverage.
-    lag_s : float
-        The clock lag already applied [s], for the record.
-    offset_db : float, optional
-        An offset fixed beforehand (another flight, a link budget): nothing is searched then.
-    fitted_on_scored : sequence of str
-        What else was fitted on these samples (``"lag_s"``, ``"mount_yaw_deg"``).
     step_db, span_db : float, (float, float)
         Offset search.
 
@@ -187,8 +175,6 @@ def compare_rss(
     order = np.flatnonzero(use)[np.argsort(time[use], kind="stable")]
     m, s = measured[order], simulated[order]
     fit = grid_offset(m, s, step_db=step_db, span_db=span_db)
-    if offset_db is not None:
-        fit = _fixed(m, s, offset_db)
     offsets, curve = offset_curve(m, s, step_db=step_db, span_db=span_db)
     simple = {name: _levels(levels) for name, levels in (baselines or {}).items()}
     return RssComparison(
@@ -208,8 +194,6 @@ def compare_rss(
             name: grid_offset(m, level[order], step_db=step_db, span_db=span_db) for name, level in simple.items()
         },
         baseline_intervals={name: _rmse_interval(m, level[order]) for name, level in simple.items()},
-        lag_s=lag_s,
-        fitted_on_scored=(() if offset_db is not None else ("offset_db",)) + tuple(fitted_on_scored),
         residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
     )
 
@@ -261,12 +245,6 @@ def _levels(values: ArrayLike) -> FloatArray:
     """Levels as floats; infinities (no power) become NaN."""
     array = np.asarray(values, dtype=np.float64)
     return np.where(np.isfinite(array), array, np.nan)
-
-
-def _fixed(measured: FloatArray, simulated: FloatArray, offset_db: float) -> OffsetFit:
-    residual = measured + offset_db - simulated
-    rmse = float(np.sqrt(np.mean(residual**2))) if len(residual) else float("nan")
-    return OffsetFit(float(offset_db), rmse, len(residual), False)
 
 
 def _rmse_interval(measured: FloatArray, simulated: FloatArray) -> Interval:
@@ -368,85 +346,41 @@ def _window_sums(values: FloatArray, first: Any, last: Any) -> FloatArray:
 
 
 def averaged_fits(
-    time_s: ArrayLike,
     measured_db: ArrayLike,
     simulations: Mapping[str, ArrayLike],
+    averages: Mapping[str, Callable[[FloatArray], FloatArray]],
     *,
-    windows_s: Sequence[float] = (0.0, 1.0, 4.0),
     step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
-) -> dict[str, dict[float, OffsetFit]]:
-    """Coherent, power-sum and local-mean simulations against the measurement averaged over the same window.
+) -> dict[str, dict[str, OffsetFit]]:
+    """Simulations against the measurement, both sides averaged alike.
 
     Parameters
     ----------
-    time_s, measured_db : array_like, (n,)
-        The measurement.
-    simulations : mapping of str to array_like, (n,)
-        Such as ``{"coherent": ..., "power_sum": ..., "local_mean": ...}`` [dB].
-    windows_s : sequence of float
-        Averaging windows [s] applied to both sides, over the samples that both sides have.
-    step_db, span_db : float, (float, float)
-        Of the offset search [dB].
+    measured_db : array_like, (n,)
+        [dB]
+    simulations : mapping of str to array_like (n,)
+        Levels by name, such as "coherent", "power_sum" or "local_mean".
+    averages : mapping of str to callable
+        Means of levels (n,), NaN where either side has none: by :func:`local_mean_db` or :func:`stretch_means_db`.
+    step_db, span_db
+        Offset search.
 
     Returns
     -------
     dict
-        ``result[name][window]``: offset and RMSE.
+        ``result[simulation][average]``.
     """
     measured = _levels(measured_db)
-    result: dict[str, dict[float, OffsetFit]] = {}
+    result: dict[str, dict[str, OffsetFit]] = {}
     for name, levels in simulations.items():
         simulated = _levels(levels)
         both = np.isfinite(measured) & np.isfinite(simulated)
-        m, s = np.where(both, measured, np.nan), np.where(both, simulated, np.nan)
+        sides = [np.where(both, side, np.nan) for side in (measured, simulated)]
         result[name] = {
-            float(w): grid_offset(
-                local_mean_db(time_s, m, w), local_mean_db(time_s, s, w), step_db=step_db, span_db=span_db
-            )
-            for w in windows_s
+            average: grid_offset(*(mean(side) for side in sides), step_db=step_db, span_db=span_db)
+            for average, mean in averages.items()
         }
-    return result
-
-
-def path_averaged_fits(
-    position_m: FloatArray,
-    measured_db: ArrayLike,
-    simulations: Mapping[str, ArrayLike],
-    *,
-    lengths_m: Sequence[float],
-    step_db: float = STEP_DB,
-    span_db: tuple[float, float] = SPAN_DB,
-) -> dict[str, dict[float, OffsetFit]]:
-    """As :func:`averaged_fits`, with both sides averaged over stretches of path: ``result[name][length]``.
-
-    Parameters
-    ----------
-    position_m : (n, 3)
-        In time order; a sample without a position belongs to no stretch.
-    measured_db : array_like, (n,)
-        Levels [dB]; NaN does not count.
-    simulations : mapping of str to array_like, (n,)
-        Levels [dB] by name.
-    lengths_m : sequence of float
-        Lengths of the stretches.
-    step_db, span_db : float, (float, float)
-        Of the offset search [dB].
-
-    Returns
-    -------
-    dict
-        ``result[name][length_m]``: offset and RMSE.
-    """
-    measured = _levels(measured_db)
-    result: dict[str, dict[float, OffsetFit]] = {name: {} for name in simulations}
-    for length in lengths_m:
-        stretch = stretches(position_m, length)
-        for name, levels in simulations.items():
-            simulated = _levels(levels)
-            both = np.isfinite(measured) & np.isfinite(simulated)
-            pair = (stretch_means_db(stretch[both], side[both]) for side in (measured, simulated))
-            result[name][float(length)] = grid_offset(*pair, step_db=step_db, span_db=span_db)
     return result
 
 
@@ -600,13 +534,6 @@ def _edges(values: FloatArray, edges: ArrayLike | int) -> FloatArray:
         return np.array([0.0, 1.0])
     low, high = float(values.min()), float(values.max())
     return np.linspace(low, high if high > low else low + 1.0, int(edges) + 1)
-
-
-def residual_tables(
-    residual_db: ArrayLike, quantities: Mapping[str, ArrayLike], *, bins: int = 12
-) -> dict[str, ResidualBins]:
-    """:func:`bin_residual` for distance, elevation, azimuth, heading, altitude, line of sight, foliage, time."""
-    return {name: bin_residual(residual_db, values, bins) for name, values in quantities.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -792,10 +719,8 @@ def channel_difference(
     *,
     position_m: FloatArray | None = None,
     context: Mapping[str, ArrayLike] | None = None,
-    part_db: float = PART_DB,
-    window_s: float = 1.0,
 ) -> ChannelDifference:
-    """Difference of two channels, and where they part by more than ``part_db`` [dB].
+    """Difference of two channels, and where they part by more than :data:`PART_DB` after their mean difference.
 
     Parameters
     ----------
@@ -807,10 +732,6 @@ def channel_difference(
         For the places at which they part.
     context : mapping of str to array_like (n,), optional
         Geometry that may explain it, as in :func:`error_spans`.
-    part_db : float
-        Difference beyond which they part, after their mean difference.
-    window_s : float
-        Averaging of the difference before its spans are sought.
 
     Returns
     -------
@@ -827,15 +748,13 @@ def channel_difference(
     difference = first - second
     mean = float(difference[ok].mean())
     residual = difference - mean
-    spans = error_spans(
-        time_s, residual, position_m=position_m, context=context, window_s=window_s, threshold_db=part_db
-    )
+    spans = error_spans(time_s, residual, position_m=position_m, context=context, window_s=PART_S, threshold_db=PART_DB)
     return ChannelDifference(
         n=int(ok.sum()),
         mean_db=mean,
         std_db=float(residual[ok].std()),
         correlation=correlation(first, second),
-        share_parted=float(np.mean(np.abs(residual[ok]) > part_db)),
+        share_parted=float(np.mean(np.abs(residual[ok]) > PART_DB)),
         interval_std_db=error_intervals(second[ok], first[ok]).rmse_db,
         spans=spans,
     )

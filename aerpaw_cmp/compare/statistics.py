@@ -8,14 +8,14 @@ the statistic over the draws, corrected for the finite number of blocks, gives t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.units import FloatArray, IntArray, wrap_degrees
+from ..common.units import FloatArray
 from .memory import FEWEST, mean_draws, power_draws
 
 REPLICATES = 1000
@@ -296,19 +296,12 @@ def _block_sums(columns: FloatArray, length: int) -> FloatArray:
     return np.asarray(running[length:] - running[:-length])
 
 
-def _spread(replicates: FloatArray) -> float:
-    good = replicates[np.isfinite(replicates)]
-    return float(good.std(ddof=1)) if len(good) > 1 else float("nan")
-
-
 def interval(
     estimate: float,
     replicates: FloatArray,
     known: Autocorrelation,
     *,
     bounds: tuple[float, float] = (-np.inf, np.inf),
-    forward: Callable[[FloatArray], FloatArray] | None = None,
-    backward: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Interval:
     """95 % interval around an estimate from its bootstrap replicates.
 
@@ -322,8 +315,6 @@ def interval(
         Of the sequence that was resampled.
     bounds : (low, high)
         The statistic's range.
-    forward, backward : callable, optional
-        Scale on which the statistic is nearly normal (log, Fisher z), and back.
 
     Returns
     -------
@@ -331,23 +322,11 @@ def interval(
         NaN ("no interval") below :data:`FEWEST_INDEPENDENT` independent samples. Where resampling biases the
         statistic (distances, RMSE), the same bias sits in the estimate and is taken off.
     """
-    if not known.enough or not np.isfinite(estimate):
+    good = replicates[np.isfinite(replicates)]
+    if not known.enough or not np.isfinite(estimate) or len(good) < 2:
         return NO_INTERVAL
-    with np.errstate(divide="ignore", invalid="ignore"):
-        value = float(np.asarray(forward(np.asarray(estimate))) if forward else estimate)
-        drawn = np.asarray(forward(replicates) if forward else replicates, dtype=np.float64)
-    if not np.isfinite(value):  # at the end of its scale (RMSE 0, correlation 1): the spread itself must do
-        low, high = np.nanquantile(np.append(replicates, estimate), [0.025, 0.975])
-        return float(low), float(high)
-    good = drawn[np.isfinite(drawn)]
-    if len(good) < 2:
-        return NO_INTERVAL
-    centre = value - (float(good.mean()) - value)
-    reach = known.half_width * _spread(good)
-    ends = np.array([centre - reach, centre + reach])
-    if backward:
-        ends = np.asarray(backward(ends))
-    low, high = np.clip(ends, *bounds)
+    centre, reach = 2.0 * estimate - float(good.mean()), known.half_width * float(good.std(ddof=1))
+    low, high = np.clip([centre - reach, centre + reach], *bounds)
     return float(min(low, estimate)), float(max(high, estimate))
 
 
@@ -608,118 +587,3 @@ def share_interval(share: float, spread: float, known: Autocorrelation) -> Inter
     reach = np.sqrt(z2 * (share * (1 - share) / size + z2 / (4 * size**2))) / (1 + z2 / size)
     low, high = float(centre - reach), float(centre + reach)
     return (0.0 if share == 0.0 else max(0.0, low)), (1.0 if share == 1.0 else min(1.0, high))
-
-
-@dataclass(frozen=True, slots=True)
-class Repeatability:
-    """What two passes of the same places differ by: no model can be expected to do better.
-
-    Parameters
-    ----------
-    rmse_db : float
-        Root mean square difference after the best constant [dB]; NaN without a pair.
-    offset_db : float
-        That constant (second pass minus first) [dB].
-    n : int
-        Pairs.
-    interval_db : (low, high)
-        95 % interval of ``rmse_db``.
-    """
-
-    rmse_db: float
-    offset_db: float
-    n: int
-    interval_db: Interval
-
-
-def same_places(
-    position_m: FloatArray,
-    other_position_m: FloatArray,
-    *,
-    radius_m: float = 2.0,
-    heading_deg: FloatArray | None = None,
-    other_heading_deg: FloatArray | None = None,
-    heading_within_deg: float = 20.0,
-) -> tuple[IntArray, IntArray]:
-    """Samples of two passes at the same places: flights of one route laid over each other.
-
-    Parameters
-    ----------
-    position_m, other_position_m : (n, 3), (m, 3)
-        Places [m]; rows with NaN pair with nothing.
-    radius_m : float
-        A sample pairs with the nearest one of the other pass within this distance [m].
-    heading_deg, other_heading_deg : (n,), (m,), optional
-        Where given, the headings of a pair agree within ``heading_within_deg``.
-    heading_within_deg : float
-        Largest difference of the headings of a pair [deg].
-
-    Returns
-    -------
-    (here, there) : each (pairs,) int
-        Indices into both passes.
-    """
-    from scipy.spatial import cKDTree
-
-    here = np.flatnonzero(np.isfinite(position_m).all(axis=1))
-    there = np.flatnonzero(np.isfinite(other_position_m).all(axis=1))
-    if not len(here) or not len(there):
-        return here[:0], there[:0]
-    distance, nearest = cKDTree(other_position_m[there]).query(position_m[here], distance_upper_bound=radius_m)
-    paired = np.isfinite(distance)
-    here, there = here[paired], there[nearest[paired]]
-    if heading_deg is not None and other_heading_deg is not None:
-        turn = wrap_degrees(other_heading_deg[there] - heading_deg[here])
-        same = np.abs(turn) <= heading_within_deg
-        here, there = here[same], there[same]
-    return here, there
-
-
-def repeatability(
-    position_m: FloatArray,
-    level_db: FloatArray,
-    other_position_m: FloatArray,
-    other_level_db: FloatArray,
-    *,
-    radius_m: float = 2.0,
-    heading_deg: FloatArray | None = None,
-    other_heading_deg: FloatArray | None = None,
-    heading_within_deg: float = 20.0,
-) -> Repeatability:
-    """Repeatability floor of two passes (two flights, or two parts of one); arguments as in :func:`same_places`.
-
-    ``level_db`` (n,) and ``other_level_db`` (m,) are the levels [dB]; NaN is left out.
-
-    Parameters
-    ----------
-    position_m, other_position_m : (n, 3), (m, 3)
-        Places of the two passes.
-    level_db, other_level_db : (n,), (m,)
-        Levels [dB]; NaN is left out.
-    radius_m : float
-        Two samples nearer than this were taken at the same place.
-    heading_deg, other_heading_deg : (n,), (m,), optional
-        Headings; given both, those of a pair have to agree.
-    heading_within_deg : float
-        Within this.
-
-    Returns
-    -------
-    Repeatability
-        Standard deviation and mean of the difference (other minus first) [dB], number of pairs, interval.
-    """
-    known, other_known = np.flatnonzero(np.isfinite(level_db)), np.flatnonzero(np.isfinite(other_level_db))
-    here, there = same_places(
-        position_m[known],
-        other_position_m[other_known],
-        radius_m=radius_m,
-        heading_deg=None if heading_deg is None else heading_deg[known],
-        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_known],
-        heading_within_deg=heading_within_deg,
-    )
-    here, there = known[here], other_known[there]
-    if not len(here):
-        return Repeatability(float("nan"), float("nan"), 0, NO_INTERVAL)
-    difference = other_level_db[there] - level_db[here]
-    bounds = error_intervals(level_db[here], other_level_db[there])
-    return Repeatability(float(difference.std()), float(difference.mean()), len(here), bounds.rmse_db)

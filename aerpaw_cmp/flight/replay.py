@@ -15,7 +15,7 @@ from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
-from ..propagation.drivers.moving import loss_along, moving_matrices, replay_moving
+from ..propagation.drivers.moving import loss_along, replay_moving
 from ..propagation.drivers.pairs import replay_pairs
 from ..propagation.drivers.parts import Each, replay_in_parts
 from ..propagation.field.sum import Fields, channel_matrices
@@ -527,9 +527,8 @@ def fields_from(
         H (poses, 1, n_rx, n_tx) and powers.
     """
     loss_db = loss_along(loss, paths, sources_m, poses.position_m)
-    if len(sources_m) == 1:
-        return channel_matrices(paths, faces, sources_m, poses, link, loss_db)
-    return moving_matrices(paths, faces, sources_m, poses, link, loss_db)
+    places_m = sources_m if len(sources_m) == 1 else sources_m[:, None]
+    return channel_matrices(paths, faces, places_m, poses, link, loss_db)
 
 
 def check_interactions(rt: RtSettings) -> None:

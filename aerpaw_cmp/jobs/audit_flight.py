@@ -186,8 +186,7 @@ def _of_series(
         ),
         Field(loss=path_loss(site, rt, replayed.link.carrier_hz)),
         Run(cache_dir=None if rt.advanced.cache else ""),
-        links=links,
-        second=Second(expected=expected, ks=ks, reference_links=reference_links),
+        Second(links=links, expected=expected, ks=ks, reference_links=reference_links),
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from ..compare.causes import Cause
 from ..compare.detection import DetectionScore, score_detection
 from ..compare.forecast import ForecastScore, score_forecast
 from ..compare.ladder import log_distance_level_db
+from ..compare.passes import Visit, repeatability
 from ..compare.result import (
     APPLIED,
     Censored,
@@ -34,7 +36,6 @@ from ..compare.result import (
     PairResult,
     RankFurther,
     RankResult,
-    Repeated,
     RssFurther,
     RssResult,
     SnrScore,
@@ -144,9 +145,11 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         posed=levels.posed,
         step_db=settings.advanced.step_db,
         span_db=settings.span_db,
-        lag_s=float("nan") if clock is None else clock.result.radio_minus_telemetry_s,
-        fitted_on_scored=("lag_s",) if clock is not None and clock.result.applied == APPLIED else (),
     )
+    if clock is not None:
+        also = ("lag_s",) if clock.result.applied == APPLIED else ()
+        lag_s = clock.result.radio_minus_telemetry_s
+        score = dataclasses.replace(score, lag_s=lag_s, fitted_on_scored=(*score.fitted_on_scored, *also))
     wild = rss.outliers(levels.measured_db)
     without = score.rmse_db
     if wild.any():
@@ -159,8 +162,9 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     other = rss_alternatives(data.site, data.settings.rt, replayed, settings.field)
     alternatives = {name: at_samples(series, replayed, level, settings) for name, level in other.items()}
     stated = stated_spread(replayed, settings.window_s)
+    passes = _halves(series.time, position, levels.measured_db, geometry.get("heading_deg"))
     quantities = {**geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
-    residual_by = rss.residual_tables(score.residual_db, quantities)
+    residual_by = {name: rss.bin_residual(score.residual_db, values) for name, values in quantities.items()}
     curve_offset_db, curve_rmse_db = offsets.offset_curve(
         levels.measured_db, levels.simulated_db, step_db=settings.advanced.step_db, span_db=settings.span_db
     )
@@ -205,7 +209,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             detection=None if trained else _detection(settings, series, levels),
             snr=None if trained else _snr(series, levels),
             expected_offset=_expected(settings.reference_powers, data.folder, series, score.offset_db),
-            repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
+            repeatability={name: repeatability(*pair, PASSES_WITHIN_M) for name, pair in passes.items()},
             foliage=foliage_rss_difference(alternatives) or None,
             explained_by={name: table.explained for name, table in residual_by.items()},
             likely_cause=None if trained else _cause(data.site, series, replayed, levels, simple["free_space"]),
@@ -298,22 +302,22 @@ def _averaged(
         "coherent": replayed.spread(replayed.level_dbm("coherent")),
         "power_sum": replayed.spread(replayed.level_dbm("power")),
     }
-    over_time = rss.averaged_fits(
-        series.time, levels.measured_db, simulations, windows_s=AVERAGING_WINDOWS_S, step_db=settings.advanced.step_db,
-        span_db=settings.span_db,
-    )  # fmt: skip
+    wavelength = wavelength_m(series.link.carrier_hz)
     lengths = {
-        AVERAGING_WAVELENGTHS * wavelength_m(series.link.carrier_hz): f"{AVERAGING_WAVELENGTHS} wavelengths of path",
-        AVERAGING_LENGTH_M: f"{AVERAGING_LENGTH_M:g} m of path",
+        f"{AVERAGING_WAVELENGTHS} wavelengths of path": AVERAGING_WAVELENGTHS * wavelength,
+        f"{AVERAGING_LENGTH_M:g} m of path": AVERAGING_LENGTH_M,
     }
-    over_path = rss.path_averaged_fits(
-        position_m, levels.measured_db, simulations, lengths_m=tuple(lengths), step_db=settings.advanced.step_db,
-        span_db=settings.span_db,
-    )  # fmt: skip
+    averages = {f"{w:g} s": partial(rss.local_mean_db, series.time, window_s=w) for w in AVERAGING_WINDOWS_S}
+    averages |= {name: partial(rss.stretch_means_db, rss.stretches(position_m, m)) for name, m in lengths.items()}
+    fits = rss.averaged_fits(
+        levels.measured_db, simulations, averages, step_db=settings.advanced.step_db, span_db=settings.span_db
+    )
     return {
-        name: {f"{w:g} s": Fit(offset_db=f.offset_db, rmse_db=f.rmse_db) for w, f in over_time[name].items()}
-        | {lengths[m]: Fit(offset_db=f.offset_db, rmse_db=f.rmse_db, n=f.n) for m, f in over_path[name].items()}
-        for name in simulations
+        name: {
+            average: Fit(offset_db=fit.offset_db, rmse_db=fit.rmse_db, n=fit.n if average in lengths else None)
+            for average, fit in each.items()
+        }
+        for name, each in fits.items()
     }
 
 
@@ -397,28 +401,21 @@ def _censored(settings: RssSettings, levels: Levels) -> Censored | None:
     )
 
 
-def _repeatability(
-    time: Any, position_m: FloatArray, measured_db: FloatArray, heading_deg: FloatArray | None
-) -> dict[str, Repeated]:
-    """How well the measurement repeats where the second half of the flight passes places of the first."""
+def _halves(
+    time: Any, position_m: FloatArray, values: FloatArray, heading_deg: FloatArray | None
+) -> dict[str, tuple[Visit, Visit]]:
+    """Both halves of a flight, whose second passes places of the first: with headings that count, and without."""
     elapsed = rss.seconds(time)
     with np.errstate(invalid="ignore"):
         late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
-    repeated = {}
-    for name, turned in (("same_heading", heading_deg), ("any_heading", None)):
-        if name == "same_heading" and turned is None:
-            continue
-        fit = statistics.repeatability(
-            position_m[~late],
-            measured_db[~late],
-            position_m[late],
-            measured_db[late],
-            radius_m=PASSES_WITHIN_M,
-            heading_deg=None if turned is None else turned[~late],
-            other_heading_deg=None if turned is None else turned[late],
-        )
-        repeated[name] = Repeated(rmse_db=fit.rmse_db, rmse_ci95_db=fit.interval_db, n=fit.n)
-    return repeated
+    headings = {"same_heading": heading_deg, "any_heading": None}
+    if heading_deg is None:
+        del headings["same_heading"]
+
+    def half(rows: BoolArray, turned: FloatArray | None) -> Visit:
+        return Visit(position_m[rows], values[rows], None if turned is None else turned[rows])
+
+    return {name: (half(~late, turned), half(late, turned)) for name, turned in headings.items()}
 
 
 def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
@@ -627,21 +624,6 @@ def _repeated_rank(
     time: Any, position_m: FloatArray, rank: FloatArray, replayed: Replayed, rows: IntArray
 ) -> dict[str, ranks.RankRepeat]:
     """How well the modem agrees with itself where the second half of the flight passes places of the first."""
-    elapsed = rss.seconds(time)
-    with np.errstate(invalid="ignore"):
-        late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
     heading = None if replayed.track is None else replayed.spread(replayed.track.heading_deg)[rows]
-    repeated = {}
-    for name, turned in (("same_heading", heading), ("any_heading", None)):
-        if name == "same_heading" and turned is None:
-            continue
-        repeated[name] = ranks.repeat_rank(
-            position_m[~late],
-            rank[~late],
-            position_m[late],
-            rank[late],
-            radius_m=PASSES_WITHIN_M,
-            heading_deg=None if turned is None else turned[~late],
-            other_heading_deg=None if turned is None else turned[late],
-        )
-    return repeated
+    passes = _halves(time, position_m, rank, heading)
+    return {name: ranks.repeat_rank(*pair, PASSES_WITHIN_M) for name, pair in passes.items()}

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..common.units import FloatArray
 from ..compare.offset import Pooling, pooled_moments
-from ..compare.passes import Pass, PassPair, PassTable
+from ..compare.passes import Pass, PassPair, PassTable, Visit
 from ..compare.rank import repeat_rank
 from ..flight.settings import Positive, Settings
 from ..report.campaign_data import FlownRank, PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
@@ -137,9 +137,8 @@ def rank_repeats(flown: Sequence[FlownRank], radius_m: float) -> list[RankPairin
             continue
         if not _near(boxes[i], boxes[j], radius_m):
             continue
-        repeated = repeat_rank(
-            first.position_m, first.rank, second.position_m, second.rank, radius_m=radius_m, replicates=0
-        )
+        passes = Visit(first.position_m, first.rank), Visit(second.position_m, second.rank)
+        repeated = repeat_rank(*passes, radius_m, replicates=0)
         if repeated.n:
             out.append(
                 RankPairing(

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -122,7 +121,7 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
 
 
 def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run) -> PathSet:
-    common: dict[str, Any] = {"max_depth": search.max_depth, "progress": run.progress}
+    depth = search.max_depth
     links = scene.links_to(poses)
     extent = None if run.whole is None else run.whole.extent_m
     if by_beams(scene, search, _links(scene, run)):
@@ -130,16 +129,18 @@ def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run)
         from .search import prisms  # compiled: loaded where there are many faces
 
         links = replace(links, longest_m=_longest_m(scene, poses, search))
-        common |= {"threads": run.threads, "on_estimate": run.on_estimate or _long_search}
+        run = replace(run, on_estimate=run.on_estimate or _long_search)
         if scene.surfaces is not None:
-            return search_beams.grow_paths(scene.surfaces, links, **common)[0]
-        return prisms.find_paths(scene.faces, links, extent_m=extent, **common)[0]
+            return search_beams.grow_paths(scene.surfaces, links, run, max_depth=depth)
+        return prisms.find_paths(scene.faces, links, run, max_depth=depth, extent_m=extent)
     if search.engine == "image":
-        return mirror.find_paths(scene.faces, links, extent_m=extent, **common)
+        return mirror.find_paths(scene.faces, links, max_depth=depth, extent_m=extent, progress=run.progress)
     from .search import sionna
 
-    about: dict[str, Any] = {"carrier_hz": link.carrier_hz, "surfaces": scene.surfaces, "progress": run.progress}
-    return sionna.find_paths(scene.faces, links, sionna.Rays(**search.rays), **about)
+    return sionna.find_paths(
+        scene.faces, links, sionna.Rays(**search.rays),
+        carrier_hz=link.carrier_hz, surfaces=scene.surfaces, progress=run.progress,
+    )  # fmt: skip
 
 
 def other_paths(

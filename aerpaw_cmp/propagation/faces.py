@@ -7,9 +7,9 @@ footprint are one wall, however many vertices the map gave it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -29,8 +29,9 @@ COLLINEAR = 1e-9
 _UP = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True, slots=True)
-class _Face:
+class _Face(NamedTuple):
+    """One row of :class:`~aerpaw_cmp.propagation.paths.Faces`."""
+
     normal: FloatArray
     along: FloatArray
     across: FloatArray
@@ -61,18 +62,9 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
     faces = [_ground(height, site.ground_material, len(grounds) > 1) for height in grounds]
     for index, building in enumerate(site.buildings):
         faces.extend(_building_faces(building, index))
-    return Faces(
-        normal=np.array([f.normal for f in faces]),
-        offset_m=np.array([f.offset_m for f in faces]),
-        material=tuple(f.material for f in faces),
-        label=tuple(f.label for f in faces),
-        along=np.array([f.along for f in faces]),
-        across=np.array([f.across for f in faces]),
-        lower=np.array([f.lower for f in faces]),
-        upper=np.array([f.upper for f in faces]),
-        polygon=tuple(f.polygon for f in faces),
-        solid=np.array([f.solid for f in faces], dtype=np.int64),
-    )
+    columns: dict[str, Any] = dict(zip(_Face._fields, zip(*faces, strict=True), strict=True))
+    numbers = {name: np.array(columns[name]) for name in _Face._fields if name not in ("material", "label", "polygon")}
+    return Faces(**(columns | numbers))
 
 
 @lru_cache(maxsize=4096)
@@ -86,14 +78,13 @@ def _building_faces(building: Building, solid: int) -> tuple[_Face, ...]:
 
 def _ground(height_m: float, material: str, several: bool) -> _Face:
     label = f"ground at {height_m:g} m" if several else "ground"
-    infinite = (np.inf, np.inf)
     return _Face(
         normal=_UP,
         along=np.array([1.0, 0, 0]),
         across=np.array([0, 1.0, 0]),
         offset_m=height_m,
         lower=(-np.inf, -np.inf),
-        upper=infinite,
+        upper=(np.inf, np.inf),
         polygon=None,
         material=material,
         label=label,

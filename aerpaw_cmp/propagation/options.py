@@ -12,7 +12,7 @@ from ..common.units import BoolArray, FloatArray
 from .field.ridges import Ridges
 from .paths import PathSet
 from .search.crowns import Crowns
-from .search.effort import OnEstimate
+from .search.effort import SearchRun
 from .search.interactions import OtherSearch, other_searches
 from .search.samples import Samples
 
@@ -170,8 +170,8 @@ class Whole:
     pairs: int
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run(SearchRun):
     """How a replay is run; nothing here changes a number.
 
     Parameters
@@ -179,22 +179,14 @@ class Run:
     cache_dir : path, optional
         Keep paths here, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for the
         ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
-    threads : int, optional
-        Of compiled code (default: the cores this process may use).
     whole : Whole, optional
         What the poses are a part of.
-    progress : callable, optional
-        Called with the share done.
-    on_estimate : callable, optional
-        Called before a search among thousands of faces with what it will take; without one, a long search is a
-        warning.
+    threads, progress, on_estimate
+        As :class:`~aerpaw_cmp.propagation.search.effort.SearchRun` has them.
     """
 
     cache_dir: str | Path | None = None
-    threads: int | None = None
     whole: Whole | None = None
-    progress: Callable[[float], None] | None = None
-    on_estimate: OnEstimate | None = None
 
 
 def _check_positive(name: str, value: float | None) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from shapely.geometry import Polygon
@@ -37,6 +38,11 @@ class Links:
     usable: BoolArray | None = None
     excluded: BoolArray | None = None
     longest_m: float | FloatArray = np.inf
+
+
+_ARRAYS = ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
+_WORDS = ("material", "label", "polygon")
+"""Columns of faces: arrays, and tuples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,16 +102,18 @@ class Faces:
     def __len__(self) -> int:
         return len(self.normal)
 
+    def select(self, rows: IntArray) -> Faces:
+        """Some of the faces."""
+        columns: dict[str, Any] = {name: tuple(getattr(self, name)[row] for row in rows) for name in _WORDS}
+        columns |= {name: getattr(self, name)[rows] for name in _ARRAYS}
+        return Faces(**columns)
+
 
 def joined(first: Faces, second: Faces) -> Faces:
     """The faces of both, the first keeping their numbers."""
-    columns = ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
-    return Faces(
-        material=first.material + second.material,
-        label=first.label + second.label,
-        polygon=first.polygon + second.polygon,
-        **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in columns},
-    )
+    columns: dict[str, Any] = {name: getattr(first, name) + getattr(second, name) for name in _WORDS}
+    columns |= {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in _ARRAYS}
+    return Faces(**columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,12 +160,39 @@ class PathSet:
 
     def select(self, rows: AnyArray | slice) -> PathSet:
         """The paths of a mask, of indices or of a slice."""
-        return PathSet(**{one.name: getattr(self, one.name)[rows] for one in fields(self)})
+        return PathSet(**{column.name: getattr(self, column.name)[rows] for column in fields(self)})
+
+    @classmethod
+    def from_tower(cls, tower: int, pose: IntArray, faces: IntArray, vertices_m: FloatArray, max_depth: int) -> PathSet:
+        """Paths of one tower over sequences (paths, depth), padded to ``max_depth``; -1 is no face.
+
+        Parameters
+        ----------
+        tower : int
+        pose : (paths,) int
+        faces : (paths, depth) int
+            From tower to UAV.
+        vertices_m : (paths, depth, 3)
+            Reflection points [m]; those without a face do not count.
+        max_depth : int
+
+        Returns
+        -------
+        PathSet
+            In the order given.
+        """
+        sequence = np.full((len(pose), max_depth), -1, dtype=np.int64)
+        points = np.full((len(pose), max_depth, 3), np.nan)
+        depth = faces.shape[1]
+        sequence[:, :depth] = faces
+        points[:, :depth] = np.where((faces >= 0)[..., None], vertices_m, np.nan)
+        return cls(pose, np.full(len(pose), tower), (sequence >= 0).sum(axis=1), sequence, points)
 
     @classmethod
     def one_after_another(cls, pieces: Sequence[PathSet]) -> PathSet:
         """The paths of all pieces, one at least, as they come; nothing is sorted."""
-        return cls(**{one.name: np.concatenate([getattr(p, one.name) for p in pieces]) for one in fields(cls)})
+        names = [column.name for column in fields(cls)]
+        return cls(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
 
     @classmethod
     def empty(cls, max_depth: int) -> PathSet:

@@ -99,15 +99,7 @@ class Scene:
         paths : PathSet
             Those that bounce off a crown.
         """
-        paths, faces = crowns.bounces(
-            self.faces,
-            self.sources_m,
-            poses.position_m,
-            max_depth=max_depth,
-            usable=self.usable,
-            excluded=self.excluded,
-            dem=site.dem,
-        )
+        paths, faces = crowns.bounces(self.faces, self.links_to(poses), max_depth=max_depth, dem=site.dem)
         more = np.zeros((len(self.usable), len(faces) - len(self.faces)), dtype=np.bool_)
         return replace(self, faces=faces, usable=np.concatenate([self.usable, more], axis=1)), paths
 

@@ -13,7 +13,6 @@ from ..site.siteyaml import load_site
 from .arrays import Link, Poses
 from .options import Diffraction, Engine, Field, Loss, Search
 from .replay import Replay, replay
-from .search.crowns import Crowns
 from .search.samples import Samples
 
 
@@ -25,7 +24,6 @@ def trace(
     max_depth: int = 2,
     *,
     loss: Loss | None = None,
-    crowns: Crowns | None = None,
     samples: Samples = "auto",
     diffraction: Diffraction = "none",
 ) -> Replay:
@@ -46,8 +44,6 @@ def trace(
         Largest number of reflections, 0 to 3.
     loss : callable, optional
         Further loss per path [dB], such as foliage.
-    crowns : Crowns, optional
-        Tree crowns that reflect.
     samples : int or "auto"
         ``sionna`` only: rays per tower; "auto" raises the number until two pilots agree.
     diffraction : {"none", "edges", "all"}
@@ -76,7 +72,7 @@ def trace(
     (1, 1)
     """
     place = site if isinstance(site, Site) else load_site(site)
-    search = Search(engine, max_depth=max_depth, samples=samples, crowns=crowns, diffraction=diffraction)
+    search = Search(engine, max_depth=max_depth, samples=samples, diffraction=diffraction)
     return replay(place, link, poses if isinstance(poses, Poses) else _level(poses), search, Field(loss))
 
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from ..common.units import FloatArray, IntArray
 from ..compare.offset import Moments, difference_moments
-from ..compare.passes import cell_means
-from ..compare.result import Repeated
+from ..compare.passes import Repeated, cell_means
 from ..compare.statistics import Interval
 from ..site.site import Site
 

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from ..common.cells import guarded
 from ..common.jsonable import fields_of, json_safe
 from ..common.stages import Progress, silent
-from ..compare.result import Repeated
+from ..compare.passes import Repeated
 from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
 from .campaign_explorer import payload

@@ -308,7 +308,11 @@ def test_what_is_kept_changes_nothing():
         found = []
         for series, tried in ((TRAIN, model), (TRAIN[:2], model), (TRAIN, MODEL), (TRAIN[2:], MODEL), (TRAIN, model)):
             if not kept:
-                for store in (direction_gain._kept, direction_gain._kept_features, direction_gain._kept_means):
+                for store in (
+                    direction_gain._equations,
+                    direction_gain._features_of_directions,
+                    direction_gain._mean_features_of_directions,
+                ):
                     store.clear()
                 direction_gain._last_sum.clear()
             for factor in (1.0, 1.9):

@@ -7,9 +7,9 @@ from aerpaw_cmp.compare.forecast import (
     brier_losses,
     constant_forecast,
     log_losses,
-    one_hot,
     score_forecast,
 )
+from aerpaw_cmp.compare.rank import one_hot
 
 
 def ranks(n=400, seed=1):

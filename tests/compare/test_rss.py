@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,6 @@ from aerpaw_cmp.compare.rss import (
     link_geometry,
     local_mean_db,
     outliers,
-    path_averaged_fits,
-    residual_tables,
     seconds,
     stretch_means_db,
     stretches,
@@ -126,14 +125,6 @@ def test_order_of_samples_does_not_matter():
     assert compare_rss(stamps, measured, simulated).as_dict() == one.as_dict()
 
 
-def test_a_fixed_offset_is_not_searched():
-    time, measured, simulated = flight(sigma=0.0)
-    found = compare_rss(time, measured, simulated, offset_db=-28.0)
-    assert found.rmse_db == pytest.approx(2.0)
-    assert found.fitted_on_scored == ()
-    assert compare_rss(time, measured, simulated, fitted_on_scored=["lag_s"]).fitted_on_scored == ("offset_db", "lag_s")
-
-
 def test_lengths_must_agree():
     with pytest.raises(ValueError, match="must be"):
         compare_rss([0.0, 1.0], [1.0], [1.0])
@@ -172,17 +163,19 @@ def test_fading_averages_out_on_the_same_footing():
     time = np.arange(0, 200, 0.1)
     mean = -70 + 8 * np.sin(time / 20)
     rayleigh = 10 * np.log10(rng.exponential(size=len(time)))
-    found = averaged_fits(time, mean + rayleigh, {"local_mean": mean, "other": 0 * mean}, windows_s=(0.0, 4.0))
-    assert found["local_mean"][0.0].rmse_db == pytest.approx(5.57, abs=0.4)  # standard deviation of Rayleigh in dB
-    assert found["local_mean"][4.0].rmse_db < 1.0
-    assert found["other"][4.0].rmse_db > 4.0
+    averages = {"each": partial(local_mean_db, time, window_s=0.0), "4 s": partial(local_mean_db, time, window_s=4.0)}
+    found = averaged_fits(mean + rayleigh, {"local_mean": mean, "other": 0 * mean}, averages)
+    assert found["local_mean"]["each"].rmse_db == pytest.approx(5.57, abs=0.4)  # standard deviation of Rayleigh in dB
+    assert found["local_mean"]["4 s"].rmse_db < 1.0
+    assert found["other"]["4 s"].rmse_db > 4.0
 
 
 def test_a_stretch_counts_once_however_long_the_hover():
     east = np.concatenate([np.arange(0.0, 100.0, 1.0), np.full(500, 100.0), np.arange(101.0, 201.0, 1.0)])
     position = np.column_stack([east, 0 * east, 0 * east + 40.0])
     level = np.where(east < 100.0, -60.0, np.where(east == 100.0, -50.0, -60.0))
-    found = path_averaged_fits(position, level, {"flat": np.full(len(east), -60.0)}, lengths_m=(10.0,))["flat"][10.0]
+    averages = {"path": partial(stretch_means_db, stretches(position, 10.0))}
+    found = averaged_fits(level, {"flat": np.full(len(east), -60.0)}, averages)["flat"]["path"]
     assert found.n == 21
     alone = 10.0  # one stretch of 21 is off by almost 10 dB
     assert found.rmse_db == pytest.approx(alone * np.sqrt(20) / 21, rel=0.02)
@@ -254,7 +247,8 @@ def test_bins_show_what_explains_the_residual():
     heading = rng.uniform(0, 360, 2000)
     los = rng.random(2000) < 0.5
     residual = 6 * np.cos(np.radians(heading)) + np.where(los, 0.0, -3.0) + rng.normal(0, 1, 2000)
-    tables = residual_tables(residual, {"heading_deg": heading, "los": los, "time_s": np.arange(2000)})
+    quantities = {"heading_deg": heading, "los": los, "time_s": np.arange(2000)}
+    tables = {name: bin_residual(residual, values) for name, values in quantities.items()}
     assert tables["heading_deg"].explained > 0.75
     assert tables["time_s"].explained < 0.05
     assert tables["los"].n.tolist() == [(~los).sum(), los.sum()]

@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 
 from aerpaw_cmp.compare import statistics
+from aerpaw_cmp.compare.passes import Visit, repeatability, same_places
 from aerpaw_cmp.compare.statistics import (
     Autocorrelation,
     autocorrelation,
@@ -18,8 +19,6 @@ from aerpaw_cmp.compare.statistics import (
     interval,
     paired_difference,
     plain,
-    repeatability,
-    same_places,
     share_interval,
 )
 
@@ -265,22 +264,23 @@ def test_repeatability_floor_of_two_passes():
     first = -60 + field + rng.normal(0, 2, 2000)
     second = -57 + field[::-1] + rng.normal(0, 2, 2000)
     first[:50] = np.nan
-    found = repeatability(here, first, there, second)
+    found = repeatability(Visit(here, first), Visit(there, second))
     assert found.rmse_db == pytest.approx(np.sqrt(8.0), rel=0.1)
-    assert found.offset_db == pytest.approx(3.0, abs=0.2)
-    assert found.interval_db[0] < np.sqrt(8.0) < found.interval_db[1]
+    assert found.rmse_ci95_db[0] < np.sqrt(8.0) < found.rmse_ci95_db[1]
     north, south = np.zeros(2000), np.full(2000, 180.0)
-    assert repeatability(here, first, there, second, heading_deg=north, other_heading_deg=south).n == 0
-    assert repeatability(here, first, there + 100.0, second).n == 0
-    assert np.isnan(repeatability(here, first, there + 100.0, second).rmse_db)
+    assert repeatability(Visit(here, first, north), Visit(there, second, south)).n == 0
+    nowhere = repeatability(Visit(here, first), Visit(there + 100.0, second))
+    assert nowhere.n == 0
+    assert np.isnan(nowhere.rmse_db)
 
 
 def test_same_places_pairs_the_nearest_and_wraps_headings():
     a = np.array([[0.0, 0, 0], [10, 0, 0], [np.nan, 0, 0]])
     b = np.array([[10.5, 0, 0], [0.2, 0, 0], [0.1, 0, 0]])
-    here, there = same_places(a, b)
+    here, there = same_places(Visit(a, np.zeros(3)), Visit(b, np.zeros(3)))
     assert (here.tolist(), there.tolist()) == ([0, 1], [2, 0])
-    here, _ = same_places(a, b, heading_deg=np.array([359.0, 0, 0]), other_heading_deg=np.array([90.0, 0, 1]))
+    turned = Visit(a, np.zeros(3), np.array([359.0, 0, 0])), Visit(b, np.zeros(3), np.array([90.0, 0, 1]))
+    here, _ = same_places(*turned)
     assert here.tolist() == [0]
 
 

@@ -33,6 +33,7 @@ from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import mirror as image
 from aerpaw_cmp.propagation.search import prisms
+from aerpaw_cmp.propagation.search.effort import SearchRun
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from aerpaw_cmp.site.installed import InstalledPattern
 from aerpaw_cmp.site.mitsuba import TriangleScene
@@ -216,7 +217,7 @@ def same_paths(one, two):
 
 def searched(faces, sources, targets, usable=None, excluded=None, **options):
     mirrors = image.find_paths(faces, Links(sources, targets, usable, excluded), **options)
-    beams, _ = prisms.find_paths(faces, Links(sources, targets, usable, excluded), **options, threads=2)
+    beams = prisms.find_paths(faces, Links(sources, targets, usable, excluded), SearchRun(threads=2), **options)
     same_paths(mirrors, beams)
     return beams
 

@@ -11,7 +11,7 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import Array
-from aerpaw_cmp.propagation.check.audit import audit
+from aerpaw_cmp.propagation.check.audit import Second, audit
 from aerpaw_cmp.propagation.field.foliage import P833, CrownIndex, NoFoliage, Opaque, foliage_loss_db
 from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.options import Field, Search
@@ -441,7 +441,7 @@ def test_the_audit_compares_paths_over_crowns(scenes):
     )
     found = opaque_replay(scenes, site, position)
     crowns, link, poses = Crowns(stand), scenes.link(site), scenes.poses(position)
-    settings = {"field": Field(loss=opaque(crowns)), "reference": "image", "links": 40}
+    settings = {"field": Field(loss=opaque(crowns)), "second": Second(reference="image", links=40)}
     same = audit(site, link, poses, found, Search(crowns=crowns), **settings).difference
     # the reference has other facets than the whole replay, so that their numbers differ
     assert (same.missing_paths, same.extra_paths, same.rss_max_error_db) == (0, 0, 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.propagation.check.explain import _chosen, near_an_edge, why_not
+from aerpaw_cmp.propagation.check.explain import near_an_edge, why_not
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.mirror import find_paths
@@ -59,5 +59,5 @@ def test_a_point_near_an_edge_is_known_as_such(scenes):
 def test_a_scene_of_triangles_is_no_error(scenes):
     """Faces without a roof, and finite ones without a building: nothing is said that was not tested."""
     faces = site_faces(scenes.site((Building("barn", box(20, -10, 30, 10), 15.0),)))
-    walls = _chosen(faces, np.arange(5))  # the roof is left out
+    walls = faces.select(np.arange(5))  # the roof is left out
     assert "triangles" in why_not(walls, np.array([0.0, 0, 10]), np.array([60.0, 0, 10]), np.zeros(0, int))

@@ -19,7 +19,8 @@ from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import mirror as image
 from aerpaw_cmp.propagation.search import power_cut, prisms
-from aerpaw_cmp.propagation.search.beams import grow_paths, reflection_points
+from aerpaw_cmp.propagation.search.beams import estimate, grow_paths, reflection_points
+from aerpaw_cmp.propagation.search.effort import SearchRun
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.export import export_scene
 from aerpaw_cmp.site.mitsuba import read_scene
@@ -56,7 +57,7 @@ def test_tilted_overlapping_open_quads_against_enumeration(seed):
     expected = enumerate_.paths(scene.vertices_m[scene.triangles], sources, targets, 2)
     assert sum(len(v) for v in expected.values()) > 6
     for way in WAYS:
-        paths, _ = grow_paths(merged(scene), Links(sources, targets), max_depth=2, **way)
+        paths = grow_paths(merged(scene), Links(sources, targets), max_depth=2, **way)
         assert enumerate_.compare(paths, expected) == (0, 0), way
 
 
@@ -74,7 +75,7 @@ def test_cropped_scenes_against_enumeration(name, middle, count):
     targets = np.column_stack([rng.uniform(-40, 40, (8, 2)) + middle, rng.uniform(1.5, 40, 8)])
     expected = enumerate_.paths(corners[near], source, targets, 2)
     for way in WAYS:
-        paths, _ = grow_paths(merged(crop), Links(source, targets), max_depth=2, **way)
+        paths = grow_paths(merged(crop), Links(source, targets), max_depth=2, **way)
         assert enumerate_.compare(paths, expected) == (0, 0), way
 
 
@@ -89,8 +90,12 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     words: list[str] = []
     found = [
         grow_paths(
-            surfaces, Links(source, targets), max_depth=2, shadows=on, on_estimate=lambda told: words.append(str(told))
-        )[0]
+            surfaces,
+            Links(source, targets),
+            SearchRun(on_estimate=lambda said: words.append(str(said))),
+            max_depth=2,
+            shadows=on,
+        )
         for on in (True, False)
     ]
     assert len(words) == 2
@@ -123,14 +128,14 @@ def test_only_a_convex_face_leaves_out_what_its_outline_covers(name):
     scene = enumerate_.scene_of([*occluder, *mirror], shapes=[0] * len(occluder) + [1, 1])
     surfaces, ends = merged(scene), (np.array([[0.0, 0, 0]]), np.array([[0.0, 0.5, 0.5]]))
     assert len(surfaces) == 2
-    paths, effort = grow_paths(surfaces, Links(*ends), max_depth=1)
-    everything, _ = grow_paths(surfaces, Links(*ends), max_depth=1, shadows=False)
-    wrong, _ = grow_paths(replace(surfaces, convex=np.ones(len(surfaces), np.bool_)), Links(*ends), max_depth=1)
+    paths, before = grow_paths(surfaces, Links(*ends), max_depth=1), estimate(surfaces, Links(*ends), max_depth=1)
+    everything = grow_paths(surfaces, Links(*ends), max_depth=1, shadows=False)
+    wrong = grow_paths(replace(surfaces, convex=np.ones(len(surfaces), np.bool_)), Links(*ends), max_depth=1)
     if name == "a square":  # itself a mirror, at (5, 1/4, 1/4); the one behind it is not followed
-        assert effort.hidden == 1
+        assert before.first_faces == 1  # the other one lies in its shadow
         assert [p[0].round(9).tolist() for p in paths.vertices_m[1:]] == [[5.0, 0.25, 0.25]]
     else:
-        assert effort.hidden == 0
+        assert before.first_faces == 2
         assert [p[0].round(9).tolist() for p in paths.vertices_m[1:]] == [[10.0, 0.25, 0.25]]
         assert len(wrong) == 1  # this scene does tell the two apart
     np.testing.assert_array_equal(paths.faces, everything.faces)
@@ -140,7 +145,7 @@ def test_a_mirror_works_on_both_sides_and_hides_from_both():
     wall = enumerate_.scene_of(quad((0, -50, -50), (0, 100, 0), (0, 0, 100)))
     for side in (1.0, -1.0):
         source, targets = np.array([[3.0 * side, 0, 0]]), np.array([[5.0 * side, 4.0, 2.0], [-5.0 * side, 4.0, 2.0]])
-        paths, _ = grow_paths(merged(wall), Links(source, targets), max_depth=1)
+        paths = grow_paths(merged(wall), Links(source, targets), max_depth=1)
         assert paths.pose.tolist() == [0, 0]
         assert paths.depth.tolist() == [0, 1]
         # the image of the source is at -3: the line to (5, 4, 2) crosses the wall at 3/8 of its way
@@ -152,7 +157,7 @@ def test_coincident_faces_give_one_path():
     again = quad((-5, -5, 0), (12, 0, 0), (0, 12, 0))  # overlaps, in the same plane, of another shape
     close = quad((-9, -9, -0.0004), (18, 0, 0), (0, 18, 0))  # the back of a double face
     scene = enumerate_.scene_of([*sheet, *again, *close], shapes=[0, 0, 1, 1, 2, 2])
-    paths, _ = grow_paths(merged(scene), Links(np.array([[0, 0, 3.0]]), np.array([[2.0, 1, 4]])), max_depth=2)
+    paths = grow_paths(merged(scene), Links(np.array([[0, 0, 3.0]]), np.array([[2.0, 1, 4]])), max_depth=2)
     assert paths.depth.tolist() == [0, 1]
 
 
@@ -168,10 +173,10 @@ def test_flipped_and_degenerate_triangles_change_nothing():
     flipped[1] = flipped[1][::-1]
     needle = np.array([[[0, 0, 1], [1, 0, 1], [2, 0, 1]]], dtype=float)
     ends = np.array([[0, 0, 3.0]]), np.array([[2.0, 1, 4]])
-    expected, _ = grow_paths(merged(enumerate_.scene_of(sheet)), Links(*ends), max_depth=2)
+    expected = grow_paths(merged(enumerate_.scene_of(sheet)), Links(*ends), max_depth=2)
     surfaces = merged(enumerate_.scene_of(np.concatenate([flipped, needle])))
     assert surfaces.notes == ("1 triangles without an area were dropped",)
-    paths, _ = grow_paths(surfaces, Links(*ends), max_depth=2)
+    paths = grow_paths(surfaces, Links(*ends), max_depth=2)
     assert np.allclose(paths.vertices_m, expected.vertices_m, equal_nan=True)
 
 
@@ -193,13 +198,14 @@ def test_the_power_cut_leaves_out_long_paths_only(way, of_link):
     sources, targets = rng.uniform(15, 45, (2, 3)), rng.uniform(5, 55, (40, 3))
     targets[7] = np.nan
     longest = power_cut.longest_m(sources, targets, 9.0) if of_link else 80.0
-    every, effort = grow_paths(surfaces, Links(sources, targets), max_depth=2, **way)
-    some, less = grow_paths(surfaces, Links(sources, targets, longest_m=longest), max_depth=2, **way)
+    short = Links(sources, targets, longest_m=longest)
+    every = grow_paths(surfaces, Links(sources, targets), max_depth=2, **way)
+    some = grow_paths(surfaces, short, max_depth=2, **way)
     limit = np.broadcast_to(longest, (2, 40))[every.tower, every.pose]
     kept = every.select((path_lengths(every, sources, targets) <= limit) | (every.depth == 0))
     for depth in (1, 2):
         assert 40 < (kept.depth == depth).sum() < (every.depth == depth).sum()
-    assert less.sequences < effort.sequences or not way.get("beams", True)
+    assert estimate(surfaces, short).sequences < estimate(surfaces, Links(sources, targets)).sequences
     for column in ("pose", "tower", "faces"):
         assert np.array_equal(getattr(kept, column), getattr(some, column)), column
 
@@ -230,11 +236,9 @@ def test_paths_can_be_recomputed_from_their_faces():
     rng = np.random.default_rng(6)
     source = np.array([[-20.0, 0.0, 20.0]])
     targets = np.column_stack([rng.uniform(-40, 40, 30), rng.uniform(-8, 8, 30), rng.uniform(1, 30, 30)])
-    paths, effort = grow_paths(surfaces, Links(source, targets), max_depth=2)
-    assert effort.estimate_s < 60.0
+    paths = grow_paths(surfaces, Links(source, targets), max_depth=2)
     rows = np.flatnonzero(paths.depth == 2)
     assert len(rows) > 10
-    assert effort.sequences > 100
     ends = source[paths.tower[rows]], targets[paths.pose[rows]]
     faces, points, good = reflection_points(surfaces, paths.faces[rows], *ends, edge_m=1e-6)
     assert good.all()
@@ -278,7 +282,7 @@ def test_prisms_by_beams_have_the_paths_of_the_image_engine(scenes, aligned):
     site = scenes.site(buildings, ((0.0, -20.0, 10.0), (3.0, -5.0, 25.0)))
     scene, poses = Scene.of(site, scenes.link(site), scenes.poses(spots)), scenes.poses(spots)
     expected = image.find_paths(scene.faces, scene.links_to(poses), max_depth=2)
-    found, _ = prisms.find_paths(scene.faces, scene.links_to(poses), max_depth=2)
+    found = prisms.find_paths(scene.faces, scene.links_to(poses), max_depth=2)
     assert len(expected) > 100
     assert np.array_equal(found.faces, expected.faces)
     assert np.array_equal(found.pose, expected.pose)

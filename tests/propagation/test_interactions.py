@@ -17,7 +17,7 @@ from aerpaw_cmp.propagation.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
-from aerpaw_cmp.propagation.check.audit import audit
+from aerpaw_cmp.propagation.check.audit import Second, audit
 from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import NOT_IN_RANKS, replay
@@ -245,7 +245,7 @@ def test_refraction_through_two_walls_loses_what_two_slabs_lose(sionna, scenes, 
     assert np.array_equal(back.rss_dbm, plain.rss_dbm, equal_nan=True)
     assert np.array_equal(back.has_path, plain.has_path)
     # the audit is of the reflections
-    report = audit(site, link, poses, found, run=Run(cache_dir=""), reference="image", links=None)
+    report = audit(site, link, poses, found, run=Run(cache_dir=""), second=Second(reference="image", links=None))
     assert (report.missing_paths, report.extra_paths, report.difference.coverage_differs) == (0, 0, 0)
     assert report.rss_max_error_db < 0.01
     counted = summary([(np.abs(found.h[..., 0, 0]) ** 2, found.other)])

@@ -8,8 +8,9 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.drivers import moving
-from aerpaw_cmp.propagation.drivers.moving import moving_matrices, replay_moving, site_with_tower_at
+from aerpaw_cmp.propagation.drivers.moving import replay_moving, site_with_tower_at
 from aerpaw_cmp.propagation.field.baselines import free_space_dbm, two_ray_dbm
+from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search.crowns import Crowns
@@ -52,7 +53,7 @@ def test_every_pose_is_traced_from_its_own_place_whatever_the_blocks(monkeypatch
     for most in (1, 7):
         monkeypatch.setattr(moving, "PLACES_AT_ONCE", most)
         np.testing.assert_allclose(replay_moving(SITE, LINK, poses(), rover()).h, found.h, rtol=1e-9)
-    again = moving_matrices(found.paths, found.faces, rover(), poses(), LINK)
+    again = channel_matrices(found.paths, found.faces, rover()[:, None], poses(), LINK)
     np.testing.assert_allclose(again.h, found.h, rtol=1e-12)
 
 

@@ -10,7 +10,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.check import field_audit
-from aerpaw_cmp.propagation.check.audit import audit
+from aerpaw_cmp.propagation.check.audit import Second, audit
 from aerpaw_cmp.propagation.field import dyads
 from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
 from aerpaw_cmp.propagation.options import Run, Search
@@ -58,7 +58,9 @@ def test_both_engines_find_the_same_paths_and_fields(sionna, scenes, case):
     assert traced.paths.vertices_m == pytest.approx(exact.paths.vertices_m, abs=1e-9, nan_ok=True)
     assert exact.paths.depth.max() == 2
     assert seen[-1] == 1.0
-    report = audit(site, link, poses, exact, Search(samples=SAMPLES, batch=BATCH), run=Run(cache_dir=""), links=75)
+    report = audit(
+        site, link, poses, exact, Search(samples=SAMPLES, batch=BATCH), run=Run(cache_dir=""), second=Second(links=75)
+    )
     assert (report.reference, report.missing_paths, report.extra_paths) == ("sionna", 0, 0)
 
 
@@ -66,7 +68,7 @@ def test_too_few_samples_lose_paths_and_the_audit_says_so(sionna, scenes, lone):
     site, poses = lone
     link = scenes.link(site)
     few = replay(site, link, poses, Search("sionna", samples=100, batch=BATCH), run=Run(cache_dir=""))
-    report = audit(site, link, poses, few, links=None)
+    report = audit(site, link, poses, few, second=Second(links=None))
     assert report.reference == "image"
     assert report.missing_paths > 0
     assert report.extra_paths == 0
@@ -343,5 +345,5 @@ def test_a_batch_without_room_is_searched_again_with_more(sionna, scenes, lone, 
     usual = searched()
     monkeypatch.setattr(sionna, "MAXIMUM_PATHS", 32)  # not below the receivers of a batch: PathSolver corrupts memory
     assert searched() == usual
-    monkeypatch.setattr(sionna, "RAISE_LIMITS", False)
+    monkeypatch.setattr(sionna._Finder, "_more_room", lambda _: False)
     assert len(searched()) < len(usual), "32 candidates were enough: the case is not hard"

@@ -6,7 +6,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.arrays import Link, single_element
-from aerpaw_cmp.propagation.check.audit import audit
+from aerpaw_cmp.propagation.check.audit import Second, audit
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 
@@ -109,7 +109,7 @@ def test_progress_reaches_one(case):
 def test_audit_by_the_same_engine_sees_no_difference(case):
     site, link, poses = case
     result = replay(site, link, poses)
-    report = audit(site, link, poses, result, reference="image", links=20)
+    report = audit(site, link, poses, result, second=Second(reference="image", links=20))
     assert report.links == 20
     assert (report.missing_paths, report.extra_paths) == (0, 0)
     assert report.rss_max_error_db == 0.0
@@ -121,12 +121,12 @@ def test_audit_sees_what_a_shallow_replay_lacks(case):
     site, link, poses = case
     shallow = replay(site, link, poses, Search(max_depth=0))
     deep = replay(site, link, poses, Search(max_depth=2))
-    report = audit(site, link, poses, shallow, reference="image", links=None)
+    report = audit(site, link, poses, shallow, second=Second(reference="image", links=None))
     assert report.links == 80
     assert report.missing_paths == (deep.paths.depth > 0).sum()
     assert report.extra_paths == 0
     assert report.rss_max_error_db > 0.5
-    turned = audit(site, link, poses, deep, Search(max_depth=0), reference="image", links=None)
+    turned = audit(site, link, poses, deep, Search(max_depth=0), second=Second(reference="image", links=None))
     assert turned.extra_paths == report.missing_paths
 
 

@@ -132,10 +132,14 @@ class Audit:
 
 @dataclass(frozen=True, slots=True)
 class Second:
-    """What is asked of the second implementation.
+    """What is checked, and against what.
 
     Parameters
     ----------
+    reference : {"image", "sionna"}, optional
+        Default: the engine that the replay did not take.
+    links : int or None
+        About this many pose-tower pairs, poses evenly spread over the flight; None checks all.
     expected : Expected, optional
         What the settings say. With it fields are checked too (:mod:`aerpaw_cmp.propagation.check.field_audit`).
     ks : sequence of float
@@ -146,6 +150,8 @@ class Second:
         Whether the replay claims to have every path.
     """
 
+    reference: Engine | None = None
+    links: int | None = 200
     expected: Expected | None = None
     ks: Sequence[float] = RANK_K
     reference_links: int = REFERENCE_LINKS
@@ -160,9 +166,6 @@ def audit(
     search: Search = Search(),  # noqa: B008 - frozen
     field: Field = Field(),  # noqa: B008
     run: Run = Run(),  # noqa: B008
-    *,
-    reference: Engine | None = None,
-    links: int | None = 200,
     second: Second = Second(),
 ) -> Audit:
     """Check a replay by another engine, on the whole scene (nothing left out).
@@ -175,12 +178,8 @@ def audit(
         The result to check.
     search, field, run
         As given to the replay; a power cut leaves the same paths out, and none is claimed to be complete.
-    reference : {"image", "sionna"}, optional
-        Default: the engine that the replay did not take.
-    links : int or None
-        About this many pose-tower pairs, poses evenly spread over the flight; None checks all.
     second : Second
-        What is checked by the second implementation, and how.
+        The other engine, how many links, and what the second implementation checks.
 
     Returns
     -------
@@ -188,8 +187,8 @@ def audit(
     """
     complete = second.complete and search.power_cut_db is None
     replay = replay.of_reflections()  # the others have no second implementation: they are listed apart
-    chosen = _spread(poses, None if links is None else -(-links // max(1, len(replay.towers))))
-    other: Engine = reference or ("image" if replay.engine == "sionna" else "sionna")
+    chosen = _spread(poses, None if second.links is None else -(-second.links // max(1, len(replay.towers))))
+    other: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
     search = replace(search, engine=other, check_power_cut=False)
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
     checked = run_replay(site, link, few, search, Field(field.loss), run)
@@ -248,10 +247,7 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
         Paths that one has and the other lacks, errors of the level [dB], links in coverage of one alone, and ranks
         that differ.
     """
-    # numbered together: the facets of crowns that a replay lists depend on its poses
-    plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])
-    ours = set(_keys(replay, plane[0], chosen))
-    theirs = set(_keys(reference, plane[1], np.arange(len(chosen))))
+    ours, theirs = (keys.keys() for keys in _keys_of_both(replay, reference, chosen))
     level, level_reference = replay.rss_dbm[chosen], reference.rss_dbm
     both = np.isfinite(level) & np.isfinite(level_reference)
     error = np.abs(level[both] - level_reference[both])
@@ -274,12 +270,22 @@ def _rank_disagreement(h: object, reference: object, ks: Sequence[float]) -> dic
 
 def extra_rows(replay: Replay, reference: Replay, chosen: IntArray) -> IntArray:
     """Paths of a replay that the reference, which has only the poses ``chosen``, has not."""
+    ours, theirs = _keys_of_both(replay, reference, chosen)
+    return np.array([row for key, row in ours.items() if key not in theirs], dtype=np.int64)
+
+
+_Keys = dict[tuple[int, ...], int]
+"""Rows of paths by place of the pose among the chosen ones, tower and planes."""
+
+
+def _keys_of_both(replay: Replay, reference: Replay, chosen: IntArray) -> tuple[_Keys, _Keys]:
+    """Paths of a replay and of a reference that has only the poses ``chosen``."""
+    # numbered together: the facets of crowns that a replay lists depend on its poses
     plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])
-    theirs = set(_keys(reference, plane[1], np.arange(len(chosen))))
-    return np.array([row for key, row in _keys(replay, plane[0], chosen).items() if key not in theirs], dtype=np.int64)
+    return _keys(replay, plane[0], chosen), _keys(reference, plane[1], np.arange(len(chosen)))
 
 
-def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> dict[tuple[int, ...], int]:
+def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> _Keys:
     """Rows of paths by (place in ``chosen``, tower, planes): coplanar faces are the same mirror."""
     place = np.full(int(max(chosen.max(initial=-1), replay.paths.pose.max(initial=-1))) + 1, -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))

@@ -327,7 +327,7 @@ def why_not(
         return "hidden, or not found: crowns and scenes of triangles are not tested here"
     for solid in np.unique(faces.solid[faces.solid >= 0]):
         members = np.flatnonzero(faces.solid == solid)
-        if Occlusion(_chosen(faces, members), tolerance).segments(corners[:-1], corners[1:]).any():
+        if Occlusion(faces.select(members), tolerance).segments(corners[:-1], corners[1:]).any():
             return f"occluded by {faces.label[members[0]].rsplit(' wall', 1)[0].rsplit(' roof', 1)[0]}"
     if Occlusion(faces, tolerance).segments(corners[:-1], corners[1:]).any():
         return "occluded by buildings that touch"
@@ -356,17 +356,6 @@ def _outside_m(faces: Faces, face: int, point: FloatArray) -> float:
         return float(polygon.distance(spot)) or -float(polygon.exterior.distance(spot))
     over = np.maximum(faces.lower[face] - place, place - faces.upper[face])
     return float(np.linalg.norm(np.maximum(over, 0.0))) if (over > 0.0).any() else float(over.max())
-
-
-def _chosen(faces: Faces, members: IntArray) -> Faces:
-    """Some of the faces."""
-    columns = ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
-    return Faces(
-        material=tuple(faces.material[i] for i in members),
-        label=tuple(faces.label[i] for i in members),
-        polygon=tuple(faces.polygon[i] for i in members),
-        **{name: getattr(faces, name)[members] for name in columns},
-    )
 
 
 def near_an_edge(
@@ -405,7 +394,7 @@ def near_an_edge(
         return False
     # moved by that much in any direction it meets a building, other than those it reflects at
     own = np.isin(faces.solid, faces.solid[list(path.planes)]) | (faces.solid < 0)
-    wide = Occlusion(_chosen(faces, np.flatnonzero(~own)), tolerance)
+    wide = Occlusion(faces.select(np.flatnonzero(~own)), tolerance)
     moves = EDGE_M * np.concatenate([np.eye(3), -np.eye(3)])
     return any(wide.segments(corners[:-1] + move, corners[1:] + move).any() for move in moves)
 

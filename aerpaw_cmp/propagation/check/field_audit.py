@@ -254,8 +254,6 @@ class _OneLink:
 
     def field_checked(self, ks: Sequence[float]) -> FieldAudit:
         """H, RSS and rank from the replay's own list of paths."""
-        from ...compare.rank import channel_rank
-
         paths, replay = [], self.replay
         if replay.through is not None and replay.through.of_link(self.row, self.tower):
             return FieldAudit(not_covered=("paths through walls",))
@@ -285,41 +283,35 @@ class _OneLink:
             count = int(((bent.pose == self.row) & (bent.tower == self.tower)).sum())
             if count != again[0]:
                 failures.append(f"{self.name}: {count} paths over edges, expected {again[0]}")
-        h = h.T if link.uav_transmits else h
+        h, tolerance = h.T if link.uav_transmits else h, EXACT_TOLERANCE if bent is None else EDGE_TOLERANCE
+        return FieldAudit(failures=tuple(failures)) + self._against(h, power, ks, tolerance, len(paths))
+
+    def _against(self, h: ComplexArray, power: float, ks: Sequence[float], tolerance: float, paths: int) -> FieldAudit:
+        """H, RSS and rank of the replay against those of so many paths with their sum of powers."""
+        link, ours, failures = self.reference.link, self.replay.h[self.row, self.tower], []
         over = _decibel(float((np.abs(h) ** 2).mean())) + link.transmit_power_dbm - link.noise_floor_dbm
         if abs(over) < 1e-3:
             return FieldAudit(doubtful=1)
         if over < 0:  # below the receiver's floor: no channel
             h = np.zeros_like(h)
-        ours = replay.h[self.row, self.tower]
         if ours.shape != h.shape:
             return FieldAudit(failures=(f"{self.name}: H is {ours.shape}, expected {h.shape}",))
         size = math.sqrt(power) or 1e-30
         under = _decibel(power) + link.transmit_power_dbm < link.noise_floor_dbm
         error = float(np.abs(ours - h).max()) / size
-        if not error <= (EXACT_TOLERANCE if bent is None else EDGE_TOLERANCE):
+        if not error <= tolerance:
             failures.append(f"{self.name}: H differs by {error:.2g} of its size")
-        levels = [
-            (replay.rss_dbm, float((np.abs(h) ** 2).mean())),
-            (replay.rss_power_dbm, 0.0 if under else power),
-        ]
-        worst = 0.0
-        for level, value in levels:
+        worst, level_of_h = 0.0, float((np.abs(h) ** 2).mean())
+        for level, value in ((self.replay.rss_dbm, level_of_h), (self.replay.rss_power_dbm, 0.0 if under else power)):
             off = _level_error(float(level[self.row, self.tower]), value, link.transmit_power_dbm, size)
             if off > 1e-3:
                 failures.append(f"{self.name}: RSS differs by {off:.2g} dB")
             worst = max(worst, off)
-        sigma = np.linalg.svd(h, compute_uv=False)
-        differs = False
-        for k in ks:
-            has_channel = sigma[0] > 0
-            near = has_channel and (np.abs(sigma * k / sigma[0] - 1.0) < 1e-4).any()
-            expected = int((sigma > sigma[0] / k).sum()) if has_channel else 0
-            differs |= not near and int(channel_rank(ours, k)) != expected
+        differs = _another_rank(ours, h, ks)
         if differs:
             failures.append(f"{self.name}: another rank")
         return FieldAudit(
-            reference_paths=len(paths), h_max_error=error, rss_max_error_db=worst, rank_differs=int(differs),
+            reference_paths=paths, h_max_error=error, rss_max_error_db=worst, rank_differs=int(differs),
             failures=tuple(failures),
         )  # fmt: skip
 
@@ -331,6 +323,17 @@ class _OneLink:
         if site.dem is not None or (len(site.trees) and self.reference.loss.model != "none"):
             return "paths over edges through trees or over terrain"
         return "" if not any(b.footprint.interiors for b in site.buildings) else "edges of courtyards"
+
+
+def _another_rank(ours: ComplexArray, expected: ComplexArray, ks: Sequence[float]) -> bool:
+    """Whether a rank differs for a K at which no singular value lies near the threshold."""
+    from ...compare.rank import channel_rank
+
+    sigma = np.linalg.svd(expected, compute_uv=False)
+    if not sigma[0] > 0:
+        return any(int(channel_rank(ours, k)) for k in ks)
+    clear = [k for k in ks if not (np.abs(sigma * k / sigma[0] - 1.0) < 1e-4).any()]
+    return any(int(channel_rank(ours, k)) != int((sigma > sigma[0] / k).sum()) for k in clear)
 
 
 def _decibel(power: float) -> float:

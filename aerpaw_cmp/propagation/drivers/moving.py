@@ -14,12 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...common.errors import UsageError
-from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray
+from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...site.site import Site, Tower
 from ..arrays import Link, Poses
-from ..field.sum import Fields, channel_matrices
 from ..options import Field, Loss, Run, Search, Whole
-from ..paths import Faces, PathSet
+from ..paths import PathSet
 from ..replay import Replay, replay
 from .parts import Each, put_together
 
@@ -203,60 +202,6 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
         towers=(name,),
         left_out=[re.sub(re.escape(name) + "@[0-9]+", name, text) for text in replayed.left_out],
     )
-
-
-def moving_matrices(
-    paths: PathSet,
-    faces: Faces,
-    sources_m: FloatArray,
-    poses: Poses,
-    link: Link,
-    loss_db: FloatArray | None = None,
-) -> Fields:
-    """Channel matrices of the paths of one tower that moves, as :func:`channel_matrices` gives them of a fixed one.
-
-    Parameters
-    ----------
-    paths : PathSet
-        Sorted by pose.
-    faces : Faces
-    sources_m : (poses, 3)
-        Centre of the tower's array at each pose [m].
-    poses : Poses
-    link : Link
-        With one tower.
-    loss_db : (paths,), optional
-        Further loss of each path.
-
-    Returns
-    -------
-    Fields
-        H (poses, 1, n_rx, n_tx) and powers.
-    """
-    (name,) = _one_tower(link)
-    ports, uav = len(link.tower_arrays[name]), len(link.uav_array)
-    size = (ports, uav) if link.uav_transmits else (uav, ports)
-    h: ComplexArray = np.zeros((len(poses), 1, *size), dtype=np.complex128)
-    path_power, power = np.zeros(len(paths)), np.zeros((len(poses), 1))
-    for block in _blocks(sources_m):
-        at = np.full(len(poses), -1, dtype=np.int64)
-        at[block.rows] = np.arange(len(block.rows))
-        mine = np.flatnonzero(at[paths.pose] >= 0)
-        some = paths.select(mine)
-        row = at[some.pose]
-        some = replace(some, pose=row, tower=block.own[row])
-        names = [f"{name} {i}" for i in range(len(block.places_m))]
-        several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
-        spots = Poses(poses.position_m[block.rows], poses.rotation[block.rows])
-        matrices = channel_matrices(
-            some, faces, block.places_m, spots, several, None if loss_db is None else loss_db[mine],
-            work=len(poses) * ports * uav,
-        )  # fmt: skip
-        rows = np.arange(len(block.rows))
-        h[block.rows] = matrices.h[rows, block.own][:, None]
-        power[block.rows] = matrices.power[rows, block.own][:, None]
-        path_power[mine] = matrices.path_power
-    return Fields(h, path_power, power)
 
 
 def loss_along(loss: Loss | None, paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray | None:

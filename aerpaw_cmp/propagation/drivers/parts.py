@@ -108,12 +108,12 @@ def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
     common = min(_shared(parts[0].faces, part.faces) for part in parts)
     if all(len(part.faces) == common for part in parts):
         return parts[0].faces, [part.paths for part in parts]
-    faces, out = _face_part(parts[0].faces, 0, common), []
+    faces, out = parts[0].faces.select(np.arange(common)), []
     for part in parts:
         shift = len(faces) - common
         own = part.paths.faces
         out.append(replace(part.paths, faces=np.where(own >= common, own + shift, own)))
-        faces = joined(faces, _face_part(part.faces, common, len(part.faces)))
+        faces = joined(faces, part.faces.select(np.arange(common, len(part.faces))))
     return faces, out
 
 
@@ -122,15 +122,6 @@ def _shared(one: Faces, other: Faces) -> int:
     count = min(len(one), len(other))
     same = (one.normal[:count] == other.normal[:count]).all(axis=1) & (one.offset_m[:count] == other.offset_m[:count])
     return count if same.all() else int(np.argmin(same))
-
-
-def _face_part(faces: Faces, start: int, stop: int) -> Faces:
-    arrays = {
-        name: getattr(faces, name)[start:stop]
-        for name in ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
-    }
-    tuples = {name: getattr(faces, name)[start:stop] for name in ("material", "label", "polygon")}
-    return Faces(**arrays, **tuples)
 
 
 _COUNT = re.compile(r"(\d+)(?: of (\d+))? (.*)", re.DOTALL)

@@ -78,8 +78,8 @@ def geometry(
     faces : Faces
     table : (faces + 1, 3)
         Their materials: :meth:`FaceMaterials.table`.
-    sources_m : (towers, 3)
-        Centres of the tower arrays [m].
+    sources_m : (towers, 3) or (poses, towers, 3)
+        Centres of the tower arrays [m]; the latter for towers that move.
     poses : Poses
     link : Link
 
@@ -90,7 +90,8 @@ def geometry(
     depth = int(paths.depth.max(initial=0))
     sequence = paths.faces[:, :depth]
     mounts = np.stack([array.mount.T for array in link.tower_arrays.values()])
-    image, frame = sources_m[paths.tower], mounts[paths.tower]
+    image = sources_m[paths.tower] if sources_m.ndim == 2 else sources_m[paths.pose, paths.tower]
+    frame = mounts[paths.tower]
     normals = np.where((sequence >= 0)[..., None], faces.normal[sequence], 0.0)
     passed = table[sequence, 2] < 0.0
     for step in range(depth):

@@ -74,8 +74,8 @@ def channel_matrices(
     paths : PathSet
     faces : Faces
         That the paths refer to.
-    sources_m : (towers, 3)
-        Array centres, in the order of ``link.tower_arrays``.
+    sources_m : (towers, 3) or (poses, towers, 3)
+        Array centres, in the order of ``link.tower_arrays``; the latter for towers that move.
     poses : Poses
     link : Link
     loss_db : (paths,), optional

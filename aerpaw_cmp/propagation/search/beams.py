@@ -12,7 +12,7 @@ Pairs are streamed: memory does not grow with their number.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -24,9 +24,9 @@ from ..numba_options import kernel
 from ..paths import Links, PathSet
 from ..surfaces import Surfaces
 from .boxtree import box_missed, box_outside, box_tree, within_planes
-from .effort import Effort, Estimate, OnEstimate
+from .effort import Estimate, Progress, SearchRun
 from .merging import WINDOW
-from .mirror import MINIMUM_LENGTH_M, merge
+from .mirror import merge, searched_links
 
 SIDE_M = 1e-6
 """Closer to a plane than this [m] is on it."""
@@ -45,8 +45,6 @@ SOLID_MARGIN = 1e-6
 
 FIRST_CHUNK = 64
 """First faces whose search gives the estimate for the others."""
-
-Progress = Callable[[float], None]
 
 
 class _Mirrors(NamedTuple):
@@ -80,15 +78,13 @@ class _Rules(NamedTuple):
 def grow_paths(
     surfaces: Surfaces,
     links: Links,
+    run: SearchRun = SearchRun(),  # noqa: B008 - frozen
     *,
     max_depth: int = 2,
     beams: bool = True,
     shadows: bool = True,
-    threads: int | None = None,
-    progress: Progress | None = None,
-    on_estimate: OnEstimate | None = None,
     solids: bool = False,
-) -> tuple[PathSet, Effort]:
+) -> PathSet:
     """All paths with at most ``max_depth`` reflections.
 
     Parameters
@@ -96,18 +92,14 @@ def grow_paths(
     surfaces : Surfaces
     links : Links
         Faces over which no path is as short as ``longest_m`` are not followed.
+    run : SearchRun
+        Threads, progress, and whom to tell before the first source is searched what it will take.
     max_depth : int
         0 to 3.
     beams : bool
         False follows every sequence of faces: the same paths, for tests.
     shadows : bool
         False follows first faces that one convex face hides wholly, too.
-    threads : int, optional
-        Default: the cores that this process may use.
-    progress : callable, optional
-        Called with the share done.
-    on_estimate : callable, optional
-        Called once, before the first source is searched, with the estimate of time and memory.
     solids : bool
         The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
         all. What is found are candidates for :mod:`aerpaw_cmp.propagation.search.prisms`, coincident ones among them.
@@ -116,53 +108,30 @@ def grow_paths(
     -------
     PathSet
         Sorted by pose, tower, depth, faces; of coincident paths one.
-    Effort
     """
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
-    started = time.perf_counter()
-    towers = len(links.sources_m)
+    towers, threads, on_estimate = len(links.sources_m), thread_count(run.threads), run.on_estimate
     pieces: list[PathSet] = []
-    effort = Effort()
     rules = _rules(surfaces, max_depth, solids=solids, beams=beams, shadows=shadows)
-    for tower, poses, one in _searches(surfaces, links, rules):
-        pieces.append(_pad(one.direct(), poses, tower, max_depth))
+    for tower, poses, search in _searches(surfaces, links, rules):
+        levels = [search.direct()]
         if max_depth:
-            first, hidden = one.first_faces()
+            first = search.first_faces()
+            if on_estimate:
+                on_estimate(search.estimate(first, threads).times(towers - tower))
+                on_estimate = None
 
             def share(done: float, tower: int = tower) -> None:
-                if progress:
-                    progress((tower + done) / towers)
+                if run.progress:
+                    run.progress((tower + done) / towers)
 
-            if on_estimate:
-                on_estimate(one.estimate(first, thread_count(threads)).times(towers - tower))
-                on_estimate = None
-            parts, spent = one.run(first, thread_count(threads), share)
-            pieces += [_pad(part, poses, tower, max_depth) for part in parts]
-            effort = Effort(
-                sequences=effort.sequences + spent.sequences,
-                candidates=effort.candidates + spent.candidates,
-                hidden=effort.hidden + hidden,
-                estimate_s=effort.estimate_s + spent.estimate_s,
-            )
-        if progress:
-            progress((tower + 1) / towers)
+            levels += search.run(first, threads, share)
+        pieces += [PathSet.from_tower(tower, poses[pose], faces, at, max_depth) for pose, faces, at in levels]
+        if run.progress:
+            run.progress((tower + 1) / towers)
     paths = merge(pieces, max_depth, None)
-    paths = paths if solids else without_coincident(paths, surfaces)
-    return paths, Effort(
-        sequences=effort.sequences,
-        candidates=effort.candidates,
-        hidden=effort.hidden,
-        seconds=time.perf_counter() - started,
-        estimate_s=effort.estimate_s,
-    )
-
-
-def _searched(source: FloatArray, targets_m: FloatArray, excluded: BoolArray | None) -> IntArray:
-    """Poses that may have paths from a source."""
-    gap = np.linalg.norm(targets_m - source, axis=1)
-    alive = np.isfinite(gap) & (gap >= MINIMUM_LENGTH_M)
-    return np.flatnonzero(alive if excluded is None else alive & ~excluded)
+    return paths if solids else without_coincident(paths, surfaces)
 
 
 def estimate(
@@ -181,8 +150,8 @@ def estimate(
     """
     if not max_depth:
         return None
-    for tower, _, one in _searches(surfaces, links, _rules(surfaces, max_depth, solids=solids)):
-        return one.estimate(one.first_faces()[0], thread_count(threads)).times(len(links.sources_m) - tower)
+    for tower, _, search in _searches(surfaces, links, _rules(surfaces, max_depth, solids=solids)):
+        return search.estimate(search.first_faces(), thread_count(threads)).times(len(links.sources_m) - tower)
     return None
 
 
@@ -198,25 +167,17 @@ def _searches(surfaces: Surfaces, links: Links, rules: _Rules) -> Iterator[tuple
     """Tower, poses and search of every tower that has a pose to be searched for."""
     shape = len(links.sources_m), len(links.targets_m)
     longest = np.broadcast_to(np.asarray(links.longest_m, dtype=np.float64), shape)
-    for tower, source in enumerate(links.sources_m):
-        poses = _searched(source, links.targets_m, None if links.excluded is None else links.excluded[tower])
-        if len(poses):
-            usable = None if links.usable is None else links.usable[tower]
-            mirrors = _mirrors(surfaces, usable, np.full(len(surfaces), rules.margin > 0.0))
-            one = _Search(
-                mirrors=mirrors,
-                surfaces=surfaces,
-                source=source,
-                targets=links.targets_m[poses],
-                longest=longest[tower, poses],
-                rules=rules,
-            )
-            yield tower, poses, one
+    alive = searched_links(links)
+    for tower in np.flatnonzero(alive.any(axis=1)).tolist():
+        poses = np.flatnonzero(alive[tower])
+        usable = None if links.usable is None else links.usable[tower]
+        mirrors = _mirrors(surfaces, usable, front_only=rules.margin > 0.0)
+        ends = links.sources_m[tower], links.targets_m[poses], longest[tower, poses]
+        yield tower, poses, _Search(mirrors, surfaces, *ends, rules)
 
 
-def _mirrors(surfaces: Surfaces, usable: BoolArray | None, front_only: BoolArray | None = None) -> _Mirrors:
+def _mirrors(surfaces: Surfaces, usable: BoolArray | None = None, *, front_only: bool = False) -> _Mirrors:
     faces = surfaces.faces
-    count = len(faces)
     return _Mirrors(
         normal=np.ascontiguousarray(faces.normal),
         offset=np.ascontiguousarray(faces.offset_m),
@@ -225,15 +186,15 @@ def _mirrors(surfaces: Surfaces, usable: BoolArray | None, front_only: BoolArray
         window=surfaces.window_m,
         convex=surfaces.convex,
         plane=surfaces.plane,
-        front_only=np.zeros(count, np.bool_) if front_only is None else front_only,
-        usable=np.ones(count, np.bool_) if usable is None else np.ascontiguousarray(usable),
+        front_only=np.full(len(faces), front_only),
+        usable=np.ones(len(faces), np.bool_) if usable is None else np.ascontiguousarray(usable),
         first=surfaces.first,
         flat=surfaces.flat_m,
     )
 
 
 _Level = tuple[IntArray, IntArray, FloatArray]
-"""Receivers (n,), faces (n, depth), reflection points (n, depth, 3)."""
+"""Receivers (n,), faces (n, depth), reflection points (n, depth, 3); -1 and any point where a path has fewer."""
 
 
 class _Search:
@@ -261,11 +222,10 @@ class _Search:
         pose = np.flatnonzero(free)
         return pose, np.zeros((len(pose), 0), np.int64), np.zeros((len(pose), 0, 3))
 
-    def first_faces(self) -> tuple[IntArray, int]:
-        """First faces worth following, in an order whose beginning is a fair sample; how many hide from the source."""
-        good, hidden = _first_faces(self.mirrors, self.face_tree, self.source, self.rules)
-        good &= self._near_enough()
-        return np.random.default_rng(0).permutation(np.flatnonzero(good)), int(hidden)
+    def first_faces(self) -> IntArray:
+        """First faces worth following, in an order whose beginning is a fair sample."""
+        good = _first_faces(self.mirrors, self.face_tree, self.source, self.rules) & self._near_enough()
+        return np.random.default_rng(0).permutation(np.flatnonzero(good))
 
     def _near_enough(self) -> BoolArray:
         """Faces over which a path to the box of the targets may be short enough."""
@@ -278,8 +238,8 @@ class _Search:
             ways += np.linalg.norm(np.maximum(np.maximum(low - far, near - high), 0.0), axis=1)
         return np.asarray(~(ways > longest + SLACK_M))
 
-    def follow(self, some: IntArray) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
-        """Paths whose first face is one of some, and how many sequences and candidates there were."""
+    def follow(self, some: IntArray) -> tuple[IntArray, IntArray, FloatArray, int]:
+        """Paths whose first face is one of some, and how many sequences there were."""
         return _follow(  # type: ignore[no-any-return]
             self.mirrors, self.face_tree, self.corners, self.tree, self.targets, self.target_tree, self.longest,
             self.source, some, self.rules,
@@ -290,49 +250,27 @@ class _Search:
         some = first[:FIRST_CHUNK]
         self.follow(some[:1])  # the first call compiles, or loads what was compiled
         begun = time.thread_time()  # what others do on this machine is not told beforehand
-        sequences = self.follow(some)[3][0]
+        sequences = self.follow(some)[3]
         seconds = time.thread_time() - begun
         share = len(first) / max(1, len(some))
+        arrays = (self.corners, self.targets, *self.tree, *self.face_tree, *self.target_tree, *self.mirrors)
         return Estimate(
             seconds=seconds * share / max(1, threads if len(first) > FIRST_CHUNK else 1),
             sources=1,
             first_faces=len(first),
             sequences=int(sequences * share),
-            memory_mib=memory_mib(self),
+            memory_mib=sum(array.nbytes for array in arrays) / 2**20,
         )
 
-    def run(self, first: IntArray, threads: int, share: Progress) -> tuple[list[_Level], Effort]:
+    def run(self, first: IntArray, threads: int, share: Progress) -> list[_Level]:
         """Follow all sequences that begin with the faces ``first``."""
         levels: list[_Level] = []
-        totals = np.zeros(2, np.int64)
-        begun = time.perf_counter()
-        done, estimate = 0, 0.0
+        done = 0
         for part, size in _chunks(first, threads):
-            for pose, faces, points, counts in in_threads(self.follow, part, threads):
-                depth = (faces >= 0).sum(axis=1)
-                for d in np.unique(depth):
-                    rows = depth == d
-                    levels.append((pose[rows], faces[rows, :d], points[rows, :d]))
-                totals[:] += counts
-            if not done:
-                estimate = (time.perf_counter() - begun) * len(first) / size / max(1, threads)
+            levels += [(pose, faces, points) for pose, faces, points, _ in in_threads(self.follow, part, threads)]
             done += size
             share(done / len(first))
-        spent = time.perf_counter() - begun
-        return levels, Effort(sequences=int(totals[0]), candidates=int(totals[1]), estimate_s=estimate, seconds=spent)
-
-
-def memory_mib(search: _Search) -> float:
-    """Memory that a search holds [MiB]: geometry and trees; sequences are streamed."""
-    held: list[object] = [
-        search.corners,
-        search.targets,
-        *search.tree,
-        *search.face_tree,
-        *search.target_tree,
-        *search.mirrors,
-    ]
-    return float(sum(a.nbytes for a in held if isinstance(a, np.ndarray)) / 2**20)
+        return levels
 
 
 def _chunks(first: IntArray, threads: int) -> Iterator[tuple[list[IntArray], int]]:
@@ -345,15 +283,6 @@ def _chunks(first: IntArray, threads: int) -> Iterator[tuple[list[IntArray], int
         parts = [first[k : k + each] for k in range(at, min(at + each * 4 * threads, len(first)), each)]
         yield parts, sum(len(p) for p in parts)
         at += each * 4 * threads
-
-
-def _pad(level: _Level, poses: IntArray, tower: int, max_depth: int) -> PathSet:
-    pose, sequence, points = level
-    count, depth = sequence.shape
-    faces = np.full((count, max_depth), -1, dtype=np.int64)
-    vertices = np.full((count, max_depth, 3), np.nan)
-    faces[:, :depth], vertices[:, :depth] = sequence, points
-    return PathSet(poses[pose], np.full(count, tower), np.full(count, depth), faces, vertices)
 
 
 COINCIDENT_M = 5e-3
@@ -413,7 +342,7 @@ def reflection_points(
     start = np.searchsorted(surfaces.plane[order], np.arange(len(surfaces) + 1))
     sequence = np.ascontiguousarray(sequence).copy()
     vertices, good = _points_of(
-        tuple(_mirrors(surfaces, None)), order, start, sequence,
+        tuple(_mirrors(surfaces)), order, start, sequence,
         np.ascontiguousarray(sources_m), np.ascontiguousarray(targets_m), edge_m,
     )  # fmt: skip
     return sequence, vertices, good
@@ -565,10 +494,9 @@ def _height(normal, offset, f, p):  # type: ignore[no-untyped-def]
 
 @kernel
 def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-def]
-    """Which faces may come first (faces,), and how many of the others are hidden by one convex face."""
+    """Faces (faces,) that may come first: none that one convex face hides wholly."""
     normal, offset, _, _, _, _, _, front_only, usable, _, _ = mirrors
     good = np.zeros(len(normal), np.bool_)
-    hidden = 0
     stack = np.empty(64, np.int64)
     for f in range(len(normal)):
         if not usable[f]:
@@ -576,11 +504,8 @@ def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-
         height = _height(normal, offset, f, source)
         if (abs(height) <= rules[4] and rules[3] == 0.0) or (front_only[f] and height < -rules[4]):
             continue
-        if rules[6] and _wholly_hidden(mirrors, face_tree, source, f, rules, stack):
-            hidden += 1
-            continue
-        good[f] = True
-    return good, hidden
+        good[f] = not (rules[6] and _wholly_hidden(mirrors, face_tree, source, f, rules, stack))
+    return good
 
 
 @kernel
@@ -760,7 +685,7 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, so
     out_faces = np.full((space, max_depth), -1, np.int64)
     out_points = np.zeros((space, max_depth, 3))
     total = 0
-    counts = np.zeros(2, np.int64)
+    followed = 0
     next_faces = np.empty((max_depth + 1, max(faces_n, len(firsts))), np.int64)
     waiting = np.zeros(max_depth + 2, np.int64)
     turn = np.zeros(max_depth + 2, np.int64)
@@ -805,7 +730,7 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, so
                     break
             if not ahead:
                 continue
-        counts[0] += 1
+        followed += 1
         chain[level] = f
         signs[level] = sign
         n0, n1, n2 = normal[f, 0], normal[f, 1], normal[f, 2]
@@ -879,7 +804,6 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, so
                         break
                 if not good:
                     continue
-                counts[1] += 1
                 start, start_normal, start_offset = source, none, 0.0
                 cut = False
                 for step in range(level + 1):
@@ -909,7 +833,7 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, so
             waiting[level + 1] = within_planes(face_tree, mine, many[level], reach, next_faces[level + 1])
             turn[level + 1] = 0
             level += 1
-    return out_pose[:total].copy(), out_faces[:total].copy(), out_points[:total].copy(), counts
+    return out_pose[:total].copy(), out_faces[:total].copy(), out_points[:total].copy(), followed
 
 
 def try_out() -> None:
@@ -929,8 +853,6 @@ def try_out() -> None:
 
 
 __all__ = [
-    "Effort",
-    "Estimate",
     "estimate",
     "grow_paths",
     "in_face",

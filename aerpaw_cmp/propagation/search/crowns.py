@@ -14,7 +14,6 @@ the rectangle, east and north, that a beam lights between the lowest and the hig
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -28,8 +27,8 @@ from ...site.materials import CROWN
 from ...site.meshes import CROWN_SIDES, crown_corners_m
 from ...site.site import Trees
 from ..field.foliage import crown_index
-from ..paths import Faces, PathSet, joined
-from .mirror import CELLS_PER_CHUNK, MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, merge
+from ..paths import Faces, Links, PathSet, joined
+from .mirror import CELLS_PER_CHUNK, RELATIVE_TOLERANCE, merge, searched_links
 from .occlusion import Occlusion
 
 FACES_PER_CROWN = CROWN_SIDES + 1
@@ -47,8 +46,8 @@ WIDE_SHARE = 0.2
 KEPT_BEAMS = 12
 """Sources whose beams are kept; 10 MB each for 10 000 trees."""
 
-PAIRS_AT_ONCE = 200_000
-"""Of a facet and a pose; about 100 MB of temporary arrays."""
+RECTANGLES_AT_ONCE = 2_000
+"""Each of them holds less than a fifth of the poses both ways."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +118,9 @@ class Crowns:
     def bounces(
         self,
         faces: Faces,
-        sources_m: FloatArray,
-        targets_m: FloatArray,
+        links: Links,
         *,
         max_depth: int = 2,
-        usable: BoolArray | None = None,
-        excluded: BoolArray | None = None,
         dem: Dem | None = None,
     ) -> tuple[PathSet, Faces]:
         """All paths with one bounce off a crown that neither buildings nor trees nor terrain stop.
@@ -133,15 +129,10 @@ class Crowns:
         ----------
         faces : Faces
             The traced scene: ground planes and buildings.
-        sources_m : (towers, 3)
-        targets_m : (poses, 3)
-            NaN positions have no path.
+        links : Links
+            Of the usable faces, ground planes count here.
         max_depth : int
             Largest number of reflections; without one there is nothing to find.
-        usable : (towers, faces) bool, optional
-            Faces that may reflect for each tower; of these, ground planes count here.
-        excluded : (towers, poses) bool, optional
-            Links without any path.
         dem : Dem, optional
             Terrain that may stop the way to the crown and from it.
 
@@ -152,11 +143,10 @@ class Crowns:
         faces : Faces
             ``faces`` and, after them, the facets that the paths meet.
         """
-        known = np.isfinite(targets_m).all(axis=1)
-        alive = known & (np.linalg.norm(targets_m - sources_m[:, None], axis=2) >= MINIMUM_LENGTH_M)
-        alive &= True if excluded is None else ~excluded
-        tolerance_m = self._tolerance_m(sources_m, targets_m)
+        alive = searched_links(links)
+        tolerance_m = self._tolerance_m(links.sources_m, links.targets_m)
         hiding = Occlusion(faces, tolerance_m)
+        sources_m, targets_m, usable = links.sources_m, links.targets_m, links.usable
         ground = faces.solid[None] < 0 if usable is None else usable & (faces.solid < 0)
         ground = np.broadcast_to(ground, (len(sources_m), len(faces)))
         pieces: list[PathSet] = []
@@ -271,25 +261,10 @@ class _Search:
             pose, number, vertices = pose[good], number[good], vertices[good]
             free = self._free(source_m, vertices, targets_m[pose], number // FACES_PER_CROWN)
             pose, number, vertices = pose[free], number[free], vertices[free]
-            sequence, points, tree = (
-                np.full((len(pose), max_depth), -1),
-                np.full((len(pose), max_depth, 3), np.nan),
-                np.full((len(pose), max_depth), -1),
-            )
-            sequence[:, :depth] = self.ground
+            sequence, tree = np.full((len(pose), depth), self.ground), np.full((len(pose), max_depth), -1)
             sequence[:, int(self.before)] = number
-            points[:, :depth] = vertices
             tree[:, int(self.before)] = number // FACES_PER_CROWN
-            pieces.append(
-                PathSet(
-                    pose=pose,
-                    tower=np.full(len(pose), tower),
-                    depth=np.full(len(pose), depth),
-                    faces=sequence,
-                    vertices_m=points,
-                    tree=tree,
-                )
-            )
+            pieces.append(replace(PathSet.from_tower(tower, pose, sequence, vertices, max_depth), tree=tree))
         return merge(pieces, max_depth, None)
 
     def _height(self, point_m: FloatArray) -> FloatArray:
@@ -469,32 +444,10 @@ def _lit(beams: _Beams, rows: IntArray, points_m: FloatArray) -> Iterator[tuple[
 
 
 def _within(low_m: FloatArray, high_m: FloatArray, points_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs (rectangle, point) of all points inside rectangles (2, n), and some nearby; in parts of bounded size.
-
-    The points are sorted into square cells of about two points; a row of cells is a run of points.
-    """
-    corner = points_m[:, :2].min(axis=0)
-    span = np.ptp(points_m[:, :2], axis=0)
-    cell = max(math.sqrt(float(span.prod()) * 2 / len(points_m)), float(span.max()) / len(points_m), 1e-6)
-    shape = (span / cell).astype(np.int64) + 1
-    at = ((points_m[:, :2] - corner) / cell).astype(np.int64)
-    key = at[:, 0] * shape[1] + at[:, 1]
-    order = np.argsort(key, kind="stable")
-    begins = np.searchsorted(key[order], np.arange(int(shape.prod()) + 1))
-    first, last = (np.floor(np.clip((x.T - corner) / cell, -1, shape + 1)).astype(np.int64) for x in (low_m, high_m))
-    first, last = first.clip(0), np.minimum(last, shape - 1)
-    rows = np.where((last >= first).all(axis=1), last[:, 0] - first[:, 0] + 1, 0)
-    rectangle = np.repeat(np.arange(len(rows)), rows)
-    row = first[rectangle, 0] + np.arange(len(rectangle)) - np.repeat(np.cumsum(rows) - rows, rows)
-    begin = begins[row * shape[1] + first[rectangle, 1]]
-    count = begins[row * shape[1] + last[rectangle, 1] + 1] - begin
-    done = np.cumsum(count)
-    start = 0
-    while start < len(count):
-        used = int(done[start - 1]) if start else 0
-        stop = max(start + 1, int(np.searchsorted(done, used + PAIRS_AT_ONCE, side="right")))
-        some = count[start:stop]
-        run = np.repeat(np.arange(start, stop), some)
-        place = begin[run] + np.arange(len(run)) - np.repeat(np.cumsum(some) - some, some)
-        yield rectangle[run], order[place]
-        start = stop
+    """Pairs (rectangle, point) of all points inside rectangles (2, n), in parts of bounded size."""
+    first, last = points_m[:, :2].min(axis=0)[:, None] - 1.0, points_m[:, :2].max(axis=0)[:, None] + 1.0
+    boxes = shapely.box(*np.clip(low_m, first, last), *np.clip(high_m, first, last))
+    tree = shapely.STRtree(shapely.points(points_m[:, :2]))
+    for start in range(0, len(boxes), RECTANGLES_AT_ONCE):
+        rectangle, point = tree.query(boxes[start : start + RECTANGLES_AT_ONCE])
+        yield start + rectangle, point

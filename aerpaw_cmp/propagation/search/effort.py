@@ -1,34 +1,9 @@
-"""What a search among thousands of faces takes: told before it begins, and counted after."""
+"""How a search runs among thousands of faces, and the statement beforehand of what it will take."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Effort:
-    """What a search took.
-
-    Parameters
-    ----------
-    sequences : int
-        Sequences of at least one face that were followed.
-    candidates : int
-        Paths before anything was asked to hide them.
-    hidden : int
-        First faces in the shadow of one convex face, over all sources.
-    seconds : float
-        Wall clock.
-    estimate_s : float
-        What was expected after the first faces.
-    """
-
-    sequences: int = 0
-    candidates: int = 0
-    hidden: int = 0
-    seconds: float = 0.0
-    estimate_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,4 +39,24 @@ class Estimate:
         )
 
 
-OnEstimate = Callable[[Estimate], None]
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SearchRun:
+    """How a search is run; nothing here changes a number.
+
+    Parameters
+    ----------
+    threads : int, optional
+        Of compiled code (default: the cores this process may use).
+    progress : callable, optional
+        Called with the share done.
+    on_estimate : callable, optional
+        Called before a search among thousands of faces with what it will take; without one, a long search is a
+        warning.
+    """
+
+    threads: int | None = None
+    progress: Progress | None = None
+    on_estimate: Callable[[Estimate], None] | None = None

@@ -15,7 +15,6 @@ when a UAV lands.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +23,7 @@ from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..faces import corners, inside
 from ..paths import Faces, Links, PathSet
+from .effort import Progress
 from .occlusion import Occlusion
 
 RELATIVE_TOLERANCE = 1e-12
@@ -39,12 +39,7 @@ CELLS_PER_CHUNK = 1_000_000
 """Bounds the memory of every dense step (8 MB per array)."""
 
 TARGETS_AT_ONCE = 1024
-"""Targets whose heights over all faces stay in the cache of a core."""
-
-FEW_TARGETS = 32
-"""Targets that show most faces to have one in front."""
-
-Progress = Callable[[float], None]
+"""Targets whose heights over all faces are held."""
 
 
 def find_paths(
@@ -94,19 +89,19 @@ def find_paths(
     if not hidden:
         hiding.pieces = []
     box = _Bounds.of(faces, float(max(1.0, *(np.abs(p).max(initial=0.0) for p in (known, sources_m)))))
-    # without a second reflection nobody asks
-    facing = _facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)
-    alive = _alive(sources_m, targets_m, links.excluded)
-    of_any = np.asarray(alive.any(axis=0))
-    shared = _Ends.of(faces, targets_m, of_any, tolerance_m)
+    growth = _Growth(
+        faces=faces,
+        bounds=box,
+        facing=_facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_),
+        tolerance_m=tolerance_m,
+        max_depth=max_depth,
+        budget=budget,
+    )
+    alive = searched_links(links)
 
     def sequences(tower: int) -> list[Sequences]:
-        usable_faces = np.ones(len(faces), np.bool_) if usable is None else usable[tower]
-        if not alive[tower].any():
-            return []
-        few = 2 * alive[tower].sum() < of_any.sum()  # a tower with poses of its own
-        ends = _Ends.of(faces, targets_m, alive[tower], tolerance_m) if few else shared
-        return Sequences.of(faces, box, facing, sources_m[tower], ends, usable_faces, max_depth, budget, tolerance_m)
+        reflecting = np.ones(len(faces), np.bool_) if usable is None else usable[tower]
+        return growth.sequences(sources_m[tower], reflecting, targets_m[alive[tower]]) if alive[tower].any() else []
 
     pieces: list[PathSet] = []
     for tower, source in enumerate(sources_m):
@@ -118,15 +113,15 @@ def find_paths(
     return merge(pieces, max_depth, faces)
 
 
-def _alive(sources_m: FloatArray, targets_m: FloatArray, excluded: BoolArray | None) -> BoolArray:
-    """Links (towers, poses) that may have paths."""
-    alive = np.empty((len(sources_m), len(targets_m)), dtype=np.bool_)
+def searched_links(links: Links) -> BoolArray:
+    """Links (towers, poses) that may have paths: with a pose, long enough and not excluded."""
+    alive = np.empty((len(links.sources_m), len(links.targets_m)), dtype=np.bool_)
     with np.errstate(invalid="ignore"):
-        for tower, source in enumerate(sources_m.reshape(-1, 3)):
-            apart = targets_m - source
+        for tower, source in enumerate(links.sources_m.reshape(-1, 3)):
+            apart = links.targets_m - source
             gap2 = np.einsum("ij,ij->i", apart, apart)
             alive[tower] = (gap2 >= MINIMUM_LENGTH_M**2) & (gap2 < np.inf)
-    return np.asarray(alive if excluded is None else alive & ~excluded)
+    return np.asarray(alive if links.excluded is None else alive & ~links.excluded)
 
 
 def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
@@ -161,44 +156,6 @@ class _Bounds:
 
 
 @dataclass(frozen=True, slots=True)
-class _Ends:
-    """What the growth of sequences asks of the targets, of most towers at once: no path is lost by one too many.
-
-    Parameters
-    ----------
-    lit : (faces,) bool
-        Faces with a target in front.
-    hull_m : (1, 3), (1, 3, 3)
-        Centre of the box of the targets, and half of each of its sides.
-    """
-
-    lit: BoolArray
-    hull_m: tuple[FloatArray, FloatArray]
-
-    @classmethod
-    def of(cls, faces: Faces, targets_m: FloatArray, some: BoolArray, tolerance_m: float) -> _Ends:
-        targets = targets_m if some.all() else targets_m[some]
-        if not len(targets):
-            return cls(np.zeros(len(faces), dtype=np.bool_), (np.zeros((1, 3)), np.zeros((1, 3, 3))))
-        lit = cls._before(faces, targets[:: max(1, len(targets) // FEW_TARGETS)], tolerance_m)
-        dark = np.flatnonzero(~lit)  # by a few targets; the others are asked about what is left
-        lit[dark] = cls._before(faces, targets, tolerance_m, dark)
-        low, high = targets.min(axis=0), targets.max(axis=0)
-        return cls(lit, ((low + high)[None] / 2, np.diag(high - low)[None] / 2))
-
-    @staticmethod
-    def _before(
-        faces: Faces, targets: FloatArray, tolerance_m: float, some: IntArray | slice = slice(None)
-    ) -> BoolArray:
-        """Which faces have a target in front."""
-        normal, offset = faces.normal[some], faces.offset_m[some]
-        highest = np.full(len(offset), -np.inf)
-        for start in range(0, len(targets), TARGETS_AT_ONCE):
-            np.maximum(highest, (normal @ targets[start : start + TARGETS_AT_ONCE].T).max(axis=1), out=highest)
-        return np.asarray(highest - offset >= -tolerance_m)
-
-
-@dataclass(frozen=True, slots=True)
 class Sequences:
     """Face sequences of one length with their images.
 
@@ -212,56 +169,92 @@ class Sequences:
     faces: IntArray
     images_m: FloatArray
 
-    @classmethod
-    def of(
-        cls,
-        faces: Faces,
-        box: _Bounds,
-        facing: BoolArray,
-        source: FloatArray,
-        ends: _Ends,
-        usable: BoolArray,
-        max_depth: int,
-        budget: int,
-        tolerance_m: float,
-    ) -> list[Sequences]:
-        """Sequences of depth 0 .. max_depth that geometry does not rule out for any target.
 
-        ``box`` are the bounds of the faces, ``facing`` which of them can follow which.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Growth:
+    """Growth of face sequences, face by face, wherever the tower stands.
 
-        Parameters
-        ----------
-        faces : Faces
-        box : _Bounds
-            Of the faces.
-        facing : (faces, faces) bool
-            Which of them can follow which.
-        source : (3,)
-        ends : _Ends
-            The targets.
-        usable : (faces,) bool
-            Faces that may reflect.
-        max_depth, budget : int
-            Most reflections; most sequences of one depth.
-        tolerance_m : float
-            A point this far behind a face still counts as before it [m].
+    Parameters
+    ----------
+    faces : Faces
+    bounds : _Bounds
+        Of the faces.
+    facing : (faces, faces) bool
+        Faces that can follow each other.
+    tolerance_m : float
+        A point this far behind a face still counts as before it [m].
+    max_depth, budget : int
+        Most reflections; most sequences of one tower.
+    """
 
-        Returns
-        -------
-        list of Sequences
-            One per depth, from the line of sight on; shorter where no sequence is left.
-        """
-        level = cls(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
-        levels = [level]
-        facing = facing & usable[None, :]
-        total = 1
-        for _ in range(max_depth):
-            level = _grow(faces, level, source, usable, facing, box, tolerance_m, budget - total)
-            total += len(level.faces)
+    faces: Faces
+    bounds: _Bounds
+    facing: BoolArray
+    tolerance_m: float
+    max_depth: int
+    budget: int
+
+    def sequences(self, source: FloatArray, usable: BoolArray, targets_m: FloatArray) -> list[Sequences]:
+        """Sequences from the line of sight on that geometry does not rule out for all targets, by their lengths."""
+        level = Sequences(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
+        levels, left = [level], self.budget - 1
+        for _ in range(self.max_depth):
+            level = self._grown(level, source, usable, left)
+            left -= len(level.faces)
             if not len(level.faces):
                 break
             levels.append(level)
-        return [_reaching(faces, step, ends, box, tolerance_m) for step in levels]
+        normal, starts = self.faces.normal, range(0, len(targets_m), TARGETS_AT_ONCE)
+        highest = [(normal @ targets_m[start : start + TARGETS_AT_ONCE].T).max(axis=1) for start in starts]
+        lit = np.max(highest, axis=0) - self.faces.offset_m >= -self.tolerance_m
+        low, high = targets_m.min(axis=0), targets_m.max(axis=0)
+        hull = (low + high)[None] / 2, np.diag(high - low)[None] / 2
+        return [levels[0], *(self._reaching(level, lit, hull) for level in levels[1:])]
+
+    def _grown(self, level: Sequences, source: FloatArray, usable: BoolArray, left: int) -> Sequences:
+        """Sequences one face longer, at most ``left`` of them."""
+        faces, box, depth = self.faces, self.bounds, level.faces.shape[1]
+        grown: list[IntArray] = []
+        images: list[FloatArray] = []
+        step = max(1, CELLS_PER_CHUNK // (8 * len(faces)))
+        for start in range(0, len(level.faces), step):
+            now, past = level.faces[start : start + step], level.images_m[start : start + step]
+            last_image = past[:, -1] if depth else np.broadcast_to(source, (len(now), 3))
+            height = last_image @ faces.normal.T - faces.offset_m
+            # the source itself may lie on the face, an image may not: its reflection would be an edge of two faces
+            good = usable & (height > self.tolerance_m if depth else height >= -self.tolerance_m)
+            row, face = np.nonzero(good & self.facing[now[:, -1]] if depth else good)
+            if depth:
+                before = now[row, -1]
+                beam = last_image[row], box.corners_m[before], box.centre_m[face], box.reach_m[face]
+                keep = _beam_meets(*beam, self.tolerance_m)
+                keep |= ~np.isfinite(faces.lower[face, 0]) | ~np.isfinite(faces.lower[before, 0])
+                row, face = row[keep], face[keep]
+            mirrored = last_image[row] - 2.0 * height[row, face][:, None] * faces.normal[face]
+            grown.append(np.concatenate([now[row], face[:, None]], axis=1))
+            images.append(np.concatenate([past[row], mirrored[:, None]], axis=1))
+            left -= len(row)
+            if left < 0:
+                raise UsageError(
+                    f"the scene has more than {self.budget} face sequences of up to {depth + 1} reflections "
+                    f"({len(faces)} faces)",
+                    expected="a rural scene with few faces",
+                    cause="many buildings: engine 'sionna', a smaller max_depth, or pip install 'aerpaw-cmp[fast]'",
+                )
+        return Sequences(np.concatenate(grown), np.concatenate(images))
+
+    def _reaching(self, level: Sequences, lit: BoolArray, hull_m: tuple[FloatArray, FloatArray]) -> Sequences:
+        """Sequences whose last face is ``lit`` by a target, with a beam through it that reaches their box.
+
+        ``hull_m`` (1, 3), (1, 3, 3) is the centre of that box, and half of each of its sides.
+        """
+        last = level.faces[:, -1]
+        keep = lit[last]
+        row = np.flatnonzero(keep & np.isfinite(self.faces.lower[last, 0]))
+        for part in np.array_split(row, max(1, len(row) // 20_000)):
+            window = self.bounds.corners_m[last[part]]
+            keep[part] = _beam_meets(level.images_m[part, -1], window, *hull_m, self.tolerance_m)
+        return Sequences(level.faces[keep], level.images_m[keep])
 
 
 def _facing(faces: Faces, box: _Bounds, tolerance_m: float) -> BoolArray:
@@ -271,52 +264,6 @@ def _facing(faces: Faces, box: _Bounds, tolerance_m: float) -> BoolArray:
         highest += np.abs(faces.normal @ half)
     ahead = highest > tolerance_m
     return np.asarray(ahead & ahead.T)
-
-
-def _grow(
-    faces: Faces,
-    level: Sequences,
-    source: FloatArray,
-    usable: BoolArray,
-    facing: BoolArray,
-    box: _Bounds,
-    tolerance_m: float,
-    budget: int,
-) -> Sequences:
-    """Sequences one face longer."""
-    grown: list[IntArray] = []
-    images: list[FloatArray] = []
-    count = 0
-    step = max(1, CELLS_PER_CHUNK // (8 * len(faces)))
-    for start in range(0, len(level.faces), step):
-        now = level.faces[start : start + step]
-        past = level.images_m[start : start + step]
-        last_image = past[:, -1] if now.shape[1] else np.broadcast_to(source, (len(now), 3))
-        height = last_image @ faces.normal.T - faces.offset_m
-        # the source itself may lie on the face, an image may not: its reflection would be an edge of two faces
-        good = height > tolerance_m if now.shape[1] else height >= -tolerance_m
-        if now.shape[1]:
-            good &= facing[now[:, -1]]
-            row, face = np.nonzero(good)
-            keep = _beam_meets(
-                last_image[row], box.corners_m[now[row, -1]], box.centre_m[face], box.reach_m[face], tolerance_m
-            )
-            keep |= ~np.isfinite(faces.lower[face, 0]) | ~np.isfinite(faces.lower[now[row, -1], 0])
-            row, face = row[keep], face[keep]
-        else:
-            row, face = np.nonzero(good & usable)
-        mirrored = last_image[row] - 2.0 * height[row, face][:, None] * faces.normal[face]
-        grown.append(np.concatenate([now[row], face[:, None]], axis=1))
-        images.append(np.concatenate([past[row], mirrored[:, None]], axis=1))
-        count += len(row)
-        if count > budget:
-            raise UsageError(
-                f"the scene has more than {budget} face sequences of {now.shape[1] + 1} reflections "
-                f"({len(faces)} faces)",
-                expected="a rural scene with few faces",
-                cause="many buildings: engine 'sionna', a smaller max_depth, or pip install 'aerpaw-cmp[fast]'",
-            )
-    return Sequences(np.concatenate(grown), np.concatenate(images))
 
 
 def _beam_meets(
@@ -340,19 +287,6 @@ def _beam_meets(
 
 
 _NEXT_CORNER, _SECOND, _THIRD = [1, 2, 3, 0], [1, 2, 0], [2, 0, 1]
-
-
-def _reaching(faces: Faces, level: Sequences, ends: _Ends, box: _Bounds, tolerance_m: float) -> Sequences:
-    """Sequences whose last face, and the beam through it, can reach the box of targets."""
-    if not level.faces.shape[1]:
-        return level
-    last = level.faces[:, -1]
-    keep = ends.lit[last]
-    row = np.flatnonzero(keep & np.isfinite(faces.lower[last, 0]))
-    for part in np.array_split(row, max(1, len(row) // 20_000)):
-        window = box.corners_m[last[part]]
-        keep[part] = _beam_meets(level.images_m[part, -1], window, *ends.hull_m, tolerance_m)
-    return Sequences(level.faces[keep], level.images_m[keep])
 
 
 def _paths_of_level(
@@ -384,7 +318,7 @@ def _paths_of_level(
             vertices, good = trace_back(faces, sequence, level.images_m[part][row], targets[pose], hiding.tolerance_m)
             sequence, pose, vertices = sequence[good], pose[good], vertices[good]
             free = ~hiding.any_segment(np.broadcast_to(source, (len(pose), 3)), vertices, targets[pose])
-            pieces.append(_pad(pose[free], tower, sequence[free], vertices[free], max_depth))
+            pieces.append(PathSet.from_tower(tower, pose[free], sequence[free], vertices[free], max_depth))
     return merge(pieces, max_depth, None)
 
 
@@ -492,15 +426,6 @@ def images_of(faces: Faces, sequence: IntArray, sources_m: FloatArray) -> FloatA
         point = point - 2.0 * height[:, None] * normal
         images[:, step] = point
     return images
-
-
-def _pad(pose: IntArray, tower: int, sequence: IntArray, vertices: FloatArray, max_depth: int) -> PathSet:
-    count, depth = sequence.shape
-    faces = np.full((count, max_depth), -1, dtype=np.int64)
-    points = np.full((count, max_depth, 3), np.nan)
-    faces[:, :depth] = sequence
-    points[:, :depth] = vertices
-    return PathSet(pose, np.full(count, tower), np.full(count, depth), faces, points)
 
 
 def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet:

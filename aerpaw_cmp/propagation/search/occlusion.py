@@ -211,23 +211,11 @@ def _prisms(
     foot = np.minimum.reduceat(np.where(level, np.inf, faces.lower[rows, 1]), starts)
     foot[np.isposinf(foot)] = -np.inf  # no walls
     roofs = rows[level]
-    footprints = _footprints(faces, roofs)
-    if all(faces.polygon[roof] is None for roof in roofs.tolist()):
-        return number[level], list(footprints), _planes_of_boxes(faces, roofs, foot[number[level]])
-    pieces = _convex(footprints)
+    pieces = _convex(_footprints(faces, roofs))
     times = [len(some) for some in pieces]
     solid = np.repeat(number[level], times)
     flat = [piece for some in pieces for piece in some]
     return solid, flat, _planes(flat, foot[solid], np.repeat(faces.offset_m[roofs], times))
-
-
-def _planes_of_boxes(faces: Faces, roofs: IntArray, foot: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """:func:`_planes` of prisms under roofs (roofs,) that are rectangles: their axes are the normals."""
-    up, along, across = faces.normal[roofs], faces.along[roofs], faces.across[roofs]
-    low, high = faces.lower[roofs], faces.upper[roofs]
-    normal = np.stack([up, -up, along, -along, across, -across], axis=1)
-    offset = np.stack([faces.offset_m[roofs], -foot, high[:, 0], -low[:, 0], high[:, 1], -low[:, 1]], axis=1)
-    return list(zip(normal, offset, strict=True))
 
 
 def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:

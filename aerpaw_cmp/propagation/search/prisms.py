@@ -13,9 +13,9 @@ from ...common.units import FloatArray
 from ..faces import corners, triangles
 from ..paths import Faces, Links, PathSet
 from ..surfaces import Surfaces
-from .beams import Progress, grow_paths
+from .beams import grow_paths
 from .boxtree import box_tree
-from .effort import Effort, OnEstimate
+from .effort import SearchRun
 from .merging import WINDOW
 from .mirror import images_of, merge, planes_of, scene_tolerance_m, trace_back
 from .occlusion import Occlusion
@@ -30,13 +30,11 @@ OVERLAP_M = 1e-3
 def find_paths(
     faces: Faces,
     links: Links,
+    run: SearchRun = SearchRun(),  # noqa: B008 - frozen
     *,
     max_depth: int = 2,
     extent_m: FloatArray | None = None,
-    threads: int | None = None,
-    progress: Progress | None = None,
-    on_estimate: OnEstimate | None = None,
-) -> tuple[PathSet, Effort]:
+) -> PathSet:
     """As :func:`aerpaw_cmp.propagation.search.mirror.find_paths`, for scenes with too many sequences for it.
 
     Parameters
@@ -44,28 +42,20 @@ def find_paths(
     faces : Faces
         Closed solids and ground planes.
     links : Links
+    run : SearchRun
     max_depth : int
         0 to 3.
     extent_m : (points, 3), optional
         Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
-    threads : int, optional
-        Default: the cores that this process may use.
-    progress : callable, optional
-    on_estimate : callable, optional
-        Told before the search what it will take.
 
     Returns
     -------
     PathSet
         Sorted by pose, tower, depth, faces.
-    Effort
     """
     sources_m, targets_m = links.sources_m, links.targets_m
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m if extent_m is None else extent_m)
-    paths, effort = grow_paths(
-        solid_surfaces(faces, sources_m, targets_m), links,
-        max_depth=max_depth, threads=threads, progress=progress, on_estimate=on_estimate, solids=True,
-    )  # fmt: skip
+    paths = grow_paths(solid_surfaces(faces, sources_m, targets_m), links, run, max_depth=max_depth, solids=True)
     hiding = Occlusion(faces, tolerance_m)
     pieces = []
     for depth in range(max_depth + 1):
@@ -77,7 +67,7 @@ def find_paths(
         rows = rows[~hiding.any_segment(source[rows], vertices[rows], target[rows])]
         some.vertices_m[:, :depth] = vertices
         pieces.append(some.select(rows))
-    return merge(pieces, max_depth, faces), effort
+    return merge(pieces, max_depth, faces)
 
 
 def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -> Surfaces:

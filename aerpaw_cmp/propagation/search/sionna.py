@@ -20,7 +20,7 @@ import gc
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 from weakref import WeakSet
@@ -36,8 +36,17 @@ from ..arrays import Array, Link
 from ..faces import inside, triangles
 from ..paths import Faces, Links, PathSet, path_lengths
 from ..surfaces import Surfaces
+from .effort import Progress
 from .interactions import DIFFRACTED, REFLECTED, OtherPaths, OtherSearch
-from .mirror import MINIMUM_LENGTH_M, Progress, images_of, merge, planes_of, scene_tolerance_m, trace_back
+from .mirror import (
+    MINIMUM_LENGTH_M,
+    images_of,
+    merge,
+    planes_of,
+    scene_tolerance_m,
+    searched_links,
+    trace_back,
+)
 
 SPECULAR_TABLE_SLOTS = 2**24
 FEWEST_SLOTS = 2**20
@@ -52,10 +61,6 @@ FULLEST_TABLE = 1 / 32
 
 MOST_SLOTS = 2**28
 """Slots of the table, over all towers of a call (two tables of 4 bytes each)."""
-
-RAISE_LIMITS: bool = True
-LAST_CANDIDATES = 0
-"""What the last batch had, for benchmarks."""
 
 LARGEST_BATCH = 100
 HALF_SPACE_THICKNESS_M = 10.0
@@ -139,57 +144,65 @@ class _Scene:
     """object id -> face of each triangle"""
 
 
-def _build(
-    faces: Faces,
-    chosen: IntArray,
-    reach_m: float,
-    carrier_hz: float,
-    *,
-    own_table: bool = False,
-    surfaces: Surfaces | None = None,
-    wedges: bool = False,
-    scattering: float = 0.0,
-) -> _Scene:
-    """Scene of the faces ``chosen``: one mesh per material.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Builder:
+    """Scenes of some of the faces: one mesh per material.
 
     ``own_table`` takes Sionna's own constants of P.2040. ``wedges`` lets triangles share the corners in which they
     meet, which is how Sionna knows an edge. ``scattering`` is the scattering coefficient of every material.
     """
-    import mitsuba as mi
-    import sionna.rt as rt
 
-    if _ALIVE:
-        gc.collect()  # an exception may have kept one
-    scene = rt.load_scene()
-    _ALIVE.add(scene)
-    scene.frequency = carrier_hz
-    vertices, triangle, owner = triangles(faces, reach_m) if surfaces is None else surfaces.mesh()
-    objects = []
-    owners = []
-    for name in dict.fromkeys(faces.material[i] for i in chosen):
-        members = [i for i in chosen if faces.material[i] == name]
-        rows = np.flatnonzero(np.isin(owner, members))
-        corners, place = np.unique(triangle[rows], return_inverse=True)
+    faces: Faces
+    links: Links
+    carrier_hz: float
+    surfaces: Surfaces | None
+    own_table: bool = False
+    wedges: bool = False
+    scattering: float = 0.0
+
+    def scene(self, chosen: IntArray) -> _Scene:
+        """Scene of the faces ``chosen``."""
+        import sionna.rt as rt
+
+        if _ALIVE:
+            gc.collect()  # an exception may have kept one
+        scene, faces = rt.load_scene(), self.faces
+        _ALIVE.add(scene)
+        scene.frequency = self.carrier_hz
+        ends = np.concatenate([self.links.sources_m, self.links.targets_m])
+        reach = 4.0 * float(max(np.nanmax(np.abs(ends)), 100.0))
+        vertices, triangle, owner = triangles(faces, reach) if self.surfaces is None else self.surfaces.mesh()
+        objects, owners = [], []
+        for name in dict.fromkeys(faces.material[i] for i in chosen):
+            members = [i for i in chosen if faces.material[i] == name]
+            rows = np.flatnonzero(np.isin(owner, members))
+            plain = f"faces-{_plain(name)}"
+            material = _material(name, self.carrier_hz, self.own_table, self.scattering)
+            mesh = self._mesh(plain, vertices, triangle[rows])
+            objects.append(rt.SceneObject(mi_mesh=mesh, name=plain, radio_material=material))
+            owners.append(owner[rows])
+        scene.add(objects)
+        return _Scene(scene, {int(o.object_id): f for o, f in zip(objects, owners, strict=True)})
+
+    def _mesh(self, name: str, vertices: FloatArray, triangle: IntArray) -> Any:
+        import mitsuba as mi
+
+        corners, place = np.unique(triangle, return_inverse=True)
         points = vertices[corners]
-        if wedges:
+        if self.wedges:
             _, first, same = np.unique(np.round(points / WELD_M), axis=0, return_index=True, return_inverse=True)
             points, place = points[first], same.reshape(-1)[place]
-        plain = re.sub(r"[^a-z0-9_]+", "-", name)
-        mesh = mi.Mesh(f"faces-{plain}", vertex_count=len(points), face_count=len(rows))
+        mesh = mi.Mesh(name, vertex_count=len(points), face_count=len(triangle))
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(points, np.float32).ravel())
         parameters["faces"] = mi.UInt32(place.astype(np.uint32).ravel())
         parameters.update()
-        objects.append(
-            rt.SceneObject(
-                mi_mesh=mesh,
-                name=f"faces-{plain}",
-                radio_material=_material(name, carrier_hz, own_table, scattering),
-            )
-        )
-        owners.append(owner[rows])
-    scene.add(objects)
-    return _Scene(scene, {int(o.object_id): f for o, f in zip(objects, owners, strict=True)})
+        return mesh
+
+
+def _plain(name: str) -> str:
+    """A name that Mitsuba takes."""
+    return re.sub(r"[^a-z0-9_]+", "-", name)
 
 
 def _material(name: str, carrier_hz: float, own_table: bool, scattering: float = 0.0) -> Any:
@@ -197,8 +210,7 @@ def _material(name: str, carrier_hz: float, own_table: bool, scattering: float =
 
     what = material(name)
     eta = what.relative_permittivity(carrier_hz)
-    thick = HALF_SPACE_THICKNESS_M if what.thickness_m is None else what.thickness_m
-    plain = re.sub(r"[^a-z0-9_]+", "-", name)
+    thick, plain = HALF_SPACE_THICKNESS_M if what.thickness_m is None else what.thickness_m, _plain(name)
     if own_table:
         from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
@@ -231,6 +243,10 @@ def _points(values: FloatArray) -> Any:
     return mi.Point3f(*(mi.Float(column) for column in values.T.astype(np.float32).tolist()))
 
 
+_CENTRE = np.zeros((1, 3))
+"""An array of one element."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Ends:
     """Devices as PathSolver wants them: centres (devices, 3), turns (devices, 3, 3) and the array they carry."""
@@ -242,7 +258,7 @@ class _Ends:
     @classmethod
     def points(cls, centres_m: FloatArray) -> _Ends:
         """Single elements, not turned."""
-        return cls(centres_m, np.tile(np.eye(3), (len(centres_m), 1, 1)), np.zeros((1, 3)))
+        return cls(centres_m, np.tile(np.eye(3), (len(centres_m), 1, 1)), _CENTRE)
 
     def arguments(self, synthetic: bool) -> tuple[Any, Any, Any]:
         """Positions, orientations and element offsets; with explicit arrays each element is an end."""
@@ -387,11 +403,7 @@ class _Finder:
         """Whether the last batch had more candidates than there was room for; then there is room for them now."""
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
-        global LAST_CANDIDATES
         most = 0 if self.candidates is None else int(np.asarray(self.candidates.numpy()).max(initial=0))
-        LAST_CANDIDATES = most
-        if not RAISE_LIMITS:
-            return False
         slots = self.slots
         while most > FULLEST_TABLE * slots:
             slots *= 2
@@ -425,13 +437,33 @@ class _Finder:
                 f"a tower has nearly {self.limit} paths in one batch, beyond which Sionna drops paths",
                 cause="take a smaller batch",
             )
-        return paths, {
-            "valid": valid[:count],
-            "kind": paths.interactions.numpy()[:, :count],
-            "shape": paths.objects.numpy()[:, :count],
-            "primitive": paths.primitives.numpy()[:, :count],
-            "gain": np.sqrt((real**2 + imaginary**2).sum(axis=(1, 3)))[:count],
-        }
+        gain = np.sqrt((real**2 + imaginary**2).sum(axis=(1, 3)))[:count]
+        return paths, _arrays(paths, count) | {"gain": gain}
+
+
+def _arrays(paths: Any, count: int) -> dict[str, Any]:
+    """Which of Sionna's paths of the first ``count`` targets are valid, and what they meet."""
+    return {
+        "valid": paths.valid.numpy()[:count],
+        "kind": paths.interactions.numpy()[:, :count],
+        "shape": paths.objects.numpy()[:, :count],
+        "primitive": paths.primitives.numpy()[:, :count],
+    }
+
+
+def _each_batch(
+    make: Callable[[IntArray, IntArray], _Finder], groups: Iterable[tuple[IntArray, IntArray]], alive: BoolArray
+) -> Iterator[tuple[_Finder, IntArray, IntArray]]:
+    """Finder, towers and poses of every batch of links that are ``alive`` (towers, poses).
+
+    One scene is alive at a time: ``make(towers, faces)`` of a group of towers that share one.
+    """
+    for towers, chosen in groups:
+        poses = np.flatnonzero(alive[towers].any(axis=0))
+        if len(poses):
+            with make(towers, chosen) as finder:
+                for start in range(0, len(poses), finder.batch):
+                    yield finder, towers, poses[start : start + finder.batch]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -542,29 +574,26 @@ def _in_batches(
     if not 1 <= batch <= LARGEST_BATCH:
         raise UsageError(f"batch {batch}", expected=f"1 to {LARGEST_BATCH} poses per call")
     load_variant(rays.variant)
-    alive = np.isfinite(targets_m).all(axis=1)
-    groups = list(_groups(faces, sources_m, links.usable))
-    for number, (towers, chosen) in enumerate(groups):
-        poses = np.flatnonzero(alive if links.excluded is None else alive & ~links.excluded[towers].all(axis=0))
-        if not len(poses):
-            continue
-        reach = 4.0 * float(max(np.abs(targets_m[poses]).max(), np.abs(sources_m).max(), 100.0))
-        scattering = other.scattering_coefficient if other.scattering else 0.0
-        built = _build(
-            faces, chosen, reach, carrier_hz, surfaces=surfaces, wedges=other.diffraction, scattering=scattering
-        )
-        ends = _Ends.points(sources_m[towers])
-        with _Finder(built, ends, np.zeros((1, 3)), batch, flags=_flags(other)) as finder:
-            for start in range(0, len(poses), batch):
-                some = poses[start : start + batch]
-                traced, raw = finder.searched(targets_m[some], rays.max_depth, rays.samples)
-                _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
-                part = take(traced, raw, built, some, towers)
-                del traced, raw
-                yield part
-                if progress:
-                    progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
-        del built
+    scattering = other.scattering_coefficient if other.scattering else 0.0
+    builder = _Builder(
+        faces=faces, links=links, carrier_hz=carrier_hz, surfaces=surfaces, wedges=other.diffraction,
+        scattering=scattering,
+    )  # fmt: skip
+
+    def make(towers: IntArray, chosen: IntArray) -> _Finder:
+        return _Finder(builder.scene(chosen), _Ends.points(sources_m[towers]), _CENTRE, batch, flags=_flags(other))
+
+    groups, alive, done = list(_groups(faces, sources_m, links.usable)), searched_links(links), 0
+    count = sum(int(alive[towers].any(axis=0).sum()) for towers, _ in groups)
+    for finder, towers, some in _each_batch(make, groups, alive):
+        traced, raw = finder.searched(targets_m[some], rays.max_depth, rays.samples)
+        _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
+        part = take(traced, raw, finder.built, some, towers)
+        del traced, raw
+        yield part
+        done += len(some)
+        if progress:
+            progress(done / count)
 
 
 def _flags(other: OtherSearch) -> dict[str, bool]:
@@ -655,31 +684,34 @@ def own_coefficients(
     Coefficients
     """
     load_variant(rays.variant)
-    sources_m, targets_m, batch = links.sources_m, links.targets_m, rays.batch
+    sources_m, targets_m = links.sources_m, links.targets_m
     arrays = list(probe.tower_arrays.values())
-    reach = 4.0 * float(max(np.abs(targets_m).max(), np.abs(sources_m).max(), 100.0))
+    pattern = np.array([array.patterns[0].name for array in arrays])
+    builder = _Builder(faces=faces, links=links, carrier_hz=probe.carrier_hz, surfaces=surfaces, own_table=True)
+
+    def make(towers: IntArray, chosen: IntArray) -> _Finder:
+        ends = _Ends(sources_m[towers], turns[0][towers], _CENTRE)
+        names = str(pattern[towers[0]]), probe.uav_array.patterns[0].name
+        return _Finder(builder.scene(chosen), ends, _CENTRE, rays.batch, patterns=names)
+
+    groups = (
+        (sharing[pattern[sharing] == name], chosen)
+        for sharing, chosen in _groups(faces, sources_m, links.usable)
+        for name in dict.fromkeys(pattern[sharing].tolist())
+    )
     pieces: list[PathSet] = []
     gains: list[ComplexArray] = []
-    for sharing, chosen in _groups(faces, sources_m, links.usable):
-        for name in dict.fromkeys(arrays[t].patterns[0].name for t in sharing):
-            towers = np.array([t for t in sharing if arrays[t].patterns[0].name == name])
-            built = _build(faces, chosen, reach, probe.carrier_hz, own_table=True, surfaces=surfaces)
-            ends = _Ends(sources_m[towers], turns[0][towers], np.zeros((1, 3)))
-            patterns = (name, probe.uav_array.patterns[0].name)
-            with _Finder(built, ends, np.zeros((1, 3)), batch, patterns=patterns) as finder:
-                for start in range(0, len(targets_m), batch):
-                    some = np.arange(start, min(start + batch, len(targets_m)))
-                    target = _Ends(targets_m[some], turns[1][some], np.zeros((1, 3)))
-                    part, gain = _raw_paths(finder, built, target, some, towers, rays)
-                    weights = _slants(probe.uav_array), np.stack([_slants(array) for array in arrays])[part.tower]
-                    gains.append(np.einsum("pab,au,pbv->puv", gain, weights[0], weights[1]))
-                    pieces.append(part)
-            del built
+    slants = np.stack([_slants(array) for array in arrays])
+    every = np.ones((len(sources_m), len(targets_m)), np.bool_)
+    for finder, towers, some in _each_batch(make, groups, every):
+        part, gain = _raw_paths(finder, _Ends(targets_m[some], turns[1][some], _CENTRE), some, towers, rays)
+        gains.append(np.einsum("pab,au,pbv->puv", gain, _slants(probe.uav_array), slants[part.tower]))
+        pieces.append(part)
     paths = PathSet.one_after_another(pieces) if pieces else PathSet.empty(rays.max_depth)
     gain = np.concatenate(gains) if gains else np.zeros((0, 2, 2), dtype=np.complex128)
     if links.excluded is not None:
-        kept = ~links.excluded[paths.tower, paths.pose]
-        paths, gain = paths.select(kept), gain[kept]
+        counts = ~links.excluded[paths.tower, paths.pose]
+        paths, gain = paths.select(counts), gain[counts]
     length = path_lengths(paths, sources_m, targets_m)
     cycles = length / wavelength_m(probe.carrier_hz)
     return Coefficients(paths, gain * np.exp(-2j * np.pi * (cycles - np.round(cycles)))[:, None, None], length)
@@ -691,23 +723,18 @@ def _slants(array: Array) -> FloatArray:
 
 
 def _raw_paths(
-    finder: _Finder, built: _Scene, target: _Ends, poses: IntArray, towers: IntArray, rays: Rays
+    finder: _Finder, target: _Ends, poses: IntArray, towers: IntArray, rays: Rays
 ) -> tuple[PathSet, ComplexArray]:
     """Paths of one batch made of reflections only, and their gains (paths, V and H, V and H)."""
     traced = finder.trace(target, rays.max_depth, rays.samples)
     real, imaginary = (np.asarray(part.numpy()) for part in traced.a)
-    raw: dict[str, Any] = {
-        "valid": traced.valid.numpy()[: len(poses)],
-        "kind": traced.interactions.numpy()[:, : len(poses)],
-        "shape": traced.objects.numpy()[:, : len(poses)],
-        "primitive": traced.primitives.numpy()[:, : len(poses)],
-    }
+    raw = _arrays(traced, len(poses))
     receiver, tower, path = np.nonzero(raw["valid"])
     steps = min(rays.max_depth, len(raw["kind"]))
     kinds = raw["kind"][:, receiver, tower, path]
     good = np.flatnonzero(((kinds == 0) | (kinds == 1)).all(axis=0))
     receiver, tower, path = receiver[good], tower[good], path[good]
-    pose, source, sequence = _sequences(raw, built.face_of, poses, towers, rays.max_depth)
+    pose, source, sequence = _sequences(raw, finder.built.face_of, poses, towers, rays.max_depth)
     points = np.full((len(pose), rays.max_depth, 3), np.nan)
     points[:, :steps] = np.moveaxis(traced.vertices.numpy()[:steps, receiver, tower, path], 0, 1)
     points[sequence < 0] = np.nan
@@ -743,25 +770,24 @@ def own_channels(
     (poses, towers, n_rx, n_tx) complex
     """
     load_variant(rays.variant)
-    sources_m, targets_m, batch = links.sources_m, links.targets_m, rays.batch
-    arrays = list(link.tower_arrays.values())
-    for array in (*arrays, link.uav_array):
+    sources_m, targets_m = links.sources_m, links.targets_m
+    arrays, uav = list(link.tower_arrays.values()), link.uav_array
+    for array in (*arrays, uav):
         if any(pattern.name != "iso" for pattern in array.patterns):
             raise UsageError("a pattern that is not isotropic", expected="isotropic elements in Sionna's own arrays")
-    h = np.zeros((len(targets_m), len(arrays), len(link.uav_array), len(arrays[0])), dtype=np.complex128)
-    reach = 4.0 * float(max(np.abs(targets_m).max(), np.abs(sources_m).max(), 100.0))
-    for towers, chosen in _groups(faces, sources_m, links.usable):
-        mounts = np.stack([arrays[t].mount for t in towers])
-        sources = _Ends(sources_m[towers], mounts, arrays[0].positions_m)
-        built = _build(faces, chosen, reach, link.carrier_hz, surfaces=surfaces)
-        with _Finder(built, sources, link.uav_array.positions_m, batch, synthetic=not explicit) as finder:
-            for start in range(0, len(targets_m), batch):
-                rows = slice(start, start + batch)
-                targets = _Ends(targets_m[rows], rotation[rows] @ link.uav_array.mount, link.uav_array.positions_m)
-                a, _ = finder.trace(targets, rays.max_depth, rays.samples).cir(normalize_delays=False, out_type="numpy")
-                mixed = _slanted(a[: len(targets.centres_m), ..., 0].sum(axis=-1), link.uav_array, arrays[0])
-                h[rows, towers] = np.moveaxis(mixed, 2, 1)
-        del built
+    h = np.zeros((len(targets_m), len(arrays), len(uav), len(arrays[0])), dtype=np.complex128)
+    builder = _Builder(faces=faces, links=links, carrier_hz=link.carrier_hz, surfaces=surfaces)
+
+    def make(towers: IntArray, chosen: IntArray) -> _Finder:
+        sources = _Ends(sources_m[towers], np.stack([arrays[t].mount for t in towers]), arrays[0].positions_m)
+        return _Finder(builder.scene(chosen), sources, uav.positions_m, rays.batch, synthetic=not explicit)
+
+    every = np.ones((len(sources_m), len(targets_m)), np.bool_)
+    for finder, towers, rows in _each_batch(make, _groups(faces, sources_m, links.usable), every):
+        targets = _Ends(targets_m[rows], rotation[rows] @ uav.mount, uav.positions_m)
+        a, _ = finder.trace(targets, rays.max_depth, rays.samples).cir(normalize_delays=False, out_type="numpy")
+        mixed = _slanted(a[: len(rows), ..., 0].sum(axis=-1), uav, arrays[0])
+        h[np.ix_(rows, towers)] = np.moveaxis(mixed, 2, 1)
     return np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
 
 
@@ -769,8 +795,7 @@ def _slanted(a: AnyArray, uav: Array, tower: Array) -> ComplexArray:
     """(rx, uav ports, tx, tower ports) from V and H halves (rx, 2 uav elements, tx, 2 tower elements)."""
     n_uav, n_tower = len(uav), len(tower)
     halves = a.reshape(len(a), 2, n_uav, a.shape[2], 2, n_tower).astype(np.complex128)
-    weights = [np.stack([np.cos(x.slant_rad), np.sin(x.slant_rad)]) for x in (uav, tower)]
-    return np.asarray(np.einsum("rautbv,au,bv->rutv", halves, *weights))
+    return np.asarray(np.einsum("rautbv,au,bv->rutv", halves, _slants(uav), _slants(tower)))
 
 
 def _groups(faces: Faces, sources_m: FloatArray, usable: BoolArray | None) -> Iterator[tuple[IntArray, IntArray]]:
@@ -868,9 +893,11 @@ def _relocate(
     for step in range(sequence.shape[1]):
         outside = np.flatnonzero(~inside(faces, sequence[:, step], everywhere[:, step], EDGE_TOLERANCE_M))
         for row in outside:  # few: only scenes with disjoint coplanar faces
-            for other in np.flatnonzero(plane == plane[sequence[row, step]]):
-                if inside(faces, np.array([other]), everywhere[row, step][None], EDGE_TOLERANCE_M)[0]:
-                    result[row, step] = other
+            twins = np.flatnonzero(plane == plane[sequence[row, step]])
+            point = np.tile(everywhere[row, step], (len(twins), 1))
+            holding = twins[inside(faces, twins, point, EDGE_TOLERANCE_M)]
+            if len(holding):
+                result[row, step] = holding[-1]
     return np.asarray(result)
 
 

@@ -234,8 +234,10 @@ def free_in_sionna(surfaces: Any, paths: Any, sources: np.ndarray, targets: np.n
 
     from aerpaw_cmp.propagation.search import sionna
 
-    built = sionna._build(surfaces.faces, np.arange(len(surfaces)), 1e4, CARRIER_HZ, surfaces=surfaces)
-    scene = built.scene.mi_scene
+    builder = sionna._Builder(
+        faces=surfaces.faces, links=Links(sources, targets), carrier_hz=CARRIER_HZ, surfaces=surfaces
+    )
+    scene = builder.scene(np.arange(len(surfaces))).scene.mi_scene
     clear = np.ones(len(paths), dtype=bool)
     for row in range(len(paths)):
         points = [sources[paths.tower[row]], *paths.vertices_m[row, : paths.depth[row]], targets[paths.pose[row]]]

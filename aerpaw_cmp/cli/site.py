@@ -115,7 +115,7 @@ def site_export(
 @command(
     "show",
     of=site_app,
-    text="Plan view, 3-D picture and a standalone page of a site.",
+    text="Plan of a site, and a standalone page that shows it in 3-D.",
     examples=[
         "aerpaw-cmp site show",
         "aerpaw-cmp site show site.yaml -o reports/site --export",

@@ -53,6 +53,11 @@ def json_safe(value: Any) -> Any:
     return value if value is None else str(value)
 
 
+def json_object(**entries: Any) -> dict[str, Any]:
+    """Entries by name, their values as JSON can hold them."""
+    return {name: json_safe(value) for name, value in entries.items()}
+
+
 def _listed(array: AnyArray) -> Any:
     if array.dtype.kind == "f":  # large maps: one pass, not one call per number
         boxed = array.astype(object)

@@ -94,6 +94,7 @@ def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
         high_db=said["q95_db"].to_numpy(np.float64),
         share_near=float(near.mean()),
         common_db=said["slow_sd_db"].to_numpy(np.float64) if "slow_sd_db" in said else 0.0,
+        start=one.start,
     )
 
 

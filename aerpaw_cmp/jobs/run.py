@@ -494,7 +494,7 @@ def run_site_show(
     export: bool = False,
     force: bool = False,
 ) -> list[Path]:
-    """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths.
+    """Plan view and a page of the scene in 3-D; with a flight its track, with a pose its paths.
 
     Without a site the flight's own is shown; with neither, the packaged one.
 

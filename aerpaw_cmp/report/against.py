@@ -26,6 +26,8 @@ class AgainstSeries:
     low_db: FloatArray
     high_db: FloatArray
     share_near: float
+    start: np.datetime64 | None = None
+    """Instant of ``time_s`` 0 (UTC); None of logs with relative times."""
     common_db: FloatArray | float = 0.0
     """Part of ``sd_db`` that the whole flight may share."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -19,34 +20,21 @@ SHARES = np.arange(0.1, 1.0, 0.1)
 """Of the reliability plot."""
 
 
-def against_specs(against: Against) -> list[FigureSpec]:
+def against_specs(against: Against) -> Iterator[FigureSpec]:
     """Levels over time with their intervals, then reliability and sharpness."""
-    out = []
     for s in against.series:
-        out.append(
-            FigureSpec(
-                name=f"against_{safe_name(s.tower)}_{safe_name(s.channel)}",
-                page=True,
-                section="against",
-                title=f"{s.tower} {s.channel}: predicted before this flight",
-                caption="Band: 90 % interval of one sample as it was predicted. Nothing of this flight was used.",
-                alt=f"Measured level of {s.tower} {s.channel} over time beside its prediction",
-                draw=partial(_over_time, s),
-            )
-        )
-    out.append(
-        FigureSpec(
-            name="against_reliability",
-            page=True,
-            section="against",
-            title="Reliability and sharpness",
-            caption="Left: share of samples inside intervals of a nominal share; on the diagonal intervals hold what "
-            "they say. Right: standard deviations that were given; smaller is sharper.",
-            alt="Observed against nominal coverage, and a histogram of standard deviations",
-            draw=partial(_reliability, against),
-        )
-    )
-    return out
+        yield FigureSpec(
+            f"against_{safe_name(s.tower)}_{safe_name(s.channel)}", "against",
+            f"{s.tower} {s.channel}: predicted before this flight",
+            "Band: 90 % interval of one sample as it was predicted. Nothing of this flight was used.",
+            partial(_over_time, s),
+        )  # fmt: skip
+    yield FigureSpec(
+        "against_reliability", "against", "Reliability and sharpness",
+        "Left: share of samples inside intervals of a nominal share; on the diagonal intervals hold what they say. "
+        "Right: standard deviations that were given; smaller is sharper.",
+        partial(_reliability, against),
+    )  # fmt: skip
 
 
 def _over_time(s: AgainstSeries) -> Figure:
@@ -55,7 +43,7 @@ def _over_time(s: AgainstSeries) -> Figure:
     ax.fill_between(s.time_s, s.low_db, s.high_db, color=canvas.SIMULATED, alpha=0.22, linewidth=0, label="90 %")
     ax.plot(s.time_s, s.measured_db, ".", markersize=2, color=canvas.MEASURED, label="measured", rasterized=True)
     ax.plot(s.time_s, s.level_db, color=canvas.SIMULATED, linewidth=1.2, label="predicted")
-    ax.set_xlabel("time [s]")
+    canvas.time_axis(ax, np.datetime64(0, "ns") if s.start is None else s.start)
     ax.set_ylabel("level [dB]")
     canvas.legend_below(ax, 3)
     return fig

@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from markupsafe import Markup
-
-from .html import environment, policy, script
+from .html import rendered
 
 LEVEL_COLUMNS = {
     "rmse_db": ("RMSE", "dB"),
@@ -164,20 +162,14 @@ def benchmark_page(tables: Sequence[TaskTable], missing: Sequence[str], generate
     -------
     str
     """
-    code = script("benchmark.js")
     names = dict.fromkeys(bar.title for table in tables for bar in table.bars)
-    text: str = (
-        environment()
-        .get_template("benchmark.html.jinja")
-        .render(
-            tables=tables,
-            first_words=_first_words(tables),
-            missing=missing,
-            generated=generated,
-            version=version,
-            content_policy=policy(code),
-            code=Markup(code),
-            entrants=sorted(names),
-        )
+    return rendered(
+        "benchmark",
+        ("benchmark.js",),
+        tables=tables,
+        first_words=_first_words(tables),
+        missing=missing,
+        generated=generated,
+        version=version,
+        entrants=sorted(names),
     )
-    return text

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..common.jsonable import json_safe
-from ..common.provenance import KEY
+from ..common.jsonable import json_object
 from ..compare.calibration import BASELINES
 from . import canvas
 from .calibration_data import AntennaMap, CalibrationData
-from .canvas import FigureSpec, Picture
-from .export import write_file
-from .html import by_section, environment, policy
+from .canvas import FigureSpec
+from .export import about
+from .html import write_page
 from .names import safe_name
 
 SPLIT_TITLE = {
@@ -33,29 +31,24 @@ SPLIT_TITLE = {
 
 def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
     """The numbers of the page under stable names."""
-    safe: dict[str, Any] = json_safe(
-        {
-            "calibration": data.name,
-            "generated": data.generated,
-            "versions": dict(sorted(data.versions.items())),
-            "flights": list(data.flights),
-            KEY: list(data.trained_on),
-            "scores": {k: list(v) for k, v in data.scores.items()},
-            "controls": {k: list(v) for k, v in data.controls.items()},
-            "mounts": data.mounts,
-            "strengths": data.strengths,
-            "ground": data.ground,
-            "learning_curve": {"points": list(data.curve), "one_more_rmse_db": data.one_more_rmse_db},
-            "antennas": [
-                {"name": a.name, "share_of_sphere_seen": share_seen(a), "n_bins": len(a.seen)} for a in data.antennas
-            ],
-            "words": list(data.words),
-            "warnings": list(data.warnings),
-            "rank": data.rank or {},
-            "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
-        }
+    return json_object(
+        calibration=data.name,
+        flights=data.flights,
+        trained_on=data.trained_on,
+        scores=data.scores,
+        controls=data.controls,
+        mounts=data.mounts,
+        strengths=data.strengths,
+        ground=data.ground,
+        learning_curve={"points": data.curve, "one_more_rmse_db": data.one_more_rmse_db},
+        antennas=[
+            {"name": a.name, "share_of_sphere_seen": share_seen(a), "n_bins": len(a.seen)} for a in data.antennas
+        ],
+        words=data.words,
+        warnings=data.warnings,
+        rank=data.rank or {},
+        **about(data),
     )
-    return safe
 
 
 def share_seen(antenna: AntennaMap, within_deg: float = 10.0) -> float:
@@ -157,80 +150,46 @@ def _mean(rows: Sequence[Mapping[str, Any]], key: str = "rmse_db") -> float:
     return float(np.mean([r[key] for r in rows])) if rows else float("nan")
 
 
-def figure_specs(data: CalibrationData) -> list[FigureSpec]:
+def figure_specs(data: CalibrationData) -> Iterator[FigureSpec]:
     """All figures."""
-    out = []
     if data.scores.get("flight_left_out"):
-        out.append(
-            FigureSpec(
-                name="scores",
-                section="scores",
-                title="What carries over",
-                caption="Mean RMSE after one offset per flight and channel. Nothing is scored where it was learned.",
-                alt="Bars of RMSE for every left-out split and control",
-                draw=partial(draw_scores, data),
-                page=True,
-            )
-        )
+        yield FigureSpec(
+            "scores", "scores", "What carries over",
+            "Mean RMSE after one offset per flight and channel. Nothing is scored where it was learned.",
+            partial(draw_scores, data),
+        )  # fmt: skip
     if len(data.curve) > 1:
-        out.append(
-            FigureSpec(
-                name="learning_curve",
-                section="scores",
-                title="What another flight would bring",
-                caption=f"Mean RMSE over {data.curve[0]['series']} series, each predicted by subsets of the other "
-                "flights. The last point is extrapolated: the squared error as a constant and a part that falls with "
-                "the number of flights.",
-                alt="RMSE on flights left out against the number of flights learned from",
-                draw=partial(draw_curve, data),
-                page=True,
-            )
-        )
+        yield FigureSpec(
+            "learning_curve", "scores", "What another flight would bring",
+            f"Mean RMSE over {data.curve[0]['series']} series, each predicted by subsets of the other flights. The "
+            "last point is extrapolated: the squared error as a constant and a part that falls with the number of "
+            "flights.",
+            partial(draw_curve, data),
+        )  # fmt: skip
     for a in data.antennas:
-        out.append(
-            FigureSpec(
-                name=f"antenna_{safe_name(a.name)}",
-                section="antennas",
-                title=a.name,
-                caption=f"Flights looked within 10 degrees of {100 * share_seen(a):.0f} % of the sphere (dots). "
-                "Elsewhere the gain is a guess, and its standard deviation says so. The level is normalised to a mean "
-                "of 0 dBi over the sphere: it is not identified beside the offsets.",
-                alt=f"Gain of {a.name} over azimuth and elevation with flown directions",
-                draw=partial(draw_antenna, a),
-                page=True,
-            )
-        )
+        yield FigureSpec(
+            f"antenna_{safe_name(a.name)}", "antennas", a.name,
+            f"Flights looked within 10 degrees of {100 * share_seen(a):.0f} % of the sphere (dots). Elsewhere the gain "
+            "is a guess, and its standard deviation says so. The level is normalised to a mean of 0 dBi over the "
+            "sphere: it is not identified beside the offsets.",
+            partial(draw_antenna, a),
+        )  # fmt: skip
     if data.place is not None:
-        out.append(
-            FigureSpec(
-                name="place",
-                section="place",
-                title="Field over places",
-                caption="What the fit with a place field puts into places instead of antennas. No antenna file has it.",
-                alt="Map of the place field along the flights",
-                draw=partial(draw_place, data.place, "field over places"),
-                page=True,
-            )
-        )
-    return out
+        yield FigureSpec(
+            "place", "place", "Field over places",
+            "What the fit with a place field puts into places instead of antennas. No antenna file has it.",
+            partial(draw_place, data.place, "field over places"),
+        )  # fmt: skip
 
 
 def write_calibration(data: CalibrationData, folder: Path) -> list[Path]:
     """Write ``calibration.html``, ``metrics.json`` and ``figures/``."""
-    written = [write_file(folder / "metrics.json", json.dumps(calibration_metrics(data), indent=2) + "\n")]
-    drawn, files = canvas.write_figures(figure_specs(data), folder / "figures")
-    page = write_file(folder / "calibration.html", _page(data, drawn))
-    return [page, *written, *files]
-
-
-def _page(data: CalibrationData, pictures: Sequence[Picture]) -> str:
-    text: str = environment().get_template("calibration.html.jinja").render(
+    rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
+    columns = ("rmse_db", "rmse_4s_db", *BASELINES)
+    return write_page(
+        folder, "calibration", calibration_metrics(data), figure_specs(data),
         data=data,
-        sections=by_section(pictures),
         split_title=SPLIT_TITLE,
         baselines=BASELINES,
-        means={k: ([_mean(v, key) for key in ("rmse_db", "rmse_4s_db", *BASELINES)], len(v))
-               for k, v in {**data.scores, **{f"control: {k}": v for k, v in data.controls.items()}}.items()},
-        content_policy=policy(),
+        means={name: ([_mean(scores, key) for key in columns], len(scores)) for name, scores in rows.items()},
     )  # fmt: skip
-    return text

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from .canvas import (
     FigureSpec,
     beyond,
     colour_bar,
-    count,
     draw_site,
     figure,
     frame_around,
@@ -26,14 +26,13 @@ from .canvas import (
 )
 from .maps_figures import COLOURS, LINES, MARKERS, grouped
 from .names import k_key, safe_name
-from .words import pretty
+from .rss_figures import running_levels
+from .words import count, pretty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DISTANCE_BINS = 30
-FEWEST_PER_BIN = 8
-"""Samples that a bin needs before it gets a median and a band."""
 
 MAPS_PER_ROW = 3
 
@@ -70,44 +69,25 @@ def look(number: int) -> dict[str, Any]:
     return {"color": COLOURS[number % len(COLOURS)], "linestyle": LINES[(number + number // len(COLOURS)) % len(LINES)]}
 
 
-def binned(quantity: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Percentiles 10, 50 and 90 of the values in each bin that has enough.
-
-    Returns
-    -------
-    (middle, percentiles) : (b,), (b, 3)
-        ``middle`` is the mean of the quantity in the bin.
-    """
-    good = np.isfinite(quantity) & np.isfinite(values)
-    which = np.digitize(quantity[good], edges)
-    middle, levels = [], []
-    for number in range(1, len(edges)):
-        inside = which == number
-        if inside.sum() >= FEWEST_PER_BIN:
-            middle.append(float(quantity[good][inside].mean()))
-            levels.append(np.percentile(values[good][inside], [10, 50, 90]))
-    return np.array(middle), np.array(levels).reshape(-1, 3)
-
-
 def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
     """RSS after the offset against distance, and its difference to the simulation below, all flights on one axis."""
     fig = figure((9.2, 6.4))
     top, low = fig.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
     reach = max((float(np.nanmax(r.distance_m)) for r in rows if np.isfinite(r.distance_m).any()), default=1.0)
-    edges = np.linspace(0.0, reach * 1.001, DISTANCE_BINS + 1)
+
+    def binned(row: RssRow, values: FloatArray) -> FloatArray:
+        levels = running_levels(row.distance_m, values, DISTANCE_BINS, (0.0, reach))
+        return levels[np.isfinite(levels[:, 0])]
+
     for row in rows:
         style = look(numbers[row.flight])
         for ax, values in ((top, row.measured_db + row.offset_db), (low, row.residual_db)):
-            middle, levels = binned(row.distance_m, values, edges)
-            ax.fill_between(middle, levels[:, 0], levels[:, 2], color=style["color"], alpha=0.15, linewidth=0)
-            ax.plot(
-                middle, levels[:, 1], linewidth=1.8, label=f"{row.flight}, measured + offset ({count(row.n)})", **style
-            )
-        middle, levels = binned(
-            row.distance_m, np.where(np.isfinite(row.measured_db), row.simulated_dbm, np.nan), edges
-        )
+            middle, low_level, median, high_level = binned(row, values).T
+            ax.fill_between(middle, low_level, high_level, color=style["color"], alpha=0.15, linewidth=0)
+            ax.plot(middle, median, linewidth=1.8, label=f"{row.flight}, measured + offset ({count(row.n)})", **style)
+        middle, _, median, _ = binned(row, np.where(np.isfinite(row.measured_db), row.simulated_dbm, np.nan)).T
         top.plot(
-            middle, levels[:, 1], linestyle="none", marker=MARKERS[numbers[row.flight] % len(MARKERS)], markersize=4.5,
+            middle, median, linestyle="none", marker=MARKERS[numbers[row.flight] % len(MARKERS)], markersize=4.5,
             markerfacecolor="white", color=style["color"], label=f"{row.flight}, ray tracing",
         )  # fmt: skip
     low.axhline(0.0, color="black", linewidth=0.8)
@@ -217,44 +197,6 @@ def season_places(data: CampaignData) -> Figure:
     frame_around(ax, east, north)
     colour_bar(fig, mesh, [ax], "Mean of measured − simulated [dB]", beyond(place_map.mean_db, -reach, reach))
     return fig
-
-
-def season_specs(data: CampaignData) -> list[FigureSpec]:
-    """What stands on the page where no script runs, and in print."""
-    if not data.season.over_all():
-        return []
-    figures = [
-        FigureSpec(
-            name="season_errors",
-            section="season",
-            title="Error of the flights under every setting",
-            caption="Best setting on top"
-            + (f", {MOST_SETTINGS} of {len(data.settings)}." if len(data.settings) > MOST_SETTINGS else "."),
-            alt="Distribution of the error over flights for each setting",
-            draw=lambda: season_errors(data),
-        ),
-        FigureSpec(
-            name="season_drift",
-            section="season",
-            title="Offsets over the season",
-            caption=f"Each flight's own offset under “{data.reference}”, by tower and channel.",
-            alt="Offset of every flight over its date",
-            draw=lambda: season_drift(data),
-        ),
-    ]
-    if any(len(p.n) for p in data.season.places):
-        figures.append(
-            FigureSpec(
-                name="season_places",
-                section="season",
-                title="Where the simulation errs, over all flights",
-                caption=f"Mean over flights of the mean residual in cells of {data.cell_m:g} m, “{data.reference}”, "
-                "all towers and channels.",
-                alt="Map of the mean residual over all flights",
-                draw=lambda: season_places(data),
-            )
-        )
-    return figures
 
 
 def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
@@ -407,88 +349,73 @@ def held_out_curves(fold: HeldOutFold, numbers: dict[str, int]) -> Figure:
 
 def figure_specs(data: CampaignData) -> list[FigureSpec]:
     """Every figure that the campaign has numbers for."""
+    return [*_season_specs(data), *_flight_specs(data)]
+
+
+def _season_specs(data: CampaignData) -> Iterator[FigureSpec]:
+    """What stands on the page where no script runs, and in print."""
+    if not data.season.over_all():
+        return
+    some = f", {MOST_SETTINGS} of {len(data.settings)}" if len(data.settings) > MOST_SETTINGS else ""
+    yield FigureSpec(
+        "season_errors", "season", "Error of the flights under every setting", f"Best setting on top{some}.",
+        partial(season_errors, data),
+    )  # fmt: skip
+    yield FigureSpec(
+        "season_drift", "season", "Offsets over the season",
+        f"Each flight's own offset under “{data.reference}”, by tower and channel.",
+        partial(season_drift, data),
+    )  # fmt: skip
+    if any(len(p.n) for p in data.season.places):
+        yield FigureSpec(
+            "season_places", "season", "Where the simulation errs, over all flights",
+            f"Mean over flights of the mean residual in cells of {data.cell_m:g} m, “{data.reference}”, all towers and "
+            "channels.",
+            partial(season_places, data),
+        )  # fmt: skip
+
+
+def _flight_specs(data: CampaignData) -> Iterator[FigureSpec]:
     numbers = {track.flight: number for number, track in enumerate(data.tracks)}
-    figures: list[FigureSpec] = season_specs(data)
     if data.rss and len(data.rss) <= MOST_BARS:
-        figures.append(
-            FigureSpec(
-                name="settings_rmse",
-                section="result",
-                title="RMSE of every setting and flight",
-                caption="Each row has its own best offset. Lines: 95 % interval from blocks as long as the residual "
-                "remembers. The grey bar is what two flights differ by at the same "
-                "places (the pair with most of them); where few samples have a pair, it speaks for those places only.",
-                alt="RMSE per setting, flight and link, with baselines",
-                draw=lambda: settings_rmse(data),
-            )
-        )
+        yield FigureSpec(
+            "settings_rmse", "result", "RMSE of every setting and flight",
+            "Each row has its own best offset. Lines: 95 % interval from blocks as long as the residual remembers. The "
+            "grey bar is what two flights differ by at the same places (the pair with most of them); where few samples "
+            "have a pair, it speaks for those places only.",
+            partial(settings_rmse, data),
+        )  # fmt: skip
     if data.rank and len(data.rank) <= MOST_BARS:
-        figures.append(
-            FigureSpec(
-                name="rank_tv",
-                section="result",
-                title="Total variation of rank, every setting and flight",
-                caption="Distance between the histograms of measured and simulated rank, 0 when equal, 1 when apart, "
-                "with 95 % intervals. Equal histograms do not mean that ranks agree pose by pose: see kappa.",
-                alt="Total variation per flight, K and setting",
-                draw=lambda: rank_tv(data),
-            )
-        )
+        yield FigureSpec(
+            "rank_tv", "result", "Total variation of rank, every setting and flight",
+            "Distance between the histograms of measured and simulated rank, 0 when equal, 1 when apart, with 95 % "
+            "intervals. Equal histograms do not mean that ranks agree pose by pose: see kappa.",
+            partial(rank_tv, data),
+        )  # fmt: skip
     if numbers and data.site is not None:
-        site = data.site
-        figures.append(
-            FigureSpec(
-                name="tracks",
-                section="overlay",
-                title="The flights laid over each other",
-                caption="Where the radio was sampled.",
-                alt="Plan of all flights, and their heights over time",
-                draw=lambda: tracks(data, site, numbers),
-            )
-        )
+        yield FigureSpec(
+            "tracks", "overlay", "The flights laid over each other", "Where the radio was sampled.",
+            partial(tracks, data, data.site, numbers),
+        )  # fmt: skip
     for link, rows in grouped(data.reference_rows, lambda r: r.link).items():
-        figures += _link_specs(data, link, rows, numbers)
+        scored = [row for row in rows if row.n > 0]
+        if scored and len(scored) <= MOST_FLIGHTS:
+            yield FigureSpec(
+                f"distance_{safe_name(link)}", "overlay", f"{link}: RSS against distance, all flights",
+                f"Setting: {data.reference}. Lines: medians of {DISTANCE_BINS} bins of distance; bands: 10 % to 90 %. "
+                "Open markers: medians of the simulation at the same samples. Each flight has its own offset.",
+                partial(against_distance, scored, numbers),
+            )  # fmt: skip
+            yield FigureSpec(
+                f"places_{safe_name(link)}", "overlay", f"{link}: where the simulation errs, flight by flight",
+                f"Mean residual in cells of {data.cell_m:g} m, all heights together, one colour scale. A pattern that "
+                "comes back on another flight is an error of the model; one that does not is of that flight.",
+                partial(places, data, scored),
+            )  # fmt: skip
     for number, fold in enumerate(data.held_out[:MOST_FLIGHTS]):
-        figures.append(_fold_spec(fold, number, numbers))
-    return figures
-
-
-def _link_specs(data: CampaignData, link: str, rows: list[RssRow], numbers: dict[str, int]) -> list[FigureSpec]:
-    scored = [row for row in rows if row.n > 0]
-    if not scored or len(scored) > MOST_FLIGHTS:
-        return []
-    return [
-        FigureSpec(
-            name=f"distance_{safe_name(link)}",
-            section="overlay",
-            title=f"{link}: RSS against distance, all flights",
-            caption=f"Setting: {data.reference}. "
-            f"Lines: medians of {DISTANCE_BINS} bins of distance; bands: 10 % to 90 %. "
-            "Open markers: medians of the simulation at the same samples. Each flight has its own offset.",
-            alt=f"Medians of measured and simulated RSS of {link} against distance for each flight",
-            draw=lambda: against_distance(scored, numbers),
-        ),
-        FigureSpec(
-            name=f"places_{safe_name(link)}",
-            section="overlay",
-            title=f"{link}: where the simulation errs, flight by flight",
-            caption=f"Mean residual in cells of {data.cell_m:g} m, all heights together, one colour scale. "
-            "A pattern that "
-            "comes back on another flight is an error of the model; one that does not is of that flight.",
-            alt=f"Maps of the mean residual of {link}, one per flight",
-            draw=lambda: places(data, scored),
-        ),
-    ]
-
-
-def _fold_spec(fold: HeldOutFold, number: int, numbers: dict[str, int]) -> FigureSpec:
-    on = ", ".join(fold.fitted_on)
-    return FigureSpec(
-        name=f"held_out_{number + 1}",
-        section="held_out",
-        title=f"Fitted on {on}",
-        caption="RMSE along each parameter, the others as fitted; every point has its own offset. A flight whose least "
-        "RMSE lies elsewhere does not support the fit.",
-        alt=f"RMSE against each parameter, fitted on {on}",
-        draw=lambda: held_out_curves(fold, numbers),
-    )
+        yield FigureSpec(
+            f"held_out_{number + 1}", "held_out", f"Fitted on {', '.join(fold.fitted_on)}",
+            "RMSE along each parameter, the others as fitted; every point has its own offset. A flight whose least "
+            "RMSE lies elsewhere does not support the fit.",
+            partial(held_out_curves, fold, numbers),
+        )  # fmt: skip

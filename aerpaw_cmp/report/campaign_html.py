@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
 
 from ..common.cells import guarded
 from ..common.jsonable import fields_of, json_safe
@@ -33,11 +31,10 @@ from .campaign_words import (
     worst_flights,
 )
 from .canvas import Picture
-from .explorer import as_json
-from .export import write_file
+from .export import json_text, write_file
 from .exports.points import of_campaign
 from .exports.write import write_exports
-from .html import by_section, environment, policy, script
+from .html import by_section, embedded, rendered
 from .words import pretty
 
 MANY = 200
@@ -193,10 +190,10 @@ def halves(data: CampaignData) -> list[tuple[RssRow, Repeated | None, Repeated]]
 
 def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page."""
-    template = environment().get_template("campaign.html.jinja")
     linked = payload(data)
-    code = script("common.js", "campaign_explorer.js") if linked else ""
-    text: str = template.render(
+    return rendered(
+        "campaign",
+        ("common.js", "campaign_explorer.js") if linked else (),
         data=data,
         sections=by_section(pictures),
         mean_rmse=mean_rmse(data),
@@ -220,11 +217,8 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         few_flights=FEW_FLIGHTS,
         rows_shown=ROWS_SHOWN,
         fold_rows=FOLD_ROWS,
-        explorer=Markup(as_json(linked)) if linked else "",
-        script=Markup(code),
-        content_policy=policy(code),
+        explorer=embedded(linked),
     )
-    return text
 
 
 def write_campaign(
@@ -252,10 +246,9 @@ def write_campaign(
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < COMPACT_ROWS else None
-    numbers = json.dumps(campaign_metrics(data), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
     table = campaign_frame(data)
     written = [
-        write_file(folder / "campaign.json", numbers),
+        write_file(folder / "campaign.json", json_text(campaign_metrics(data), indent)),
         write_file(folder / "campaign.csv", guarded(table).to_csv(index=False, lineterminator="\n")),
     ]
     if data.repeats or data.rank_repeats:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..common.stages import Progress, silent
-from ..common.units import AnyArray, BoolArray, FloatArray
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site, Trees
@@ -55,28 +55,26 @@ RASTER_DPI = 130
 WIDE = (9.2, 4.2)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class FigureSpec:
-    """A figure that can be drawn, with the words that go with it; ``page``: the page itself shows it."""
+    """A figure that can be drawn: file name, section of the page, its words, and the function that draws it.
+
+    ``page``: the page itself shows it, not only ``--figures all``.
+    """
 
     name: str
     section: str
     title: str
     caption: str
-    alt: str
     draw: Callable[[], Figure]
-    page: bool = False
+    page: bool = True
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Picture:
-    """A drawn figure: its words, the picture by format ("png", "svg", "pdf"), and the smaller PNG that a page holds."""
+    """A drawn figure: the picture by format ("png", "svg", "pdf"), and the smaller PNG that a page holds."""
 
-    name: str
-    section: str
-    title: str
-    caption: str
-    alt: str
+    spec: FigureSpec
     formats: Mapping[str, bytes]
     inline: bytes = b""
 
@@ -143,12 +141,6 @@ def figure(size: tuple[float, float] = WIDE) -> Figure:
     return Figure(figsize=size, layout="constrained")
 
 
-def save(fig: Figure) -> tuple[bytes, bytes]:
-    """The figure as SVG and PNG."""
-    images = save_as(fig, ("svg", "png"))
-    return images["svg"], images["png"]
-
-
 def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
     """The figure in some of :data:`FORMATS`; on paper as wide as two columns of an IEEE page."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -192,15 +184,7 @@ def render(spec: FigureSpec, formats: Sequence[str] = ("svg", "png"), kind: str 
     """Draw a figure and forget it; its pictures stay."""
     with style(kind):
         files = save_as(spec.draw(), formats, kind)
-    return Picture(
-        name=spec.name,
-        section=spec.section,
-        title=spec.title,
-        caption=spec.caption,
-        alt=spec.alt,
-        formats=files,
-        inline=smaller(files["png"]) if "png" in files else b"",
-    )
+    return Picture(spec, files, smaller(files["png"]) if "png" in files else b"")
 
 
 def write_figures(
@@ -235,7 +219,7 @@ def write_figures(
         progress("figures", len(drawn) / len(specs))
         picture = render(spec, formats, kind)
         drawn.append(picture)
-        written += [write_file(folder / f"{picture.name}.{form}", one) for form, one in picture.formats.items()]
+        written += [write_file(folder / f"{spec.name}.{form}", one) for form, one in picture.formats.items()]
     if specs:
         progress("figures", 1.0)
     return drawn, written
@@ -302,17 +286,6 @@ def time_axis(ax: Axes, start: np.datetime64) -> None:
     ax.set_xlim(low, high)
 
 
-def count(n: int) -> str:
-    """A number of samples, thousands set apart.
-
-    Examples
-    --------
-    >>> count(3172) == "3\N{NARROW NO-BREAK SPACE}172", count(40)
-    (True, '40')
-    """
-    return f"{n:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
-
-
 def plain_ticks(axis: Axis) -> None:
     """Decades of a logarithmic axis as plain numbers (0.01, 1, 1000): read at a glance, and drawn faster."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
@@ -321,13 +294,44 @@ def plain_ticks(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def thinned(east: FloatArray, north: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
-    """A line with at most about ``limit`` points that looks the same: both extremes of each stretch are kept.
+def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
+    """Indices of at most about ``limit`` samples, with the smallest and largest of each array in each stretch.
 
     Parameters
     ----------
-    east, north : (n,)
-        Abscissa and ordinate; NaN in the ordinate breaks the line and is kept as a break.
+    values : sequence of (n,)
+        Arrays whose extremes must stay; NaN counts as no extreme.
+    limit : int
+        Samples wanted.
+
+    Returns
+    -------
+    (m,) int
+        Rising; all of them when n <= limit.
+
+    Examples
+    --------
+    >>> keep_extremes([np.array([0.0, 5.0, 1.0, 0.0, -7.0, 0.0])], 3).tolist()
+    [0, 1, 4, 5]
+    """
+    n = len(values[0])
+    if n <= limit:
+        return np.arange(n)
+    per = -(-n // max(1, limit // (2 * len(values))))
+    starts = np.arange(0, n, per)
+    kept = [np.array([0, n - 1])]
+    for array in values:
+        table = np.pad(np.asarray(array, dtype=np.float64), (0, -n % per), constant_values=np.nan).reshape(-1, per)
+        missing = np.isnan(table)
+        kept += [starts + np.where(missing, np.inf, table).argmin(axis=1)]
+        kept += [starts + np.where(missing, -np.inf, table).argmax(axis=1)]
+    return np.unique(np.minimum(np.concatenate(kept), n - 1))
+
+
+def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
+    """A line (n,) with at most about ``limit`` points that looks the same: both extremes of each stretch are kept.
+
+    NaN in the values breaks the line and is kept as a break.
 
     Examples
     --------
@@ -335,20 +339,8 @@ def thinned(east: FloatArray, north: FloatArray, limit: int = POINTS_PER_LINE) -
     >>> len(a) <= 3002, bool(b.max() > 0.999999)
     (True, True)
     """
-    n = len(east)
-    if n <= limit:
-        return east, north
-    per = -(-2 * n // limit)
-    buckets = -(-n // per)
-    padded = np.full(buckets * per, np.nan)
-    padded[:n] = north
-    table = padded.reshape(buckets, per)
-    gone = np.isnan(table)
-    low = np.where(gone, np.inf, table).argmin(axis=1)
-    high = np.where(gone, -np.inf, table).argmax(axis=1)
-    base = np.arange(buckets) * per
-    index = np.minimum(np.sort(np.stack([base + low, base + high], axis=1), axis=1).ravel(), n - 1)
-    return east[index], north[index]
+    rows = keep_extremes([values], limit)
+    return at[rows], values[rows]
 
 
 def spread_out(count: int, most: int) -> AnyArray:
@@ -380,17 +372,9 @@ def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
     >>> 2000 <= len(rows) <= 3200, bool(values[rows].max() == 7.0), len(cloud(values[:50]))
     (True, True, 50)
     """
-    n = len(values)
-    if n <= limit:
-        return np.arange(n)
-    per = -(-n // 600)  # about two pixels of a figure
-    padded = np.full(-(-n // per) * per, np.nan)
-    padded[:n] = values
-    table = padded.reshape(-1, per)
-    base = np.arange(len(table)) * per
-    ends = [np.where(np.isnan(table), fill, table) for fill in (np.inf, -np.inf)]
-    extremes = np.concatenate([base + ends[0].argmin(axis=1), base + ends[1].argmax(axis=1)])
-    return np.unique(np.concatenate([spread_out(n, limit), np.minimum(extremes, n - 1)]))
+    if len(values) <= limit:
+        return np.arange(len(values))
+    return np.union1d(spread_out(len(values), limit), keep_extremes([values], 1200))  # an extreme in every two pixels
 
 
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
@@ -676,28 +660,15 @@ def used_towers(data: ReportData) -> list[str]:
 
 
 def thinned_plan(east: FloatArray, north: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
-    """Every so many points of a plan line: shape matters there, not extremes."""
-    step = max(1, -(-len(east) // limit))
-    return east[::step], north[::step]
+    """A plan line of at most ``limit`` points: shape matters there, not extremes."""
+    rows = spread_out(len(east), limit)
+    return east[rows], north[rows]
 
 
-def only(ax: Axes, labels: Sequence[str]) -> tuple[list[Any], list[str]]:
-    """Handles and labels of the named legend entries."""
-    pairs = [(h, t) for h, t in zip(*ax.get_legend_handles_labels(), strict=True) if t in labels]
-    return [h for h, _ in pairs], [t for _, t in pairs]
-
-
-def signed(value: float) -> str:
-    """A number with its sign set off: ``+ 52.1``.
-
-    Examples
-    --------
-    >>> signed(52.13), signed(-4.0)
-    ('+ 52.1', '− 4.0')
-    """
-    if not np.isfinite(value):
-        return "(no offset) 0"
-    return f"{'−' if value < 0 else '+'} {abs(value):.1f}"
+def legend_of(ax: Axes, shown: Callable[[str], bool]) -> tuple[list[Any], list[str]]:
+    """Handles and labels of the legend entries that a rule wants."""
+    pairs = [(handle, label) for handle, label in zip(*ax.get_legend_handles_labels(), strict=True) if shown(label)]
+    return [handle for handle, _ in pairs], [label for _, label in pairs]
 
 
 def robust_limits(ax: Axes, levels: Sequence[FloatArray], around: float | None = None) -> None:
@@ -712,9 +683,3 @@ def robust_limits(ax: Axes, levels: Sequence[FloatArray], around: float | None =
         low, high = around - reach, around + reach
     margin = max(0.08 * (high - low), 0.5)
     ax.set_ylim(low - margin, high + margin)
-
-
-def first_labels(ax: Axes, count: int) -> tuple[list[Any], list[str]]:
-    """Legend entries but the waypoints."""
-    pairs = [(h, t) for h, t in zip(*ax.get_legend_handles_labels(), strict=True) if t != "waypoint"][:count]
-    return [h for h, _ in pairs], [t for _, t in pairs]

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..common.jsonable import fields_of, json_safe
+from ..common.jsonable import fields_of, json_object
 from .diff_data import ReportDiff
 from .diff_words import verdict
-from .export import write_file
-from .html import environment, policy
+from .export import json_text, write_file
+from .html import rendered
 
 
 def diff_metrics(diff: ReportDiff) -> dict[str, Any]:
     """Everything as plain JSON: verdict, differences, and the fields of the record."""
-    safe: dict[str, Any] = json_safe(
-        {
-            "verdict": verdict(diff),
-            "differs": bool(diff.differences),
-            "differences": diff.differences,
-            **fields_of(diff),
-        }
+    return json_object(
+        verdict=verdict(diff), differs=bool(diff.differences), differences=diff.differences, **fields_of(diff)
     )
-    return safe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,15 +62,10 @@ def whiskers(diff: ReportDiff) -> tuple[list[Whisker], float]:
 def diff_page(diff: ReportDiff) -> str:
     """The whole page."""
     rows, reach = whiskers(diff)
-    text: str = (
-        environment()
-        .get_template("diff.html.jinja")
-        .render(diff=diff, verdict=verdict(diff), whiskers=rows, reach=reach, content_policy=policy())
-    )
-    return text
+    return rendered("diff", diff=diff, verdict=verdict(diff), whiskers=rows, reach=reach)
 
 
 def write_diff(diff: ReportDiff, folder: Path) -> list[Path]:
     """Write ``diff.html`` and ``diff.json``; gives the files, page first."""
-    numbers = json.dumps(diff_metrics(diff), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    numbers = json_text(diff_metrics(diff))
     return [write_file(folder / "diff.html", diff_page(diff)), write_file(folder / "diff.json", numbers)]

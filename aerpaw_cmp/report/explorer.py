@@ -6,20 +6,19 @@ correlation and histograms of the chosen samples), by the same formulas as :mod:
 
 from __future__ import annotations
 
-import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ..common.units import BoolArray, FloatArray, IntArray
+from ..common.units import BoolArray, IntArray
 from ..compare.result import ModelLevel, RankResult, RssResult
 from ..compare.rss import RssComparison
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site
-from .canvas import seconds_since, spread_out, start_of
+from .canvas import keep_extremes, seconds_since, spread_out, start_of
 from .data import GEOMETRY, PosePaths, ReportData, Source
 from .names import k_key
 from .packed import PackedArrays
@@ -31,39 +30,6 @@ POINTS = 50_000
 
 TREES = 1500
 TRACK_POINTS = 4000
-
-
-def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
-    """Indices of at most about ``limit`` samples, with the smallest and largest of each array in each stretch.
-
-    Parameters
-    ----------
-    values : sequence of (n,)
-        Arrays whose extremes must stay; NaN counts as no extreme.
-    limit : int
-        Samples wanted.
-
-    Returns
-    -------
-    (m,) int
-        Rising; all of them when n <= limit.
-
-    Examples
-    --------
-    >>> keep_extremes([np.array([0.0, 5.0, 1.0, 0.0, -7.0, 0.0])], 3).tolist()
-    [0, 1, 4, 5]
-    """
-    n = len(values[0])
-    if n <= limit:
-        return np.arange(n)
-    stretches = max(1, limit // (2 * len(values)))
-    edges = np.linspace(0, n, stretches + 1).astype(np.int64)
-    kept = [np.array([0, n - 1])]
-    for array in values:
-        low, high = np.nan_to_num(array, nan=np.inf), np.nan_to_num(array, nan=-np.inf)
-        for start, stop in itertools.pairwise(edges):
-            kept.append(np.array([start + low[start:stop].argmin(), start + high[start:stop].argmax()]))
-    return np.unique(np.concatenate(kept))
 
 
 def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
@@ -189,9 +155,9 @@ def _paths(paths: PosePaths, start: np.datetime64) -> dict[str, Any]:
     }
 
 
-def scene(site: Site) -> dict[str, Any]:
+def scene(site: Site, most_trees: int = TREES) -> dict[str, Any]:
     """Towers, buildings, trees and forests as plain lists, rounded to 0.1 m."""
-    trees, pick = site.trees, spread_out(len(site.trees), TREES)
+    trees, pick = site.trees, spread_out(len(site.trees), most_trees)
     columns = ("east_m", "north_m", "ground_m", "height_m", "crown_diameter_m", "crown_base_m")
     return {
         "name": site.name,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -324,6 +325,20 @@ def _times(time: Any, part: slice) -> dict[str, Any]:
     first = known.min()
     seconds = (instants[part] - first) / np.timedelta64(1, "s")
     return {"time_utc": iso_time(instants[part]) if has_wall_clock(first) else "", "time_s": seconds}
+
+
+def json_text(numbers: Mapping[str, Any], indent: int | None = 2) -> str:
+    """Numbers as the text of a file."""
+    return json.dumps(numbers, indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def about(page: Any) -> dict[str, Any]:
+    """When and by what a page was made, in metrics.json: its ``generated``, ``versions`` and ``stages_s``."""
+    return {
+        "generated": page.generated,
+        "versions": dict(sorted(page.versions.items())),
+        "stages": {f"{name}_s": seconds for name, seconds in page.stages_s.items()},
+    }
 
 
 def write_file(path: Path, content: str | bytes | Iterator[str]) -> Path:

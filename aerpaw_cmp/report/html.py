@@ -10,9 +10,10 @@ import base64
 import hashlib
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,10 @@ from ..compare.ladder import LadderRow
 from ..compare.rss import PART_DB
 from ..logs.records import has_wall_clock
 from . import words
-from .canvas import Picture, start_of
+from .canvas import FigureSpec, Picture, start_of, write_figures
 from .data import RANKS, ReportData
 from .explorer import as_json, payload
-from .export import FITTED, further_numbers
+from .export import FITTED, further_numbers, json_text, write_file
 from .first_screen import headlines, verdict
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
@@ -184,11 +185,55 @@ def script(*names: str) -> str:
     return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
 
 
+def rendered(template: str, scripts: Sequence[str] = (), **content: Any) -> str:
+    """A page from its template, with its scripts and the content policy that lets a browser run them alone."""
+    code = script(*scripts) if scripts else ""
+    page = environment().get_template(f"{template}.html.jinja")
+    text: str = page.render(script=Markup(code), content_policy=policy(code), **content)
+    return text
+
+
+def embedded(content: Mapping[str, Any] | None) -> Markup:
+    """The data of a page's script, inside the page; empty without any."""
+    return Markup(as_json(content)) if content else Markup("")
+
+
+def write_page(
+    folder: Path, name: str, numbers: Mapping[str, Any], specs: Iterable[FigureSpec], **content: Any
+) -> list[Path]:
+    """Write ``metrics.json``, ``figures/`` and the page NAME.html of a job.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str
+        Of the page and its template.
+    numbers : mapping
+        For metrics.json.
+    specs : iterable of FigureSpec
+        Figures; the page has them by section in ``sections``.
+    content
+        For the template.
+
+    Returns
+    -------
+    list of Path
+        The page first.
+    """
+    drawn, figures = write_figures(list(specs), folder / "figures")
+    page = rendered(name, sections=by_section(drawn), **content)
+    return [
+        write_file(folder / f"{name}.html", page),
+        write_file(folder / "metrics.json", json_text(numbers)),
+        *figures,
+    ]
+
+
 def by_section(pictures: Sequence[Picture]) -> dict[str, list[Picture]]:
     """Pictures in their order, by the section that they stand in."""
     sections: dict[str, list[Picture]] = {}
     for picture in pictures:
-        sections.setdefault(picture.section, []).append(picture)
+        sections.setdefault(picture.spec.section, []).append(picture)
     return sections
 
 
@@ -214,16 +259,15 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
     files : sequence of str
         Names of the files beside the page.
     """
-    template = environment().get_template("report.html.jinja")
-    linked = bool(data.rss or data.rank)
-    code = script("uplot.min.js", "common.js", "explorer.js") if linked else ""
+    linked = payload(data) if data.rss or data.rank else None
     sections = by_section(pictures)
-    text: str = template.render(
+    return rendered(
+        "report",
+        ("uplot.min.js", "common.js", "explorer.js") if linked else (),
         data=data,
         sections=sections,
         overview=next(iter(sections.get("overview", [])), None),
-        explorer=Markup(as_json(payload(data))) if linked else "",
-        script=Markup(code),
+        explorer=embedded(linked),
         first_words=verdict(data),
         numbers=headlines(data),
         start=start_of(data),
@@ -243,6 +287,4 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         rank_columns=RANK_COLUMNS,
         rejected_shown=REJECTED_SHOWN,
         pretty=words.pretty,
-        content_policy=policy(code),
     )
-    return text

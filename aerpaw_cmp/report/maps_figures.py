@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -330,118 +331,67 @@ def level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
 
 def figure_specs(data: MapsData) -> list[FigureSpec]:
     """Every figure that the data allow, in reading order."""
-    result: list[FigureSpec] = []
+    return [*_rss_specs(data), *_rank_specs(data), *_kriging_specs(data)]
+
+
+def _under(foliage: str) -> str:
+    return f", foliage {foliage}" if foliage else ""
+
+
+def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
     levels = (*data.rss, *data.corrected)
     limits = level_limits(levels)
-    for (antennas, foliage, height), maps in grouped(
-        levels, lambda one: (one.antennas, one.foliage, one.altitude_m)
-    ).items():
-        words = f"{antennas}{f', foliage {foliage}' if foliage else ''}, {height:g} m"
-        result.append(_rss_spec(data, maps, limits, words))
-    for (antennas, foliage), maps in grouped(levels, lambda one: (one.antennas, one.foliage)).items():
-        words = f"{antennas}{f', foliage {foliage}' if foliage else ''}"
-        result.append(
-            FigureSpec(
-                name=f"rss_cdf_{safe_name(words)}",
-                section="rss",
-                title=f"Distribution of RSS, {words}",
-                caption="Share of positions with an RSS below the value; a curve starts at its share of Z.",
-                alt=f"Distribution functions of RSS, {words}.",
-                draw=lambda maps=maps: cdfs(maps),  # type: ignore[misc]
-            )
-        )
-    return result + _rank_specs(data) + _layer_specs(data) + _kriging_specs(data)
+    by_height = grouped(levels, lambda one: (f"{one.antennas}{_under(one.foliage)}", one.altitude_m))
+    for (antennas, height), maps in by_height.items():
+        words = f"{antennas}, {height:g} m"
+        yield FigureSpec(
+            f"rss_map_{safe_name(words)}", "rss", f"RSS, {words}",
+            "Each tower alone and, where shown, jointly with the nearest tower serving. Percentages: positions in "
+            "coverage. One colour scale for all RSS maps.",
+            partial(rss_maps, data, maps, limits),
+        )  # fmt: skip
+    for words, maps in grouped(levels, lambda one: f"{one.antennas}{_under(one.foliage)}").items():
+        yield FigureSpec(
+            f"rss_cdf_{safe_name(words)}", "rss", f"Distribution of RSS, {words}",
+            "Share of positions with an RSS below the value; a curve starts at its share of Z.",
+            partial(cdfs, maps),
+        )  # fmt: skip
 
 
-def _rss_spec(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float], words: str) -> FigureSpec:
-    return FigureSpec(
-        name=f"rss_map_{safe_name(words)}",
-        section="rss",
-        title=f"RSS, {words}",
-        caption="Each tower alone and, where shown, jointly with the nearest tower serving. Percentages: positions in "
-        "coverage. One colour scale for all RSS maps.",
-        alt=f"RSS maps of {', '.join(one.tower for one in maps)}, {words}.",
-        draw=lambda: rss_maps(data, maps, limits),
-    )
+def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
+    for words, maps in grouped(data.rank, lambda one: f"K = {k_key(one.k)}{_under(one.foliage)}").items():
+        yield FigureSpec(
+            f"rank_map_{safe_name(words)}", "rank", f"Rank, {words}", "The nearest tower serves. Hatched: no path.",
+            partial(rank_grid, data, maps),
+        )  # fmt: skip
+    for words, maps in grouped(data.rank, lambda one: _under(one.foliage)).items():
+        yield FigureSpec(
+            "_".join(["rank_share", *([safe_name(words)] if words else [])]), "rank", f"Rank against height{words}",
+            "Share of positions with each rank; Z is out of coverage.",
+            partial(rank_shares, maps),
+        )  # fmt: skip
+    for name, layers in grouped(data.layers, lambda one: one.name).items():
+        caption = f"{layers[0].label[0].upper()}{layers[0].label[1:]}. Hatched: no path."
+        yield FigureSpec(f"layer_{safe_name(name)}", "layers", name, caption, partial(layer_maps, data, layers))
 
 
-def _rank_specs(data: MapsData) -> list[FigureSpec]:
-    result = []
-    for (k, foliage), maps in grouped(data.rank, lambda one: (one.k, one.foliage)).items():
-        words = f"K = {k_key(k)}{f', foliage {foliage}' if foliage else ''}"
-        result.append(
-            FigureSpec(
-                name=f"rank_map_{safe_name(words)}",
-                section="rank",
-                title=f"Rank, {words}",
-                caption="The nearest tower serves. Hatched: no path.",
-                alt=f"Rank maps at {', '.join(f'{one.altitude_m:g} m' for one in maps)}, {words}.",
-                draw=lambda maps=maps: rank_grid(data, maps),  # type: ignore[misc]
-            )
-        )
-    for foliage, maps in grouped(data.rank, lambda one: one.foliage).items():
-        words = f", foliage {foliage}" if foliage else ""
-        result.append(
-            FigureSpec(
-                name=f"rank_share{f'_{safe_name(words)}' if words else ''}",
-                section="rank",
-                title=f"Rank against height{words}",
-                caption="Share of positions with each rank; Z is out of coverage.",
-                alt="Stacked bars of rank shares against height for each K.",
-                draw=lambda maps=maps: rank_shares(maps),  # type: ignore[misc]
-            )
-        )
-    return result
-
-
-def _layer_specs(data: MapsData) -> list[FigureSpec]:
-    return [
-        FigureSpec(
-            name=f"layer_{safe_name(name)}",
-            section="layers",
-            title=name,
-            caption=f"{layers[0].label[0].upper()}{layers[0].label[1:]}. Hatched: no path.",
-            alt=f"Maps of {name}.",
-            draw=lambda layers=layers: layer_maps(data, layers),  # type: ignore[misc]
-        )
-        for name, layers in grouped(data.layers, lambda one: one.name).items()
-    ]
-
-
-def _kriging_specs(data: MapsData) -> list[FigureSpec]:
-    result = []
+def _kriging_specs(data: MapsData) -> Iterator[FigureSpec]:
     if data.correlation:
-        result.append(
-            FigureSpec(
-                name="correlation",
-                section="kriging",
-                title="Spatial correlation",
-                caption="Pearson correlation between positions against their distance, and the fitted model. "
-                + " ".join(f"{c.title}: {c.excluded} constant positions left out." for c in data.correlation),
-                alt="Correlation against distance with its model.",
-                draw=lambda: correlations(data.correlation),
-            )
-        )
+        yield FigureSpec(
+            "correlation", "kriging", "Spatial correlation",
+            "Pearson correlation between positions against their distance, and the fitted model. "
+            + " ".join(f"{c.title}: {c.excluded} constant positions left out." for c in data.correlation),
+            partial(correlations, data.correlation),
+        )  # fmt: skip
     for evaluation, errors in grouped(data.errors, lambda one: one.evaluation).items():
-        result.append(
-            FigureSpec(
-                name=f"mae_{safe_name(evaluation)}",
-                section="kriging",
-                title=f"Error of interpolated rank, {evaluation}",
-                caption="Mean absolute error against height; lower is better.",
-                alt=f"Error against height for each method, {evaluation}.",
-                draw=lambda errors=errors: error_curves(errors),  # type: ignore[misc]
-            )
-        )
+        yield FigureSpec(
+            f"mae_{safe_name(evaluation)}", "kriging", f"Error of interpolated rank, {evaluation}",
+            "Mean absolute error against height; lower is better.",
+            partial(error_curves, errors),
+        )  # fmt: skip
     if data.learning:
-        result.append(
-            FigureSpec(
-                name="learning_curve",
-                section="kriging",
-                title="How many samples are needed",
-                caption="Mean absolute error against the number of samples given.",
-                alt="Error against number of samples for each method.",
-                draw=lambda: learning_curves(data.learning),
-            )
-        )
-    return result
+        yield FigureSpec(
+            "learning_curve", "kriging", "How many samples are needed",
+            "Mean absolute error against the number of samples given.",
+            partial(learning_curves, data.learning),
+        )  # fmt: skip

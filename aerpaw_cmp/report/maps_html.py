@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-
-from ..common.jsonable import json_safe
+from ..common.jsonable import json_object, json_safe
 from . import canvas, maps_figures
 from .canvas import Picture
 from .data import RANKS
-from .explorer import as_json
-from .export import merge, write_file
-from .html import by_section, environment, policy, script
+from .export import about, json_text, merge, write_file
+from .html import by_section, embedded, rendered
 from .map_explorer import layer_numbers, page_layers, payload
 from .map_words import first_words, notes, warnings
 from .maps_data import MapError, MapsData
@@ -29,30 +25,27 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
         return {name: getattr(item, name) for name in names}
 
     columns, rows = len(data.east_m), len(data.north_m)
-    result: dict[str, Any] = {
-        "name": data.name,
-        "title": data.title,
-        "generated": data.generated,
-        "site": {"name": data.site.name, "illustrative": data.site.illustrative},
-        "versions": dict(sorted(data.versions.items())),
-        "grid": {"columns": columns, "rows": rows, "positions": columns * rows},
-        "coverage": [picked(m, "tower", "antennas", "foliage", "altitude_m", "coverage") for m in data.rss],
-        "rank": [
+    numbers = json_object(
+        name=data.name,
+        title=data.title,
+        site={"name": data.site.name, "illustrative": data.site.illustrative},
+        grid={"columns": columns, "rows": rows, "positions": columns * rows},
+        coverage=[picked(m, "tower", "antennas", "foliage", "altitude_m", "coverage") for m in data.rss],
+        rank=[
             {
                 **picked(m, "k", "foliage", "altitude_m"),
                 "share": dict(zip(("Z", *map(str, RANKS)), m.share, strict=True)),
             }
             for m in data.rank
         ],
-        "layers": [layer_numbers(layer) for layer in page_layers(data)],
-        "mae": [picked(e, "evaluation", "method", "k", "altitude_m", "mae", "mae_ci95", "n") for e in data.errors],
-        "paper": [picked(p, "where", "what", "paper", "ours") for p in data.paper],
-        "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
-        "warnings": warnings(data),
-    }
-    safe: dict[str, Any] = json_safe(result)
-    merge(safe, json_safe(data.metrics))
-    return safe
+        layers=[layer_numbers(layer) for layer in page_layers(data)],
+        mae=[picked(e, "evaluation", "method", "k", "altitude_m", "mae", "mae_ci95", "n") for e in data.errors],
+        paper=[picked(p, "where", "what", "paper", "ours") for p in data.paper],
+        warnings=warnings(data),
+        **about(data),
+    )
+    merge(numbers, json_safe(data.metrics))
+    return numbers
 
 
 def coverage_table(data: MapsData) -> tuple[list[str], list[tuple[list[str], list[float | None]]]]:
@@ -84,8 +77,9 @@ def error_tables(
 def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page."""
     linked = payload(data) if data.rss or data.rank or data.layers or data.further else None
-    code = script("common.js", "map_explorer.js") if linked else ""
-    text: str = environment().get_template("map.html.jinja").render(
+    return rendered(
+        "map",
+        ("common.js", "map_explorer.js") if linked else (),
         data=data,
         verdict=first_words(data),
         warnings=warnings(data),
@@ -93,19 +87,16 @@ def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str])
         sections=by_section(pictures),
         coverage=coverage_table(data),
         errors=error_tables(data.errors),
-        names={picture.name for picture in pictures},
+        names={picture.spec.name for picture in pictures},
         files=files,
-        explorer=Markup(as_json(linked)) if linked else "",
-        script=Markup(code),
-        content_policy=policy(code),
-    )  # fmt: skip
-    return text
+        explorer=embedded(linked),
+    )
 
 
 def write_maps(data: MapsData, folder: str | Path) -> list[Path]:
     """Write ``map.html``, ``metrics.json`` and ``figures/``; returns the files, the page first."""
     folder = Path(folder)
-    written = [write_file(folder / "metrics.json", json.dumps(maps_metrics(data), indent=2, ensure_ascii=False) + "\n")]
+    written = [write_file(folder / "metrics.json", json_text(maps_metrics(data)))]
     drawn, pictures = canvas.write_figures(maps_figures.figure_specs(data), folder / "figures")
     written += pictures
     page = write_file(folder / "map.html", maps_page(data, drawn, ["metrics.json"]))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from ..common.cells import guarded
-from ..common.jsonable import json_safe
+from ..common.jsonable import json_object
 from ..common.units import FloatArray
 from . import canvas
-from .canvas import FigureSpec, Picture
-from .export import write_file
-from .html import by_section, environment, policy
+from .canvas import FigureSpec
+from .export import about, write_file
+from .html import write_page
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,63 +51,44 @@ class PlanPage:
 
 def plan_metrics(data: PlanPage) -> dict[str, Any]:
     """The numbers of the page under stable names."""
-    safe: dict[str, Any] = json_safe(
-        {
-            "target": data.target,
-            "sentence": data.sentence,
-            "antennas": list(data.antennas),
-            "flights": list(data.flights),
-            "sd_now_db": float(np.sqrt(np.mean(data.before_db**2))),
-            "candidates": list(data.candidates),
-            "length": list(data.curve),
-            "warnings": list(data.warnings),
-            "generated": data.generated,
-            "versions": dict(sorted(data.versions.items())),
-            "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
-        }
+    return json_object(
+        target=data.target,
+        sentence=data.sentence,
+        antennas=data.antennas,
+        flights=data.flights,
+        sd_now_db=float(np.sqrt(np.mean(data.before_db**2))),
+        candidates=data.candidates,
+        length=data.curve,
+        warnings=data.warnings,
+        **about(data),
     )
-    return safe
 
 
 def write_plan(data: PlanPage, folder: Path) -> list[Path]:
     """Write the page and all files beside it; the page first."""
-    written = [write_file(folder / "metrics.json", json.dumps(plan_metrics(data), indent=2) + "\n")]
+    numbers = plan_metrics(data)
+    written = write_page(folder, "plan", numbers, _figures(data), data=data, metrics=numbers)
     written += [write_file(folder / name, text) for name, text in data.files.items()]
     columns = dict(zip(("east_m", "north_m", "height_m"), data.place_m.T, strict=True))
     table: pd.DataFrame = pd.DataFrame({**columns, "sd_before_db": data.before_db, "sd_after_db": data.after_db})
     guarded(table.round(3)).to_csv(folder / "sd_map.csv", index=False, lineterminator="\n")
-    drawn, files = canvas.write_figures(_figures(data), folder / "figures")
-    page = write_file(folder / "plan.html", _page(data, drawn))
-    return [page, *written, folder / "sd_map.csv", *files]
+    return [*written, folder / "sd_map.csv"]
 
 
-def _figures(data: PlanPage) -> list[FigureSpec]:
-    out = [
-        FigureSpec(
-            name="map",
-            section="maps",
-            title="Standard deviation before and after the proposed flight",
-            caption="Root mean square over antennas and headings at each point of the target, dB. Line: the proposed "
-            "route. Grey: where a route may run.",
-            alt="Two maps of the expected standard deviation with the proposed route",
-            draw=lambda: _draw_map(data),
-            page=True,
-        )
-    ]
+def _figures(data: PlanPage) -> Iterator[FigureSpec]:
+    yield FigureSpec(
+        "map", "maps", "Standard deviation before and after the proposed flight",
+        "Root mean square over antennas and headings at each point of the target, dB. Line: the proposed route. Grey: "
+        "where a route may run.",
+        partial(_draw_map, data),
+    )  # fmt: skip
     if len(data.curve) > 1:
-        out.append(
-            FigureSpec(
-                name="length",
-                section="length",
-                title="What a longer flight buys",
-                caption="The best of three candidates, flown for a part of the battery or beyond it; a longer flight "
-                "may hold the shorter one. Dashed: no further flight.",
-                alt="Expected standard deviation against flight time",
-                draw=lambda: _draw_curve(data),
-                page=True,
-            )
-        )
-    return out
+        yield FigureSpec(
+            "length", "length", "What a longer flight buys",
+            "The best of three candidates, flown for a part of the battery or beyond it; a longer flight may hold the "
+            "shorter one. Dashed: no further flight.",
+            partial(_draw_curve, data),
+        )  # fmt: skip
 
 
 def _draw_map(data: PlanPage) -> Figure:
@@ -147,12 +128,3 @@ def _draw_curve(data: PlanPage) -> Figure:
     ax.set_ylabel("standard deviation over the target [dB]")
     ax.set_ylim(bottom=0.0)
     return fig
-
-
-def _page(data: PlanPage, pictures: Sequence[Picture]) -> str:
-    text: str = (
-        environment()
-        .get_template("plan.html.jinja")
-        .render(data=data, metrics=plan_metrics(data), sections=by_section(pictures), content_policy=policy())
-    )
-    return text

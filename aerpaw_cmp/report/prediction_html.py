@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,13 +15,12 @@ from matplotlib.figure import Figure
 from ..common.cells import guarded
 from ..common.cf import dataset, file_attributes, netcdf_bytes
 from ..common.errors import UsageError
-from ..common.jsonable import json_safe
-from ..common.provenance import KEY
+from ..common.jsonable import json_object
 from ..site.site import Site
 from . import canvas
-from .canvas import FigureSpec, Picture
-from .export import write_file
-from .html import by_section, environment, policy
+from .canvas import FigureSpec
+from .export import about, write_file
+from .html import write_page
 from .names import safe_name
 from .prediction_words import FLAGS
 
@@ -72,26 +70,21 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
         for name, part in data.series
     }
     ranks = data.table[data.table["channel"] == "rank"]
-    safe: dict[str, Any] = json_safe(
-        {
-            "prediction": data.name,
-            "kind": data.kind,
-            "generated": data.generated,
-            "versions": dict(sorted(data.versions.items())),
-            "flights": list(data.flights),
-            KEY: list(data.trained_on),
-            "sentence": data.verdict,
-            "threshold_db": data.threshold_db,
-            "chosen": dict(data.chosen),
-            "candidates": list(data.candidates),
-            "field": dict(data.model),
-            "series": series,
-            "ranks": {tower: {k: part[f"p_rank{k}"].mean() for k in "1234"} for tower, part in ranks.groupby("tower")},
-            "warnings": list(data.warnings),
-            "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
-        }
+    return json_object(
+        prediction=data.name,
+        kind=data.kind,
+        flights=data.flights,
+        trained_on=data.trained_on,
+        sentence=data.verdict,
+        threshold_db=data.threshold_db,
+        chosen=data.chosen,
+        candidates=data.candidates,
+        field=data.model,
+        series=series,
+        ranks={tower: {k: part[f"p_rank{k}"].mean() for k in "1234"} for tower, part in ranks.groupby("tower")},
+        warnings=data.warnings,
+        **about(data),
     )
-    return safe
 
 
 def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], list[str]]:
@@ -108,20 +101,17 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
         The page first.
     said : list of str
     """
-    written = [write_file(folder / "metrics.json", json.dumps(prediction_metrics(data), indent=2) + "\n")]
+    numbers = prediction_metrics(data)
+    written = write_page(folder, "prediction", numbers, _figures(data), data=data, metrics=numbers, flags=FLAGS)
     rounded = data.table.round({c: 3 for c in data.table.columns if c.endswith(("_db", "_m", "_deg", "_s"))})
     rounded = rounded.round({c: 4 for c in data.table.columns if c.startswith("p_")})
     guarded(rounded).to_csv(folder / "prediction.csv", index=False, lineterminator="\n")
     written.append(folder / "prediction.csv")
-    said = []
     try:
-        (folder / "prediction.nc").write_bytes(netcdf_bytes(_dataset(data)))
-        written.append(folder / "prediction.nc")
+        written.append(write_file(folder / "prediction.nc", bytes(netcdf_bytes(_dataset(data)))))
     except UsageError as missing:
-        said.append(str(missing))
-    drawn, files = canvas.write_figures(_figures(data), folder / "figures")
-    page = write_file(folder / "prediction.html", _page(data, drawn))
-    return [page, *written, *files], said
+        return written, [str(missing)]
+    return written, []
 
 
 def _dataset(data: PredictionPage) -> Any:
@@ -149,33 +139,28 @@ def _dataset(data: PredictionPage) -> Any:
 # --- figures -------------------------------------------------------------------------------------------------------
 
 
-def _figures(data: PredictionPage) -> list[FigureSpec]:
-    out = []
+def _figures(data: PredictionPage) -> Iterator[FigureSpec]:
+    size = 0 if data.shape is None else data.shape[0] * data.shape[1]
     for name, part in data.series:
-        if data.shape is not None:
-            for k, height in enumerate(data.heights_m):
-                count = data.shape[0] * data.shape[1]
-                some = part.iloc[k * count : (k + 1) * count]
-                out.append(_spec(data, f"{name}, {height:g} m", some, partial(_draw_map, data, some)))
-        else:
-            out.append(_spec(data, name, part, partial(_draw_map, data, part)))
+        for k, height in enumerate(data.heights_m if size else ()):
+            yield _map_spec(data, name, part.iloc[k * size : (k + 1) * size], f", {height:g} m")
+        if not size:
+            yield _map_spec(data, name, part)
             if data.kind == "route":
-                out.append(_profile(data, name, part))
-    return out
+                yield FigureSpec(
+                    f"route_{safe_name(name)}", "routes", f"{name} along the route",
+                    "The interval holds one sample in nine of ten cases: model, field, flight, noise and fading.",
+                    partial(_draw_profile, data, name, part),
+                )  # fmt: skip
 
 
-def _spec(data: PredictionPage, name: str, part: pd.DataFrame, draw: Any) -> FigureSpec:
-    unit = data.units.get(" ".join(name.split(",")[0].split()), "dB")
+def _map_spec(data: PredictionPage, name: str, part: pd.DataFrame, height: str = "") -> FigureSpec:
     return FigureSpec(
-        name=f"map_{safe_name(name)}",
-        section="maps",
-        title=name,
-        caption=f"Median level [{unit}] and the standard deviation of one sample [dB]. Grey lines: flights that were "
-        f"learned from. Median SD {part['sd_db'].median():.1f} dB.",
-        alt=f"Map of predicted level and standard deviation, {name}",
-        draw=draw,
-        page=True,
-    )
+        f"map_{safe_name(name + height)}", "maps", name + height,
+        f"Median level [{data.units.get(name, 'dB')}] and the standard deviation of one sample [dB]. Grey lines: "
+        f"flights that were learned from. Median SD {part['sd_db'].median():.1f} dB.",
+        partial(_draw_map, data, part),
+    )  # fmt: skip
 
 
 def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
@@ -207,38 +192,16 @@ def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
     return fig
 
 
-def _profile(data: PredictionPage, name: str, part: pd.DataFrame) -> FigureSpec:
-    def draw() -> Figure:
-        fig = canvas.figure((9.2, 3.2))
-        ax = fig.subplots()
-        time = part["time_s"].to_numpy()
-        ax.fill_between(time, part["q05_db"], part["q95_db"], color=canvas.SIMULATED, alpha=0.25, linewidth=0,
-                        label="90 % interval of one sample")  # fmt: skip
-        ax.plot(time, part["level_db"], color=canvas.SIMULATED, linewidth=1.2, label="median")
-        if data.threshold_db is not None:
-            ax.axhline(data.threshold_db, color="0.4", linestyle="--", linewidth=1, label="threshold")
-        ax.set_xlabel("time along the route [s]")
-        ax.set_ylabel(f"level [{data.units.get(name, 'dB')}]")
-        canvas.legend_below(ax, 3)
-        return fig
-
-    return FigureSpec(
-        name=f"route_{safe_name(name)}",
-        section="routes",
-        title=f"{name} along the route",
-        caption="The interval holds one sample in nine of ten cases: model, field, flight, noise and fading.",
-        alt=f"Predicted level of {name} over time with its 90 % interval",
-        draw=draw,
-        page=True,
-    )
-
-
-def _page(data: PredictionPage, pictures: Sequence[Picture]) -> str:
-    text: str = environment().get_template("prediction.html.jinja").render(
-        data=data,
-        metrics=prediction_metrics(data),
-        flags=FLAGS,
-        sections=by_section(pictures),
-        content_policy=policy(),
-    )  # fmt: skip
-    return text
+def _draw_profile(data: PredictionPage, name: str, part: pd.DataFrame) -> Figure:
+    fig = canvas.figure((9.2, 3.2))
+    ax = fig.subplots()
+    time = part["time_s"].to_numpy()
+    ax.fill_between(time, part["q05_db"], part["q95_db"], color=canvas.SIMULATED, alpha=0.25, linewidth=0,
+                    label="90 % interval of one sample")  # fmt: skip
+    ax.plot(time, part["level_db"], color=canvas.SIMULATED, linewidth=1.2, label="median")
+    if data.threshold_db is not None:
+        ax.axhline(data.threshold_db, color="0.4", linestyle="--", linewidth=1, label="threshold")
+    ax.set_xlabel("time along the route [s]")
+    ax.set_ylabel(f"level [{data.units.get(name, 'dB')}]")
+    canvas.legend_below(ax, 3)
+    return fig

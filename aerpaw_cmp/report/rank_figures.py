@@ -16,14 +16,13 @@ from .canvas import (
     TOWER,
     WAYPOINT,
     colour_bar,
-    count,
     draw_out_of_coverage,
     draw_site,
     draw_waypoints,
     figure,
-    first_labels,
     frame_around,
     legend_below,
+    legend_of,
     plain_ticks,
     plan_shape,
     rank_colour,
@@ -33,6 +32,7 @@ from .canvas import (
 )
 from .data import RANKS, ReportData
 from .names import k_key
+from .words import count
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,9 +70,8 @@ def rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: Fl
             zorder=3.0 + 1.0 / number,  # the rarer a rank, the higher it lies: a few points must not vanish under many
         )  # fmt: skip
     ax.set_title(title)
-    pairs = [(h, t) for h, t in zip(*ax.get_legend_handles_labels(), strict=True) if t.startswith(("rank", "Z"))]
-    if pairs:
-        handles, labels = zip(*pairs, strict=True)
+    handles, labels = legend_of(ax, lambda label: label.startswith(("rank", "Z")))
+    if handles:
         ax.legend(
             handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, markerscale=1.6,
             columnspacing=1.0,
@@ -155,7 +154,7 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
         ax.set_yticks(RANKS)
         ax.set_ylim(0.5, 4.5)
         ax.set_ylabel("Rank")
-        ax.legend(*first_labels(ax, 2), loc="center left", bbox_to_anchor=(1.0, 0.5))
+        ax.legend(*legend_of(ax, lambda label: label != "waypoint"), loc="center left", bbox_to_anchor=(1.0, 0.5))
     if panel.sinr_db is not None:
         axes[rows].plot(
             seconds, panel.sinr_db, linestyle="none", marker=".", markersize=2, color="#0072B2", rasterized=True,
@@ -197,7 +196,7 @@ def rank_forecast(data: ReportData, panel: RankResult) -> Figure:
     lower.set_yticks(RANKS)
     lower.set_ylim(0.5, 4.5)
     lower.set_ylabel("Rank")
-    lower.legend(*first_labels(lower, 2), loc="center left", bbox_to_anchor=(1.0, 0.5))
+    lower.legend(*legend_of(lower, lambda label: label != "waypoint"), loc="center left", bbox_to_anchor=(1.0, 0.5))
     time_axis(lower, start)
     return fig
 

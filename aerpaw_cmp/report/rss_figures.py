@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..common.units import FloatArray
+from ..compare.detection import DetectionScore
 from ..compare.ladder import LadderRow
 from ..compare.result import PairResult, RankResult, RssResult
 from ..compare.rss import PART_DB
@@ -22,18 +23,16 @@ from .canvas import (
     beyond,
     cloud,
     colour_bar,
-    count,
     draw_out_of_coverage,
     draw_site,
     draw_waypoints,
     figure,
     frame_around,
     legend_below,
+    legend_of,
     lonely,
-    only,
     robust_limits,
     seconds_since,
-    signed,
     spread_out,
     start_of,
     thinned,
@@ -42,7 +41,7 @@ from .canvas import (
     used_towers,
 )
 from .data import GEOMETRY, ReportData, Track
-from .words import pretty
+from .words import count, pretty, signed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -127,7 +126,9 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     whole.set_title("Whole site")
     close.set_title("The flight")
     whole.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
-    close.legend(*only(close, ("flight (colour: height)",)), loc="upper center", bbox_to_anchor=(0.5, -0.12))
+    close.legend(
+        *legend_of(close, lambda label: label.startswith("flight")), loc="upper center", bbox_to_anchor=(0.5, -0.12)
+    )
     return fig
 
 
@@ -163,7 +164,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     few = cloud(calibrated)
     ax.plot(
         seconds[few], calibrated[few], linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
-        label=f"measured {signed(score.offset_db)} dB ({count(score.n)} scored)", zorder=3.5,
+        label=f"measured, {_offset(score.offset_db)} ({count(score.n)} scored)", zorder=3.5,
     )  # fmt: skip
     for number, (name, baseline) in enumerate(panel.baselines.items()):
         colour, dashes = baseline_style(name, number)
@@ -202,11 +203,15 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     robust_limits(below, [residual], around=0.0)
     below.set_ylabel("Residual [dB]")
     time_axis(below, start)
-    handles, labels = only(below, ("measured − simulated", f"RMSE {score.rmse_db:.1f} dB"))
+    shown = legend_of(below, lambda label: label.startswith(("measured", "RMSE")))
     below.legend(
-        handles, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1
+        *shown, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1
     )  # fmt: skip
     return fig
+
+
+def _offset(offset_db: float) -> str:
+    return f"offset {signed(offset_db)} dB" if np.isfinite(offset_db) else "no offset"
 
 
 def rss_diagnostics(panel: RssResult) -> Figure:
@@ -273,7 +278,7 @@ def offset_curve(ax: Axes, panel: RssResult) -> None:
         edge = " (edge of the search!)" if score.at_edge else ""
         ax.plot(
             score.offset_db, score.rmse_db, marker="o", color=TOWER, linestyle="none",
-            label=f"chosen: {signed(score.offset_db).replace(' ', '')} dB{edge}",
+            label=f"chosen: {signed(score.offset_db)} dB{edge}",
         )  # fmt: skip
     for number, (name, baseline) in enumerate(panel.baselines.items()):
         colour, dashes = baseline_style(name, number)
@@ -296,10 +301,8 @@ def offset_curve(ax: Axes, panel: RssResult) -> None:
     ax.legend(loc="upper center", fontsize=7)
 
 
-def detection_reliability(panel: RssResult) -> Figure:
+def detection_reliability(score: DetectionScore) -> Figure:
     """Share of detected samples over the probability that the predicted level gave them; area: samples."""
-    score = panel.further.detection
-    assert score is not None
     said, seen, n = np.array(score.reliability, dtype=np.float64).T
     fig = figure((4.8, 3.6))
     ax = fig.subplots()
@@ -365,29 +368,33 @@ def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssResult) -> None:
     if good.sum() < 40 or np.ptp(quantity[good]) == 0:
         return
     bins = int(np.clip(good.sum() // 40, 8, 20))
-    middle, low, median, high = running_levels(quantity[good], residual[good], bins).T
+    middle, low, median, high = running_levels(quantity, residual, bins).T
     ax.plot(middle, median, color=SIMULATED, linewidth=1.3, marker="o", markersize=1.6, label="median")
     ax.plot(middle, low, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)), label="10 % and 90 %")
     ax.plot(middle, high, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)))
 
 
-def running_levels(quantity: FloatArray, values: FloatArray, bins: int = 20, fewest: int = 8) -> FloatArray:
-    """Mean quantity and 10, 50, 90 % points of the values in bins of equal width (bins, 4).
+FEWEST_PER_BIN = 8
+"""Samples that a bin needs: no line is drawn over what was not flown."""
 
-    NaN where a bin has fewer than ``fewest`` samples: no line is drawn over what was not flown.
+
+def running_levels(
+    quantity: FloatArray, values: FloatArray, bins: int = 20, span: tuple[float, float] | None = None
+) -> FloatArray:
+    """Mean quantity and 10, 50, 90 % points of the values in bins of equal width.
 
     Parameters
     ----------
     quantity, values : (n,)
-        Finite numbers.
+        Pairs with a NaN do not count.
     bins : int
-    fewest : int
-        Samples that a bin needs.
+    span : (low, high), optional
+        Of the bins; by default that of the quantity.
 
     Returns
     -------
     (bins, 4)
-        Mean quantity, then the 10, 50 and 90 % points of the values.
+        Mean quantity, then the 10, 50 and 90 % points of the values; NaN below :data:`FEWEST_PER_BIN` samples.
 
     Examples
     --------
@@ -396,12 +403,17 @@ def running_levels(quantity: FloatArray, values: FloatArray, bins: int = 20, few
     >>> np.flatnonzero(np.isfinite(levels[:, 2])).tolist(), levels[0].round(3).tolist()
     ([0, 1, 18, 19], [9.5, 1.9, 9.5, 17.1])
     """
-    edges = np.linspace(quantity.min(), quantity.max(), bins + 1)
-    which = np.clip(np.searchsorted(edges, quantity, side="right") - 1, 0, bins - 1)
+    good = np.isfinite(quantity) & np.isfinite(values)
+    quantity, values = quantity[good], values[good]
     levels = np.full((bins, 4), np.nan)
+    if not len(quantity):
+        return levels
+    low, high = span or (float(quantity.min()), float(quantity.max()))
+    edges = np.linspace(low, high, bins + 1)
+    which = np.clip(np.searchsorted(edges, quantity, side="right") - 1, 0, bins - 1)
     for number in range(bins):
         inside = which == number
-        if inside.sum() >= fewest:
+        if inside.sum() >= FEWEST_PER_BIN:
             levels[number] = quantity[inside].mean(), *np.percentile(values[inside], [10, 50, 90])
     return levels
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..common.units import AnyArray
 from ..compare.serving import ServingComparison
-from .canvas import TOWER, FigureSpec, colour_bar, count, figure
+from .canvas import TOWER, FigureSpec, colour_bar, figure
+from .words import count
 
 MOST_CELLS = 16
 """Cells with a row of their own; the others stand together."""
@@ -71,15 +72,12 @@ def _frame(place: int) -> Any:
 
 def serving_spec(serving: ServingComparison) -> FigureSpec:
     """The matrix with its words."""
-    n_cells = int((np.asarray(serving.confusion).sum(axis=1) > 0).sum())
     return FigureSpec(
-        name="serving_confusion",
-        page=True,
-        section="serving",
-        title="Which cell serves",
-        caption=f"Counts of {count(serving.n)} samples; colour is the share of each cell that served (rows). Framed: "
+        "serving_confusion",
+        "serving",
+        "Which cell serves",
+        f"Counts of {count(serving.n)} samples; colour is the share of each cell that served (rows). Framed: "
         f"the cell predicted strongest served, {100 * serving.hit_share:.0f} % of all; always naming the cell that "
         f"served most hits {100 * serving.majority_share:.0f} %. Levels are as simulated, without offsets.",
-        alt=f"Confusion matrix of {n_cells} serving cells against the cells predicted strongest.",
-        draw=lambda: confusion(serving),
+        lambda: confusion(serving),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from ..common.stages import Stages
 from . import figures, html
 from .canvas import FORMATS, STYLES, write_figures
 from .data import ReportData
-from .export import metrics, rank_csv, rss_csv, write_file
+from .export import json_text, metrics, rank_csv, rss_csv, write_file
 from .exports.formats import FOLDER
 
 PAGE = "page"
@@ -87,5 +86,5 @@ def write_report(
         shown = [one for one in pictures if {"png", "svg"} & set(one.formats)]
         page = write_file(folder / "report.html", html.page(data, shown, files))
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
-    numbers = json.dumps(metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    return WrittenReport(files=(page, *written, write_file(folder / "metrics.json", numbers)), data=data)
+    numbers = write_file(folder / "metrics.json", json_text(metrics(data)))
+    return WrittenReport(files=(page, *written, numbers), data=data)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.report import explorer
+from aerpaw_cmp.report import canvas, explorer
 from aerpaw_cmp.report.data import Source
 
 
@@ -78,7 +78,7 @@ def test_long_series_are_thinned_with_their_extremes(report_data):
 @given(st.lists(st.floats(-1e3, 1e3) | st.just(float("nan")), min_size=1, max_size=300), st.integers(4, 80))
 def test_extremes_stay(values, limit):
     array = np.array(values)
-    pick = explorer.keep_extremes([array], limit)
+    pick = canvas.keep_extremes([array], limit)
     assert (np.diff(pick) > 0).all()
     assert len(pick) <= max(limit, 2) + 2
     if np.isfinite(array).any():

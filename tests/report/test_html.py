@@ -77,10 +77,7 @@ def parse(text: str) -> Page:
 def fake_pictures(data: ReportData) -> list[Picture]:
     from aerpaw_cmp.report.figures import figure_specs
 
-    return [
-        Picture(name=p.name, section=p.section, title=p.title, caption=p.caption, alt=p.alt, formats={"svg": b"<svg/>"})
-        for p in figure_specs(data)
-    ]
+    return [Picture(p, {"svg": b"<svg/>"}) for p in figure_specs(data)]
 
 
 def render(data: ReportData) -> Page:

@@ -13,10 +13,7 @@ from aerpaw_cmp.report.maps_data import MapsData
 
 
 def pictures(data):
-    return [
-        Picture(name=p.name, section=p.section, title=p.title, caption=p.caption, alt=p.alt, formats={"svg": b"<svg/>"})
-        for p in maps_figures.figure_specs(data)
-    ]
+    return [Picture(p, {"svg": b"<svg/>"}) for p in maps_figures.figure_specs(data)]
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ import numpy as np
 from ...common.units import AnyArray
 from ...maps import kml
 from ...maps.kml import xml_text
-from ..explorer import keep_extremes
+from ..canvas import keep_extremes
 from ..names import iso_time
 from .points import Column, Export, latitude_longitude
 from .scales import Scale, scales_of

@@ -7,7 +7,8 @@ lines of ``sample_logs`` and of ``$AERPAW_CMP_FIELD_DATA``; mutations change byt
 package's own; at most 2 s of the processor and 300 MiB; the process lives. Input ``i`` of a target depends on the
 seed, the target and ``i`` alone, so a violation is made again with ``--reproduce TARGET I``.
 
-``--inputs 20000`` is the recorded run of docs/security.md: under an hour.
+``--inputs 20000 --workers 2`` is the recorded run of docs/security.md: some 1 300 s of the processor for all readers.
+Each row is printed as soon as it is done, so that what an interrupted run has done counts.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -742,12 +744,31 @@ def run(chosen: Iterable[Target], inputs: int, seed: int, tell: Callable[[str], 
         yield row
 
 
+def side_by_side(parts: Iterable[Iterator[dict[str, Any]]]) -> Iterator[dict[str, Any]]:
+    """Rows of several runs, each in a process of its own, as they come."""
+    context = multiprocessing.get_context("fork")
+    queue = context.SimpleQueue()
+
+    def put(rows: Iterator[dict[str, Any]]) -> None:
+        for row in chain(rows, [None]):
+            queue.put(row)
+
+    workers = [context.Process(target=put, args=(part,)) for part in parts]
+    for worker in workers:
+        worker.start()
+    for _ in workers:
+        yield from iter(queue.get, None)
+    for worker in workers:
+        worker.join()
+
+
 def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
     """Mutate, read, count."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, default=1000, help="per target; the recorded run: 20000")
     parser.add_argument("--target", default="*", help="pattern of target names, e.g. 'reader:*'")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=1, help="processes that share the targets")
     parser.add_argument("--reproduce", nargs=2, metavar=("TARGET", "I"), help="run one input here, with its traceback")
     parser.add_argument("--save", type=Path, help="with --reproduce: write the input to this file")
     parser.add_argument("--json", action="store_true")
@@ -766,7 +787,11 @@ def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
     heads = ("inputs", "read", "refused", "violation", "slowest_ms", "ms/input")
     if not arguments.json:
         print(f"{'target':26} " + " ".join(f"{head:>10}" for head in heads))
-    for row in run(chosen, arguments.inputs, arguments.seed, lambda text: print(text, file=sys.stderr)):
+    tell = partial(print, file=sys.stderr)
+    parts = [
+        run(chosen[k :: arguments.workers], arguments.inputs, arguments.seed, tell) for k in range(arguments.workers)
+    ]
+    for row in side_by_side(parts) if len(parts) > 1 else parts[0]:
         rows.append(row)
         if not arguments.json:  # each row at once: what an interrupted run has done counts
             numbers = (*(row[key] for key in heads[:-1]), round(1e3 * row["reading_s"] / row["inputs"], 2))

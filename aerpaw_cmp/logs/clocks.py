@@ -51,10 +51,6 @@ class Instants:
     warnings: tuple[str, ...] = field(default=())
     zoned: bool = False
 
-    def take(self, rows: IntArray) -> Instants:
-        """Some of the times; the warnings stay with the whole."""
-        return Instants(self.time[rows], self.ambiguous[rows], self.nonexistent[rows])
-
     def flag(self, column: AnyArray) -> None:
         """Add the reasons to a flag column, in place."""
         add_flag(column, self.ambiguous, AMBIGUOUS)

@@ -99,12 +99,16 @@ def _quick_answer(arguments: list[str]) -> int | None:
     return None
 
 
-def _message(error: BaseException) -> tuple[str, int]:
+def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
     """What the user is told of an exception that reached the top, and the exit code."""
     from .common.errors import AerpawCmpError
 
     if isinstance(error, AerpawCmpError):
-        return f"aerpaw-cmp: {error}", error.exit_code
+        from .common.next_step import next_step
+
+        text = f"aerpaw-cmp: {error}".rstrip(".")
+        gap = "\n  " if "\n" in text else " " if text.endswith("?") else ". "
+        return f"{text}{gap}Next: {next_step(error, arguments)}", error.exit_code
     if callable(wording := getattr(error, "format_message", None)):
         # a wrong option or argument; known by its method, since typer may bring its own copy of click
         context = getattr(error, "ctx", None)
@@ -184,7 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
         exec("")  # CPython remembers an interrupt that left an exec(), and would end by the signal in place of 130
         code = _interrupted(interrupt)
     except Exception as error:
-        code = _failed(error, debug)
+        code = _failed(error, debug, arguments)
     if own_process:
         gc.freeze()  # memory goes back with the process; a last look at all objects takes 0.3 s
     return _code_of_output(code)
@@ -198,14 +202,14 @@ def _interrupted(interrupt: KeyboardInterrupt) -> int:
     return SIGNALLED + by
 
 
-def _failed(error: Exception, debug: bool) -> int:
+def _failed(error: Exception, debug: bool, arguments: list[str]) -> int:
     if type(error).__name__ == "Abort":  # click's word for a Ctrl-C at a prompt
         return SIGNALLED + signal.SIGINT
     if debug:
         import traceback
 
         traceback.print_exc()
-    text, code = _message(error)
+    text, code = _message(error, arguments)
     print(text, file=sys.stderr)
     return code
 

@@ -109,13 +109,13 @@ def raising(error: BaseException):
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (CheckError("RMSE 7 dB", expected="at most 5 dB"), 1, "aerpaw-cmp: RMSE 7 dB; expected at most 5 dB\n"),
+        (CheckError("RMSE 7 dB", expected="at most 5 dB"), 1, "aerpaw-cmp: RMSE 7 dB; expected at most 5 dB. Next: "),
         (
             UsageError("unknown key 'sight'", path="f.yaml", line=3),
             2,
-            "aerpaw-cmp: f.yaml, line 3: unknown key 'sight'\n",
+            "aerpaw-cmp: f.yaml, line 3: unknown key 'sight'. Next: 'aerpaw-cmp report --help' lists the options\n",
         ),
-        (InputError("the file is empty", path="a.txt"), 3, "aerpaw-cmp: a.txt: the file is empty\n"),
+        (InputError("the file is empty", path="a.txt"), 3, "aerpaw-cmp: a.txt: the file is empty. Next: 'ls "),
         (KeyboardInterrupt(), 130, "aerpaw-cmp: interrupted\n"),
         (ModuleNotFoundError("x", name="distributed"), 1, "the Python package 'distributed' is not installed"),
     ],

@@ -25,6 +25,15 @@ def _program() -> Any:
     return typer.main.get_command(app)
 
 
+def _refused(error: Any) -> UsageError:
+    """The usage error of a wrong option or argument, with the first example of the command."""
+    text = str(error.format_message()).replace("Value error, ", "").replace("Input should be ", "expected ")
+    command = getattr(getattr(error, "ctx", None), "command", None)
+    _, _, examples = (getattr(command, "epilog", None) or "").partition("Examples:\n  ")
+    expected = f"a line such as '{examples.partition(chr(10))[0]}'" if examples else None
+    return UsageError(text.rstrip("."), expected=expected)
+
+
 def main(arguments: list[str]) -> int:
     """Run the command line and give its exit code; ``__main__`` turns exceptions into messages."""
     say.quiet = False
@@ -39,7 +48,7 @@ def main(arguments: list[str]) -> int:
     except Exception as error:
         # typer may vendor click: what counts is the shape of a usage error, not its module
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):
-            raise UsageError(error.format_message()) from error
+            raise _refused(error) from error
         raise
     finally:
         say.end()

@@ -675,6 +675,7 @@ class _Place:
             )
 
     def _claim(self, folder: bool) -> int:
+        fault = None
         for _ in range(1000):  # another run may remove it between our steps
             try:
                 if folder:
@@ -683,17 +684,19 @@ class _Place:
                     descriptor = os.open(self.part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
                 else:
                     descriptor = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
-            except FileNotFoundError:
+            except FileNotFoundError as error:
                 if not self.part.parent.is_dir():
                     raise
+                fault = error
                 continue
+            fault = None
             if not _lock(descriptor):
                 os.close(descriptor)
                 raise self._busy()
             if self._is_there(descriptor):
                 return descriptor
             os.close(descriptor)
-        raise self._busy()
+        raise fault or self._busy()
 
     def _busy(self) -> UsageError:
         return UsageError(
@@ -834,7 +837,7 @@ _REMEDIES = {
     errno.EROFS: "the disk is mounted read-only: name another place with -o",
     errno.EACCES: "no right to write here: name another place with -o",
     errno.EPERM: "no right to write here: name another place with -o",
-    errno.ENOENT: "the folder was removed while the run went on: run again",
+    errno.ENOENT: "a place that takes no files, or a folder that was removed while the run went on",
 }
 _WRONG_NAMES = (errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
 

@@ -144,10 +144,13 @@ def parse_yaml(text: str, model: type[ModelT], path: str | Path | None = None) -
 def _checked(document: _Document, model: type[ModelT], path: str | Path | None) -> ModelT:
     if document.value is None:
         raise UsageError(
-            "the file holds no settings", expected=f"keys such as {_listed(_field_names(model)[:4])}", path=path
+            "the file holds no settings", expected=_KEYS.format(_listed(_field_names(model)[:4])), path=path
         )
     if not isinstance(document.value, dict):
-        raise UsageError("the file is not a list of 'key: value' settings", path=path, line=1)
+        raise UsageError(
+            "the file is not a list of 'key: value' settings", expected=_KEYS.format(_listed(_field_names(model)[:4])),
+            cause="another kind of file", path=path, line=1,
+        )  # fmt: skip
     try:
         return model.model_validate(document.value)
     except pydantic.ValidationError as error:
@@ -162,7 +165,7 @@ def _read_text(path: Path) -> str:
     except InputError as error:
         raise UsageError(error.found, expected=error.expected, path=path) from None
     except FileNotFoundError:
-        raise InputError("no such file", cause="a misspelt path", path=path) from None
+        raise InputError("no such file", expected="a YAML file", cause="a misspelt path", path=path) from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path=path) from None
     try:
@@ -203,6 +206,9 @@ class _Open:
     merges: list[tuple[Any, int]] = field(default_factory=list)
 
 
+_KEYS = "keys such as {}"
+
+
 def _parse(text: str, path: str | Path | None) -> _Document:
     try:
         return _Builder(path).build(yaml.parse(text, Loader=_LOADER))
@@ -210,8 +216,14 @@ def _parse(text: str, path: str | Path | None) -> _Document:
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         cause = "tabs cannot indent in YAML; use blanks" if _tab_indents(text, mark) else None
+        if "unacceptable" in problem:
+            cause = "a log, or another binary file, in place of the settings"
         raise UsageError(
-            f"not YAML: {problem}", cause=cause, path=path, line=None if mark is None else mark.line + 1
+            f"not YAML: {problem}",
+            expected="'key: value' lines",
+            cause=cause,
+            path=path,
+            line=None if mark is None else mark.line + 1,
         ) from None
 
 

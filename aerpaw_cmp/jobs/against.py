@@ -44,7 +44,9 @@ def score_against(data: FlightData, folder: Path) -> Against:
         groups = dict(iter(table[table["level_db"].notna()].groupby(["tower", "channel"])))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"no prediction ({error})", expected="the output folder of 'aerpaw-cmp predict'", path=folder
+            f"no prediction ({getattr(error, 'strerror', None) or error})",
+            expected="the output folder of 'aerpaw-cmp predict'",
+            path=folder,
         ) from None
     if own := common(flight_logs(data), [learned]):
         raise UsageError(

@@ -214,6 +214,8 @@ def predict(
 def site_of(where: Path, known: Sequence[FlightData]) -> Site:
     """Of WHERE where it is a site, else of the flights; all must share a frame."""
     site = known[0].site
+    if where.suffix and not where.exists():
+        raise InputError("no such file", expected="a site, a route, points or a flight.yaml", path=where)
     if (is_settings(where) and flight_of(where) is None) or not where.exists():
         site = load_site(where if where.is_file() else str(where))
     for data in known:

@@ -236,7 +236,7 @@ def read_log(
     if not exists(path):
         raise InputError(
             "there is no such log",
-            expected=f"the file below {root}",
+            expected=f"a log below '{root}'",
             cause="a wrong path, or --logs-root",
             path=path,
         )

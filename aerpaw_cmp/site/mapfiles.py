@@ -55,7 +55,7 @@ def read_map_file(path: str | Path) -> MapFile:
     try:
         data = read_bounded(path, MAX_BYTES, "a map file")
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path=path) from None
+        raise InputError(f"cannot be read ({error.strerror})", expected="a map file", path=path) from None
     if data.startswith(b"PK\x03\x04"):
         data = _unzipped(data, path)
     start = data[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")

@@ -1,0 +1,71 @@
+"""What to type after a failure: the last part of every message."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+from .errors import AerpawCmpError, CheckError, InputError, OutputError, one_line
+
+_SETTINGS = (".yaml", ".yml")
+_OF_LOGS = [["report"], ["audit"], ["explain"], ["calibrate"], ["campaign"], ["predict"], ["plan"]]
+
+
+def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
+    """The step that most likely mends a failure of a command line.
+
+    Parameters
+    ----------
+    error : AerpawCmpError
+    arguments : sequence of str
+        The command line, without the program's name.
+
+    Returns
+    -------
+    str
+    """
+    words = [word for word in arguments[:2] if not word.startswith("-")]
+    command = " ".join(["aerpaw-cmp", *words[: 2 if words[:1] == ["site"] else 1]])
+    place = None if error.path is None else Path(error.path)
+    if isinstance(error, CheckError):
+        return "read the page, or run without the check"
+    if isinstance(error, OutputError) or re.search(r"after -o\b|a new name", error.expected or ""):
+        return "the same command with another name after -o"
+    if place is not None and place.suffix in _SETTINGS and _exists(place):
+        line = "" if error.line is None else f", line {error.line},"
+        return f"mend {one_line(place.name)}{line} and run the same command"
+    if place is None or not isinstance(error, InputError):
+        return f"'{command} --help' lists the options"
+    if not _exists(place):
+        return _nearest(place)
+    if not place.is_file():
+        return f"'ls {one_line(str(place))}' shows what the folder holds"
+    if words[:1] == ["ingest"]:
+        return "'aerpaw-cmp formats' lists what can be read"
+    if words[:1] in _OF_LOGS:
+        return f"'aerpaw-cmp ingest {one_line(str(place))}' shows what the file holds"
+    return f"the same command with another file than {one_line(place.name)}"
+
+
+def _exists(place: Path) -> bool:
+    try:
+        return place.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def _nearest(place: Path) -> str:
+    """A file with a name like it, or the nearest folder that exists."""
+    folder = place.parent
+    while not _exists(folder) and folder != folder.parent:
+        folder = folder.parent
+    try:
+        names = [one.name for one in folder.iterdir()]
+    except OSError:
+        names = []
+    near = get_close_matches(place.name, names, n=1, cutoff=0.8) if folder == place.parent else []
+    if near:
+        return f"the same command with {one_line(str(folder / near[0]))}"
+    return f"'ls {one_line(str(folder))}' shows the names there"

@@ -1,0 +1,215 @@
+"""Every message of the command line, once per command and kind of fault: found, expected, likely cause, what to type.
+
+python -m tests.test_messages        writes docs/reference/messages.md, the table of all of them
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from tests.test_cli_bad_input import FLIGHT, GOOD_POWER, GOOD_TELEMETRY
+
+PAGE = Path(__file__).parents[1] / "docs" / "reference" / "messages.md"
+FILES = {
+    "flight.yaml": FLIGHT,
+    "vehicleOut.txt": GOOD_TELEMETRY,
+    "power_log.txt": GOOD_POWER,
+    "syntax.yaml": "flight: [a\nsite: lake_wheeler\n",
+    "key.yaml": FLIGHT.replace("site:", "sight:"),
+    "type.yaml": FLIGHT.replace("audit_links: 0", "audit_links: many"),
+    "no_log.yaml": FLIGHT.replace("power_log.txt", "gone.txt"),
+    "zone.yaml": FLIGHT.replace("America/New_York", "America/New_Pork"),
+    "damaged.yaml": FLIGHT.replace("power_log.txt", "damaged.txt"),
+    "damaged.txt": "\x00\x01 no log at all \x02\n" * 40,
+    "empty.txt": "",
+    "campaign_key.yaml": "campaign: a\nflights: [flight.yaml]\nsetings: {}\n",
+    "campaign.yaml": "campaign: a\nflights: [gone.yaml]\n",
+    "calibration_key.yaml": "calibration: a\nflights: [flight.yaml]\nfitt: {}\n",
+    "calibration.yaml": "calibration: a\nflights: [gone.yaml]\n",
+    "notes.txt": "keep me\n",
+    "page/notes.txt": "keep me\n",
+    "route.kml": "<kml></kml>\n",
+    "scores.csv": "a,b\n1,2\n",
+}
+KINDS: dict[str, tuple[str, ...]] = {
+    "no such command": ("reprot flight.yaml",),
+    "no argument": ("report", "explain flight.yaml", "diff one", "predict", "site import", "calibrate", "simulate"),
+    "unknown option": ("report flight.yaml --quickly", "ingest --zone UTC", "tap --prot", "bench --fast"),
+    "bad option value": (
+        "report flight.yaml --figures few",
+        "report flight.yaml --audit some",
+        "report flight.yaml --export geojsn",
+        "ingest . --timezone New_York",
+        "map lake_wheeler --spacing 0",
+        "map lake_wheeler --rss-altitude -3",
+        "map lake_wheeler --foliage autumn",
+        "explain flight.yaml --tower LW9 --time 5",
+        "explain flight.yaml --tower LW1 --time noon",
+        "predict lake_wheeler --with flight.yaml --height high",
+        "plan sphere",
+        "tap log --ri-hz 0 --duration 1 --wait 0",
+        "tap --export cvs",
+        "campaign campaign.yaml --workers 0",
+        "bench --poses none",
+        "site show nowhere",
+        "site export lake_weeler -o scene",
+    ),
+    "missing file": (
+        "ingest gone.txt",
+        "report gone.yaml",
+        "report no_log.yaml",
+        "audit gone",
+        "explain gone.yaml --tower LW1 --time 5",
+        "simulate gone.yaml",
+        "calibrate gone.yaml",
+        "calibrate calibration.yaml",
+        "campaign gone.yaml",
+        "report flihgt.yaml",
+        "benchmark --data gone",
+        "benchmark score gone.csv",
+        "diff gone other",
+        "predict gone.kml --with flight.yaml",
+        "plan gone.kml --site lake_wheeler",
+        "map gone.yaml",
+        "tap --play gone",
+        "report flight.yaml --with gone.yaml",
+        "report flight.yaml --against gone",
+        "site import gone.osm -o site.yaml",
+    ),
+    "wrong type of file": (
+        "report .",
+        "report damaged.txt",
+        "simulate vehicleOut.txt",
+        "calibrate flight.yaml",
+        "campaign flight.yaml",
+        "diff . .",
+        "predict vehicleOut.txt --with calibration.yaml",
+        "audit flight.yaml",
+        "benchmark score scores.csv",
+        "map damaged.txt",
+        "tap --play .",
+        "site import notes.txt -o site.yaml",
+        "plan route.kml --site lake_wheeler",
+        "report flight.yaml --against .",
+        "report flight.yaml --with flight.yaml",
+    ),
+    "bad YAML": (
+        "report syntax.yaml",
+        "simulate syntax.yaml",
+        "calibrate syntax.yaml",
+        "campaign syntax.yaml",
+        "map syntax.yaml",
+        "explain syntax.yaml --tower LW1 --time 5",
+    ),
+    "unknown key": (
+        "report key.yaml",
+        "simulate key.yaml",
+        "campaign campaign_key.yaml",
+        "calibrate calibration_key.yaml",
+    ),
+    "wrong value": ("report type.yaml", "report zone.yaml"),
+    "damaged log": ("ingest damaged.txt", "ingest empty.txt", "report damaged.yaml"),
+    "output exists": (
+        "report flight.yaml -o page",
+        "ingest vehicleOut.txt power_log.txt --timezone America/New_York -o notes.txt",
+        "map lake_wheeler -o page",
+        "site export lake_wheeler -o page",
+        "sample -o page",
+        "campaign campaign.yaml -o page",
+        "calibrate calibration.yaml -o notes.txt",
+        "diff page page",
+        "predict lake_wheeler --with flight.yaml -o page",
+    ),
+    "disk takes nothing": (
+        "report flight.yaml -o /proc/nothing/page",
+        "ingest vehicleOut.txt --timezone America/New_York -o /dev/full",
+        "sample -o /proc/nothing",
+        "site export lake_wheeler -o /proc/nothing",
+    ),
+    "no port, no network": (
+        "tap /dev/ttyNOTHING --duration 1 --wait 0 -o log",
+        "tap --web 999.1.1.1:80 --duration 1 --wait 0 -o log",
+        "map lake_wheeler --scheduler nowhere",
+    ),
+}
+
+
+@contextlib.contextmanager
+def place(folder: Path) -> Iterator[None]:
+    """A folder with the files, as the working folder."""
+    for name, text in FILES.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text)
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+
+
+def said(line: str) -> tuple[int, str]:
+    """Exit code and message of a command line."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main(line.split())
+    _, mark, message = err.getvalue().partition("aerpaw-cmp: ")
+    return code, f"{mark}{message}".strip()
+
+
+def table() -> str:
+    """All messages in a page."""
+    lines = [
+        "# Messages of the command line",
+        "",
+        "Each kind of fault, each command that can meet it, and what it says: found, expected, likely cause, next step.",
+        "Made by the program `tests/test_messages.py`. Commands stand without `aerpaw-cmp`. `exit` is the exit code: 2 wrong usage or configuration, 3 an input",
+        "that cannot be read or an output that cannot be written.",
+    ]
+    with tempfile.TemporaryDirectory() as folder, place(Path(folder)):
+        for kind, commands in KINDS.items():
+            lines += ["", f"## {kind.capitalize()}", "", "| command | exit | message |", "| --- | --- | --- |"]
+            for line in commands:
+                code, text = said(line)
+                shown = text.replace(folder, "...").replace("|", "\\|").replace("\n", "<br>").replace("<kml", "&lt;kml")
+                lines.append(f"| `{line}` | {code} | {shown.removeprefix('aerpaw-cmp: ')} |")
+    return "\n".join(lines) + "\n"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with place(tmp_path_factory.mktemp("messages")):
+        yield
+
+
+@pytest.mark.parametrize(("kind", "line"), [(kind, line) for kind, lines in KINDS.items() for line in lines])
+def test_a_message_says_what_was_found_what_is_expected_and_what_to_type(kind: str, line: str) -> None:
+    code, text = said(line)
+    assert code in (2, 3)
+    assert text.startswith("aerpaw-cmp: ")
+    assert "Traceback" not in text
+    assert "Errno" not in text
+    found = re.split(r"; expected |\. Likely cause: |[.?] Next: |; did you mean ", text)
+    assert len(found[0].split()) >= 3
+    assert re.search(r"expected |Likely cause: |did you mean |problems\n", text), "neither expected nor likely cause"
+    assert re.search(r"Next: \S|did you mean ", text), "nothing to type next"
+    assert len(text.splitlines()[0]) < 420
+
+
+def test_every_message_stands_in_the_page() -> None:
+    """The page lists the commands that are tried, kind by kind."""
+    listed = re.findall(r"^\| `(.*?)` \| \d", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert listed == [line for lines in KINDS.values() for line in lines]
+
+
+if __name__ == "__main__":
+    PAGE.write_text(table(), encoding="utf-8")

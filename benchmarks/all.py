@@ -65,7 +65,6 @@ SMALLEST: dict[str, list[str]] = {
     "all": ["--only", "kriging", "--no-history"],
     "clock_power": ["sample_logs/UAV", "--quiet"],
     "coverage_of_intervals": ["--flights", "20", "--replicates", "100"],
-    "drafted_reports": ["sample_logs/UAV"],
     "diffraction": ["--poses", "100", "--pairs", "1"],
     "drafts": ["sample_logs"],
     "estimate": [],
@@ -79,6 +78,7 @@ SMALLEST: dict[str, list[str]] = {
     "kernel": ["--poses", "200", "--pairs", "1"],
     "kriging": ["--quick", "--pairs", "60"],
     "kriging_field": ["--quick"],
+    "left_out_reports": ["--only", "lte50"],
     "long_flight": ["--hours", "0.3", "--shares", "1"],
     "mutation": ["record", "{folder}/map.json", "--tests", "tests/compare/test_offset.py"],
     "outside_faults": ["--only", "take-off ground not added to the track", "--no-tests"],
@@ -101,7 +101,7 @@ SMALLEST: dict[str, list[str]] = {
 }
 """How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards."""
 
-ON_FIELD_DATA = ("kriging_field",)
+ON_FIELD_DATA = ("kriging_field", "left_out_reports")
 
 AXES = ("poses", "towers", "faces", "samples", "report", "flights", "workers")
 

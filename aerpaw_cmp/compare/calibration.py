@@ -12,6 +12,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.units import BoolArray, FloatArray, IntArray
+from .detection import floored_fit
 from .direction_gain import GainFit, GainModel, LinkSamples, Pairs, Term, fit_gain, shared_knots
 from .gain_choice import Choice, choose_and_fit
 from .ladder import log_distance_level_db
@@ -40,6 +41,8 @@ class Observed:
     """Samples with what a score needs besides: level of free space (n,) [dB], heading of the nose (n,) [deg].
 
     ``tower_m`` (n, 3): places of a tower that moves [m]. ``start``: the instant of ``time_s`` 0 (UTC), where known.
+    ``locked`` (n,): 1 where the receiver was in lock, 0 where it had lost it, NaN unknown. ``sent_dbm``: transmit power
+    of ``free_space_db``.
     """
 
     samples: LinkSamples
@@ -47,11 +50,19 @@ class Observed:
     heading_deg: FloatArray
     tower_m: FloatArray | None = None
     start: np.datetime64 | None = None
+    locked: FloatArray | None = None
+    sent_dbm: float = 0.0
 
     def part(self, keep: BoolArray | IntArray) -> Observed:
         """Some of the samples."""
-        tower = None if self.tower_m is None else self.tower_m[keep]
-        return Observed(self.samples.part(keep), self.free_space_db[keep], self.heading_deg[keep], tower, self.start)
+        return dataclasses.replace(
+            self,
+            samples=self.samples.part(keep),
+            free_space_db=self.free_space_db[keep],
+            heading_deg=self.heading_deg[keep],
+            tower_m=None if self.tower_m is None else self.tower_m[keep],
+            locked=None if self.locked is None else self.locked[keep],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,9 +173,22 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, choice: Choice | None =
         choice, fit = choose_and_fit(left, recipe.model, pairs=recipe.pairs)
     else:
         fit = fit_gain(left, choice.model, recipe.pairs)
+    if any(s.floor_db is not None for s in series):  # once more; another time changes nothing on flights left out
+        fit = fit_gain([_at_floor(s, bare.mean(s), fit) for s in series], choice.model, recipe.pairs)
     antennas = dict.fromkeys(s.antenna for s in series)
     fading = {name: fading_of([s for s in series if s.antenna == name], choice.model.bin_s) for name in antennas}
     return Learned(recipe, choice, mounts, fit, fading)
+
+
+def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkSamples:
+    """What is left of the residual beside ``known_db``; below the floor, what the fit expects, no higher than it."""
+    left = samples.residual_db - known_db
+    if samples.floor_db is None:
+        return dataclasses.replace(samples, residual_db=left)
+    floor, gain = samples.floor_db - known_db, fit.mean(samples)
+    offset_db = floored_fit(left - floor, gain - floor, 0.0).offset_db
+    lost = np.minimum(gain - offset_db, floor)
+    return dataclasses.replace(samples, residual_db=np.where(left < floor, lost, left))
 
 
 @dataclass(frozen=True, slots=True)

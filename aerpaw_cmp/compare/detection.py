@@ -2,21 +2,87 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..common.units import BoolArray, FloatArray
+from ..common.units import BoolArray, FloatArray, IntArray
 from .forecast import brier_losses, constant_forecast, log_losses
-from .offset import OffsetFit, offset_grid
+from .offset import STEP_DB, OffsetFit, offset_grid
 from .receiver import out_of_group
 
 SEGMENTS = 10
 """Held-out segments of a flight, equally long."""
 
 _PENALTY = 1.0
+_SPAN_DB = 60.0
 _FEWEST = 50
 """Samples of either kind that a score needs."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectionForecast:
+    """P(detected) of a predicted level, learned on flights: logistic in the level.
+
+    Parameters
+    ----------
+    level_db : float
+        Predicted level at which half of the samples are detected.
+    per_db : float
+        Slope of the log odds.
+    share : float
+        Of detected samples, mean over the flights: the forecast of who knows no level.
+    """
+
+    level_db: float
+    per_db: float
+    share: float
+
+    def probability(self, level_db: FloatArray) -> FloatArray:
+        """P(detected) (n,) at predicted levels (n,) [dB]."""
+        from scipy.special import expit
+
+        return np.asarray(expit(self.per_db * (level_db - self.level_db)))
+
+
+def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> DetectionForecast | None:
+    """P(detected) of predicted levels, each flight of the same weight; None where either outcome is rare.
+
+    Parameters
+    ----------
+    flights : sequence of ((n,), (n,))
+        Predicted levels [dB], finite, and which samples were detected.
+
+    Returns
+    -------
+    DetectionForecast or None
+        None, too, where the detected samples do not have the higher levels.
+    """
+    from scipy.optimize import minimize
+
+    flights = [one for one in flights if len(one[0])]
+    detected = np.concatenate([np.zeros(0, dtype=np.bool_), *(seen for _, seen in flights)])
+    if min(int(detected.sum()), int((~detected).sum())) < _FEWEST:
+        return None
+    level = np.concatenate([each for each, _ in flights])
+    weight = np.concatenate([np.full(len(each), 1.0 / len(each)) for each, _ in flights])
+    centre, scale = float(level.mean()), max(float(level.std()), 1e-9)
+    unit = (level - centre) / scale
+
+    def loss(c: FloatArray) -> tuple[float, FloatArray]:
+        odds = c[0] + c[1] * unit
+        over = DetectionForecast(level_db=0.0, per_db=1.0, share=0.0).probability(odds) - detected
+        value = (weight * (np.logaddexp(0.0, odds) - detected * odds)).sum() + 1e-3 * c[1] ** 2
+        return float(value), np.array([(weight * over).sum(), (weight * over * unit).sum() + 2e-3 * c[1]])
+
+    constant, slope = minimize(loss, np.zeros(2), jac=True).x
+    if slope <= 0.0:
+        return None
+    share = float(np.mean([seen.mean() for _, seen in flights]))
+    return DetectionForecast(
+        level_db=centre - scale * float(constant / slope), per_db=float(slope) / scale, share=share
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,10 +95,14 @@ class DetectionScore:
         Lower levels count as this one [unit of the measurement].
     n, n_detected : int
     brier, constant_brier, log_score, constant_log_score : float
-        Of P(detected) from the predicted level, in held-out segments; constant: the share in the other segments.
-        Brier counts one of the two outcomes: 0 to 1. Log score in nat.
+        Of P(detected) from the predicted level; constant: the share in what P(detected) was learned from. Brier counts
+        one of the two outcomes: 0 to 1. Log score in nat.
+    learned_on : str
+        ``other flights``, or ``held-out segments``: each segment of this flight from the others.
     offset_db, rmse_db : float
         All samples, both sides no lower than the floor; the offset is added to the measurement.
+    free_space_rmse_db : float
+        The same of free space.
     detected_rmse_db : float
         Of the detected samples alone, at that offset. They are selected by their level: never to be given alone.
     reliability : tuple of (float, float, int)
@@ -48,8 +118,12 @@ class DetectionScore:
     constant_log_score: float
     offset_db: float
     rmse_db: float
+    free_space_rmse_db: float
     detected_rmse_db: float
     reliability: tuple[tuple[float, float, int], ...]
+    learned_on: str
+    locks: bool = False
+    """The log itself says when the receiver was in lock; else a sample without a level was not detected."""
 
 
 def score_detection(
@@ -59,8 +133,8 @@ def score_detection(
     detected: BoolArray,
     *,
     floor_db: float,
-    span_db: tuple[float, float],
-    step_db: float,
+    free_space_db: FloatArray | None = None,
+    forecast: DetectionForecast | None = None,
 ) -> DetectionScore | None:
     """Score of a log in two parts; None where either outcome is rare.
 
@@ -70,8 +144,12 @@ def score_detection(
     measured_db, simulated_db : (n,)
         Measured NaN: below the floor. Samples without a simulated level take no part.
     detected : (n,) bool
-    floor_db, span_db, step_db : float
-        Floor of the measurement; grid of the offset.
+    floor_db : float
+        Floor of the measurement.
+    free_space_db : (n,), optional
+        Level of free space, for comparison.
+    forecast : DetectionForecast, optional
+        Learned on other flights, of ``simulated_db``; without, each segment is forecast from the others.
 
     Returns
     -------
@@ -82,14 +160,16 @@ def score_detection(
     measured = np.maximum(np.nan_to_num(measured_db[known], nan=floor_db), floor_db)
     if min(int(detected.sum()), int((~detected).sum())) < _FEWEST:
         return None
-    segment = np.minimum((time - time.min()) / max(np.ptp(time), 1e-9) * SEGMENTS, SEGMENTS - 1).astype(np.int64)
     outcome = detected.astype(np.int64) + 1
-    said = out_of_group(simulated[:, None], outcome, segment, _PENALTY)[:, :2]
-    said = said / said.sum(axis=1, keepdims=True)  # two outcomes of the four that a receiver of ranks knows
-    constant = np.zeros_like(said)
-    for one in np.unique(segment):
-        constant[segment == one] = constant_forecast(outcome[segment != one], 2)
-    fit = floored_offset(measured, simulated, floor_db=floor_db, span_db=span_db, step_db=step_db)
+    if forecast is None:
+        said, constant = _held_out(time, simulated, outcome)
+    else:
+        said, constant = (
+            np.stack([1.0 - p, p], axis=1)
+            for p in (forecast.probability(simulated), np.full(len(simulated), forecast.share))
+        )
+    fit = floored_fit(measured, simulated, floor_db)
+    free = simulated if free_space_db is None else free_space_db[known]
     residual = measured - np.maximum(simulated - fit.offset_db, floor_db)
     return DetectionScore(
         floor_db=floor_db,
@@ -101,9 +181,32 @@ def score_detection(
         constant_log_score=float(log_losses(constant, outcome).mean()),
         offset_db=fit.offset_db,
         rmse_db=fit.rmse_db,
+        free_space_rmse_db=floored_fit(measured, free, floor_db).rmse_db,
         detected_rmse_db=float(np.sqrt(np.mean(residual[detected] ** 2))),
         reliability=_reliability(said[:, 1], detected),
+        learned_on="held-out segments" if forecast is None else "other flights",
     )
+
+
+def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Probabilities (n, 2) of each segment from the others: by the level, and of a constant."""
+    segment = np.minimum((time_s - time_s.min()) / max(np.ptp(time_s), 1e-9) * SEGMENTS, SEGMENTS - 1).astype(np.int64)
+    said = out_of_group(level_db[:, None], outcome, segment, _PENALTY)[:, :2]
+    said = said / said.sum(axis=1, keepdims=True)  # two outcomes of the four that a receiver of ranks knows
+    constant = np.zeros_like(said)
+    for one in np.unique(segment):
+        constant[segment == one] = constant_forecast(outcome[segment != one], 2)
+    return said, constant
+
+
+def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> OffsetFit:
+    """:func:`floored_offset` within 60 dB of the median above the floor; pairs (n,) with a NaN do not count."""
+    known = np.isfinite(measured_db) & np.isfinite(simulated_db)
+    measured, simulated = np.maximum(measured_db[known], floor_db), simulated_db[known]
+    above = measured > floor_db
+    middle = float(np.median((simulated - measured)[above])) if above.any() else 0.0
+    span = (middle - _SPAN_DB, middle + _SPAN_DB)
+    return floored_offset(measured, simulated, floor_db=floor_db, span_db=span, step_db=STEP_DB)
 
 
 def floored_offset(

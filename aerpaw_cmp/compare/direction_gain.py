@@ -53,6 +53,8 @@ class LinkSamples:
         Unit vector towards the UAV in the frame of the mast (east, north, up).
     residual_db : (n,)
         Measured minus model [dB]; NaN does not count.
+    floor_db : (n,), optional
+        The residual of a level at the receiver's floor [dB]: a smaller one says "no higher than that".
     """
 
     flight: str
@@ -63,6 +65,7 @@ class LinkSamples:
     at_uav: FloatArray
     at_tower: FloatArray
     residual_db: FloatArray
+    floor_db: FloatArray | None = None
 
     @property
     def antenna(self) -> str:
@@ -75,7 +78,8 @@ class LinkSamples:
     def part(self, keep: BoolArray | IntArray) -> LinkSamples:
         """Some of the samples."""
         arrays: dict[str, Any] = {name: getattr(self, name)[keep] for name in _ARRAYS}
-        return dataclasses.replace(self, **arrays)
+        floor_db = None if self.floor_db is None else self.floor_db[keep]
+        return dataclasses.replace(self, floor_db=floor_db, **arrays)
 
     def binned(self, width_s: float) -> LinkSamples:
         """Means over bins of time; directions are normalised again.
@@ -91,7 +95,7 @@ class LinkSamples:
         means: dict[str, Any] = {name: _bin_means(getattr(kept, name), member) for name in _ARRAYS}
         for name in ("at_uav", "at_tower"):
             means[name] /= np.linalg.norm(means[name], axis=1, keepdims=True)
-        return dataclasses.replace(kept, **means)
+        return dataclasses.replace(kept, floor_db=None, **means)
 
 
 _ARRAYS = ("time_s", "position_m", "at_uav", "at_tower", "residual_db")

@@ -254,39 +254,41 @@ def _learned_lines(known: Proposal) -> list[str]:
 
 def _settings(entries: _Entries, known: Proposal) -> list[str]:
     """Lines for ``rt``, ``rss`` and ``rank`` that real logs ask for."""
-    if entries.flown is None:
-        receiver = {"receiver": known.receiver} if "rank" in entries.kinds and known.receiver else {}
-        return [f"rank: {_plain(receiver)}  # {known.receiver_about}\n"] if receiver else []
-    frame, lines = entries.flown[0].frame, list[str]()
-    alone = ", max_depth: 0" if known.antennas else ""  # the gains were learned beside line of sight alone
-    if "rank" in entries.kinds:
-        lines.append("# rt.attitude: logged needs link.rank.uav mounted as seen from the aircraft's nose.\n")
-        lines.append(f"rt: {{audit_links: {QUICK_AUDIT}}}{_QUICK}\n")
-    elif _has_attitude(frame):
-        lines.append(f"rt: {{attitude: logged{alone}, audit_links: {QUICK_AUDIT}}}{_QUICK}\n")
-    else:
-        lines.append(
-            f"rt: {{attitude: level{alone}, audit_links: {QUICK_AUDIT}}}"
-            "  # a quick audit; no attitude in the telemetry: the nose points along the track?\n"
-        )
-    low: dict[str, Any] = {}
-    if float(np.nanmax(frame["altitude_m"].to_numpy(np.float64), initial=-np.inf)) > FLOWN_ABOVE_M:
-        low = {"minimum_height_m": MINIMUM_HEIGHT_M}
+    lines = _replay_lines(entries, known)
+    low: dict[str, Any] = {"minimum_height_m": MINIMUM_HEIGHT_M} if entries.highest_m() > FLOWN_ABOVE_M else {}
     for kind in sorted(entries.kinds & {"rss", "rank"}, reverse=True):
         chosen: dict[str, Any] = dict(low)
         reasons = ["without take-off and landing"] if low else []
-        if kind == "rss":
+        if kind == "rss" and entries.flown is not None:
             chosen |= {"field": "power"}
             reasons.append("powers of paths added: phases of a real ground are not known")
             if span := _span_of_offsets(entries.offsets_db):
                 chosen |= span
                 reasons.append("the levels lie outside the usual span of offsets")
-        elif known.receiver:
+        elif kind == "rank" and known.receiver:
             chosen |= {"receiver": known.receiver}
             reasons.append(known.receiver_about)
         if chosen:
             lines.append(f"{kind}: {_plain(chosen)}  # {'; '.join(reasons)}\n")
     return lines
+
+
+def _replay_lines(entries: _Entries, known: Proposal) -> list[str]:
+    """``rt``, where there is a track."""
+    if entries.flown is None:
+        return []
+    alone = ", max_depth: 0" if known.antennas else ""  # the gains were learned beside line of sight alone
+    if "rank" in entries.kinds:
+        return [
+            "# rt.attitude: logged needs link.rank.uav mounted as seen from the aircraft's nose.\n",
+            f"rt: {{audit_links: {QUICK_AUDIT}}}{_QUICK}\n",
+        ]
+    if _has_attitude(entries.flown[0].frame):
+        return [f"rt: {{attitude: logged{alone}, audit_links: {QUICK_AUDIT}}}{_QUICK}\n"]
+    return [
+        f"rt: {{attitude: level{alone}, audit_links: {QUICK_AUDIT}}}"
+        "  # a quick audit; no attitude in the telemetry: the nose points along the track?\n"
+    ]
 
 
 _MARGIN_DB = 20.0
@@ -369,6 +371,12 @@ class _Entries:
     """Nodes that the site does not have, and the question about each."""
     offsets_db: list[float] = field(default_factory=list)
     """Expected of each level."""
+    tops_m: list[float] = field(default_factory=list)
+    """Greatest height of each log that has positions of its own and is compared at them."""
+
+    def highest_m(self) -> float:
+        """Greatest height [m] of the track, or of logs with positions of their own where there is no track."""
+        return max(self.tops_m, default=-np.inf) if self.flown is None else _top_m(self.flown[0])
 
     @property
     def _track(self) -> Stream | None:
@@ -449,6 +457,7 @@ class _Entries:
         if self.placer is not None:
             self.offsets_db += [o for s in kept if (o := self._offset_db(s, entry, self.placer)) is not None]
         self.kinds |= {s.kind for s in kept}
+        self.tops_m += [_top_m(s) for s in kept if _has_positions(s)]
         self.series += [(*_key(s, entry), file.result.reader) for s in kept if s.kind in ("rss", "rank")]
         self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
 
@@ -578,6 +587,13 @@ def _key(stream: Stream, entry: Mapping[str, Any]) -> tuple[str, ...]:
     if stream.kind == "rank":
         return tower, "rank"
     return tower, str(entry.get("channel") or stream.attributes.get("channel") or stream.name)
+
+
+def _top_m(stream: Stream) -> float:
+    """Greatest height above take-off [m]; minus infinity where none is known."""
+    if "altitude_m" not in stream.frame:
+        return -np.inf
+    return float(np.nanmax(stream.frame["altitude_m"].to_numpy(np.float64), initial=-np.inf))
 
 
 def _has_positions(stream: Stream) -> bool:

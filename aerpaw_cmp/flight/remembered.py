@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..common.errors import InputError, UsageError
-from ..site.learned import Entry, Errors, Learned, find_named, read_learned
+from ..site.learned import Entry, Errors, Learned, LearnedLock, find_named, read_learned
 from .data import FlightData, RssSeries
 from .settings import FlightFile, with_learned
 
@@ -102,6 +102,16 @@ def errors_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Pat
         return find_named(name, folder).entry.errors
     except (InputError, UsageError):
         return None
+
+
+def lock_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> LearnedLock | None:
+    """P(lock) that other flights taught with the airframe of a flight; None without one for such a channel."""
+    try:
+        named = find_named(antennas["uav"], folder)
+    except (KeyError, InputError, UsageError):
+        return None
+    locks = [s.lock for s in named.entry.series if s.channel == series.channel and s.lock is not None]
+    return locks[0] if locks else None
 
 
 def _fits(entry: Entry, series: Sequence[SeriesKey]) -> tuple[int, int]:

@@ -32,12 +32,14 @@ from ..compare.direction_gain import (
 from ..compare.learning_curve import CurvePoint, learning_curve
 from ..compare.mount import GainOf
 from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
+from ..flight.lock import LOCK_FLOOR_DB
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..flight.training import counted_once, flight_logs
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ..report.calibration_words import sentences
-from ..site.learned import Source
+from ..site.learned import LearnedLock, Source
+from .calibrate_lock import learned_locks, lock_words
 from .calibrate_rank import RankFitSettings
 
 ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
@@ -117,6 +119,8 @@ class Calibration:
     controls: Mapping[str, tuple[Score, ...]]
     ground: GroundFit | None
     curve: tuple[CurvePoint, ...]
+    locks: Mapping[str, LearnedLock]
+    """By antenna, of receivers that lose their lock."""
     warnings: tuple[str, ...]
     words: tuple[str, ...]
     rank: Any = field(default=None)
@@ -184,10 +188,12 @@ def calibrate(
             place = calibration.learn(series, with_place)
     with stages("ground"):
         ground = fit_ground(flights, observed, learned) if settings.fit.ground else None
+    kept: dict[str, Learned] = {}
     with stages("scores"):
-        scores = score_all(observed, recipe, stages)
+        scores = score_all(observed, recipe, stages, kept)
         stages.progress("scores: controls")
         controls = controls_of(observed, recipe)
+        locks = learned_locks(observed, recipe, kept)
     with stages("curve"):
         curve = learning_curve(observed, recipe)
     warnings += mount_warnings(learned)
@@ -205,8 +211,12 @@ def calibrate(
         controls=controls,
         ground=ground,
         curve=curve,
+        locks=locks,
         warnings=tuple(warnings),
-        words=sentences(scores, controls, None if ground is None else ground.likely_m, curve),
+        words=(
+            *sentences(scores, controls, None if ground is None else ground.likely_m, curve),
+            *map(lock_words, locks.values()),
+        ),
     )
 
 
@@ -327,10 +337,19 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:
         at_uav=np.einsum("nji,nj->ni", pose.rotation[keep], -at_tower),
         at_tower=at_tower,
         residual_db=series.measured_db[keep] - free,
+        floor_db=None if series.locked is None else LOCK_FLOOR_DB - free,
     )
     guessed = float(np.mean(~pose.attitude_known[keep])) if keep.any() else 0.0
     moving = place if series.tower in data.nodes else None
-    observed = Observed(samples, free, pose.heading_deg[keep], moving, time.min() if len(time) else None)
+    observed = Observed(
+        samples,
+        free,
+        pose.heading_deg[keep],
+        moving,
+        time.min() if len(time) else None,
+        locked=None if series.locked is None else series.locked[keep],
+        sent_dbm=series.link.transmit_power_dbm,
+    )
     return observed.part(order), guessed
 
 
@@ -422,12 +441,26 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
 # --- scores --------------------------------------------------------------------------------------------------------
 
 
-def score_all(observed: Sequence[Observed], recipe: Recipe, stages: Stages) -> dict[str, tuple[Score, ...]]:
-    """Every split, on flights that had no part in the fit; fits of one are used by the next."""
+def score_all(
+    observed: Sequence[Observed], recipe: Recipe, stages: Stages, kept: dict[str, Learned]
+) -> dict[str, tuple[Score, ...]]:
+    """Every split, on flights that had no part in the fit; fits of one are used by the next.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+    recipe : Recipe
+    stages : Stages
+    kept : dict of str to Learned
+        Receives what was learned without each flight.
+
+    Returns
+    -------
+    dict of str to tuple of Score
+    """
     scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
     if len(calibration.flights_of(observed)) < 2:
         return scores
-    kept: dict[str, Learned] = {}
     scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, kept)
     for split, parts, own in (
         ("altitude_left_out", calibration.altitude_parts, False),

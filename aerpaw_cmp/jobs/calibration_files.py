@@ -25,7 +25,7 @@ from ..report.calibration_data import AntennaMap, CalibrationData
 from ..report.calibration_html import write_calibration
 from ..report.export import write_file
 from ..report.names import safe_name
-from ..site.learned import Entry, Errors, LearnedReceiver, LearnedSeries
+from ..site.learned import Entry, Errors, LearnedLock, LearnedReceiver, LearnedSeries
 from ..site.pair_gain import PairGain
 from ..site.sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid, sphere_netcdf, unit_mean_gain
 from .calibrate import Calibration, CalibrationFile
@@ -52,13 +52,15 @@ def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
         for end, frame in (("uav", "body"), ("tower", "mast")):
             name = "uav" if end == "uav" else antenna
             gain, sd = fit.gain("body" if frame == "body" else "mast", antenna, flat)
-            whole = unit_mean_gain((gain + calibration.learned.pattern_db(name, flat)).reshape(shape))
+            raw = (gain + calibration.learned.pattern_db(name, flat)).reshape(shape)
+            whole = unit_mean_gain(raw)
             out[antenna, end] = AntennaMap(
                 name=f"{antenna} {end}",
                 theta_deg=theta,
                 azimuth_deg=azimuth,
                 gain_dbi=whole,
                 sd_db=sd.reshape(shape),
+                level_db=float((raw - whole).flat[0]),
                 seen=fit.seen("body" if frame == "body" else "mast", antenna),
             )
     return out
@@ -303,6 +305,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
                 tower_file=files["tower"],
                 uav_file=files["uav"],
                 sd_db=round(float(np.nanmean(seen)), 2),
+                lock=_at_unit_gain(calibration.locks.get(antenna), maps[antenna, "uav"], maps[antenna, "tower"]),
             )
         )
     return (
@@ -314,6 +317,13 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
         ),
         tables,
     )
+
+
+def _at_unit_gain(lock: LearnedLock | None, *ends: AntennaMap) -> LearnedLock | None:
+    """P(lock) of levels that are predicted with the antennas as written."""
+    if lock is None:
+        return None
+    return lock.model_copy(update={"gain_db": round(lock.gain_db - sum(end.level_db for end in ends), 2)})
 
 
 def receiver_entry(

@@ -22,7 +22,7 @@ from ..compare import offset as offsets
 from ..compare import rank as ranks
 from ..compare import rss, statistics
 from ..compare.causes import Cause
-from ..compare.detection import DetectionScore, score_detection
+from ..compare.detection import DetectionForecast, DetectionScore, score_detection
 from ..compare.forecast import ForecastScore, score_forecast
 from ..compare.ladder import log_distance_level_db
 from ..compare.passes import Visit, repeatability
@@ -45,7 +45,7 @@ from ..compare.spread import StatedSpread, inside_shares
 from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.lock import LOCK_FLOOR_DB
 from ..flight.losses import direct_foliage_m
-from ..flight.remembered import errors_elsewhere
+from ..flight.remembered import errors_elsewhere, lock_elsewhere
 from ..flight.replay import FlightReplay, Replayed
 from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..flight.training import learned_here
@@ -206,7 +206,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             compared_with={} if trained else _paired(levels, {**simple, **alternatives}),
             averaged={} if trained else _averaged(series, replayed, levels, position, settings),
             censored=None if trained else _censored(settings, levels),
-            detection=None if trained else _detection(settings, series, levels),
+            detection=None if trained else _detection(data, series, levels, simple["free_space"]),
             snr=None if trained else _snr(series, levels),
             expected_offset=_expected(settings.reference_powers, data.folder, series, score.offset_db),
             repeatability={name: repeatability(*pair, PASSES_WITHIN_M) for name, pair in passes.items()},
@@ -225,8 +225,14 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
 def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
     """Error to expect on another flight, where the antennas of the site say it."""
     errors = errors_elsewhere(data.settings.antennas, series, data.folder)
-    names = ("rmse_db", "free_space_rmse_db", "rmse_4s_db")
-    return None if errors is None else {name: getattr(errors, name) for name in names}
+    lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
+    out: dict[str, float] = {}
+    for known, names in (
+        (errors, ("rmse_db", "free_space_rmse_db", "rmse_4s_db")),
+        (lock, ("floor_rmse_db", "free_space_floor_rmse_db")),
+    ):
+        out |= {} if known is None else {name: getattr(known, name) for name in names}
+    return out or None
 
 
 def _cause(site: Site, series: RssSeries, replayed: Replayed, levels: Levels, free_space: FloatArray) -> Cause | None:
@@ -352,7 +358,7 @@ def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
     )
 
 
-def _detection(settings: RssSettings, series: RssSeries, levels: Levels) -> DetectionScore | None:
+def _detection(data: FlightData, series: RssSeries, levels: Levels, free_space_db: FloatArray) -> DetectionScore | None:
     """P(lock), or P(above the floor), and all samples with the floor; None for a level without either."""
     if series.locked is not None:
         known, detected, floor_db = np.isfinite(series.locked), series.locked == 1.0, LOCK_FLOOR_DB
@@ -363,15 +369,20 @@ def _detection(settings: RssSettings, series: RssSeries, levels: Levels) -> Dete
             return None
         floor_db = float(np.nanmin(levels.measured_db))
     at = known & levels.posed
-    return score_detection(
+    lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
+    forecast = None if lock is None else DetectionForecast(
+        level_db=lock.gain_db + series.link.transmit_power_dbm, per_db=lock.per_db, share=lock.share
+    )  # fmt: skip
+    score = score_detection(
         rss.seconds(series.time[at]),
         levels.measured_db[at],
         levels.simulated_db[at],
         detected[at],
         floor_db=floor_db,
-        span_db=settings.span_db,
-        step_db=settings.advanced.step_db,
+        free_space_db=free_space_db[at],
+        forecast=forecast,
     )
+    return None if score is None else dataclasses.replace(score, locks=series.locked is not None)
 
 
 def _censored(settings: RssSettings, levels: Levels) -> Censored | None:

@@ -19,6 +19,8 @@ class AntennaMap:
         Such as ``LW1.USRP1 tower``.
     theta_deg, azimuth_deg : (t,), (p,)
     gain_dbi, sd_db : (t, p)
+    level_db : float
+        What was taken from the learned gain for a mean of 0 dBi.
     seen : (m, 3)
         Unit vectors of the directions that flights looked in.
     """
@@ -28,6 +30,7 @@ class AntennaMap:
     azimuth_deg: FloatArray
     gain_dbi: FloatArray
     sd_db: FloatArray
+    level_db: float
     seen: FloatArray
 
 

@@ -34,7 +34,7 @@ from .rss_figures import (
     trajectory,
 )
 from .serving_figures import serving_spec
-from .words import count
+from .words import count, learned_on
 
 
 def figure_specs(data: ReportData) -> list[FigureSpec]:
@@ -155,7 +155,7 @@ def _rss_specs(data: ReportData, panel: RssResult) -> Iterator[FigureSpec]:
             f"rss_detection_{stem}", section, f"{panel.name}: is the probability of detection calibrated?",
             "Fifths of the predicted probability against the share that the receiver detected; on the diagonal the "
             f"forecast is calibrated. Brier score {score.brier:.3f}, constant forecast {score.constant_brier:.3f}; log "
-            f"score {score.log_score:.3f}, constant {score.constant_log_score:.3f} (held-out segments).",
+            f"score {score.log_score:.3f}, constant {score.constant_log_score:.3f} ({learned_on(score)}).",
             partial(detection_reliability, score),
         )  # fmt: skip
     if any(name in GEOMETRY for name in panel.geometry):

@@ -24,6 +24,7 @@ from .words import (
     expected_sentence,
     first_sentence,
     local_error,
+    lock_sentence,
     nearest_k,
     pretty,
     training_sentence,
@@ -57,7 +58,7 @@ def verdict(data: ReportData) -> tuple[str, ...]:
     if not first:
         most = max([panel.score.n for panel in data.rss], default=0)
         return (NOTHING_COMPARED if not most else TOO_FEW_COMPARED.format(n=most), trust(data))
-    first = " ".join(part for part in (first, expected_sentence(scored)) if part)
+    first = " ".join(part for part in (lock_sentence(scored), first, expected_sentence(scored)) if part)
     return first, " ".join(part for part in (_causes(scored) or _fails(scored), trust(data)) if part)
 
 

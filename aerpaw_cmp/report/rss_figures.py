@@ -308,7 +308,9 @@ def detection_reliability(score: DetectionScore) -> Figure:
     ax = fig.subplots()
     ax.plot([0, 100], [0, 100], color="0.6", linewidth=1, label="calibrated")
     ax.plot(100 * said, 100 * seen, color=SIMULATED, linewidth=1)
-    ax.scatter(100 * said, 100 * seen, s=12 + 120 * n / n.max(), color=SIMULATED, zorder=3, label="held-out segments")
+    ax.scatter(
+        100 * said, 100 * seen, s=12 + 120 * n / n.max(), color=SIMULATED, zorder=3, label="fifths of the samples"
+    )
     ax.set_xlabel("Predicted probability of detection [%]")
     ax.set_ylabel("Detected samples [%]")
     ax.set_xlim(0, 100)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.units import AnyArray
+from ..compare.detection import DetectionScore
 from ..compare.ladder import LadderRow
 from ..compare.result import BASELINE_TITLE, AuditResult, RankResult, RssResult
 from ..compare.rss import ErrorSpan
@@ -144,7 +145,7 @@ def first_sentence(facts: Judged) -> str:
 def expected_sentence(panels: Sequence[RssResult]) -> str:
     """The error to expect on another flight; nothing unless every scored channel has it from flights left out."""
     known = [panel.further.elsewhere for panel in panels]
-    if not known or not all(known):
+    if not known or not all(one and "rmse_db" in one for one in known):
         return ""
     learned, free = (
         math.sqrt(sum(one[name] ** 2 for one in known if one) / len(known))
@@ -213,7 +214,7 @@ def local_error(panel: RssResult, span: ErrorSpan) -> str:
     known = []
     if panel.clock_verdict == "cannot tell":
         known.append("the radio clock could not be confirmed")
-    if panel.further.detection is not None:
+    if lock_lost(panel) is not None:
         known.append("the receiver lost its lock on this flight")
     side = "above" if span.mean_db > 0 else "below"
     start, end = (str(t.astype("datetime64[s]"))[-8:] for t in instants(panel.time, span))
@@ -407,11 +408,47 @@ def _detection_words(panel: RssResult) -> str:
         return ""
     return (
         f" The receiver detected the signal in {100 * score.n_detected / score.n:.0f} % of {score.n} samples. "
-        f"The predicted level gives P(detected) with a Brier score of {score.brier:.2f} (held-out segments; a "
+        f"The predicted level gives P(detected) with a Brier score of {score.brier:.2f} ({learned_on(score)}; a "
         f"constant: {score.constant_brier:.2f}). With a floor at {score.floor_db:.0f}, all samples: RMSE "
-        f"{score.rmse_db:.1f} dB; detected samples, which are selected by their level: "
-        f"{score.detected_rmse_db:.1f} dB."
+        f"{score.rmse_db:.1f} dB (free space: {score.free_space_rmse_db:.1f} dB); detected samples, which are "
+        f"selected by their level: {score.detected_rmse_db:.1f} dB."
     )
+
+
+def learned_on(score: DetectionScore) -> str:
+    """Where a probability of detection comes from."""
+    return {
+        "other flights": "learned on other flights",
+        "held-out segments": "learned in other segments of this flight",
+    }[score.learned_on]
+
+
+def lock_lost(panel: RssResult) -> DetectionScore | None:
+    """The score of a receiver whose log says when it was in lock; None of others, and of one that never lost it."""
+    score = panel.further.detection
+    return score if score is not None and score.locks else None
+
+
+def lock_sentence(panels: Sequence[RssResult]) -> str:
+    """Both parts of the score of a receiver that lost its lock; nothing where none did."""
+    said = []
+    for panel in panels:
+        score, known = lock_lost(panel), panel.further.elsewhere or {}
+        if score is None:
+            continue
+        floor, expected = f"{score.floor_db:.0f}".replace("-", "\N{MINUS SIGN}"), ""
+        if "floor_rmse_db" in known:
+            expected = (
+                f" Expect {known['floor_rmse_db']:.1f} dB on another flight (free space "
+                f"{known['free_space_floor_rmse_db']:.1f} dB)."
+            )
+        said.append(
+            f"{panel.name} lost its lock in {100 - 100 * score.n_detected / score.n:.0f} % of the samples. With lower "
+            f"levels counted as {floor} {panel.unit}: RMSE {score.rmse_db:.1f} dB; free space: "
+            f"{score.free_space_rmse_db:.1f} dB.{expected} P(locked), {learned_on(score)}: Brier score "
+            f"{score.brier:.2f}; a constant: {score.constant_brier:.2f}."
+        )
+    return " ".join(said)
 
 
 def _snr_words(panel: RssResult) -> str:

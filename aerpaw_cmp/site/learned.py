@@ -51,6 +51,26 @@ class Errors(_Record):
     sector_rmse_db: float | None = None
 
 
+class LearnedLock(_Record):
+    """When a receiver is in lock: P = 1 / (1 + exp(-per_db (path gain - gain_db))) of the predicted path gain [dB].
+
+    The scores are means over flights left out: Brier and log score (nat) beside those of the constant ``share``, and
+    the RMSE [dB] of all samples where levels below the floor count as the floor.
+    """
+
+    gain_db: float
+    per_db: Annotated[float, Field(gt=0)]
+    share: Annotated[float, Field(gt=0, lt=1)]
+    flights: int
+    brier: float
+    constant_brier: float
+    log_score: float
+    constant_log_score: float
+    floor_db: float
+    floor_rmse_db: float
+    free_space_floor_rmse_db: float
+
+
 class LearnedSeries(_Record):
     """Antennas of one tower and channel, and what the log of that channel looks like."""
 
@@ -62,6 +82,7 @@ class LearnedSeries(_Record):
     uav_file: str
     sd_db: float
     """Mean standard deviation of the level over directions that were flown."""
+    lock: LearnedLock | None = None
 
 
 class LearnedReceiver(_Record):
@@ -93,11 +114,16 @@ class Entry(_Record):
     def about(self) -> str:
         """One sentence: learned from what, and what error to expect."""
         days = f" of {', '.join(self.flown)}" if self.flown else ""  # none where the logs have relative times
-        text = f"learned on {len(self.flights)} flights{days}"
+        text = f"learned on {len(self.flights)} flight{'s' if len(self.flights) > 1 else ''}{days}"
         if self.errors is not None:
             text += (
                 f"; expect an RMSE of {self.errors.rmse_db:.1f} dB on another flight, free space "
                 f"{self.errors.free_space_rmse_db:.1f} dB"
+            )
+        for lock in [one.lock for one in self.series if one.lock is not None][:1]:
+            text += (
+                f", {lock.floor_rmse_db:.1f} and {lock.free_space_floor_rmse_db:.1f} dB where levels below "
+                f"{lock.floor_db:g} count as {lock.floor_db:g}"
             )
         kappas = [one.kappa for one in self.receivers if one.kappa is not None]
         return text + (f"; expect kappa {sum(kappas) / len(kappas):.2f} on another flight" if kappas else "")

@@ -17,6 +17,7 @@ from aerpaw_cmp.compare.calibration import (
     groups_of,
     spread_flights,
 )
+from aerpaw_cmp.compare.detection import floored_fit
 from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
@@ -91,6 +92,41 @@ def test_the_mean_alone_is_that_of_the_prediction() -> None:
     np.testing.assert_allclose(learned.mean(lost), learned.predict(lost)[0], rtol=0, atol=1e-9)
     assert learned.mean_error(lost) == pytest.approx(np.nanmean(lost.residual_db - learned.mean(lost)), abs=1e-9)
     assert np.isnan(learned.mean(lost)).sum() == 5
+
+
+def test_levels_below_the_floor_of_a_receiver_teach_no_gain() -> None:
+    """Where the receiver lost its lock it writes noise: taken as levels, they flatten the antenna's null."""
+
+    def lost(o: Observed, floor_db: float | None) -> Observed:
+        faded = o.samples.residual_db + np.random.default_rng(4).normal(0.0, 3.0, len(o.samples))
+        written = np.where(faded < -1.0, -21.0, faded)
+        floor = None if floor_db is None else np.full(len(written), floor_db)
+        return dataclasses.replace(o, samples=dataclasses.replace(o.samples, residual_db=written, floor_db=floor))
+
+    truth = observed("c", seed=3).samples
+    flights = [observed("a", seed=1), observed("b", seed=2)]
+    error = {}
+    for floor_db in (None, -1.0):
+        learned = calibration.learn([lost(o, floor_db).samples for o in flights], RECIPE)
+        error[floor_db] = floored_fit(truth.residual_db, learned.mean(truth), -1.0).rmse_db
+    assert error[-1.0] < 0.8 * error[None]
+
+
+def test_part_and_bins_keep_or_drop_what_belongs_to_samples() -> None:
+    o = observed("a")
+    whole = dataclasses.replace(
+        o,
+        samples=dataclasses.replace(o.samples, floor_db=np.arange(200.0)),
+        locked=np.arange(200.0) % 2,
+        sent_dbm=30.0,
+    )
+    some = whole.part(np.arange(0, 200, 3))
+    assert some.samples.floor_db is not None
+    assert some.locked is not None
+    np.testing.assert_array_equal(some.samples.floor_db, np.arange(0.0, 200.0, 3.0))
+    np.testing.assert_array_equal(some.locked, np.arange(0, 200, 3) % 2)
+    assert some.sent_dbm == 30.0
+    assert whole.samples.binned(4.0).floor_db is None
 
 
 def leaving(parts: Parts, flights: list[Observed]) -> tuple[calibration.Score, ...]:

@@ -7,7 +7,13 @@ import pytest
 from scipy.special import expit
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
-from aerpaw_cmp.compare.detection import aligned_quality, floored_offset, score_detection
+from aerpaw_cmp.compare.detection import (
+    DetectionForecast,
+    aligned_quality,
+    floored_offset,
+    learn_detection,
+    score_detection,
+)
 
 FLOOR = -15.0
 
@@ -24,9 +30,7 @@ def _flight(offset_db: float = -40.0, n: int = 6000) -> tuple[FloatArray, FloatA
 
 def test_the_probability_is_calibrated_and_beats_the_constant() -> None:
     time, measured, simulated, detected = _flight()
-    score = score_detection(
-        time, measured, simulated, detected, floor_db=FLOOR, span_db=(-80.0, 0.0), step_db=0.1
-    )  # fmt: skip
+    score = score_detection(time, measured, simulated, detected, floor_db=FLOOR)
     assert score is not None
     truth = expit((simulated + 40.0 - FLOOR) / 3.0)
     best = float(np.mean((truth - detected) ** 2))
@@ -44,7 +48,7 @@ def test_the_probability_is_calibrated_and_beats_the_constant() -> None:
 def test_a_level_that_says_nothing_gains_nothing() -> None:
     time, measured, simulated, detected = _flight()
     shuffled = np.random.default_rng(1).permutation(simulated)
-    score = score_detection(time, measured, shuffled, detected, floor_db=FLOOR, span_db=(-80.0, 0.0), step_db=0.1)
+    score = score_detection(time, measured, shuffled, detected, floor_db=FLOOR)
     assert score is not None
     assert score.brier > 0.98 * score.constant_brier
 
@@ -62,10 +66,43 @@ def test_the_floored_offset_is_that_of_a_search_by_hand(offset_db: float) -> Non
     assert fit.at_edge is False
 
 
+def _lock(seed: int, middle_db: float, n: int) -> tuple[FloatArray, BoolArray]:
+    """Predicted levels of a flight about a middle, and when a receiver of 25 dB re -40, 3 dB a unit of odds, locks."""
+    random = np.random.default_rng(seed)
+    level = random.normal(middle_db, 8.0, n)
+    return level, random.random(n) < expit((level + 65.0) / 3.0)
+
+
+def test_other_flights_teach_when_the_receiver_locks() -> None:
+    flights = [_lock(seed, middle, n) for seed, middle, n in ((1, -60.0, 4000), (2, -70.0, 1500), (3, -50.0, 9000))]
+    forecast = learn_detection(flights)
+    assert forecast is not None
+    assert forecast.level_db == pytest.approx(-65.0, abs=0.5)
+    assert forecast.per_db == pytest.approx(1.0 / 3.0, rel=0.06)
+    assert forecast.share == pytest.approx(np.mean([seen.mean() for _, seen in flights]))
+    level, detected = _lock(9, -68.0, 5000)
+    truth = expit((level + 65.0) / 3.0)
+    time, measured = np.arange(5000.0), np.where(detected, level, -30.0)
+    for shift_db, least, most in ((0.0, 0.0, 0.003), (10.0, 0.05, 1.0)):  # nothing is fitted on this flight
+        moved = DetectionForecast(level_db=forecast.level_db + shift_db, per_db=forecast.per_db, share=forecast.share)
+        score = score_detection(time, measured, level, detected, floor_db=-65.0, forecast=moved)
+        assert score is not None
+        assert score.learned_on == "other flights"
+        assert least < score.brier - float(np.mean((truth - detected) ** 2)) < most
+        assert score.constant_brier == pytest.approx(np.mean((forecast.share - detected) ** 2))
+
+
+def test_nothing_is_learned_of_a_receiver_that_keeps_its_lock_or_locks_at_low_levels() -> None:
+    level, detected = _lock(1, -60.0, 4000)
+    assert learn_detection([(level, np.ones(4000, dtype=bool))]) is None
+    assert learn_detection([(-level, detected)]) is None
+    assert learn_detection([]) is None
+
+
 def test_one_outcome_alone_is_no_score() -> None:
     time, measured, simulated, _ = _flight()
     always = np.ones(len(time), dtype=bool)
-    assert score_detection(time, measured, simulated, always, floor_db=FLOOR, span_db=(-80, 0), step_db=0.1) is None
+    assert score_detection(time, measured, simulated, always, floor_db=FLOOR) is None
 
 
 def test_short_logs_keep_their_pairs() -> None:

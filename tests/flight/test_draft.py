@@ -317,3 +317,14 @@ def test_a_draft_of_a_flight_file_names_logs_in_it_that_came_from_above(
     files = read_logs(settings, Path())
     assert len(calls) == 1
     assert sorted(Path(file.path).name for file in files) == sorted(Path(log.path).name for log in settings.logs)
+
+
+@pytest.mark.parametrize(("top_m", "low_m"), [(40.0, 5.0), (12.0, None)])
+def test_a_rank_log_with_positions_of_its_own_is_compared_in_flight(logs: Path, top_m: float, low_m: float) -> None:
+    """On the ground grass and airframe decide the rank: on a real flight that took half of the log score's gain."""
+    (rank,) = ingest(logs / "UAV/modem_ri.csv", options=OPTIONS)
+    frame = rank.result.streams[0].frame.assign(rsrp_dbm=-80.0, cqi=9.0)
+    frame["altitude_m"] = np.minimum(np.arange(len(frame)), top_m)
+    (logs / "nemo.csv").write_bytes(nemo_csv(frame, "2025-06-01T14:00:00Z"))
+    text, _ = draft(ingest(logs / "nemo.csv"), logs)
+    assert parse_yaml(text, FlightFile).rank.minimum_height_m == low_m

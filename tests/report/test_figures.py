@@ -362,12 +362,13 @@ def test_the_reliability_of_a_detection_is_drawn_where_it_was_scored(report_data
     score = DetectionScore(
         reliability=((0.1, 0.12, 50), (0.5, 0.45, 80), (0.9, 0.93, 200)), brier=0.11, constant_brier=0.2,
         log_score=0.3, constant_log_score=0.6, n=330, n_detected=230, floor_db=-15.0, rmse_db=9.0, offset_db=1.0,
-        detected_rmse_db=7.0,
+        detected_rmse_db=7.0, free_space_rmse_db=9.9, learned_on="other flights",
     )  # fmt: skip
     assert not any("rss_detection" in spec.name for spec in figures.figure_specs(report_data))
     scored = with_numbers(panel, detection=score)
     data = dataclasses.replace(report_data, rss=(scored, *report_data.rss[1:]))
     (spec,) = [one for one in figures.figure_specs(data) if "rss_detection" in one.name]
     assert "Brier score 0.110, constant forecast 0.200" in spec.caption
+    assert "(learned on other flights)" in spec.caption
     points = spec.draw().axes[0].collections[0].get_offsets()
     np.testing.assert_allclose(points, [[10, 12], [50, 45], [90, 93]])

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.causes import Cause
+from aerpaw_cmp.compare.detection import DetectionScore
 from aerpaw_cmp.compare.field_difference import FieldAudit
 from aerpaw_cmp.compare.forecast import score_forecast
 from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
 from aerpaw_cmp.compare.rss import ErrorSpan
 from aerpaw_cmp.compare.statistics import paired_difference
+from aerpaw_cmp.report.diff_words import DIFFERENCE
 from aerpaw_cmp.report.first_screen import headlines, pooled_db, verdict
-from aerpaw_cmp.report.words import CAUSES, DIFFERENCE, Judged, first_sentence, pretty, ranking_sentence
+from aerpaw_cmp.report.words import CAUSES, Judged, first_sentence, pretty, ranking_sentence
 from benchmarks.fabricated import with_numbers
 
 
@@ -226,3 +228,25 @@ def test_a_difference_of_reports_says_what_its_interval_does(word):
     said = DIFFERENCE[word].format(difference=0.31, interval="[+0.10, +0.52]")
     assert [w for w in ("better", "worse") if w in said] == ([word] if word in ("better", "worse") else [])
     assert "+0.31 dB" in said
+
+
+def test_a_receiver_that_lost_its_lock_is_scored_in_two_parts_first(report_data):
+    score = DetectionScore(
+        brier=0.137, constant_brier=0.197, log_score=0.42, constant_log_score=0.59, n=1000, n_detected=700,
+        floor_db=-15.0, offset_db=40.0, rmse_db=8.04, free_space_rmse_db=10.3, detected_rmse_db=7.0, reliability=(),
+        learned_on="other flights", locks=True,
+    )  # fmt: skip
+    elsewhere = {"floor_rmse_db": 8.2, "free_space_floor_rmse_db": 10.4}
+
+    def said(score, elsewhere):
+        first = with_numbers(report_data.rss[0], detection=score, elsewhere=elsewhere)
+        return verdict(dataclasses.replace(report_data, rss=(first,)))[0]
+
+    text = said(score, elsewhere)
+    assert text.startswith(f"{report_data.rss[0].name} lost its lock in 30 % of the samples.")
+    assert "RMSE 8.0 dB; free space: 10.3 dB. Expect 8.2 dB on another flight (free space 10.4 dB)." in text
+    assert "P(locked), learned on other flights: Brier score 0.14; a constant: 0.20." in text
+    here = said(dataclasses.replace(score, learned_on="held-out segments"), None)
+    assert "P(locked), learned in other segments of this flight" in here
+    assert "Expect" not in here
+    assert "lock" not in said(dataclasses.replace(score, locks=False), None)  # a floor is no lock

@@ -1,0 +1,91 @@
+"""P(lock) of a predicted level: learned on flights, scored on those left out, used for a flight that is unseen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import expit
+
+from aerpaw_cmp.compare.calibration import Observed, Recipe
+from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term
+from aerpaw_cmp.flight.data import RssSeries
+from aerpaw_cmp.flight.lock import LOCK_FLOOR_DB
+from aerpaw_cmp.flight.remembered import lock_elsewhere
+from aerpaw_cmp.flight.settings import LinkSettings
+from aerpaw_cmp.jobs.calibrate_lock import learned_locks, lock_words
+from aerpaw_cmp.site.learned import Entry, LearnedLock, LearnedSeries, read_learned, remember
+
+MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
+RECIPE = Recipe(model=MODEL, rotation=lambda *_: np.eye(3), mount=False)
+HALF_DB, PER_DB, SENT_DBM, REFERENCE_DB = -95.0, 0.4, 40.0, 80.0
+
+
+def flight(name: str, seed: int, losing: bool = True) -> Observed:
+    """Circles about a rover that move away: 4 dB of cosine gain, a lock that is lost about 95 dB of path loss."""
+    random = np.random.default_rng(seed)
+    time = np.arange(0.0, 1200.0)
+    azimuth, reach = 2 * np.pi * time / 300.0 + seed, 200.0 + time
+    line = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(len(time), 0.3)], axis=1)
+    unit = line / np.linalg.norm(line, axis=1, keepdims=True)
+    path_db = -38.0 - 20.0 * np.log10(reach)
+    gain_db = 4.0 * np.cos(azimuth)
+    level_db = path_db + gain_db
+    locked = random.random(len(time)) < expit(PER_DB * (level_db - HALF_DB))
+    measured = np.where(locked, level_db + REFERENCE_DB + random.normal(0.0, 2.0, len(time)), -28.0)
+    samples = LinkSamples(
+        flight=name,
+        tower="ROVER",
+        channel="power",
+        time_s=time,
+        position_m=reach[:, None] * line,
+        at_uav=-unit,
+        at_tower=unit,
+        residual_db=measured - path_db - SENT_DBM,
+        floor_db=LOCK_FLOOR_DB - path_db - SENT_DBM,
+    )
+    kept = locked.astype(np.float64) if losing else np.ones(len(time))
+    return Observed(samples, path_db + SENT_DBM, np.zeros(len(time)), locked=kept, sent_dbm=SENT_DBM)
+
+
+def test_the_planted_lock_is_recovered_and_beats_the_share_on_flights_left_out() -> None:
+    locks = learned_locks([flight(name, seed) for seed, name in enumerate("abc")], RECIPE, {})
+    lock = locks["ROVER.power"]
+    assert lock.gain_db == pytest.approx(HALF_DB, abs=1.5)  # of the path gain: not of 40 dBm
+    assert lock.per_db == pytest.approx(PER_DB, rel=0.35)
+    assert lock.flights == 3
+    assert lock.brier < 0.7 * lock.constant_brier
+    assert lock.log_score < 0.7 * lock.constant_log_score
+    assert lock.floor_rmse_db < 0.8 * lock.free_space_floor_rmse_db  # 2 dB of noise; 4 dB of cosine beside it
+    assert f"{lock.brier:.3f}" in lock_words(lock)
+
+
+def test_one_flight_or_a_receiver_that_keeps_its_lock_teaches_nothing() -> None:
+    assert learned_locks([flight("a", 1)], RECIPE, {}) == {}
+    assert learned_locks([flight("a", 1, losing=False), flight("b", 2, losing=False)], RECIPE, {}) == {}
+
+
+def test_what_a_site_remembers_of_the_lock_is_used_with_its_airframe_alone(tmp_path: Path) -> None:
+    lock = LearnedLock(
+        gain_db=-95.0, per_db=0.1, share=0.7, flights=3, brier=0.13, constant_brier=0.2, log_score=0.42,
+        constant_log_score=0.6, floor_db=-15.0, floor_rmse_db=8.2, free_space_floor_rmse_db=10.3,
+    )  # fmt: skip
+    series = LearnedSeries(
+        tower="ROVER", channel="power", reader="flight_mat", carrier_hz=3.32e9, tower_file="t.gz", uav_file="u.gz",
+        sd_db=3.0, lock=lock,
+    )  # fmt: skip
+    entry = Entry(command="c", made="2026-01-02", flights=["a", "b"], flown=[], trained_on=["a" * 64], series=[series])
+    remember(tmp_path / "mine.yaml", "afar", entry, {})
+    assert read_learned(tmp_path / "mine.yaml").entries["afar"].series[0].lock == lock
+    times = np.zeros(0, dtype="datetime64[ns]")
+    link = LinkSettings(carrier_hz=3.32e9)
+
+    def known(channel: str, antennas: dict[str, str]) -> LearnedLock | None:
+        one = RssSeries("NODE", channel, "dB re full scale", times, np.zeros(0), link, "")
+        return lock_elsewhere(antennas, one, tmp_path)
+
+    assert known("power", {"uav": "mine/afar_uav"}) == lock
+    assert known("power", {}) is None
+    assert known("RSRP", {"uav": "mine/afar_uav"}) is None
+    assert known("power", {"uav": "mine/nobody_uav"}) is None

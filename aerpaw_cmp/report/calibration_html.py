@@ -154,13 +154,13 @@ def figure_specs(data: CalibrationData) -> Iterator[FigureSpec]:
     """All figures."""
     if data.scores.get("flight_left_out"):
         yield FigureSpec(
-            "scores", "scores", "What carries over",
+            "scores", "scores", "Errors on what was left out",
             "Mean RMSE after one offset per flight and channel. Nothing is scored where it was learned.",
             partial(draw_scores, data),
         )  # fmt: skip
     if len(data.curve) > 1:
         yield FigureSpec(
-            "learning_curve", "scores", "What another flight would bring",
+            "learning_curve", "scores", "Expected gain of one flight more",
             f"Mean RMSE over {data.curve[0]['series']} series, each predicted by subsets of the other flights. The "
             "last point is extrapolated: the squared error as a constant and a part that falls with the number of "
             "flights.",
@@ -169,9 +169,9 @@ def figure_specs(data: CalibrationData) -> Iterator[FigureSpec]:
     for a in data.antennas:
         yield FigureSpec(
             f"antenna_{safe_name(a.name)}", "antennas", a.name,
-            f"Flights looked within 10 degrees of {100 * share_seen(a):.0f} % of the sphere (dots). Elsewhere the gain "
-            "is a guess, and its standard deviation says so. The level is normalised to a mean of 0 dBi over the "
-            "sphere: it is not identified beside the offsets.",
+            f"Flights saw directions within 10 degrees of {100 * share_seen(a):.0f} % of the sphere (dots). "
+            "Elsewhere the gain is a guess, and its standard deviation says so. The level is normalised to a mean of "
+            "0 dBi over the sphere: it is not identified beside the offsets.",
             partial(draw_antenna, a),
         )  # fmt: skip
     if data.place is not None:

@@ -56,11 +56,13 @@ STATED: dict[str, tuple[str, str]] = {
     "none": (HELD_OUT, ""),
     "no interval": ("", ""),
     "narrow": (
-        HELD_OUT + " They are too narrow: errors are {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) as stated.",
+        HELD_OUT
+        + " They are too narrow: errors are {effect:.1f} times as large as stated (95 %: {low:.1f} to {high:.1f}).",
         "add a flight of this area",
     ),
     "wide": (
-        HELD_OUT + " They are too wide: errors are {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) as stated.",
+        HELD_OUT
+        + " They are too wide: errors are {effect:.1f} times as large as stated (95 %: {low:.1f} to {high:.1f}).",
         "",
     ),
     "biased": (
@@ -74,11 +76,13 @@ FLOWN: dict[str, tuple[str, str]] = {
     "none": ("Intervals are as stated.", "`aerpaw-cmp predict` with this flight for the next route"),
     "no interval": ("Too few samples to judge the intervals.", ""),
     "narrow": (
-        "Intervals of {where} are too narrow: errors are {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) as stated.",
+        "Intervals of {where} are too narrow: errors are {effect:.1f} times as large as stated "
+        "(95 %: {low:.1f} to {high:.1f}).",
         "add this flight to those that are learned from",
     ),
     "wide": (
-        "Intervals of {where} are too wide: errors are {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) as stated.",
+        "Intervals of {where} are too wide: errors are {effect:.1f} times as large as stated "
+        "(95 %: {low:.1f} to {high:.1f}).",
         "add this flight to those that are learned from",
     ),
     "biased": (

@@ -1,0 +1,124 @@
+"""The six pages as HTML, from made-up records: for the tests of words and of first screens."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from aerpaw_cmp.compare.calibration import Score
+from aerpaw_cmp.compare.report_difference import Overlap, level_difference, pooled_difference
+from aerpaw_cmp.report import calibration_html, campaign_html, diff_html, html, maps_html, prediction_html
+from aerpaw_cmp.report.calibration_data import CalibrationData
+from aerpaw_cmp.report.calibration_words import sentences
+from aerpaw_cmp.report.diff_data import Entry, ReportDiff, ReportSide
+from aerpaw_cmp.report.prediction_words import first_words
+from benchmarks import fabricated
+
+Fixture = Callable[[str], Any]
+DATA = (
+    "made for a test", "Towers of another source differ by up to 9 m.", "repeated lines were re-expanded from",
+    "Tower heights are 10 m.", "A season that was never flown", "samples (expected at least", "settings flights",
+    "fields instead of", "a null of the two-ray pattern", "everything else is synthetic", "of woodland covers",
+)  # fmt: skip
+"""Words of the made-up records themselves."""
+
+
+def _written(write: Callable[[Any, Path], Any], data: Any, name: str) -> str:
+    with tempfile.TemporaryDirectory() as folder:
+        write(data, Path(folder))
+        return (Path(folder) / f"{name}.html").read_text(encoding="utf-8")
+
+
+def report(fixture: Fixture) -> str:
+    return html.page(fixture("report_data"), [], ["metrics.json"])
+
+
+def site_map(fixture: Fixture) -> str:
+    return maps_html.maps_page(fixture("maps_data"), [], ["metrics.json"])
+
+
+def campaign(_: Fixture) -> str:
+    return campaign_html.campaign_page(fabricated.season(30, 6, 2, 2), [], ["campaign.json"])
+
+
+def calibration(_: Fixture) -> str:
+    """Four flights, two channels: 3.5 dB with learned antennas, 6 dB without."""
+    scatter = np.random.default_rng(4).normal(0.0, 0.2, (5, 8))
+
+    def scores(learned_db: float, free_db: float, row: int) -> list[Score]:
+        return [
+            Score(flight=f"F{i // 2}", tower="LW1", channel=f"USRP{i % 2 + 1}", rmse_db=learned_db + scatter[row, i],
+                  rmse_4s_db=learned_db - 0.7, free_space_rmse_db=free_db + scatter[4, i],
+                  constant_rmse_db=free_db + 2.0, log_distance_rmse_db=free_db + 0.5, n=4000)
+            for i in range(8)
+        ]  # fmt: skip
+
+    left = {"flight_left_out": scores(3.5, 6.0, 0), "sector_left_out": scores(4.2, 6.3, 1), "heading_left_out": []}
+    controls = {
+        "body frame, no patterns": scores(3.6, 6.0, 0),
+        "world frame at the UAV": scores(5.1, 6.0, 2),
+        "heading turned the wrong way": scores(5.6, 6.0, 3),
+    }
+    as_dicts = [{k: [dataclasses.asdict(s) for s in v] for k, v in part.items()} for part in (left, controls)]
+    data = CalibrationData(
+        name="lake_wheeler_july", generated="2026-11-21T00:00:00+00:00", flights=["F0", "F1", "F2", "F3"],
+        trained_on=["ab" * 32], words=sentences(left, controls, (0.02, np.inf), ()), warnings=[], scores=as_dicts[0],
+        controls=as_dicts[1], mounts={}, strengths={}, ground=None, curve=[], one_more_rmse_db=np.nan, antennas=[],
+        settings_text="link: {}",
+    )  # fmt: skip
+    return _written(calibration_html.write_calibration, data, "calibration")
+
+
+def diff(_: Fixture) -> str:
+    """The second report has 2 dB of further noise on its replay, and one other setting."""
+    draw = np.random.default_rng(5)
+    n = 2000
+    time, simulated, first = 0.2 * np.arange(n), draw.normal(-80.0, 5.0, n), draw.normal(0.0, 4.0, n)
+    second, overlap = first + draw.normal(0.0, 2.0, n), Overlap(first=n, second=n, common=n)
+    measured = simulated + first
+    sides = ((measured, simulated, first), (measured, measured - second, second))
+    level = level_difference("LW1", "USRP1", overlap, *sides, scored=(n, n), offsets_db=(4.0, 4.1))
+    sides_of = [ReportSide(folder=name, flight="sample", generated="2026-11-21T00:00:00+00:00", version="0.4")
+                for name in ("monday", "friday")]  # fmt: skip
+    return diff_html.diff_page(
+        ReportDiff(
+            first=sides_of[0], second=sides_of[1], settings=(Entry(key="rt.max_depth", first=2, second=1),), inputs=(),
+            versions=(), stages=(Entry(key="read", first=1.0, second=1.1),), numbers=(), levels=(level,), ranks=(),
+            pooled=pooled_difference([(time, first, second)]), new_warnings=(), gone_warnings=(),
+            links_first_only=(), links_second_only=(), tolerance_db=0.01, remarks=(),
+        )
+    )  # fmt: skip
+
+
+def prediction(fixture: Fixture) -> str:
+    """A route of 400 points under one tower, a third of them outside the flown places."""
+    from tests.report.test_prediction_words import FREE, LEARNED, WITH_FIELD, correction
+
+    chosen = correction(LEARNED, {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.1}, 3.0)
+    along = np.linspace(0.0, 1.0, 400)
+    table = pd.DataFrame(
+        {"point": np.arange(400), "time_s": 300 * along, "east_m": 400 * along, "north_m": 100 * along, "height_m": 40.0,
+         "yaw_deg": 90.0, "tower": "LW1", "channel": "USRP1", "level_db": -60 - 20 * along, "sd_db": 3.0,
+         "slow_sd_db": 2.0, "q05_db": -65 - 20 * along, "q95_db": -55 - 20 * along, "p_serving": 1.0,
+         "flag": np.where(along > 0.66, "outside_flown", "")}
+    )  # fmt: skip
+    data = prediction_html.PredictionPage(
+        name="route", kind="route", site=fixture("maps_data").site, table=table, units={"LW1 USRP1": "dBm"}, shape=None,
+        heights_m=(40.0,), verdict=first_words(chosen, 0.34), candidates=[], model={"noise_sd_db": 1.0},
+        chosen={"title": "antennas learned from the named flights, no correction", "sd_factor": 1.0, "left_out": "flights"},
+        flown={}, flights=("F0", "F1"), trained_on=(), threshold_db=None, warnings=(),
+        generated="2026-11-21T00:00:00+00:00", versions={}, stages_s={},
+    )  # fmt: skip
+    return _written(prediction_html.write_prediction, data, "prediction")
+
+
+PAGES: dict[str, Callable[[Fixture], str]] = {
+    "report": report, "map": site_map, "campaign": campaign, "calibration": calibration, "diff": diff,
+    "prediction": prediction,
+}  # fmt: skip

@@ -14,6 +14,7 @@ import numpy as np
 from ..logs import archives
 from ..logs.ingest import IngestedFile, read_bytes
 from ..logs.records import Stream, has_wall_clock
+from .grouping import stream_span
 
 _IN_NAME = re.compile(
     r"(?<!\d)(20\d\d)[-_]?([01]\d)[-_]?([0-3]\d)(?:[T_ -]([0-2]\d)[-_:]?([0-5]\d)(?:[-_:]?([0-5]\d))?)?(?!\d)"
@@ -62,11 +63,10 @@ def questions(file: IngestedFile, kept: Sequence[Stream], timezone: str | None) 
 
 def _start(kept: Sequence[Stream]) -> datetime | None:
     """First time (UTC) of some streams; None without a wall clock."""
-    times = [time[~np.isnat(time)] for s in kept if len(time := s.frame["time"].to_numpy("datetime64[us]"))]
-    first = min((time.min() for time in times if len(time)), default=None)
+    first = min((span[0] for stream in kept if (span := stream_span(stream)) is not None), default=None)
     if first is None or not has_wall_clock(first):
         return None
-    start: datetime = first.item().replace(tzinfo=zones.utc)
+    start: datetime = first.astype("datetime64[us]").item().replace(tzinfo=zones.utc)
     return start
 
 

@@ -86,6 +86,11 @@ class FlightData:
     nodes: Mapping[str, Track] = field(default_factory=dict)
     """Tracks of the towers that move; ``site`` has them in the middle of their positions."""
 
+    @property
+    def series(self) -> list[tuple[str, RssSeries | RankSeries]]:
+        """Every series with the kind of what it measured, RSS first."""
+        return [*(("RSS", s) for s in self.rss), *(("rank", s) for s in self.rank)]
+
     def poses_at(self, time: Times) -> TrackPoses:
         """Poses of the UAV at instants (n,), for a flight with a track."""
         assert self.track is not None
@@ -105,11 +110,14 @@ class FlightData:
         return place, pose.valid
 
 
+def site_place(site: str, folder: Path) -> str | Path:
+    """A site.yaml below the folder, or the name of a packaged site."""
+    return folder / site if (folder / site).is_file() else site
+
+
 def choose_site(choice: SiteChoice, folder: Path) -> Site:
     """The site of a flight, with the flight's own changes."""
-    name = choice.file
-    path = folder / name
-    site = load_site(path if path.is_file() else name, coordinates=choice.coordinates)
+    site = load_site(site_place(choice.file, folder), coordinates=choice.coordinates)
     if choice.antenna_height_m is not None:
         towers = {
             key: dataclasses.replace(tower, antenna_height_m=choice.antenna_height_m)
@@ -496,9 +504,8 @@ def _idle_attitude(data: FlightData) -> tuple[str, ...]:
     if mode == "ignored":
         return ()
     messages = []
-    for kind, tower, time in [("RSS", s.tower, s.time) for s in data.rss] + [
-        ("rank", s.tower, s.time) for s in data.rank
-    ]:
+    for kind, series in data.series:
+        tower, time = series.tower, series.time
         pose = None if data.track is None else data.track.pose_at(time)
         known = 0 if pose is None else int((pose.attitude_known if mode == "logged" else pose.valid).sum())
         if known == 0:
@@ -644,56 +651,47 @@ def _text(stream: Stream, key: str) -> str | None:
 
 
 def _check_overlap(data: FlightData) -> None:
+    """Every series must share time with the track that gives its poses, and with that of a tower that moves."""
     if not data.rss and not data.rank:
         raise UsageError(
             "none of the logs holds RSS or rank",
             expected="at least one radio log under 'logs'",
             cause="'skip', or a log left out",
         )
-    needs_track = [("RSS", s.tower, s.time) for s in data.rss] + [
-        ("rank", s.tower, s.time) for s in data.rank if s.position_m is None
-    ]
-    if needs_track and data.track is None:
-        raise UsageError(
-            f"{needs_track[0][0]} of {needs_track[0][1]} has no positions of its own and there is no telemetry log",
-            expected="a telemetry log (vehicle_out, say) under 'logs'",
-        )
-    for kind, tower, time in needs_track:
-        assert data.track is not None
-        start, end = np.datetime64(data.track.start_ns, "ns"), np.datetime64(data.track.end_ns, "ns")
-        if len(time) == 0 or time.min() > end or time.max() < start:
-            shown = f"{pd.Timestamp(time.min())} .. {pd.Timestamp(time.max())}" if len(time) else "no samples"
-            flown = f"{pd.Timestamp(start)} .. {pd.Timestamp(end)}"
-            raise InputError(
-                f"no overlap in time: {kind} of {tower} spans {shown}, telemetry {flown} (UTC)",
-                expected="logs of the same flight",
-                cause=_clock_cause(data.settings.timezone, time, start, end),
+    for kind, series in data.series:
+        if data.track is None and (isinstance(series, RssSeries) or series.position_m is None):
+            raise UsageError(
+                f"{kind} of {series.tower} has no positions of its own and there is no telemetry log",
+                expected="a telemetry log (vehicle_out, say) under 'logs'",
             )
-    _check_nodes(data)
+    for kind, series in data.series:
+        if data.track is not None and (isinstance(series, RssSeries) or series.position_m is None):
+            _check_shared(data, f"{kind} of {series.tower}", series.time, data.track)
+    for kind, series in data.series:
+        if series.tower in data.nodes and len(series.time):
+            what = f"{kind} of {series.tower}"
+            _check_shared(data, what, series.time, data.nodes[series.tower], node=series.tower)
 
 
 FIRST_YEAR = 2000
 """A log that ends before counts from a zero of its own."""
 
 
-def _check_nodes(data: FlightData) -> None:
-    """Every series of a tower that moves must share time with the tower's track."""
-    every = [("RSS", s.tower, s.time) for s in data.rss] + [("rank", s.tower, s.time) for s in data.rank]
-    for kind, tower, time in every:
-        track = data.nodes.get(tower)
-        if track is None or not len(time):
-            continue
-        start, end = np.datetime64(track.start_ns, "ns"), np.datetime64(track.end_ns, "ns")
-        if time.min() > end or time.max() < start:
-            cause = _clock_cause(data.settings.timezone, time, start, end)
-            if pd.Timestamp(end).year < FIRST_YEAR:
-                cause = "relative times: they want 'time_origin' beside the log"
-            raise InputError(
-                f"no overlap in time: {kind} of {tower} spans {pd.Timestamp(time.min())} .. {pd.Timestamp(time.max())}"
-                f", the track of this tower {pd.Timestamp(start)} .. {pd.Timestamp(end)} (UTC)",
-                expected="positions of the node during the flight",
-                cause=cause.replace("beside the log", f"beside 'path' in towers.{tower}.track"),
-            )
+def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: str | None = None) -> None:
+    """Times of a series must meet those of the telemetry, or of the track of a node."""
+    start, end = np.datetime64(track.start_ns, "ns"), np.datetime64(track.end_ns, "ns")
+    if len(time) and time.min() <= end and time.max() >= start:
+        return
+    shown = f"{pd.Timestamp(time.min())} .. {pd.Timestamp(time.max())}" if len(time) else "no samples"
+    flown = f"{pd.Timestamp(start)} .. {pd.Timestamp(end)} (UTC)"
+    cause, of = _clock_cause(data.settings.timezone, time, start, end), "telemetry"
+    expected = "logs of the same flight"
+    if node is not None:
+        of, expected = "the track of this tower", "positions of the node during the flight"
+        if pd.Timestamp(end).year < FIRST_YEAR:
+            cause = "relative times: they want 'time_origin' beside the log"
+        cause = cause.replace("beside the log", f"beside 'path' in towers.{node}.track")
+    raise InputError(f"no overlap in time: {what} spans {shown}, {of} {flown}", expected=expected, cause=cause)
 
 
 def _clock_cause(timezone: str | None, time: Times, start: np.datetime64, end: np.datetime64) -> str:

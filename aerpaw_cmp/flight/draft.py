@@ -20,9 +20,9 @@ from ..logs.records import Stream, has_wall_clock
 from ..site.learned import Learned, read_learned
 from ..site.siteyaml import load_site
 from .cross_checks import questions
-from .data import is_ratio
+from .data import is_ratio, site_place
 from .dry_run import DryRun, dry_run
-from .grouping import flights
+from .grouping import Span, flights, stream_span
 from .heights import height_in_name, lacks_height
 from .lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
 from .node import CARRIER_HZ, POWER_DBM, Placer, listed_places
@@ -47,8 +47,6 @@ RANK = (
 )
 
 SITE = "lake_wheeler"
-
-Span = tuple[np.datetime64, np.datetime64]
 
 
 def draft(
@@ -95,7 +93,7 @@ def draft(
         mapping=dict(mapping or {}),
         timezone=timezone,
         positioned=any(_has_positions(stream) for stream in every),
-        placer=_placer(files, flown, _place_of(site, folder)),
+        placer=_placer(files, flown, site_place(site, folder)),
         locks=any(may_lose_lock(stream) for stream in every),
     )
     for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest
@@ -226,15 +224,11 @@ QUICK_AUDIT = 24
 _QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers to publish"
 
 
-def _place_of(site: str, folder: Path) -> str | Path:
-    return folder / site if (folder / site).is_file() else site
-
-
 def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
     """What the site remembers that fits; of a memory that cannot be read, nothing, and a remark says so."""
     series = [(tower, channel, reader) for tower, channel, reader in entries.series]
     try:
-        known = read_learned(_place_of(site, folder))
+        known = read_learned(site_place(site, folder))
     except (InputError, UsageError) as error:
         entries.out.append(f"what site {site} remembers: {error.found}")
         known = Learned()
@@ -518,7 +512,7 @@ class _Entries:
         refused = {}
         leading = _leading(streams)
         for stream in sorted(streams, key=_missing):
-            span = _span(stream)
+            span = stream_span(stream)
             if span is None:
                 refused[stream.name] = "no samples"
             elif stream.name in leading:
@@ -603,7 +597,7 @@ def _has_positions(stream: Stream) -> bool:
 def _has_level(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None) -> bool:
     """Whether some stream of the flight is RSS in the proper sense."""
     levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
-    spans = [span for s in levels if (span := _span(s))]
+    spans = [span for s in levels if (span := stream_span(s))]
     return any(flown is None or _meet(span, flown[1]) for span in spans)
 
 
@@ -619,7 +613,7 @@ def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
     for file in files:
         measured = any(stream.kind in ("rss", "rank") for stream in file.result.streams)
         for stream in file.result.streams:
-            if (span := _span(stream)) is None:
+            if (span := stream_span(stream)) is None:
                 continue
             if stream.kind != "telemetry":
                 others += [span] if has_wall_clock(span[0]) else []
@@ -637,12 +631,6 @@ def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
 
 def _meet(one: Span, other: Span) -> bool:
     return bool(one[0] <= other[1] and other[0] <= one[1])
-
-
-def _span(stream: Stream) -> Span | None:
-    time = stream.frame["time"].to_numpy("datetime64[ns]")
-    time = time[~np.isnat(time)]
-    return (time.min(), time.max()) if len(time) else None
 
 
 MOST_CELLS = 6

@@ -75,13 +75,16 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
 
 def span_of(file: IngestedFile) -> Span | None:
     """First and last time of a file's streams; None where it has no wall clock."""
-    times = [stream.frame["time"].to_numpy("datetime64[ns]") for stream in file.result.streams if len(stream.frame)]
-    times = [time[~np.isnat(time)] for time in times]
-    times = [time for time in times if len(time)]
-    if not times:
-        return None
-    first, last = min(time.min() for time in times), max(time.max() for time in times)
-    return (first, last) if has_wall_clock(first) else None
+    spans = [span for stream in file.result.streams if (span := stream_span(stream)) is not None]
+    first = min((begin for begin, _ in spans), default=None)
+    return None if first is None or not has_wall_clock(first) else (first, max(end for _, end in spans))
+
+
+def stream_span(stream: Stream) -> Span | None:
+    """First and last time of a stream; None where it has none."""
+    time = stream.frame["time"].to_numpy("datetime64[ns]")
+    time = time[~np.isnat(time)]
+    return (time.min(), time.max()) if len(time) else None
 
 
 def _tracks(file: IngestedFile) -> list[Stream]:

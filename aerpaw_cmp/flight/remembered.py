@@ -10,7 +10,7 @@ import numpy as np
 
 from ..common.errors import InputError, UsageError
 from ..site.learned import Entry, Errors, Learned, LearnedLock, find_named, read_learned
-from .data import FlightData, RssSeries
+from .data import FlightData, RssSeries, site_place
 from .settings import FlightFile, with_learned
 
 SeriesKey = tuple[str, str, str]
@@ -80,17 +80,13 @@ def offered(data: FlightData) -> FlightFile | None:
     series = [(s.tower, s.channel, data.files[int(number)].result.reader)
               for s in data.rss for number in np.unique(s.log)]  # fmt: skip
     try:
-        known = propose(read_learned(_beside(site, data.folder)), str(Path(site).with_suffix("")), series)
+        known = propose(read_learned(site_place(site, data.folder)), str(Path(site).with_suffix("")), series)
     except (InputError, UsageError):
         return None
     if len(known.antennas) < 2:
         return None
     settings = with_learned(data.settings.model_copy(update={"antennas": dict(known.antennas)}), data.folder)
     return settings if settings.link != data.settings.link else None
-
-
-def _beside(site: str, folder: Path) -> str | Path:
-    return folder / site if (folder / site).is_file() else site
 
 
 def errors_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> Errors | None:

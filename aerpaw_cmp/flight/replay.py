@@ -324,13 +324,10 @@ def part_of(whole: Replay, start: int, stop: int) -> Replay:
     paths = whole.paths
     chosen = (paths.pose >= start) & (paths.pose < stop)
     share = (stop - start) / max(len(whole.rss_dbm), 1)
+    columns: dict[str, Any] = {name: getattr(whole, name)[start:stop] for name in whole.per_link}
     return dataclasses.replace(
         whole,
-        rss_dbm=whole.rss_dbm[start:stop],
-        rss_power_dbm=whole.rss_power_dbm[start:stop],
-        h=whole.h[start:stop],
-        has_path=whole.has_path[start:stop],
-        pairs_differ=None if whole.pairs_differ is None else whole.pairs_differ[start:stop],
+        **columns,
         paths=dataclasses.replace(paths.select(chosen), pose=paths.pose[chosen] - start),
         other=None if whole.other is None else whole.other.part(start, stop),
         seconds=whole.seconds * share,
@@ -423,21 +420,10 @@ def replay_poses(
     check_interactions(rt)
     others = engine is None if others is None else others
     engine = engine or rt.engine
+    towers = "+".join(link.tower_arrays)
+    name = f"{engine} {towers}" if towers_m is None else f"replay {towers}, which moves"
     if towers_m is not None:
-        name = "+".join(link.tower_arrays)
-        _check_moving(rt, engine, name)
-        run = Run(threads=rt.advanced.threads, progress=share_of(progress, f"replay {name}, which moves"))
-        each: Each = replay_pairs if rt.advanced.visibility == "pairs" else replay
-        search = Search(
-            max_depth=rt.max_depth,
-            crowns=reflecting_crowns(site.trees, rt),
-            diffraction=rt.diffraction,
-            ridges=rt.advanced.ridges,
-            refraction=rt.refraction,
-        )
-        field = Field(path_loss(site, rt, link.carrier_hz))
-        return replay_moving(site, link, poses, towers_m, search, field, run, each=each)
-    name = f"{engine} {'+'.join(link.tower_arrays)}"
+        _check_moving(rt, engine, towers)
     search = Search(
         engine,
         max_depth=rt.max_depth,
@@ -458,11 +444,13 @@ def replay_poses(
         cache_dir=None if rt.advanced.cache else "",
         threads=rt.advanced.threads,
         # the image engine is done before a bar could be seen
-        progress=share_of(progress, name) if engine == "sionna" or long else None,
+        progress=share_of(progress, name) if engine == "sionna" or long or towers_m is not None else None,
         on_estimate=lambda estimate: _tell(progress, name, estimate),
     )
     field = Field(path_loss(site, rt, link.carrier_hz), rt.advanced.relevance_db)
-    each = replay_pairs if rt.advanced.visibility == "pairs" and engine == "image" else replay
+    each: Each = replay_pairs if rt.advanced.visibility == "pairs" and engine == "image" else replay
+    if towers_m is not None:
+        return replay_moving(site, link, poses, towers_m, search, field, run, each=each)
     if long:
         each = partial(replay_in_parts, size=BLOCK, each=each)
     replayed = each(site, link, poses, search, field, run)
@@ -491,18 +479,16 @@ def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
             expected="rt.engine: image (or --engine image)",
             cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
         )
-    if rt.advanced.relevance_db is not None:
-        raise UsageError(
-            f"rt.advanced.relevance_db with towers.{name}, which moves",
-            expected="a tower that stands still, or no rt.advanced.relevance_db",
-            cause="the relevance of a building depends on the place of the tower",
-        )
-    if rt.advanced.power_cut_db is not None:
-        raise UsageError(
-            f"rt.advanced.power_cut_db with towers.{name}, which moves",
-            expected="a tower that stands still, or no rt.advanced.power_cut_db",
-            cause="what the cut costs is checked for one place of the tower",
-        )
+    for key, cause in (
+        ("relevance_db", "the relevance of a building depends on the place of the tower"),
+        ("power_cut_db", "what the cut costs is checked for one place of the tower"),
+    ):
+        if getattr(rt.advanced, key) is not None:
+            raise UsageError(
+                f"rt.advanced.{key} with towers.{name}, which moves",
+                expected=f"a tower that stands still, or no rt.advanced.{key}",
+                cause=cause,
+            )
 
 
 def fields_from(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -243,8 +243,6 @@ class Track:
         Lower poses are raised to this height above the take-off ground [m].
     ground_m : float
         Height of the take-off point above the site origin [m], added to ``altitude_m``.
-    method : {"linear", "pchip"}
-        Interpolation of positions.
 
     Attributes
     ----------
@@ -262,7 +260,6 @@ class Track:
         maximum_gap_s: float = MAXIMUM_GAP_S,
         minimum_height_m: float = MINIMUM_HEIGHT_M,
         ground_m: float = 0.0,
-        method: Literal["linear", "pchip"] = "linear",
     ) -> None:
         if not maximum_gap_s > 0:
             raise ValueError(f"maximum_gap_s must be positive, found {maximum_gap_s}")
@@ -270,7 +267,6 @@ class Track:
         self.maximum_gap_s = maximum_gap_s
         self.minimum_height_m = minimum_height_m
         self.ground_m = ground_m
-        self.method = method
         self._load(telemetry)
 
     def _load(self, telemetry: pd.DataFrame) -> None:
@@ -356,7 +352,7 @@ class Track:
         velocity = np.full((n, 3), np.nan)
         known, raised = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         if valid.any():
-            position[valid] = self._positions(t[valid])
+            position[valid] = _interpolate(t[valid], self._time_s, self._position)
             velocity[valid] = _interpolate(t[valid], self._time_s, self._velocity)
             rotation[valid], known[valid] = self._rotations(t[valid])
             floor = self.ground_m + self.minimum_height_m
@@ -382,13 +378,6 @@ class Track:
         code[t < self._time_s[0] - _SAME_S] = REASONS.index("before telemetry")
         code[t > self._time_s[-1] + _SAME_S] = REASONS.index("after telemetry")
         return code
-
-    def _positions(self, t: FloatArray) -> FloatArray:
-        if self.method == "pchip" and len(self) > 1:
-            from scipy.interpolate import PchipInterpolator
-
-            return np.asarray(PchipInterpolator(self._time_s, self._position, axis=0)(t))
-        return _interpolate(t, self._time_s, self._position)
 
     def _rotations(self, t: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Rotation at every instant (n, 3, 3) and whether it comes from logged attitude."""

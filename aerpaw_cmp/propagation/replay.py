@@ -102,6 +102,12 @@ class Replay:
     through: ThroughWalls | None = None
     other: OtherInteractions | None = None
 
+    @property
+    def per_link(self) -> tuple[str, ...]:
+        """Names of the arrays (poses, towers, ...)."""
+        names = ("rss_dbm", "rss_power_dbm", "h", "has_path", "pairs_differ")
+        return names if self.pairs_differ is not None else names[:-1]
+
     def of_reflections(self) -> Replay:
         """The replay without what other interactions add: what its paths and H are."""
         other = self.other

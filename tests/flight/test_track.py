@@ -216,17 +216,6 @@ def test_attitude_known_in_part():
     np.testing.assert_allclose(poses.heading_deg, [30, 0], atol=0.1)
 
 
-def test_pchip_does_not_overshoot():
-    up = np.array([0, 0, 30, 30, 30.0])
-    frame = telemetry(np.arange(5.0), 0, 0, up, roll_deg=1, pitch_deg=0, yaw_deg=0)
-    asked = np.linspace(0, 4, 101)
-    height = Track(frame, FRAME, method="pchip").pose_at(at(asked)).position_m[:, 2]
-    assert height.min() == 0.5
-    assert height.max() <= 30 + 1e-9
-    linear = Track(frame, FRAME).pose_at(at(asked)).position_m[:, 2]
-    assert np.abs(height - linear).max() > 0.5
-
-
 def test_ground_height_shifts_everything():
     frame = telemetry([0, 1], 0, 0, [0.0, 20.0], roll_deg=1, pitch_deg=0, yaw_deg=0)
     up = Track(frame, FRAME, ground_m=7.0).pose_at(at([0, 1])).position_m[:, 2]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -189,13 +190,10 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     def own(values: AnyArray) -> AnyArray:
         return np.ascontiguousarray(values[row, block.own][:, None])
 
+    columns: dict[str, Any] = {name: own(getattr(replayed, name)) for name in replayed.per_link}
     return replace(
         replayed,
-        rss_dbm=own(replayed.rss_dbm),
-        rss_power_dbm=own(replayed.rss_power_dbm),
-        h=own(replayed.h),
-        has_path=own(replayed.has_path),
-        pairs_differ=None if replayed.pairs_differ is None else own(replayed.pairs_differ),
+        **columns,
         paths=replace(replayed.paths, tower=np.zeros_like(replayed.paths.tower)),
         through=through,
         edge_paths=None if bent is None else replace(bent, tower=np.zeros_like(bent.tower)),

@@ -72,7 +72,7 @@ def put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
         "through": _through([part.through for part in parts if part.through is not None], rows),
         "edge_paths": None if first.edge_paths is None else _edge_paths([b for b in bent if b is not None], rows),
     }
-    names = ["rss_dbm", "rss_power_dbm", "h", "has_path", *(["pairs_differ"] if first.pairs_differ is not None else [])]
+    names = first.per_link
     columns = {name: [getattr(part, name) for part in parts] for name in names}
     parts.clear()
     arrays: dict[str, Any] = {}

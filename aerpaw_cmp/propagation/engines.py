@@ -91,9 +91,9 @@ def search_or_read(
     from_cache : bool
     """
     key = cache.key(scene, poses.position_m, link.carrier_hz, search) if cache else ""
-    kept = cache.load(key) if cache else None
-    if kept:
-        return *kept, True
+    entry = cache.load(key) if cache else None
+    if entry:
+        return *entry, True
     started = time.perf_counter()
     paths = search_paths(scene, link, poses, search, run)
     seconds = time.perf_counter() - started
@@ -160,9 +160,9 @@ def other_paths(
     """
     cache = None if other.scattering else cache
     key = cache.key(scene, poses.position_m, link.carrier_hz, search, other) if cache else ""
-    kept = cache.load_others(key) if cache else None
-    if kept is not None:
-        yield kept
+    entry = cache.load_others(key) if cache else None
+    if entry is not None:
+        yield entry
         return
     from .search import sionna
 

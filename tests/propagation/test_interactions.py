@@ -246,7 +246,7 @@ def test_refraction_through_two_walls_loses_what_two_slabs_lose(sionna, scenes, 
     assert np.array_equal(back.has_path, plain.has_path)
     # the audit is of the reflections
     report = audit(site, link, poses, found, run=Run(cache_dir=""), second=Second(reference="image", links=None))
-    assert (report.missing_paths, report.extra_paths, report.difference.coverage_differs) == (0, 0, 0)
+    assert (report.missing_paths, report.extra_paths, report.coverage_differs) == (0, 0, 0)
     assert report.rss_max_error_db < 0.01
     counted = summary([(np.abs(found.h[..., 0, 0]) ** 2, found.other)])
     assert counted["links_without_reflections"] == 2

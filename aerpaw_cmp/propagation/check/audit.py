@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -12,10 +12,10 @@ from ...compare.field_difference import FieldAudit
 from ...site.site import Site
 from ..arrays import Link, Poses
 from ..options import Engine, Field, Run, Search
-from ..paths import PathSet, joined
+from ..paths import joined
 from ..replay import Replay
 from ..replay import replay as run_replay
-from ..search.mirror import planes_of
+from ..search.mirror import plane_keys, planes_of
 from .field_audit import (
     REFERENCE_LINKS,
     Expected,
@@ -33,7 +33,7 @@ RANK_K = (10.0, 100.0, 1000.0)
 """Singular-value ratios of the paper."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
     """What one replay has and another has not, on the same poses.
 
@@ -59,16 +59,15 @@ class Difference:
     rank_disagreement: dict[float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Audit:
-    """A replay checked by the other engine.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Audit(Difference):
+    """A replay checked by the other engine: how it differs on the checked links, and what that took.
 
     Parameters
     ----------
     engine, reference : str
     links : int
         Pose-tower pairs checked.
-    difference : Difference
     seconds, reference_seconds : float
         Time of the replay (all its links) and of the reference on the checked links; a reference whose paths came
         from the cache counts with the time its search once took.
@@ -83,47 +82,25 @@ class Audit:
     engine: str
     reference: str
     links: int
-    difference: Difference
     seconds: float
     reference_seconds: float
     samples: int = 0
     samples_reason: str = ""
     field: FieldAudit | None = None
 
-    @property
-    def missing_paths(self) -> int:
-        """Paths that the reference has and the replay lacks."""
-        return self.difference.missing_paths
-
-    @property
-    def extra_paths(self) -> int:
-        """Paths that the replay has and the reference lacks."""
-        return self.difference.extra_paths
-
-    @property
-    def rss_max_error_db(self) -> float:
-        """Largest difference of RSS on links both cover."""
-        return self.difference.rss_max_error_db
-
-    @property
-    def rank_disagreement(self) -> dict[float, float]:
-        """Share of links whose rank differs, per K."""
-        return self.difference.rank_disagreement
-
     def as_dict(self) -> dict[str, object]:
         """For ``metrics.json``: plain numbers, K as text, None for a difference that no link could show."""
-        d = self.difference
         return {
             "engine": self.engine,
             "reference": self.reference,
             "links": self.links,
-            "reference_paths": d.reference_paths,
-            "missing_paths": d.missing_paths,
-            "extra_paths": d.extra_paths,
-            "rss_max_error_db": _number(d.rss_max_error_db),
-            "rss_rms_error_db": _number(d.rss_rms_error_db),
-            "coverage_differs": d.coverage_differs,
-            "rank_disagreement": {f"{k:g}": share for k, share in d.rank_disagreement.items()},
+            "reference_paths": self.reference_paths,
+            "missing_paths": self.missing_paths,
+            "extra_paths": self.extra_paths,
+            "rss_max_error_db": _number(self.rss_max_error_db),
+            "rss_rms_error_db": _number(self.rss_rms_error_db),
+            "coverage_differs": self.coverage_differs,
+            "rank_disagreement": {f"{k:g}": share for k, share in self.rank_disagreement.items()},
             "seconds": self.seconds,
             "reference_seconds": self.reference_seconds,
             "field": None if self.field is None else self.field.as_dict(),
@@ -211,7 +188,7 @@ def audit(
         engine=replay.engine,
         reference=other,
         links=len(chosen) * len(replay.towers),
-        difference=compare(replay, checked, chosen, ks),
+        **asdict(compare(replay, checked, chosen, ks)),
         seconds=replay.seconds,
         samples=max(checked.samples, replay.samples),
         samples_reason=checked.samples_reason or replay.samples_reason,
@@ -290,11 +267,9 @@ def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> _Keys:
     place = np.full(int(max(chosen.max(initial=-1), replay.paths.pose.max(initial=-1))) + 1, -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
     index = np.flatnonzero(place[replay.paths.pose] >= 0)
-    paths: PathSet = replay.paths.select(index)
-    plane = np.append(planes, -1)
-    rows = np.column_stack([place[paths.pose], paths.tower, plane[paths.faces]])
-    # without the padding: the two may have different depths
-    return {tuple(n for n in row if n >= 0): int(at) for row, at in zip(rows.tolist(), index, strict=True)}
+    paths = replay.paths.select(index)
+    keys = plane_keys(replace(paths, pose=place[paths.pose]), planes)
+    return dict(zip(keys, index.tolist(), strict=True))
 
 
 def _number(value: float | FloatArray) -> float | None:

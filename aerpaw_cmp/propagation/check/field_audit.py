@@ -27,7 +27,7 @@ from ..options import Field, Search
 from ..paths import Faces, PathSet
 from ..replay import Replay
 from ..scene import Scene
-from ..search.mirror import planes_of
+from ..search.mirror import plane_keys, planes_of
 from ..search.terrain import TERRAIN
 from .bent import bent_matrix
 from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
@@ -560,14 +560,8 @@ def _matched(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Face
     from ..paths import joined
 
     plane = planes_of(joined(our_faces, their_faces))
-
-    def keys(paths: PathSet, start: int) -> list[tuple[int, ...]]:
-        number = np.append(plane[start:], -1)
-        rows = np.column_stack([paths.pose, paths.tower, number[paths.faces]])
-        return [tuple(n for n in row if n >= 0) for row in rows.tolist()]
-
-    known = {key: index for index, key in enumerate(keys(theirs, len(our_faces)))}
-    pairs = [(i, known[key]) for i, key in enumerate(keys(ours, 0)) if key in known]
+    known = {key: index for index, key in enumerate(plane_keys(theirs, plane[len(our_faces) :]))}
+    pairs = [(i, known[key]) for i, key in enumerate(plane_keys(ours, plane[: len(our_faces)])) if key in known]
     both = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     return both[:, 0], both[:, 1]
 

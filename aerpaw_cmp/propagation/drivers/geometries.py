@@ -111,8 +111,6 @@ def singular_values_of(
     uav: Array,
     poses: Poses,
     carrier_hz: float,
-    *,
-    material: str = GROUND_MATERIAL,
 ) -> Iterator[FloatArray]:
     """Singular values (n, ports) of each geometry, absolute, descending.
 
@@ -128,8 +126,6 @@ def singular_values_of(
         Positions and pattern; slants and mount are those of the geometry.
     poses : Poses
     carrier_hz : float
-    material : str
-        Of the ground.
 
     Yields
     ------
@@ -147,7 +143,7 @@ def singular_values_of(
         mount = (g.uav_yaw_deg, g.uav_pitch_deg, g.uav_roll_deg)
         if mount != last:
             turned = dataclasses.replace(uav, mount=np.asarray(rotation_from_yaw_pitch_roll(*map(np.radians, mount))))
-            direct, bounced = basis_fields(tower, tower_m, turned, poses, carrier_hz, material=material)
+            direct, bounced = basis_fields(tower, tower_m, turned, poses, carrier_hz)
             last = mount
         at_uav, at_tower = slant_basis(g.uav_slant_deg), slant_basis(g.tower_slant_deg).T
         los, ground = at_uav @ direct @ at_tower, g.ground * (at_uav @ bounced @ at_tower)
@@ -169,7 +165,7 @@ def _hermitian(matrix: ComplexArray) -> ComplexArray:
 
 
 def basis_fields(
-    tower: Array, tower_m: FloatArray, uav: Array, poses: Poses, carrier_hz: float, *, material: str = GROUND_MATERIAL
+    tower: Array, tower_m: FloatArray, uav: Array, poses: Poses, carrier_hz: float
 ) -> tuple[ComplexArray, ComplexArray]:
     """Channel matrices (n, 2 uav ports, 2 tower ports) of line of sight and of the ground reflection alone.
 
@@ -183,15 +179,13 @@ def basis_fields(
         [m].
     poses : Poses
     carrier_hz : float
-    material : str
-        Of the ground.
 
     Returns
     -------
     direct, bounced : (n, 2 uav ports, 2 tower ports) complex
     """
     link = Link(carrier_hz, {"tower": _both_slants(tower)}, _both_slants(uav), uav_transmits=False)
-    faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (material,), ("ground",))
+    faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (GROUND_MATERIAL,), ("ground",))
     n = len(poses)
     index, zero = np.arange(n), np.zeros(n, dtype=np.int64)
     fields = []

@@ -56,16 +56,16 @@ def idle_objects(
     edges = np.searchsorted(number[order], np.arange(len(worst) + 1))
     total = np.zeros(link_power.size)
     idle: list[int] = []
-    for one in np.argsort(worst, kind="stable").tolist():
-        if worst[one] > 1.0:
+    for solid in np.argsort(worst, kind="stable").tolist():
+        if worst[solid] > 1.0:
             break
-        mine = order[edges[one] : edges[one + 1]]
+        mine = order[edges[solid] : edges[solid + 1]]
         touched = link[path[mine]]
         np.add.at(total, touched, harm[mine])
         if len(touched) and total[touched].max() > 1.0:
             np.subtract.at(total, touched, harm[mine])
             continue
-        idle.append(one)
+        idle.append(solid)
     return _labels(faces, idle), float(total.max(initial=0.0))
 
 
@@ -73,9 +73,7 @@ def _labels(faces: Faces, solids: list[int]) -> list[str]:
     first: dict[int, str] = {}
     for number, label in zip(faces.solid.tolist(), faces.label, strict=True):
         first.setdefault(number, label)
-    return [
-        first[one].rsplit(" wall", 1)[0].rsplit(" face", 1)[0].removesuffix(" roof") for one in solids if one in first
-    ]
+    return [first[n].rsplit(" wall", 1)[0].rsplit(" face", 1)[0].removesuffix(" roof") for n in solids if n in first]
 
 
 def in_words(labels: list[str], relevance_db: float) -> list[str]:

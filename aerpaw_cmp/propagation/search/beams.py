@@ -295,8 +295,8 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
         return paths
     plane = np.append(surfaces.plane, -1)[paths.faces]
     key = np.column_stack([paths.pose, paths.tower, paths.depth, plane])
-    _, kept = np.unique(key, axis=0, return_index=True)
-    paths = paths.select(np.sort(kept))
+    _, first = np.unique(key, axis=0, return_index=True)
+    paths = paths.select(np.sort(first))
     # near coincidence: neighbours in a grid of twice the tolerance, asked pairwise within a link
     order = np.lexsort((paths.depth, paths.tower, paths.pose))
     link = np.column_stack([paths.pose, paths.tower, paths.depth])[order]

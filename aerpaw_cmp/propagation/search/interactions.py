@@ -114,7 +114,7 @@ class OtherPaths:
 
     def select(self, rows: AnyArray) -> OtherPaths:
         """The paths of a mask or of indices."""
-        return OtherPaths(**{one.name: getattr(self, one.name)[rows] for one in fields(self)})
+        return OtherPaths(**{column.name: getattr(self, column.name)[rows] for column in fields(self)})
 
     def once(self) -> OtherPaths:
         """Each path once, in the order of poses and towers: an edge is found from both of its faces."""

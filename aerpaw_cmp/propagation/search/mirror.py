@@ -447,12 +447,12 @@ def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:
         return PathSet.empty(max_depth)
-    whole = PathSet.one_after_another(pieces)
-    order = _order(whole)
+    paths = PathSet.one_after_another(pieces)
+    order = _order(paths)
     if faces is not None:
-        order = order[~_repeated(whole, order, faces)[order]]
-    same = len(order) == len(whole) and bool((np.diff(order) == 1).all())
-    return whole if same else whole.select(order)
+        order = order[~_repeated(paths, order, faces)[order]]
+    same = len(order) == len(paths) and bool((np.diff(order) == 1).all())
+    return paths if same else paths.select(order)
 
 
 def _order(paths: PathSet) -> IntArray:
@@ -488,3 +488,12 @@ def planes_of(faces: Faces) -> IntArray:
     plane = np.empty(len(key), dtype=np.int64)
     plane[order] = np.cumsum((np.diff(key[order], axis=0, prepend=np.nan) != 0.0).any(axis=1))
     return plane - 1
+
+
+def plane_keys(paths: PathSet, planes: IntArray) -> list[tuple[int, ...]]:
+    """(pose, tower, planes) of each path, ``planes`` (faces,) being the number of each face's: equal for the same path.
+
+    The padding is left out: two sets may have different depths.
+    """
+    rows = np.column_stack([paths.pose, paths.tower, np.append(planes, -1)[paths.faces]])
+    return [tuple(number for number in row if number >= 0) for row in rows.tolist()]

@@ -232,8 +232,8 @@ def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
 
 def _convex(footprints: AnyArray) -> list[list[Polygon]]:
     """The convex pieces of each footprint."""
-    whole = _is_convex(footprints).tolist()
-    return [[one] if convex else convex_pieces(one) for one, convex in zip(footprints, whole, strict=True)]
+    convex = _is_convex(footprints).tolist()
+    return [[part] if fills else convex_pieces(part) for part, fills in zip(footprints, convex, strict=True)]
 
 
 def convex_pieces(footprint: Polygon) -> list[Polygon]:

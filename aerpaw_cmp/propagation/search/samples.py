@@ -16,7 +16,7 @@ import numpy as np
 
 from ...common.units import IntArray
 from ..paths import Faces, PathSet
-from .mirror import planes_of
+from .mirror import plane_keys, planes_of
 
 Samples = int | Literal["auto"]
 
@@ -60,22 +60,18 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
     -------
     Choice
     """
-    plane = np.append(planes_of(faces), -1)
+    plane = planes_of(faces)
     samples = FIRST
     before = pilot(samples)
     while samples < MOST:
         samples *= FACTOR
         paths = pilot(samples)
-        if _keys(paths, plane) == _keys(before, plane):
+        if set(plane_keys(paths, plane)) == set(plane_keys(before, plane)):
             words = f"{samples // FACTOR:,} and {samples:,} rays a tower found the same {len(paths)} paths"
             return Choice(samples, f"{words} at {poses} poses".replace(",", " "), paths)
         before = paths
     words = f"{samples:,} rays a tower still found other paths than {samples // FACTOR:,} at {poses} poses"
     return Choice(samples, words.replace(",", " "), before)
-
-
-def _keys(paths: PathSet, plane: IntArray) -> set[tuple[int, ...]]:
-    return {tuple(row) for row in np.column_stack([paths.pose, paths.tower, plane[paths.faces]]).tolist()}
 
 
 def spread(known: IntArray, count: int) -> IntArray:

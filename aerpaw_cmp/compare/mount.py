@@ -10,6 +10,9 @@ import numpy as np
 from ..common.units import FloatArray
 from .direction_gain import GainModel, LinkSamples, Term, column_forms
 
+STEP_DEG = 10.0
+"""Between the azimuths that are tried."""
+
 MOUNT_NOISE_DB = 10.0
 """Standard deviation of a bin about the patterns: 4 dB of residual that stays alike over some six bins."""
 
@@ -57,8 +60,6 @@ def fit_mounts(
     rotation: Callable[[float, float, float], FloatArray],
     *,
     tilt: bool = False,
-    step_deg: float = 10.0,
-    model: GainModel = MOUNT_MODEL,
 ) -> dict[str, MountFit]:
     """Mounts of antennas with a pattern, all at once.
 
@@ -73,10 +74,6 @@ def fit_mounts(
     tilt : bool
         Fit pitch and roll too. Off, they are 0: on dataset 12 tilts fitted on one flight (up to 20 degrees) raise the
         error of the other from 3.53 to 4.00 dB.
-    step_deg : float
-        Of the azimuth grid.
-    model : GainModel
-        Gives the covariance of what the patterns do not explain.
 
     Returns
     -------
@@ -87,14 +84,14 @@ def fit_mounts(
     ``log p = -(y - u - t)' Sigma^-1 (y - u - t) / 2`` is a quadratic form of columns computed once. Azimuths of
     tower antennas are optimised for each azimuth of the UAV; tilts follow at the best azimuths, within 20 degrees.
     """
-    grid = np.arange(0.0, 360.0, step_deg)
+    grid = np.arange(0.0, 360.0, STEP_DEG)
     turned = {name: [(a, 0.0, 0.0) for a in grid] for name in patterns}
-    forms = _quadratic_forms(series, model, patterns, rotation, turned)
+    forms = _quadratic_forms(series, patterns, rotation, turned)
     chosen, probability = _best_together(forms)
     span = np.arange(-20.0, 21.0, 5.0) if tilt else np.zeros(1)
     tilts = [(float(p), float(r)) for p in span for r in span]
     tilted = {name: [(float(grid[chosen[name]]), p, r) for p, r in tilts] for name in patterns}
-    tilt_index, weight = _best_together(_quadratic_forms(series, model, patterns, rotation, tilted))
+    tilt_index, weight = _best_together(_quadratic_forms(series, patterns, rotation, tilted))
     return {
         name: _mount(grid, probability[name], tilted[name][tilt_index[name]], weight[name], np.asarray(tilts))
         for name in patterns
@@ -130,7 +127,6 @@ class _Forms:
 
 def _quadratic_forms(
     series: Sequence[LinkSamples],
-    model: GainModel,
     patterns: Mapping[str, GainOf],
     rotation: Callable[[float, float, float], FloatArray],
     mounts: Mapping[str, Sequence[tuple[float, float, float]]],
@@ -143,18 +139,18 @@ def _quadratic_forms(
     def candidates(samples: LinkSamples) -> FloatArray:
         """Target and candidates (bins, q) of a series."""
         good = samples.part(np.isfinite(samples.residual_db) & np.isfinite(samples.at_uav).all(axis=1))
-        kept = good.binned(model.bin_s)
-        out = np.zeros((len(kept), start))
-        out[:, 0] = kept.residual_db
+        bins = good.binned(MOUNT_MODEL.bin_s)
+        out = np.zeros((len(bins), start))
+        out[:, 0] = bins.residual_db
         for name, pattern in patterns.items():
             if name not in ("uav", samples.antenna):
                 continue
-            direction = kept.at_uav if name == "uav" else kept.at_tower
+            direction = bins.at_uav if name == "uav" else bins.at_tower
             for column, angles in zip(range(*columns[name].indices(start)), mounts[name], strict=True):
                 out[:, column] = pattern(direction @ rotation(*angles))
         return np.asarray(out - out.mean(axis=0), dtype=np.float64)
 
-    return _Forms(column_forms(series, model, candidates, start), columns)
+    return _Forms(column_forms(series, MOUNT_MODEL, candidates, start), columns)
 
 
 def _best_together(forms: _Forms) -> tuple[dict[str, int], dict[str, FloatArray]]:

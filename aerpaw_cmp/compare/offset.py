@@ -54,27 +54,26 @@ class OffsetFit:
     at_edge: bool
 
 
-@dataclass(frozen=True, slots=True)
-class CensoredFit:
-    """Offset from a Tobit likelihood, where "below" is an observation too.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Censored:
+    """Offset where "below" is an observation too; only ``n`` = 0 where a side has no level.
 
     Parameters
     ----------
     offset_db, sigma_db : float
         Offset added to the measurement and standard deviation of the residual [dB].
-    n, n_measured_below, n_simulated_below, n_both_below : int
-        Full pairs; pairs with only the measurement, only the simulation, and both below their floors.
-    at_edge : bool
-        As in :class:`OffsetFit`.
+    n, n_measured_below, n_simulated_below : int
+        Full pairs; pairs with only the measurement, and only the simulation, below their floors.
+    at_search_edge : bool
+        As ``at_edge`` of :class:`OffsetFit`.
     """
 
-    offset_db: float
-    sigma_db: float
+    offset_db: float | None = None
+    sigma_db: float | None = None
     n: int
-    n_measured_below: int
-    n_simulated_below: int
-    n_both_below: int
-    at_edge: bool
+    n_measured_below: int | None = None
+    n_simulated_below: int | None = None
+    at_search_edge: bool | None = None
 
 
 def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB) -> FloatArray:
@@ -276,7 +275,7 @@ def censored_offset(
     simulated_floor_db: float,
     step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
-) -> CensoredFit:
+) -> Censored:
     """Offset when a sample at the noise floor or without a path is an observation: "below".
 
     Parameters
@@ -293,7 +292,7 @@ def censored_offset(
 
     Returns
     -------
-    CensoredFit
+    Censored
 
     Notes
     -----
@@ -309,13 +308,16 @@ def censored_offset(
     full = (simulated - measured)[~low_m & ~low_s]
     above = (simulated - measured_floor_db)[low_m & ~low_s]
     below = (simulated_floor_db - measured)[~low_m & low_s]
-    counts = (len(full), len(above), len(below), int((low_m & low_s).sum()))
-    if not len(full):
-        return CensoredFit(float("nan"), float("nan"), *counts, False)
-    mean, sigma = _tobit(full, above, below)
-    grid = offset_grid(step_db, span_db)
-    best = nearest_offset(grid, mean, step_db)
-    return CensoredFit(float(grid[best]), sigma, *counts, best in (0, len(grid) - 1))
+    offset, sigma, at_edge = float("nan"), float("nan"), False
+    if len(full):
+        mean, sigma = _tobit(full, above, below)
+        grid = offset_grid(step_db, span_db)
+        best = nearest_offset(grid, mean, step_db)
+        offset, at_edge = float(grid[best]), best in (0, len(grid) - 1)
+    return Censored(
+        offset_db=offset, sigma_db=sigma, n=len(full), n_measured_below=len(above), n_simulated_below=len(below),
+        at_search_edge=at_edge,
+    )  # fmt: skip
 
 
 def _tobit(full: FloatArray, above: FloatArray, below: FloatArray) -> tuple[float, float]:

@@ -20,6 +20,7 @@ from .detection import DetectionScore
 from .field_difference import FieldAudit
 from .forecast import ForecastScore
 from .ladder import LadderRow
+from .offset import Censored
 from .passes import Repeated
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import LEARNED_HERE, ChannelDifference, ErrorSpan, ResidualBins, RssComparison
@@ -75,18 +76,6 @@ class ModelLevel:
     offset_db: float
     rmse_db: float
     rmse_ci95_db: Interval
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Censored:
-    """Offset where samples below the weakest level seen count as such; only ``n`` = 0 where a side has no level."""
-
-    offset_db: float | None = None
-    sigma_db: float | None = None
-    n: int
-    n_measured_below: int | None = None
-    n_simulated_below: int | None = None
-    at_search_edge: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,7 +28,6 @@ from ..compare.ladder import log_distance_level_db
 from ..compare.passes import Visit, repeatability
 from ..compare.result import (
     APPLIED,
-    Censored,
     ExpectedOffset,
     Fit,
     FlightResult,
@@ -385,15 +384,15 @@ def _detection(data: FlightData, series: RssSeries, levels: Levels, free_space_d
     return None if score is None else dataclasses.replace(score, locks=series.locked is not None)
 
 
-def _censored(settings: RssSettings, levels: Levels) -> Censored | None:
+def _censored(settings: RssSettings, levels: Levels) -> offsets.Censored | None:
     """Offset when samples without a signal, or without a path, count as "below the weakest level seen"."""
     measured, simulated = levels.measured_db[levels.posed], levels.simulated_db[levels.posed]
     if not len(measured) or (np.isfinite(measured) & np.isfinite(simulated)).all():
         return None
     floors = [float(np.min(side, where=np.isfinite(side), initial=np.inf)) for side in (measured, simulated)]
     if not np.isfinite(floors).all():
-        return Censored(n=0)
-    fit = offsets.censored_offset(
+        return offsets.Censored(n=0)
+    return offsets.censored_offset(
         measured,
         simulated,
         # the weakest level itself is a measurement: it is no "below"
@@ -401,14 +400,6 @@ def _censored(settings: RssSettings, levels: Levels) -> Censored | None:
         simulated_floor_db=floors[1] - 1e-9,
         step_db=settings.advanced.step_db,
         span_db=settings.span_db,
-    )
-    return Censored(
-        offset_db=fit.offset_db,
-        sigma_db=fit.sigma_db,
-        n=fit.n,
-        n_measured_below=fit.n_measured_below,
-        n_simulated_below=fit.n_simulated_below,
-        at_search_edge=fit.at_edge,
     )
 
 

@@ -460,10 +460,11 @@ def _each_batch(
     """
     for towers, chosen in groups:
         poses = np.flatnonzero(alive[towers].any(axis=0))
-        if len(poses):
-            with make(towers, chosen) as finder:
-                for start in range(0, len(poses), finder.batch):
-                    yield finder, towers, poses[start : start + finder.batch]
+        if not len(poses):
+            continue
+        with make(towers, chosen) as finder:
+            for start in range(0, len(poses), finder.batch):
+                yield finder, towers, poses[start : start + finder.batch]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,7 +26,7 @@ from .grouping import Span, flights, stream_span
 from .heights import height_in_name, lacks_height
 from .lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
 from .node import CARRIER_HZ, POWER_DBM, Placer, listed_places
-from .remembered import Proposal, propose
+from .remembered import Nodes, Proposal, propose
 from .settings import FlightFile, LogSettings, RssSettings, with_learned
 from .time_origin import Origin, origin_of
 
@@ -224,6 +224,10 @@ QUICK_AUDIT = 24
 _QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers to publish"
 
 
+SURE_M = 100.0
+"""A node that is placed this well is seen from a flight some hundred metres away within some tens of degrees."""
+
+
 def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
     """What the site remembers that fits; of a memory that cannot be read, nothing, and a remark says so."""
     series = [(tower, channel, reader) for tower, channel, reader in entries.series]
@@ -232,7 +236,8 @@ def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
     except (InputError, UsageError) as error:
         entries.out.append(f"what site {site} remembers: {error.found}")
         known = Learned()
-    return propose(known, str(Path(site).with_suffix("")), series)
+    fixed = () if entries.placer is None else tuple(entries.placer.site.towers)
+    return propose(known, str(Path(site).with_suffix("")), series, Nodes(placed=frozenset(entries.sure), fixed=fixed))
 
 
 def _learned_lines(known: Proposal) -> list[str]:
@@ -365,6 +370,8 @@ class _Entries:
     """Nodes that the site does not have, and the question about each."""
     offsets_db: list[float] = field(default_factory=list)
     """Expected of each level."""
+    sure: set[str] = field(default_factory=set)
+    """Those of them whose place is known well enough for the directions of an antenna."""
     tops_m: list[float] = field(default_factory=list)
     """Greatest height of each log that has positions of its own and is compared at them."""
 
@@ -467,6 +474,7 @@ class _Entries:
                 continue
             if place.tower is not None:
                 self.towers[place.node] = place.tower, place.question
+                self.sure |= {place.node} if place.radius_m <= SURE_M else set()
             if pci is None:
                 entry["node"] = place.node
                 return f"  # {place.question}" if place.tower is None and place.question else ""

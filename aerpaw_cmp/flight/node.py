@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,11 +75,14 @@ class Placement:
         Entry of ``towers`` in flight.yaml, where the site has no such tower.
     question : str
         About the proposal.
+    radius_m : float
+        Of 90 % confidence about an estimated place; 0 of a known one.
     """
 
     node: str
     tower: Mapping[str, Any] | None
     question: str
+    radius_m: float = 0.0
 
 
 @dataclass
@@ -136,7 +139,9 @@ class Placer:
             f"no tower fits the levels. They fit this place best, 90 % within {estimate.radius90_m:.0f} m, "
             f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where did the node stand?"
         )
-        return self._node(estimate.place_m, float(latitude[0]), float(longitude[0]), float(estimate.place_m[2]), about)
+        place = estimate.place_m
+        node = self._node(place, float(latitude[0]), float(longitude[0]), float(place[2]), about)
+        return replace(node, radius_m=estimate.radius90_m)
 
     def contradiction(self, track: LevelTrack, node: str) -> str | None:
         """Tower that the levels fit far better than the one that is named; None where none does."""

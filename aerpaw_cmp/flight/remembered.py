@@ -28,8 +28,18 @@ class Proposal:
     receiver_about: str
 
 
-def propose(known: Learned, site: str, series: Sequence[SeriesKey]) -> Proposal:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nodes:
+    """Nodes of a draft that are no towers of the site and whose place is well known, and the towers of the site."""
+
+    placed: frozenset[str] = frozenset()
+    fixed: Sequence[str] = ()
+
+
+def propose(known: Learned, site: str, series: Sequence[SeriesKey], nodes: Nodes = Nodes()) -> Proposal:
     """The entry that fits most series: tower antennas where the tower fits too, else the airframe alone.
+
+    The antenna of a node that flights placed themselves goes with any such node: it was learned over several places.
 
     Parameters
     ----------
@@ -38,6 +48,7 @@ def propose(known: Learned, site: str, series: Sequence[SeriesKey]) -> Proposal:
     site : str
         Its name in the names of the antennas.
     series : sequence of (tower, channel, reader)
+    nodes : Nodes
 
     Returns
     -------
@@ -53,8 +64,15 @@ def propose(known: Learned, site: str, series: Sequence[SeriesKey]) -> Proposal:
         exact = [s for s in entry.series if (s.tower, s.channel, s.reader) in series]
         alike = exact or [s for s in entry.series if (s.channel, s.reader) in {key[1:] for key in series}]
         antennas = {f"{s.tower}.{s.channel}": f"{site}/{best}_{s.tower}.{s.channel}" for s in exact}
+        antennas |= {
+            f"{tower}.{channel}": f"{site}/{best}_{s.tower}.{s.channel}"
+            for s in alike
+            for tower, channel, reader in series
+            if tower in nodes.placed and s.tower not in nodes.fixed and (s.channel, s.reader) == (channel, reader)
+        }
+        alone = "the airframe alone fits: {}, there with its tower antenna"
+        about = entry.about() if antennas else alone.format(entry.about())
         antennas["uav"] = f"{site}/{best}_uav"
-        about = entry.about() if exact else f"the airframe alone fits: {entry.about()}, there with its tower antenna"
         carrier = alike[0].carrier_hz
     ranked = {(tower, reader) for tower, channel, reader in series if channel == "rank"}
     receivers = [

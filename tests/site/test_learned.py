@@ -10,9 +10,18 @@ import pytest
 import yaml
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.flight.remembered import propose
+from aerpaw_cmp.flight.remembered import Nodes, propose
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.site.learned import Entry, LearnedReceiver, LearnedSeries, find_named, folder_of, read_learned, remember
+from aerpaw_cmp.site.learned import (
+    Entry,
+    Learned,
+    LearnedReceiver,
+    LearnedSeries,
+    find_named,
+    folder_of,
+    read_learned,
+    remember,
+)
 from aerpaw_cmp.site.sphere_pattern import SpherePattern, sphere_csv
 
 CARRIER_HZ = 3.3e9
@@ -176,6 +185,16 @@ def test_a_draft_takes_only_what_fits(folder: Path) -> None:
     elsewhere = propose(known, "mine", [("NODE", "A", "flight_mat")])
     assert elsewhere.antennas == {"uav": "mine/d12_uav"}
     assert elsewhere.antennas_about.startswith("the airframe alone fits")
+    rover = Learned(entries={"r": entry("A", tower="ROVER")})
+    for known_place, at_site, fits in (
+        (("NODE",), ("LW1",), True),
+        ((), ("LW1",), False),
+        (("NODE",), ("ROVER",), False),
+    ):
+        nodes = Nodes(placed=frozenset(known_place), fixed=at_site)
+        found = propose(rover, "mine", [("NODE", "A", "flight_mat")], nodes)
+        assert found.antennas == {"uav": "mine/r_uav"} | ({"NODE.A": "mine/r_ROVER.A"} if fits else {})
+        assert found.antennas_about.startswith("the airframe alone fits") is not fits
     for other in (("LW1", "A", "sounder_log"), ("LW1", "B", "flight_mat"), ("LW1", "rank", "flight_mat")):
         assert propose(known, "mine", [other]).antennas == {}
     receiver = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=3.4e9, file="r.json.gz", kappa=0.4)

@@ -7,6 +7,7 @@ the correction stays off unless it lowers it.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -93,6 +94,8 @@ class Correction:
     rmse_db: Mapping[tuple[str, str], float]
     held_out: Mapping[tuple[str, str], HeldOut] = field(default_factory=dict)
     sd_factor: float = 1.0
+    fits: dict[str, FieldFit] = field(default_factory=dict, repr=False, compare=False)
+    """Solved fields by antenna."""
 
     @property
     def on(self) -> bool:
@@ -112,20 +115,45 @@ class Correction:
         The standard deviation holds base, field, drift and noise, and the offset between flights unless the samples
         count about their ``own_mean``.
         """
+        return self.over_headings([samples], flight, own_mean=own_mean)
+
+    def over_headings(
+        self, each: Sequence[LinkSamples], flight: str | None = None, *, own_mean: bool = False, whole: int = 0
+    ) -> tuple[FloatArray, FloatArray]:
+        """As :meth:`predict`, of an aircraft whose heading is not known: each of some counts alike.
+
+        Parameters
+        ----------
+        each : sequence of LinkSamples
+            The same samples, as seen with each heading.
+        flight : str, optional
+        own_mean : bool
+        whole : int
+            Targets of the whole run, where these are a part: all parts are then solved alike.
+
+        Returns
+        -------
+        level_db, sd_db : (n,)
+            What a field of directions says of the heading counts as not known.
+        """
+        samples = each[0]
         channel = self.channels.get(samples.antenna)
         if channel is None:
             raise InputError(f"no flight has {samples.antenna}", expected="one of " + ", ".join(self.channels))
-        gain, gain_sd = self.predictor(samples)
-        targets = self.rows_of(samples, flight)
-        fit = FieldFit(self.model, channel.rows, channel.left_db)
-        asked = targets
-        if not self.on and flight not in self.flights and len(targets):
+        gains, gain_sds = (np.stack(part) for part in zip(*map(self.predictor, each), strict=True))
+        asked = self.rows_of(samples, flight)
+        if len(each) > 1:
+            asked = dataclasses.replace(asked, direction=np.stack([s.at_uav for s in each], axis=1))
+        if not self.on and flight not in self.flights and len(asked):
             # without a field one target with a position stands for all
-            asked = targets.part(np.array([np.isfinite(targets.position_m).all(axis=1).argmax()]))
-        mean, sd = fit.predict(asked)
+            asked = asked.part(np.array([np.isfinite(asked.position_m).all(axis=1).argmax()]))
+        fit = self.fits.setdefault(samples.antenna, FieldFit(self.model, channel.rows, channel.left_db))
+        exact = fit.fits(max(len(asked), whole))
+        mean, sd = fit.predict(asked, exact=exact)
         if own_mean:
-            _, sd = fit.predict(asked, ("place", "drift"))
-        return gain + mean, self.sd_factor * np.sqrt(sd**2 + gain_sd**2 + self.model.noise_sd_db**2)
+            _, sd = fit.predict(asked, ("place", "drift"), exact=exact)
+        variance = sd**2 + (gain_sds**2).mean(axis=0) + gains.var(axis=0) + self.model.noise_sd_db**2
+        return gains.mean(axis=0) + mean, self.sd_factor * np.sqrt(variance)
 
 
 def between_blocks_db(channel: Channel) -> float:

@@ -15,6 +15,7 @@ import dataclasses
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -100,8 +101,8 @@ class Rows:
     ----------
     position_m : (n, 3)
         East, north, up [m].
-    direction : (n, 3)
-        Unit vector towards the tower in the body frame.
+    direction : (n, 3) or (n, headings, 3)
+        Unit vector towards the tower in the body frame; of targets, at each of several headings that count alike.
     time_s : (n,)
         Since the start of the row's flight [s].
     flight : (n,) int
@@ -148,7 +149,10 @@ class _Apart:
         a, b = (np.moveaxis(r.position_m, -1, 0) for r in (one, other))
         up = np.abs(a[2][..., :, None] - b[2][..., None, :])
         across = np.hypot(a[0][..., :, None] - b[0][..., None, :], a[1][..., :, None] - b[1][..., None, :])
-        inner = one.direction @ np.swapaxes(other.direction, -1, -2)
+        if one.direction.ndim > one.position_m.ndim:  # (headings, ..., n, m)
+            inner = np.einsum("...nhk,...mk->h...nm", one.direction, other.direction, optimize=True)
+        else:
+            inner = one.direction @ np.swapaxes(other.direction, -1, -2)
         return cls(
             across,
             up,
@@ -159,10 +163,12 @@ class _Apart:
 
 
 def _place(model: FieldModel, apart: _Apart) -> FloatArray:
-    exponent = apart.across_m / model.length_m + apart.height_m / model.height_m
+    """Covariance (..., n, m); over several headings its mean, that of a level whose heading is not known."""
+    near = np.exp(-apart.across_m / model.length_m - apart.height_m / model.height_m)
     if math.isfinite(model.turn):
-        exponent = exponent + apart.chord2 / (2.0 * model.turn**2)
-    return np.asarray(model.place_sd_db**2 * np.exp(-exponent))
+        alike = np.exp(-apart.chord2 / (2.0 * model.turn**2))
+        near *= alike.mean(axis=0) if alike.ndim > near.ndim else alike
+    return np.asarray(model.place_sd_db**2 * near)
 
 
 def _drift(model: FieldModel, apart: _Apart) -> FloatArray:
@@ -248,28 +254,45 @@ class FieldFit:
         doi 10.1080/01621459.2015.1044091).
         """
         mean, sd = np.full((2, len(targets)), np.nan)
-        known = np.isfinite(np.column_stack([targets.position_m, targets.direction, targets.time_s])).all(axis=1)
-        if exact is None:
-            exact = len(self.rows) <= EXACT_ROWS and len(self.rows) ** 2 * float(known.sum()) <= EXACT_WORK
+        ends = targets.direction.reshape(len(targets), -1)
+        known = np.isfinite(np.column_stack([targets.position_m, ends, targets.time_s])).all(axis=1)
+        exact = self.fits(int(known.sum())) if exact is None else exact
         good, some = np.flatnonzero(known), targets.part(known)
-        moments = self._exact(some, parts) if exact else self._nearest(some, parts)
-        for start, (one, two) in zip(range(0, len(good), AT_ONCE), moments, strict=True):
-            mean[good[start : start + AT_ONCE]], sd[good[start : start + AT_ONCE]] = one, two
+        step = max(AT_ONCE * 3 // max(ends.shape[1], 3), 1)
+        blocks = [slice(start, start + step) for start in range(0, len(good), step)]
+        moments = (self._exact if exact else self._nearest)(some, blocks, parts)
+        for block, (one, two) in zip(blocks, moments, strict=True):
+            mean[good[block]], sd[good[block]] = one, two
         return mean, sd
 
-    def _exact(self, targets: Rows, parts: Collection[Part]) -> Iterator[tuple[FloatArray, FloatArray]]:
+    def fits(self, targets: int) -> bool:
+        """Whether so many targets have the exact solution."""
+        return len(self.rows) <= EXACT_ROWS and len(self.rows) ** 2 * float(targets) <= EXACT_WORK
+
+    @cached_property
+    def _whitened(self) -> tuple[FloatArray, FloatArray]:
+        """Factor of the covariance of the rows, and their values by it."""
         from scipy.linalg import solve_triangular
 
         lower = factor_of(_noisy(self.model, covariance(self.model, self.rows, self.rows)))
         value = np.zeros(len(self.rows)) if self.value_db is None else self.value_db
-        white = solve_triangular(lower, value, lower=True, check_finite=False)
+        return lower, np.asarray(solve_triangular(lower, value, lower=True, check_finite=False))
+
+    def _exact(
+        self, targets: Rows, blocks: Sequence[slice], parts: Collection[Part]
+    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+        from scipy.linalg import solve_triangular
+
+        lower, white = self._whitened
         prior = prior_sd_db(self.model, parts) ** 2
-        for start in range(0, len(targets), AT_ONCE):
-            across = covariance(self.model, targets.part(slice(start, start + AT_ONCE)), self.rows, parts)
+        for block in blocks:
+            across = covariance(self.model, targets.part(block), self.rows, parts)
             half = solve_triangular(lower, across.T, lower=True, overwrite_b=True, check_finite=False)
             yield half.T @ white, np.sqrt(np.maximum(prior - np.einsum("nm,nm->m", half, half), 0.0))
 
-    def _nearest(self, targets: Rows, parts: Collection[Part]) -> Iterator[tuple[FloatArray, FloatArray]]:
+    def _nearest(
+        self, targets: Rows, blocks: Sequence[slice], parts: Collection[Part]
+    ) -> Iterator[tuple[FloatArray, FloatArray]]:
         from scipy.spatial import cKDTree
 
         levels, level_sd = self._levels(targets, parts)
@@ -278,11 +301,11 @@ class FieldFit:
         near: list[Part] = ["place", "drift"]
         asked = [part for part in near if part in parts]
         prior = prior_sd_db(self.model, asked) ** 2 if asked else 0.0
-        tree, count = cKDTree(self._scaled(self.rows)), min(NEAREST, len(self.rows))
-        for start in range(0, len(targets), AT_ONCE):
-            part = slice(start, start + AT_ONCE)
+        turned = math.isfinite(self.model.turn) and targets.direction.ndim == 2
+        tree, count = cKDTree(self._scaled(self.rows, turned)), min(NEAREST, len(self.rows))
+        for part in blocks:
             some = targets.part(part)
-            index = tree.query(self._scaled(some), k=np.arange(1, count + 1))[1]
+            index = tree.query(self._scaled(some, turned), k=np.arange(1, count + 1))[1]
             rows = self.rows.part(index)
             across = covariance(self.model, some.part((slice(None), None)), rows, asked)[:, 0, :, None]
             matrix = _noisy(self.model, covariance(self.model, rows, rows, near))
@@ -291,11 +314,11 @@ class FieldFit:
             mean = levels[part] + np.einsum("tm,tm->t", weight, value[index])
             yield mean, np.sqrt(np.maximum(left, 0.0) + level_sd[part] ** 2)
 
-    def _scaled(self, rows: Rows) -> FloatArray:
-        """Coordinates in which the place part falls off evenly."""
+    def _scaled(self, rows: Rows, turned: bool) -> FloatArray:
+        """Coordinates in which the place part falls off evenly, with or without the direction."""
         m = self.model
-        turn = rows.direction / m.turn if math.isfinite(m.turn) else 0.0 * rows.direction
-        return np.column_stack([rows.position_m / (m.length_m, m.length_m, m.height_m), turn])
+        place = rows.position_m / (m.length_m, m.length_m, m.height_m)
+        return np.column_stack([place, rows.direction / m.turn]) if turned else place
 
     def _levels(self, targets: Rows, parts: Collection[Part]) -> tuple[FloatArray, FloatArray]:
         """Mean and offsets (m,) at targets from thinned rows, with their standard deviation."""

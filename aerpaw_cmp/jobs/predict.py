@@ -13,7 +13,7 @@ import pandas as pd
 from ..common.errors import InputError, UsageError
 from ..common.provenance import union
 from ..common.stages import Progress, Stages
-from ..common.units import BoolArray, FloatArray
+from ..common.units import BoolArray, FloatArray, IntArray
 from ..compare.calibration import Observed
 from ..compare.correction import BIN_S, Base, Correction, Predictor, between_blocks_db, choose, fixed_base
 from ..compare.direction_gain import LinkSamples
@@ -43,7 +43,7 @@ HULL_M = 60.0
 HULL_UP_M = 20.0
 """Targets further than this from every sample that is known are flagged, horizontally and in height [m]."""
 
-AT_ONCE = 250_000
+AT_ONCE = 50_000
 """Targets that are predicted together: bounds the memory."""
 
 REPLAYED_AT_ONCE = 20_000
@@ -288,20 +288,28 @@ def _bases(
 
 
 def _by_degree(predictor: Predictor) -> Predictor:
-    """A model of directions that takes many samples a degree at a time (gains have lengths of 11 degrees and more)."""
+    """A model of directions that takes many samples a degree at a time (gains have lengths of 11 degrees and more).
+
+    What a degree has is kept: later parts of a run, and other headings, ask for much the same directions.
+    """
+    known: dict[str, tuple[IntArray, FloatArray]] = {}
 
     def predict(samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
         if len(samples) <= MOST_DIRECTIONS:
             return predictor(samples)
-        degrees = [
-            np.degrees(angle)
-            for ray in (samples.at_tower, samples.at_uav)
-            for angle in (np.arctan2(ray[:, 1], ray[:, 0]), np.arcsin(np.clip(ray[:, 2], -1.0, 1.0)))
-        ]
-        cells = np.round(np.column_stack(degrees)).astype(np.int64)
-        _, first, member = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-        gain, sd = predictor(samples.part(first))
-        return gain[member.ravel()], sd[member.ravel()]
+        cells = np.zeros(len(samples), dtype=np.int64)
+        for ray in (samples.at_tower, samples.at_uav):
+            for angle in (np.arctan2(ray[:, 1], ray[:, 0]), np.arcsin(np.clip(ray[:, 2], -1.0, 1.0))):
+                cells = 361 * cells + np.round(np.degrees(angle)).astype(np.int64) + 180
+        asked, first, member = np.unique(cells, return_index=True, return_inverse=True)
+        keys, values = known.get(samples.antenna, (np.zeros(0, dtype=np.int64), np.zeros((2, 0))))
+        new = ~np.isin(asked, keys)
+        if new.any():
+            keys, values = np.append(keys, asked[new]), np.hstack([values, predictor(samples.part(first[new]))])
+            order = np.argsort(keys)
+            keys, values = known[samples.antenna] = keys[order], values[:, order]
+        gain, sd = values[:, np.searchsorted(keys, asked)[member.ravel()]]
+        return gain, sd
 
     return predict
 
@@ -359,14 +367,9 @@ def _over_headings(
     """Level and standard deviation of 4 s means (m,); all headings count alike where none is known."""
     position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
     free = source.free_space_db(position)
-    means, variances = [], []
-    for turn in _turns(yaw):
-        heading = np.where(np.isfinite(yaw), yaw, turn)
-        gain, sd = correction.predict(source.samples(position, heading))
-        means.append(gain)
-        variances.append(sd**2)
-    level = np.mean(means, axis=0)
-    return free + level, np.sqrt(np.mean(variances, axis=0) + np.var(means, axis=0))
+    each = [source.samples(position, np.where(np.isfinite(yaw), yaw, turn)) for turn in _turns(yaw)]
+    level, sd = correction.over_headings(each, whole=int(targets.known.sum()))
+    return free + level, sd
 
 
 def _turns(yaw_deg: FloatArray) -> FloatArray:

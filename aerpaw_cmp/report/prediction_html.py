@@ -87,6 +87,10 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
     )
 
 
+ROWS_AT_ONCE = 100_000
+"""Rows of prediction.csv that are rounded and written together: bounds the memory."""
+
+
 def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], list[str]]:
     """Write the page and all files beside it; also what could not be written, and why.
 
@@ -103,9 +107,12 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
     """
     numbers = prediction_metrics(data)
     written = write_page(folder, "prediction", numbers, _figures(data), data=data, metrics=numbers, flags=FLAGS)
-    rounded = data.table.round({c: 3 for c in data.table.columns if c.endswith(("_db", "_m", "_deg", "_s"))})
-    rounded = rounded.round({c: 4 for c in data.table.columns if c.startswith("p_")})
-    guarded(rounded).to_csv(folder / "prediction.csv", index=False, lineterminator="\n")
+    digits = {c: 3 for c in data.table.columns if c.endswith(("_db", "_m", "_deg", "_s"))}
+    digits |= {c: 4 for c in data.table.columns if c.startswith("p_")}
+    with (folder / "prediction.csv").open("w", encoding="utf-8", newline="") as book:
+        for start in range(0, len(data.table), ROWS_AT_ONCE):
+            part = guarded(data.table.iloc[start : start + ROWS_AT_ONCE].round(digits))
+            part.to_csv(book, index=False, header=not start, lineterminator="\n")
     written.append(folder / "prediction.csv")
     try:
         written.append(write_file(folder / "prediction.nc", bytes(netcdf_bytes(_dataset(data)))))

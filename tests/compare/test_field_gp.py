@@ -135,6 +135,33 @@ def test_nearest_rows_stand_in_for_all():
     assert np.max(np.abs(near[1] / exact[1] - 1.0)) < 0.06
 
 
+def test_headings_that_count_alike_are_the_mean_of_single_headings_and_hold_their_spread():
+    generator = np.random.default_rng(8)
+    rows = flights(generator, each=60)
+    yaw = np.radians(np.arange(8) * 45.0)
+    nose = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(8)])
+    place = np.column_stack([generator.uniform(0, 300, (40, 2)), np.full(40, 35.0)])
+    one = rows_at(place, flight=-1)
+    alike = dataclasses.replace(one, direction=np.tile(nose, (40, 1, 1)))
+    value = drawn(generator, MOVING, rows)
+    fit = FieldFit(MOVING, rows, value)
+    single = [fit.predict(dataclasses.replace(one, direction=np.tile(n, (40, 1)))) for n in nose]
+    mean, sd = fit.predict(alike)
+    np.testing.assert_allclose(mean, np.mean([m for m, _ in single], axis=0), atol=1e-9)
+    # the variance of a heading drawn at random is, in expectation over fields, that of all headings together
+    together = np.mean([s**2 for _, s in single], axis=0)
+    square = np.zeros(40)
+    for _ in range(60):
+        again = FieldFit(MOVING, rows, drawn(generator, MOVING, rows))
+        square += np.var(
+            [again.predict(dataclasses.replace(one, direction=np.tile(n, (40, 1))))[0] for n in nose], axis=0
+        )
+    np.testing.assert_allclose(sd**2, together + square / 60, rtol=0.12)
+    near = fit.predict(alike, exact=False)
+    assert np.sqrt(np.mean((near[0] - mean) ** 2)) < 0.2 * sd.mean()
+    np.testing.assert_allclose(near[1], sd, rtol=0.08)
+
+
 def test_nan_targets_are_nan_and_take_nothing_from_their_neighbours():
     rows = flights(np.random.default_rng(6), each=20)
     value = np.ones(len(rows))

@@ -218,3 +218,31 @@ def test_many_directions_are_those_of_a_degree():
     assert np.abs(gain - 10.0 * ray[:, 2]).max() < 10.0 * np.radians(1.01)
     assert np.abs(gain - 10.0 * ray[:, 2]).max() > 0.0
     assert set(sd) == {1.0}
+
+
+def test_directions_are_evaluated_once_per_degree_over_all_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job, "MOST_DIRECTIONS", 10)
+    asked = []
+
+    def gain(samples):
+        asked.append(len(samples))
+        return 10.0 * samples.at_tower[:, 0] + 3.0 * samples.at_uav[:, 1], 1.0 + samples.at_tower[:, 2]
+
+    azimuth = np.random.default_rng(3).uniform(-np.pi, np.pi, 4000)
+    ray = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full(4000, 0.2)]) / np.hypot(1.0, 0.2)
+    samples = LinkSamples(
+        flight="", tower="T", channel="a", time_s=np.zeros(4000), position_m=100.0 * ray, at_uav=-ray, at_tower=ray,
+        residual_db=np.zeros(4000),
+    )  # fmt: skip
+    predict = job._by_degree(gain)
+    whole = predict(samples)
+    for part in (slice(0, 2000), slice(2000, 4000)):
+        rows = np.arange(4000)[part]
+        again = predict(samples.part(rows))
+        np.testing.assert_array_equal(again[0], whole[0][rows])
+        np.testing.assert_array_equal(again[1], whole[1][rows])
+    assert len(asked) == 1
+    assert asked[0] <= 1500  # degrees at either end, not samples
+    np.testing.assert_allclose(whole[0], gain(samples)[0], atol=0.3)
+    other = predict(dataclasses.replace(samples, channel="b", at_tower=-ray, at_uav=ray))
+    np.testing.assert_allclose(other[0], -whole[0], atol=0.6)

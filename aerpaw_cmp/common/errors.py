@@ -116,6 +116,19 @@ class AerpawCmpError(Exception):
         return printable(text)
 
 
+@contextmanager
+def about_file(path: str | Path) -> Iterator[None]:
+    """Errors from inside that name no file are about this one."""
+    try:
+        yield
+    except AerpawCmpError as error:
+        if error.path is not None:
+            raise
+        raise type(error)(
+            error.found, expected=error.expected, cause=error.cause, path=path, line=error.line
+        ) from error
+
+
 class CheckError(AerpawCmpError):
     """The job ran, but a check that the user asked for did not hold."""
 

@@ -98,6 +98,14 @@ def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
     return b"".join(chunks)
 
 
+def read_input(path: Path, most: int, expected: str = "a file") -> bytes:
+    """Content of a file of at most so many bytes; InputError where it holds more, or cannot be read."""
+    try:
+        return read_bounded(path, most, expected)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", expected=expected, path=path) from None
+
+
 _CHUNK = 1 << 20
 
 

@@ -21,7 +21,7 @@ import pandas as pd
 from pydantic import Field
 
 from ..common.errors import InputError, UsageError
-from ..common.files import read_bounded
+from ..common.files import read_input
 from ..common.units import BoolArray, FloatArray, IntArray
 from ..common.yamlfile import load_yaml
 from ..compare.calibration import Observed
@@ -396,11 +396,9 @@ def read_entry(path: Path) -> Entry:
         Unreadable, no table, columns missing, rows twice, values that are no numbers.
     """
     try:
-        text = read_bounded(path, LARGEST_ENTRY, "a table of predictions").decode()
+        text = read_input(path, LARGEST_ENTRY, "a CSV of predictions").decode()
     except UnicodeDecodeError:
         raise InputError("not a text file", expected="a CSV of predictions in UTF-8", path=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", expected="a CSV of predictions", path=path) from None
     lines = text.splitlines()
     count = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
     head = {k.strip(): v.strip() for k, _, v in (line[1:].partition(":") for line in lines[:count])}
@@ -618,7 +616,7 @@ def read_leaderboard(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     try:
-        rows = json.loads(read_bounded(path, LARGEST_ENTRY, "a leaderboard"))
+        rows = json.loads(read_input(path, LARGEST_ENTRY, "a leaderboard"))
         if not isinstance(rows, list) or not all(isinstance(r, dict) and "scores" in r for r in rows):
             raise ValueError("no list of rows")
     except (ValueError, UnicodeDecodeError) as error:

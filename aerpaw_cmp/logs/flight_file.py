@@ -28,7 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from ..common.errors import InputError
+from ..common.errors import InputError, about_file
 from ..common.outputs import OutputFile
 from .records import ReadResult, RejectedLine, RejectedReason, Stream
 
@@ -282,10 +282,8 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
     if not content.startswith(_MAGIC):
         raise InputError("no HDF5 file", expected="a flight file of 'aerpaw-cmp ingest -o'", path=path)
     _refuse_changed(content, path)
-    try:
+    with about_file(path):
         items, notes = native.read("hdf5", content)
-    except InputError as error:
-        raise InputError(error.found, expected=error.expected, cause=error.cause, path=path) from error
     form, version = notes["attributes"].get("format"), notes["attributes"].get("version")
     if form != FORMAT:
         raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..common.errors import InputError, UsageError, one_line
+from ..common.errors import InputError, UsageError, about_file, one_line
 from . import archives, chunks, packed
 from .flight_file import IngestedFile, read_flight
 from .pieces import join
@@ -462,14 +462,8 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
     """What a reader says, its impossible values flagged; messages name the file, which readers do not know."""
     from . import limits, origins  # load pandas, as any reader does
 
-    try:
+    with about_file(path):
         result = origins.stated(limits.check(read()), reader, options)
-    except (InputError, UsageError) as error:
-        if error.path is None:
-            raise type(error)(
-                error.found, expected=error.expected, cause=error.cause, path=path, line=error.line
-            ) from error
-        raise
     if not result.accepted:
         first = f": {result.rejected[0].reason}" if result.rejected else ""
         raise InputError(

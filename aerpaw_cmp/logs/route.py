@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..common.errors import InputError
+from ..common.errors import InputError, about_file
 from .ingest import as_utf8, read_bytes, read_file
 from .readers import HEAD_BYTES, ReadOptions, claims
 
@@ -63,13 +63,8 @@ def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFra
         If the file is no route, or points have no height and ``height_m`` does not say it.
     """
     data = as_utf8(read_bytes(path)[0])
-    try:
-        route = _route(data, path)
-        return _table(route, height_m)
-    except InputError as error:
-        if error.path is not None:
-            raise
-        raise InputError(error.found, expected=error.expected, cause=error.cause, path=path, line=error.line) from error
+    with about_file(path):
+        return _table(_route(data, path), height_m)
 
 
 @dataclass(slots=True)

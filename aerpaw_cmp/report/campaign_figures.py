@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from ..common.units import FloatArray
+from ..common.units import FloatArray, IntArray
+from ..compare.statistics import Interval
 from ..site.site import Site
 from .campaign_data import CampaignData, HeldOutFold, RssRow, place_means
 from .canvas import (
     BASELINE,
+    TOWER,
     FigureSpec,
     beyond,
     colour_bar,
@@ -30,6 +32,7 @@ from .rss_figures import running_levels
 from .words import count, pretty
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DISTANCE_BINS = 30
@@ -168,34 +171,65 @@ def season_drift(data: CampaignData) -> Figure:
     return fig
 
 
+def _cells(
+    ax: Axes, data: CampaignData, cells: IntArray, means_db: FloatArray, reach_db: float, towers: Iterable[str]
+) -> Any:
+    """Mean residual of square cells of the plan, with towers.
+
+    Parameters
+    ----------
+    ax : Axes
+    data : CampaignData
+    cells : (n, 2)
+        Column and row of each, in multiples of ``data.cell_m`` from the origin.
+    means_db : (n,)
+    reach_db : float
+        End of the colour scale.
+    towers : iterable of str
+
+    Returns
+    -------
+    matplotlib.image.AxesImage
+    """
+    first, last = cells.min(axis=0), cells.max(axis=0) + 1
+    image = np.full(tuple(last - first)[::-1], np.nan)
+    image[cells[:, 1] - first[1], cells[:, 0] - first[0]] = means_db
+    extent = np.array([first[0], last[0], first[1], last[1]]) * data.cell_m
+    ax.set_facecolor("#F4F4F4")
+    mesh = ax.imshow(
+        image, origin="lower", extent=tuple(extent), cmap="RdBu_r", vmin=-reach_db, vmax=reach_db,
+        interpolation="none", zorder=2,
+    )  # fmt: skip
+    for tower in towers:
+        at = None if data.site is None else data.site.towers.get(tower)
+        if at is not None:
+            ax.plot(
+                at.east_m, at.north_m, marker="^", markersize=9, color=TOWER, markeredgecolor="white",
+                linestyle="none", zorder=5, label=f"tower {tower}",
+            )  # fmt: skip
+    plan_axes(ax)
+    return mesh
+
+
+def _frame(ax: Axes, data: CampaignData, cells: IntArray, towers: Iterable[str], shape: float = 1.0) -> None:
+    """Limits of a plan around cells and towers."""
+    known = {} if data.site is None else data.site.towers
+    at = [known[name].position_m[:2] for name in towers if name in known]
+    frame_around(ax, *np.concatenate([(cells + 0.5) * data.cell_m, *(place[None] for place in at)]).T, shape=shape)
+
+
 def season_places(data: CampaignData) -> Figure:
     """Mean residual of each cell of the plan over flights, all towers and channels."""
-    place_map = (
-        data.season.places[0] if len(data.season.places) == 1 else next(p for p in data.season.places if not p.tower)
-    )
-    first = np.array([place_map.east_m.min(), place_map.north_m.min()])
-    column = np.rint((place_map.east_m - first[0]) / data.cell_m).astype(int)
-    row = np.rint((place_map.north_m - first[1]) / data.cell_m).astype(int)
-    image = np.full((row.max() + 1, column.max() + 1), np.nan)
-    image[row, column] = place_map.mean_db
-    west, south = first - data.cell_m / 2
-    reach = max(float(np.percentile(np.abs(place_map.mean_db), 98)), 0.1)
+    maps = data.season.places
+    shown = maps[0] if len(maps) == 1 else next(p for p in maps if not p.tower)
+    cells = np.floor(np.column_stack([shown.east_m, shown.north_m]) / data.cell_m).astype(int)
+    reach = max(float(np.percentile(np.abs(shown.mean_db), 98)), 0.1)
+    towers = list(dict.fromkeys(row.tower for row in data.reference_rows))
     fig = figure((7.0, 5.0))
     ax = fig.subplots()
-    ax.set_facecolor("#F4F4F4")
-    extent = (west, west + image.shape[1] * data.cell_m, south, south + image.shape[0] * data.cell_m)
-    mesh = ax.imshow(
-        image, origin="lower", extent=extent, cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="none", zorder=2
-    )
-    east, north = place_map.east_m, place_map.north_m
-    for tower in () if data.site is None else dict.fromkeys(r.tower for r in data.reference_rows):
-        at = data.site.towers.get(tower) if data.site is not None else None
-        if at is not None:
-            ax.plot(at.east_m, at.north_m, marker="^", markersize=9, color="#C1121F", markeredgecolor="white", zorder=5)
-            east, north = np.append(east, at.east_m), np.append(north, at.north_m)
-    plan_axes(ax)
-    frame_around(ax, east, north)
-    colour_bar(fig, mesh, [ax], "Mean of measured − simulated [dB]", beyond(place_map.mean_db, -reach, reach))
+    mesh = _cells(ax, data, cells, shown.mean_db, reach, towers)
+    _frame(ax, data, cells, towers)
+    colour_bar(fig, mesh, [ax], "Mean of measured − simulated [dB]", beyond(shown.mean_db, -reach, reach))
     return fig
 
 
@@ -205,10 +239,9 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
     cells = np.array([cell for cell_mean in means for cell in cell_mean]).reshape(-1, 2)
     values = np.array([mean for cell_mean in means for mean, _ in cell_mean.values()])
     reach = float(np.percentile(np.abs(values), 98)) if len(values) else 1.0
-    east, north = (cells.T + 0.5) * data.cell_m
     columns = min(len(rows), MAPS_PER_ROW)
     lines = -(-len(rows) // columns)
-    shape = plan_shape(east, north)
+    shape = plan_shape(*(cells.T + 0.5) * data.cell_m)
     width = (7.2 - 0.2 * columns) / columns  # what labels and the colour bar leave
     fig = figure((9.2, 1.0 + lines * min(width / shape + 0.45, 6.0)))
     axes = fig.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
@@ -216,76 +249,66 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
     for ax in axes.ravel()[len(rows) :]:
         ax.set_visible(False)
     for ax, row, cell_mean in zip(axes.ravel(), rows, means, strict=False):
-        first, last = cells.min(axis=0), cells.max(axis=0)
-        image = np.full((last[1] - first[1] + 1, last[0] - first[0] + 1), np.nan)
-        for (e, n), (mean, _) in cell_mean.items():
-            image[n - first[1], e - first[0]] = mean
-        extent = np.array([first[0], last[0] + 1, first[1], last[1] + 1]) * data.cell_m
-        ax.set_facecolor("#F4F4F4")
-        mesh = ax.imshow(
-            image, origin="lower", extent=tuple(extent), cmap="cividis", vmin=-reach, vmax=reach, interpolation="none",
-            zorder=2,
-        )  # fmt: skip
-        tower = None if data.site is None else data.site.towers.get(row.tower)
-        if tower is not None:
-            ax.plot(
-                tower.east_m, tower.north_m, marker="^", markersize=9, color="#C1121F", markeredgecolor="white",
-                linestyle="none", zorder=5, label=f"tower {row.tower}",
-            )  # fmt: skip
-            east, north = np.append(east, tower.east_m), np.append(north, tower.north_m)
-        plan_axes(ax)
+        if cell_mean:
+            own = np.array([mean for mean, _ in cell_mean.values()])
+            mesh = _cells(ax, data, np.array(list(cell_mean)), own, reach, [row.tower])
         ax.set_title(f"{row.flight} ({count(row.n)} samples)")
         ax.label_outer()
-    frame_around(axes[0][0], east, north, shape=shape)
+    _frame(axes[0][0], data, cells, [rows[0].tower], shape)
     if mesh is not None:
         colour_bar(fig, mesh, axes.ravel().tolist(), "Mean of measured − simulated [dB]", beyond(values, -reach, reach))
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    if handles:
-        fig.legend(handles, labels, loc="outside lower center")
+    fig.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center")
     return fig
+
+
+Scored: TypeAlias = "tuple[str, float, Interval | None]"
+"""Setting, its error and the 95 % interval."""
+
+
+def _by_setting(names: Sequence[str], groups: Mapping[str, Sequence[Scored]]) -> tuple[Figure, Axes, list[FloatArray]]:
+    """Errors with intervals, a group of rows one below the other and a row per setting; also the rows of each group."""
+    step = len(names) + 1.0
+    fig = figure((9.2, min(1.6 + 0.24 * step * len(groups), TALLEST)))
+    ax = fig.subplots()
+    places = [np.arange(len(names), dtype=np.float64) + index * step for index in range(len(groups))]
+    shown: set[str] = set()
+    for index, (at, rows) in enumerate(zip(places, groups.values(), strict=True)):
+        if index % 2:
+            ax.axhspan(at[0] - 1.0, at[-1] + 1.0, color="#F3F3F3", zorder=0)
+        for name, error, interval in rows:
+            number = names.index(name)
+            colour = COLOURS[number % len(COLOURS)]
+            ax.plot(interval or (np.nan, np.nan), [at[number]] * 2, color=colour, linewidth=1.2)
+            ax.plot(
+                error, at[number], marker=MARKERS[number % len(MARKERS)], markersize=6, linestyle="none", color=colour,
+                label=None if name in shown else name, zorder=3,
+            )  # fmt: skip
+            shown.add(name)
+    ax.set_yticks([float(np.mean(at)) for at in places], list(groups))
+    ax.set_ylim(len(groups) * step, -1.0)
+    ax.grid(visible=False, axis="y")
+    return fig, ax, places
 
 
 def settings_rmse(data: CampaignData) -> Figure:
     """RMSE of every setting, flight and link with its interval; baselines and repeatability beside it."""
-    groups = list(grouped(data.rss, lambda r: (r.flight, r.link)).items())
-    names = list(data.settings)
-    step = len(names) + 1.0
-    fig = figure((9.2, min(1.6 + 0.26 * step * len(groups), TALLEST)))
-    ax = fig.subplots()
-    ticks, labels = [], []
-    for index, ((flight, link), rows) in enumerate(groups):
-        by = {row.setting: row for row in rows}
-        at = [index * step + number for number in range(len(names))]
-        ticks.append(float(np.mean(at)))
-        labels.append(f"{flight}\n{link}")
-        if index % 2:
-            ax.axhspan(at[0] - 1.0, at[-1] + 1.0, color="#F3F3F3", zorder=0)
-        for number, (name, y) in enumerate(zip(names, at, strict=True)):
-            row = by.get(name)
-            if row is None:
-                continue
-            low, high = row.rmse_ci95_db or (np.nan, np.nan)
-            ax.plot([low, high], [y, y], color=COLOURS[number % len(COLOURS)], linewidth=1.2)
-            ax.plot(
-                row.rmse_db, y, marker=MARKERS[number % len(MARKERS)], markersize=6, linestyle="none",
-                color=COLOURS[number % len(COLOURS)], label=name if index == 0 else None, zorder=3,
-            )  # fmt: skip
+    groups = grouped(data.rss, lambda r: (r.flight, r.link))
+    scored = {
+        f"{flight}\n{link}": [(row.setting, row.rmse_db, row.rmse_ci95_db) for row in rows]
+        for (flight, link), rows in groups.items()
+    }
+    fig, ax, places = _by_setting(list(data.settings), scored)
+    for index, (at, ((flight, link), rows)) in enumerate(zip(places, groups.items(), strict=True)):
+        ends = [at[0] - 0.6, at[-1] + 0.6]
         for name, value in rows[0].baselines.items():
             colour, line = BASELINE.get(name, ("#777777", ":"))
-            label = f"{pretty(name)} (own offset)" if index == 0 else None
-            ax.plot(
-                [value, value], [at[0] - 0.6, at[-1] + 0.6], color=colour, linestyle=line, linewidth=1.5, label=label
-            )
+            label = None if index else f"{pretty(name)} (own offset)"
+            ax.plot([value, value], ends, color=colour, linestyle=line, linewidth=1.5, label=label)
         floors = [r for r in data.repeats if flight in (r.first, r.second) and f"{r.tower} {r.channel}".strip() == link]
-        floors = [r for r in floors if np.isfinite(r.rmse_db)]
-        if floors:
-            best = max(floors, key=lambda r: r.n)
-            floor = best.rmse_db
-            label = f"two flights, same places ({100 * best.share:.0f} % of samples)" if index == 0 else None
-            ax.plot([floor, floor], [at[0] - 0.6, at[-1] + 0.6], color="#888888", linewidth=3.5, alpha=0.7, label=label)
-    ax.set_yticks(ticks, labels)
-    ax.invert_yaxis()
-    ax.grid(visible=False, axis="y")
+        best = max((r for r in floors if np.isfinite(r.rmse_db)), key=lambda r: r.n, default=None)
+        if best is not None:
+            label = None if index else f"two flights, same places ({100 * best.share:.0f} % of samples)"
+            ax.plot([best.rmse_db] * 2, ends, color="#888888", linewidth=3.5, alpha=0.7, label=label)
     ax.set_xlim(left=0.0)
     ax.set_xlabel("RMSE after the row's own offset, with 95 % interval [dB]")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
@@ -294,30 +317,11 @@ def settings_rmse(data: CampaignData) -> Figure:
 
 def rank_tv(data: CampaignData) -> Figure:
     """Total variation of every flight and K, settings side by side, with intervals."""
-    groups = list(grouped(data.rank, lambda r: (r.flight, r.tower, r.k)).items())
-    names = list(data.settings)
-    step = len(names) + 0.8
-    fig = figure((9.2, min(1.5 + 0.2 * step * len(groups), TALLEST)))
-    ax = fig.subplots()
-    shown: set[str] = set()
-    for index, (_key, rows) in enumerate(groups):
-        if index % 2:
-            ax.axhspan((index - 0.1) * step - 0.4, (index + 0.9) * step - 0.4, color="#F3F3F3", zorder=0)
-        for row in rows:
-            number = names.index(row.setting)
-            y = index * step + number
-            style: dict[str, Any] = {"color": COLOURS[number % len(COLOURS)]}
-            ax.plot(row.total_variation_ci95 or (np.nan, np.nan), [y, y], linewidth=1.2, **style)
-            label = None if row.setting in shown else row.setting
-            shown.add(row.setting)
-            ax.plot(
-                row.total_variation, y, marker=MARKERS[number % len(MARKERS)], linestyle="none", label=label, **style
-            )
-    middle = (len(names) - 1) / 2
-    labels = [f"{flight}, {tower}, K = {k_key(k)}" for (flight, tower, k), _ in groups]
-    ax.set_yticks([index * step + middle for index in range(len(groups))], labels)
-    ax.invert_yaxis()
-    ax.grid(visible=False, axis="y")
+    groups = {
+        f"{flight}, {tower}, K = {k_key(k)}": [(r.setting, r.total_variation, r.total_variation_ci95) for r in rows]
+        for (flight, tower, k), rows in grouped(data.rank, lambda r: (r.flight, r.tower, r.k)).items()
+    }
+    fig, ax, _ = _by_setting(list(data.settings), groups)
     ax.set_xlim(0.0, 1.02)
     ax.set_xlabel("Total variation, measured against simulated rank")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)

@@ -377,6 +377,23 @@ def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
     return np.union1d(spread_out(len(values), limit), keep_extremes([values], 1200))  # an extreme in every two pixels
 
 
+def dots(ax: Axes, at: FloatArray, values: FloatArray, size: float = 2.0, **options: Any) -> None:
+    """A cloud of points, thinned and rasterised.
+
+    Parameters
+    ----------
+    ax : Axes
+    at, values : (n,)
+    size : float
+        Of a dot.
+    options
+        Of :meth:`matplotlib.axes.Axes.plot`.
+    """
+    rows = cloud(values)
+    options = {"marker": ".", **options}
+    ax.plot(at[rows], values[rows], linestyle="none", markersize=size, rasterized=True, **options)
+
+
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
     """Stretches of True as (first, last) indices, both inside.
 

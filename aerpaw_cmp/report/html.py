@@ -138,10 +138,12 @@ def short(value: Any) -> str:
 
 def policy(script: str = "") -> str:
     """The content policy of a page with one script, or none."""
-    if not script:
-        return CONTENT_POLICY.format(script="'none'")
-    digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
-    return CONTENT_POLICY.format(script=f"'sha256-{digest}'")
+    return CONTENT_POLICY.format(script=digest(script) if script else "'none'")
+
+
+def digest(text: str) -> str:
+    """A script or style as a content policy names it."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
 
 
 def picture_uri(picture: Picture) -> str:

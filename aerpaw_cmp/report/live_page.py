@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +12,7 @@ from markupsafe import Markup
 from ..common.units import AnyArray, FloatArray
 from ..site.site import Site
 from .explorer import as_json, plan_of
-from .html import environment, script
+from .html import digest, environment, script
 from .names import k_key
 from .packed import PackedArrays
 
@@ -97,8 +95,4 @@ def live_page(background: LiveMap | None, title: str) -> tuple[bytes, str]:
             scene=Markup(as_json(background.content() if background else {})),
         )
     )
-    return text.encode(), POLICY.format(script=_digest(code), style=_digest(style))
-
-
-def _digest(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
+    return text.encode(), POLICY.format(script=digest(code), style=digest(style))

@@ -222,8 +222,7 @@ def cdfs(maps: Sequence[RssMap]) -> Figure:
         ax.set_xlabel("RSS [dBm]")
         ax.set_ylim(0, 1.0)
     axes[0].set_ylabel("Share of positions below")
-    handles, labels = axes[0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=6)
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     return fig
 
 
@@ -250,8 +249,7 @@ def rank_shares(maps: Sequence[RankMap]) -> Figure:
         ax.set_xlabel("Height [m]")
         ax.grid(visible=False)
     axes[0].set_ylabel("Share of positions [%]")
-    handles, labels = axes[0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=5)
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     return fig
 
 
@@ -294,8 +292,7 @@ def error_curves(errors: Sequence[MapError]) -> Figure:
     worst = max((one.mae for one in errors if np.isfinite(one.mae)), default=1.0)
     axes[0].set_ylim(0.0, 1.08 * worst if worst > 0 else 1.0)  # shared by all panels
     axes[0].set_ylabel("Mean absolute error of the rank")
-    handles, labels = axes[0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=4)
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return fig
 
 

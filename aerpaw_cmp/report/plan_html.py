@@ -107,15 +107,12 @@ def _draw_map(data: PlanPage) -> Figure:
         for name, at in data.towers.items():
             ax.plot(at[0], at[1], "^", color="black", markersize=5)
             ax.annotate(name, at[:2], xytext=(3, 3), textcoords="offset points", fontsize=7, annotation_clip=True)
-        ax.set_aspect("equal")
+        canvas.plan_axes(ax)
         ax.set_title(title)
-        ax.set_xlabel("east [m]")
+        ax.label_outer()
     seen = np.concatenate([data.place_m[:, :2], data.outline_m, data.track_m[:, :2]])
-    reach = np.maximum(0.05 * np.ptp(seen, axis=0), 30.0)
-    axes[0].set_xlim(*(seen.min(axis=0) - reach)[[0]], *(seen.max(axis=0) + reach)[[0]])
-    axes[0].set_ylim(*(seen.min(axis=0) - reach)[[1]], *(seen.max(axis=0) + reach)[[1]])
+    canvas.frame_around(axes[0], *seen.T, shape=canvas.plan_shape(*seen.T))
     axes[1].plot(data.track_m[:, 0], data.track_m[:, 1], color=canvas.MEASURED, linewidth=1.0)
-    axes[0].set_ylabel("north [m]")
     return fig
 
 

@@ -189,13 +189,9 @@ def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
         fig.colorbar(shown, ax=ax, label=label, pad=0.02, shrink=0.85)
         for tower in data.site.towers.values():
             ax.plot(tower.position_m[0], tower.position_m[1], "^", color="black", markersize=5, zorder=3)
-        ax.set_aspect("equal")
-        ax.set_xlabel("east [m]")
-    span = [(np.nanmin(v), np.nanmax(v)) for v in (east, north)]
-    reach = [max(0.05 * (high - low), 30.0) for low, high in span]
-    axes[0].set_xlim(span[0][0] - reach[0], span[0][1] + reach[0])
-    axes[0].set_ylim(span[1][0] - reach[1], span[1][1] + reach[1])
-    axes[0].set_ylabel("north [m]")
+        canvas.plan_axes(ax)
+        ax.label_outer()
+    canvas.frame_around(axes[0], east, north, shape=canvas.plan_shape(east, north))
     return fig
 
 

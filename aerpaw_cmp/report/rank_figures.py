@@ -16,6 +16,7 @@ from .canvas import (
     TOWER,
     WAYPOINT,
     colour_bar,
+    dots,
     draw_out_of_coverage,
     draw_site,
     draw_waypoints,
@@ -156,10 +157,7 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
         ax.set_ylabel("Rank")
         ax.legend(*legend_of(ax, lambda label: label != "waypoint"), loc="center left", bbox_to_anchor=(1.0, 0.5))
     if panel.sinr_db is not None:
-        axes[rows].plot(
-            seconds, panel.sinr_db, linestyle="none", marker=".", markersize=2, color="#0072B2", rasterized=True,
-            label="SINR",
-        )  # fmt: skip
+        dots(axes[rows], seconds, panel.sinr_db, color="#0072B2", label="SINR")
         axes[rows].set_ylabel("SINR [dB]")
         axes[rows].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
     draw_singular_values(axes[-1], seconds, panel)
@@ -219,10 +217,7 @@ def draw_singular_values(ax: Axes, seconds: FloatArray, panel: RankResult) -> No
     """Singular values relative to the largest, with every threshold K."""
     values = panel.singular_ratio_db
     for column, colour in enumerate(("#111111", "#0072B2", "#9AD0F0")[: values.shape[1]]):
-        ax.plot(
-            seconds, values[:, column], linestyle="none", marker=".", markersize=2, color=colour, rasterized=True,
-            label=f"σ{chr(0x2082 + column)}/σ₁",
-        )  # fmt: skip
+        dots(ax, seconds, values[:, column], color=colour, label=f"σ{chr(0x2082 + column)}/σ₁")
     for number, k in enumerate(panel.rank):
         level = -20 * np.log10(k)
         ax.axhline(

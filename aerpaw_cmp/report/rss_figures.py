@@ -23,6 +23,7 @@ from .canvas import (
     beyond,
     cloud,
     colour_bar,
+    dots,
     draw_out_of_coverage,
     draw_site,
     draw_waypoints,
@@ -68,11 +69,7 @@ def overview(data: ReportData, panel: RssResult) -> Figure:
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
     calibrated = panel.calibrated_db
-    few = cloud(calibrated)
-    right.plot(
-        seconds[few], calibrated[few], linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
-        label="measured, calibrated",
-    )  # fmt: skip
+    dots(right, seconds, calibrated, 2.5, color=MEASURED, label="measured, calibrated")
     right.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing")
     time_axis(right, start)
     right.set_ylabel("RSS [dBm]")
@@ -161,11 +158,8 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
         ax, seconds, panel.measured_out_of_coverage, "no signal in the measurement", height=0.05, hatch="xxxxx"
     )
     calibrated, residual = panel.calibrated_db, panel.residual_db
-    few = cloud(calibrated)
-    ax.plot(
-        seconds[few], calibrated[few], linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
-        label=f"measured, {_offset(score.offset_db)} ({count(score.n)} scored)", zorder=3.5,
-    )  # fmt: skip
+    label = f"measured, {_offset(score.offset_db)} ({count(score.n)} scored)"
+    dots(ax, seconds, calibrated, 2.5, color=MEASURED, label=label, zorder=3.5)
     for number, (name, baseline) in enumerate(panel.baselines.items()):
         colour, dashes = baseline_style(name, number)
         # each model is drawn where its own best offset puts it against the same calibrated points
@@ -187,11 +181,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     robust_limits(ax, [calibrated, panel.simulated_dbm])
     ax.set_ylabel("RSS [dBm]")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), ncols=3, markerscale=3)
-    few = cloud(residual)
-    below.plot(
-        seconds[few], residual[few], linestyle="none", marker=".", markersize=2, color="#0072B2", rasterized=True,
-        label="measured − simulated",
-    )  # fmt: skip
+    dots(below, seconds, residual, color="#0072B2", label="measured − simulated")
     below.axhline(0.0, color=SIMULATED, linewidth=0.8)
     if np.isfinite(score.rmse_db):
         for sign in (-1, 1):
@@ -228,11 +218,8 @@ def rss_diagnostics(panel: RssResult) -> Figure:
 
 def scatter_levels(ax: Axes, panel: RssResult) -> None:
     """Calibrated measurement against simulation, with the line of equality."""
-    few = cloud(panel.residual_db)
-    ax.plot(
-        panel.simulated_dbm[few], panel.calibrated_db[few], linestyle="none", marker=".", markersize=2, alpha=0.5,
-        color="#0072B2", rasterized=True, label=f"sample ({count(panel.score.n)})",
-    )  # fmt: skip
+    label = f"sample ({count(panel.score.n)})"
+    dots(ax, panel.simulated_dbm, panel.calibrated_db, alpha=0.5, color="#0072B2", label=label)
     both = np.isfinite(panel.simulated_dbm) & np.isfinite(panel.calibrated_db)
     if both.any():
         values = np.concatenate([panel.simulated_dbm[both], panel.calibrated_db[both]])
@@ -359,12 +346,8 @@ def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssResult) -> None:
     ]
     for label, chosen, colour, marker in groups:
         if chosen.any():
-            rows = np.flatnonzero(chosen)
-            rows = rows[cloud(residual[rows])]
-            ax.plot(
-                quantity[rows], residual[rows], linestyle="none", marker=marker, markersize=2, alpha=0.5,
-                color=colour, rasterized=True, label=f"{label} ({count(int(chosen.sum()))})",
-            )  # fmt: skip
+            label = f"{label} ({count(int(chosen.sum()))})"
+            dots(ax, quantity[chosen], residual[chosen], marker=marker, alpha=0.5, color=colour, label=label)
     ax.axhline(0.0, color=SIMULATED, linewidth=0.8)
     good = np.isfinite(quantity) & np.isfinite(residual)
     if good.sum() < 40 or np.ptp(quantity[good]) == 0:
@@ -463,11 +446,8 @@ def channel_difference(data: ReportData, pair: PairResult) -> Figure:
     seconds = seconds_since(pair.time, start)
     fig = figure((9.2, 3.2))
     ax = fig.subplots()
-    few = cloud(pair.difference_db)
-    ax.plot(
-        seconds[few], pair.difference_db[few], linestyle="none", marker=".", markersize=2.5, color=MEASURED,
-        rasterized=True, label=f"measured ({count(int(np.isfinite(pair.difference_db).sum()))})", zorder=3,
-    )  # fmt: skip
+    label = f"measured ({count(int(np.isfinite(pair.difference_db).sum()))})"
+    dots(ax, seconds, pair.difference_db, 2.5, color=MEASURED, label=label, zorder=3)
     ax.plot(*thinned(seconds, pair.simulated_difference_db), color=SIMULATED, linewidth=0.9, label="ray tracing")
     for sign in (-1, 1):
         ax.axhline(

@@ -21,8 +21,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.errors import InputError, UsageError
-from ..common.files import LARGEST_TABLE, read_bounded
+from ..common.errors import InputError, UsageError, about_file
+from ..common.files import LARGEST_TABLE, read_input
 from ..common.units import AnyArray, ComplexArray, FloatArray, amplitude_from_db, db_from_power, power_from_db
 from ..logs.matfile import read_arrays
 
@@ -279,9 +279,7 @@ _FREQUENCY = re.compile(
 
 def _read_rows(path: Path) -> _Rows:
     try:
-        text = read_bounded(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig")
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path=path) from None
+        text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError("not a text file", expected="an antenna pattern file", path=path) from None
     rows = _Rows(np.zeros((0, 7)))
@@ -503,12 +501,8 @@ def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) 
         No such grid.
     """
     path = Path(path)
-    try:
-        content = read_arrays(read_bounded(path, LARGEST_TABLE, "a file of gain grids"), None)
-    except OSError as error:
-        raise InputError(f"the file cannot be read ({error.strerror or error})", path=path) from None
-    except InputError as error:
-        raise InputError(error.found, expected=error.expected, cause=error.cause, path=path) from None
+    with about_file(path):
+        content = read_arrays(read_input(path, LARGEST_TABLE, "a file of gain grids"), None)
     if not {"theta2", "phi2"} <= set(content):
         raise InputError("no variables 'theta2' and 'phi2'", expected="a file of gain grids (rad_pat.mat)", path=path)
     elevation, azimuth = np.ravel(content["theta2"]).astype(float), np.ravel(content["phi2"]).astype(float)

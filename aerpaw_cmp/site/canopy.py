@@ -11,7 +11,7 @@ import shapely
 from scipy import ndimage
 from shapely.geometry import Polygon
 
-from ..common.errors import InputError
+from ..common.errors import InputError, about_file
 from ..common.geodesy import SiteFrame
 from ..common.units import FloatArray
 from .dem import Dem, read_dem
@@ -38,10 +38,8 @@ def with_canopy(model: SiteModel, path: Path) -> tuple[SiteModel, list[str]]:
         Unreadable file, heights below the ground or above any tree.
     """
     content = model.model_dump()
-    try:
+    with about_file(path):
         forests, trees, actions = canopy_of(read_dem(path, _frame(model), anchored=False))
-    except InputError as error:
-        raise InputError(error.found, expected=error.expected, cause=error.cause, path=path) from None
     content["forests"] = [{**outline_dict(f.name, f.area), "height_m": f.height_m} for f in forests]
     content["trees"] |= only_trees(trees)
     return SiteModel.model_validate(content), actions

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.errors import InputError, UsageError
-from ..common.files import read_bounded
+from ..common.errors import InputError, UsageError, about_file
+from ..common.files import read_input
 from ..common.geodesy import SiteFrame, in_shape
 from ..common.units import BoolArray, FloatArray, IntArray
 
@@ -247,24 +247,18 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None, anch
         No crs for an ASCII grid; rasterio is missing for a GeoTIFF.
     """
     path = Path(path)
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            start = file.read(4)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path=path) from None
-    if size > MAX_BYTES:
-        raise InputError(f"the file has {size} bytes", expected=f"at most {MAX_BYTES}; cut the site out", path=path)
-    if start[:2] in (b"II", b"MM"):
-        return _read_geotiff(path, frame, anchored)
-    if crs is None:
-        raise UsageError("an ASCII grid names no coordinate system", expected="crs, such as EPSG:4326", path=path)
-    return _read_ascii(path, frame, crs, anchored)
+    data = read_input(path, MAX_BYTES, "an elevation model")
+    with about_file(path):
+        if data[:2] in (b"II", b"MM"):
+            return _read_geotiff(data, frame, anchored)
+        if crs is None:
+            raise UsageError("an ASCII grid names no coordinate system", expected="crs, such as EPSG:4326")
+        return _read_ascii(data, path, frame, crs, anchored)
 
 
-def _read_ascii(path: Path, frame: SiteFrame, crs: str, anchored: bool) -> Dem:
+def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str, anchored: bool) -> Dem:
     try:
-        lines = read_bounded(path, MAX_BYTES).decode("utf-8-sig").splitlines()
+        lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise InputError("not text", expected="an ESRI ASCII grid", path=path) from None
     header, begin = _ascii_header(lines, path)
@@ -285,7 +279,10 @@ def _read_ascii(path: Path, frame: SiteFrame, crs: str, anchored: bool) -> Dem:
         )
     west = header.get("xllcenter", header.get("xllcorner", 0.0) + step / 2)
     south = header.get("yllcenter", header.get("yllcorner", 0.0) + step / 2)
-    return _placed(path, Dem, flat.reshape(rows, columns)[::-1], west, south, step, step, crs, frame, anchored)
+    return Dem(
+        height_m=flat.reshape(rows, columns)[::-1], west=west, south=south, step_x=step, step_y=step, crs=crs,
+        frame=frame, anchored=anchored,
+    )  # fmt: skip
 
 
 def _ascii_header(lines: list[str], path: Path) -> tuple[dict[str, float], int]:
@@ -320,7 +317,7 @@ def _ascii_cells(line: str, gap: float, path: Path, number: int) -> FloatArray:
     return _plausible(np.where(row == gap, np.nan, row), path, number)
 
 
-def _plausible(height_m: FloatArray, path: Path, line: int | None = None) -> FloatArray:
+def _plausible(height_m: FloatArray, path: Path | None = None, line: int | None = None) -> FloatArray:
     """The heights, if each is a gap or one that ground on Earth can have."""
     wrong = height_m[(height_m < LOWEST_M) | (height_m > HIGHEST_M)]
     if wrong.size:
@@ -334,34 +331,22 @@ def _plausible(height_m: FloatArray, path: Path, line: int | None = None) -> Flo
     return height_m
 
 
-def _read_geotiff(path: Path, frame: SiteFrame, anchored: bool) -> Dem:
+def _read_geotiff(data: bytes, frame: SiteFrame, anchored: bool) -> Dem:
     from ..common.native import read
 
     if importlib.util.find_spec("rasterio") is None:
-        raise UsageError(
-            "a GeoTIFF needs rasterio", expected="pip install 'aerpaw-cmp[geo]', or an ASCII grid (.asc)", path=path
-        )
-    try:
-        arrays, notes = read("geotiff", read_bounded(path, MAX_BYTES))
-    except InputError as error:
-        raise InputError(error.found, expected=error.expected, cause=error.cause, path=path) from None
+        raise UsageError("a GeoTIFF needs rasterio", expected="pip install 'aerpaw-cmp[geo]', or an ASCII grid (.asc)")
+    arrays, notes = read("geotiff", data)
     band, unit = arrays["band"], notes["unit"]
     step_east, shear_east, west, shear_north, step_north, north = notes["transform"]
     if notes["crs"] is None or shear_east or shear_north or step_east <= 0 or step_north >= 0:
-        raise InputError("the GeoTIFF is not georeferenced north-up", cause="gdalwarp makes it so", path=path)
+        raise InputError("the GeoTIFF is not georeferenced north-up", cause="gdalwarp makes it so")
     if unit.startswith(("f", "us survey f")):
-        raise InputError(
-            f"heights in '{unit}'", expected="metres", cause="gdal_calc or gdal_translate converts", path=path
-        )
-    band = _plausible(band, path)
+        raise InputError(f"heights in '{unit}'", expected="metres", cause="gdal_calc or gdal_translate converts")
+    band = _plausible(band)
     west += step_east / 2
     south = north + step_north * (band.shape[0] - 0.5)
-    return _placed(path, Dem, band[::-1], west, south, step_east, -step_north, notes["crs"], frame, anchored)
-
-
-def _placed(path: Path, make: type[Dem], *arguments: Any) -> Dem:
-    """The model; errors of placing it name the file."""
-    try:
-        return make(*arguments)
-    except (InputError, UsageError) as error:
-        raise type(error)(error.found, expected=error.expected, cause=error.cause, path=path) from None
+    return Dem(
+        height_m=band[::-1], west=west, south=south, step_x=step_east, step_y=-step_north, crs=notes["crs"],
+        frame=frame, anchored=anchored,
+    )  # fmt: skip

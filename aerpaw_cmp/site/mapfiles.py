@@ -21,9 +21,10 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 from ..common.errors import InputError
-from ..common.files import read_bounded
+from ..common.files import read_input
 from .osmfiles import read_elements
 from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, left_out, lonlat
+from .xmlfiles import xml_root
 
 MAX_BYTES = 256 * 1024 * 1024
 """A map of a whole county is smaller; a site needs a few kilometres."""
@@ -52,10 +53,7 @@ def read_map_file(path: str | Path) -> MapFile:
         No such file, none of the formats, or not WGS84.
     """
     path = Path(path)
-    try:
-        data = read_bounded(path, MAX_BYTES, "a map file")
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", expected="a map file", path=path) from None
+    data = read_input(path, MAX_BYTES, "a map file")
     if data.startswith(b"PK\x03\x04"):
         data = _unzipped(data, path)
     start = data[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
@@ -247,8 +245,6 @@ def _polygon(rings: list[Any], outline: Outline, path: Path) -> None:
 def _from_xml(data: bytes, path: Path) -> MapFile:
     if b"<html" in data[:4096].lower():
         raise InputError("a web page", expected=FORMATS, cause="the server's message was saved, not the map", path=path)
-    if b"<!DOCTYPE" in data[:65536] or b"<!ENTITY" in data[:65536]:
-        raise InputError("the XML declares entities", expected="plain OSM or KML", path=path)
     if (tags := data.count(b"<")) > MAX_TAGS:
         raise InputError(
             f"the XML has {tags} tags",
@@ -256,12 +252,7 @@ def _from_xml(data: bytes, path: Path) -> MapFile:
             cause="a map of a whole country: cut out the site ('osmium extract')",
             path=path,
         )
-    try:
-        root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        line = error.position[0] if isinstance(error, ElementTree.ParseError) else None
-        why = str(error).split(": line")[0]
-        raise InputError(f"not XML: {why}", cause="the file was cut off?", path=path, line=line) from None
+    root = xml_root(data, path, "plain OSM or KML")
     tag = _plain(root.tag)
     if tag == "kml":
         return _kml(root, path, data)

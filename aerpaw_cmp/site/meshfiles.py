@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..common.errors import InputError
-from ..common.files import read_bounded
+from ..common.files import read_input
 from ..common.units import FloatArray, IntArray
 
 LARGEST_HEADER = 65_536
@@ -56,10 +56,7 @@ def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
     InputError
         No such file, too large, or damaged.
     """
-    try:
-        data = read_bounded(path, LARGEST_FILE, "a mesh")
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror or error})", path=path) from None
+    data = read_input(path, LARGEST_FILE, "a mesh")
     mesh = read_obj(data, path) if path.suffix.lower() == ".obj" else read_ply(data, path)
     return check(mesh, path), data
 

@@ -17,10 +17,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..common.errors import InputError, UsageError
-from ..common.files import read_bounded
+from ..common.files import read_input
 from ..common.units import FloatArray, IntArray
 from .materials import material, stated_name
 from .meshfiles import RawMesh, read_mesh
+from .xmlfiles import xml_root
 
 DEFAULT_THICKNESS_M = 0.1
 """Of a slab without a stated thickness, as in Sionna RT."""
@@ -139,19 +140,8 @@ def _gathered(reading: _Reading, notes: list[str]) -> TriangleScene:
 
 
 def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
-    try:
-        data = read_bounded(path, LARGEST_XML, "a scene")
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror or error})", path=path) from None
-    # entities are how XML explodes or reads other files; UTF-16 would hide them from this look
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
-        raise InputError("the XML declares entities, or is not UTF-8", expected="a plain Mitsuba scene", path=path)
-    try:
-        root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        line = error.position[0] if isinstance(error, ElementTree.ParseError) else None
-        why = str(error).split(": line")[0]
-        raise InputError(f"not XML: {why}", cause="the file was cut off?", path=path, line=line) from None
+    data = read_input(path, LARGEST_XML, "a scene")
+    root = xml_root(data, path, "a plain Mitsuba scene")
     if root.tag != "scene":
         raise InputError(f"XML of '{root.tag}'", expected="a Mitsuba scene ('scene')", path=path)
     if root.find(".//include") is not None:

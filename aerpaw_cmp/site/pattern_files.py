@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..common.errors import InputError
-from ..common.files import LARGEST_TABLE, read_bounded
+from ..common.files import LARGEST_TABLE, read_input
 from ..common.units import FloatArray, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, read_pattern_text
 
@@ -51,10 +51,7 @@ def read_pattern_file(
         Another kind of file, missing angles or units; with the line where there is one.
     """
     path = Path(path)
-    try:
-        text = read_bounded(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path=path) from None
+    text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
     name = name or path.stem
     if _PLANET.search(text):
         return _from_cuts(*_planet(text, path), name, path, _megahertz(_FREQUENCY.search(text)))

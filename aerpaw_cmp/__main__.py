@@ -37,6 +37,10 @@ BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Threads of BLAS: the tool solves many small systems, on which several threads wait for each other (3.6 times the
 processor time of the sample's report). What the user set stays."""
 
+_UNUSABLE = (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENOTDIR, errno.EIO, errno.ESTALE)
+"""Faults of a path itself, which pathlib's own questions such as ``is_dir`` raise."""
+LONGEST_NAME = 120
+
 NEW_OBJECTS = 10_000
 """Made before Python looks for cycles among them (700 by default): a report makes a million, of which most stay."""
 
@@ -118,6 +122,10 @@ def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
         return f"aerpaw-cmp: the Python package '{error.name}' is not installed; 'make setup' installs everything", 1
     if isinstance(error, FileNotFoundError) and _is_homeless():
         return "aerpaw-cmp: the working folder was removed; expected a folder that exists ('cd' to one)", 2
+    if isinstance(error, OSError) and error.errno in _UNUSABLE and error.filename:
+        shown = os.fsdecode(error.filename)
+        shown = shown if len(shown) <= LONGEST_NAME else f"{shown[:LONGEST_NAME]}..."
+        return f"aerpaw-cmp: {shown}: cannot be used ({error.strerror}); expected a file or folder of yours", 3
     kind = type(error).__name__
     return (
         f"aerpaw-cmp: internal error, {kind}: {str(error).strip() or 'no message'}\n"

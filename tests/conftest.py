@@ -70,7 +70,6 @@ DEAREST = (
     "report/test_report.py",
     "logs/test_flight_file.py",
     "report/test_exports.py",
-    "propagation/test_interactions.py",
     "compare/test_receiver.py",
     "jobs/test_outcomes.py",
     "report/test_maps.py",

@@ -76,6 +76,17 @@ def test_a_missing_input_is_exit_code_3(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("line", MISSING)
+def test_a_name_that_no_file_system_takes_is_no_internal_fault(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main([word.replace("nope", "n" * 300) for word in line.split()]) in (2, 3)
+    said = capsys.readouterr().err
+    assert "nnnn" in said
+    assert "internal error" not in said
+
+
 ROOT = Path(__file__).parents[1]
 PAGE = json_page.PAGE.read_text(encoding="utf-8")
 QUICK = {

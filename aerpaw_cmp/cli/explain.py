@@ -89,12 +89,6 @@ def _print(explanation: Any) -> None:
         table(["path", "face", "material", "incidence deg", "|TE| dB", "|TM| dB"], bounces, "Reflections")
     levels = [number(level, "{:.2f}") for level in (explanation.level_dbm, explanation.power_sum_dbm)]
     print(f"coherent sum {levels[0]} dBm, sum of powers {levels[1]} dBm")
-    if (other := explanation.other_interactions) is not None:
-        power, level = number(other.power_dbm, "{:.2f}"), number(other.level_dbm, "{:.2f}")
-        kinds = ", ".join(f"{count} {kind}" for kind, count in other.kinds.items()) or "none found"
-        print(
-            f"{' and '.join(other.interactions)} by Sionna: {kinds}; {power} dBm together, level with them {level} dBm"
-        )
     if explanation.measured_db is not None:
         print(f"measured {number(explanation.measured_db, '{:.2f}')} {explanation.unit}, before any offset")
     for path, reason in explanation.absent:

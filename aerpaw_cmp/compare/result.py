@@ -373,9 +373,6 @@ class EngineResult:
     settings: Mapping[str, object] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
     audit: AuditResult | None = None
-    other_interactions: Mapping[str, object] | None = None
-    """Paths with diffraction, scattering or refraction in RSS: ``paths``, ``kinds``, ``links``,
-    ``links_without_reflections``, ``median_power_share``, ``in_ranks``; None where none were asked for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -18,10 +18,11 @@ from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.drivers.moving import loss_along, replay_moving
 from ..propagation.drivers.pairs import replay_pairs
 from ..propagation.drivers.parts import Each, replay_in_parts
+from ..propagation.edges import EdgePaths
 from ..propagation.field.sum import Fields, channel_matrices
 from ..propagation.options import Engine, Field, Loss, Run, Search
 from ..propagation.paths import Faces, PathSet
-from ..propagation.replay import NOT_IN_RANKS, Replay, replay
+from ..propagation.replay import Replay, replay
 from ..propagation.search.effort import Estimate
 from ..site.site import Site
 from .clock import Along, ClockChannel, ClockEstimate, judge_clock
@@ -317,19 +318,27 @@ def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
     return Clock(result=result, applied_s=np.full(len(series.time), fit.correction_s if used else 0.0))
 
 
+PathsT = TypeVar("PathsT", PathSet, EdgePaths)
+
+
 def part_of(whole: Replay, start: int, stop: int) -> Replay:
     """The replay of poses ``start`` to ``stop``."""
     if (start, stop) == (0, len(whole.rss_dbm)):
         return whole
-    paths = whole.paths
-    chosen = (paths.pose >= start) & (paths.pose < stop)
+
+    def cut(paths: PathsT) -> PathsT:
+        rows = (paths.pose >= start) & (paths.pose < stop)
+        return dataclasses.replace(paths.select(rows), pose=paths.pose[rows] - start)
+
+    through = whole.through
     share = (stop - start) / max(len(whole.rss_dbm), 1)
     columns: dict[str, Any] = {name: getattr(whole, name)[start:stop] for name in whole.per_link}
     return dataclasses.replace(
         whole,
         **columns,
-        paths=dataclasses.replace(paths.select(chosen), pose=paths.pose[chosen] - start),
-        other=None if whole.other is None else whole.other.part(start, stop),
+        paths=cut(whole.paths),
+        edge_paths=None if whole.edge_paths is None else cut(whole.edge_paths),
+        through=None if through is None else dataclasses.replace(through, paths=cut(through.paths)),
         seconds=whole.seconds * share,
         search_seconds=whole.search_seconds * share,
     )
@@ -355,9 +364,7 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
         poses = Poses(position[valid], rotation)
         progress(f"replay rank {series.tower}: {len(poses)} poses")
         # H holds reflections alone, so nothing else is searched
-        replayed = replay_poses(
-            data.site, data.settings.rt, link, poses, towers_m=towers_m, others=False, progress=progress
-        )
+        replayed = replay_poses(data.site, data.settings.rt, link, poses, towers_m=towers_m, progress=progress)
         out.append(Replayed(link=link, poses=poses, valid=valid, replay=replayed, track=track, tower_m=towers_m))
     return out
 
@@ -386,7 +393,6 @@ def replay_poses(
     *,
     towers_m: FloatArray | None = None,
     engine: Engine | None = None,
-    others: bool | None = None,
     progress: Progress = silent,
 ) -> Replay:
     """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``.
@@ -402,8 +408,6 @@ def replay_poses(
     towers_m : (poses, 3), optional
         Places of the one tower of the link, which moves [m].
     engine : {"image", "sionna"}, optional
-    others : bool, optional
-        Whether to search for the interactions of ``rt`` besides reflections. By default where no engine is named.
     progress : Progress
         Share done; of the sionna engine alone.
 
@@ -415,10 +419,8 @@ def replay_poses(
     Raises
     ------
     UsageError
-        ``rt.advanced.interactions`` besides reflection with ``rt.engine: image``; what a replay raises.
+        What a replay raises.
     """
-    check_interactions(rt)
-    others = engine is None if others is None else others
     engine = engine or rt.engine
     towers = "+".join(link.tower_arrays)
     name = f"{engine} {towers}" if towers_m is None else f"replay {towers}, which moves"
@@ -433,8 +435,6 @@ def replay_poses(
         diffraction=rt.diffraction,
         ridges=rt.advanced.ridges,
         refraction=rt.refraction,
-        interactions=rt.advanced.interactions if others else ("reflection",),
-        scattering_coefficient=rt.advanced.scattering_coefficient if others else None,
         device=rt.advanced.device,
     )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
@@ -454,8 +454,6 @@ def replay_poses(
     if long:
         each = partial(replay_in_parts, size=BLOCK, each=each)
     replayed = each(site, link, poses, search, field, run)
-    if rt.other_interactions and not others:
-        replayed.left_out.append(NOT_IN_RANKS)
     return replayed
 
 
@@ -515,13 +513,3 @@ def fields_from(
     loss_db = loss_along(loss, paths, sources_m, poses.position_m)
     places_m = sources_m if len(sources_m) == 1 else sources_m[:, None]
     return channel_matrices(paths, faces, places_m, poses, link, loss_db)
-
-
-def check_interactions(rt: RtSettings) -> None:
-    """Refuse interactions that the engine has not; not in the settings, since ``--engine`` comes after them."""
-    if rt.other_interactions and rt.engine != "sionna":
-        raise UsageError(
-            f"rt.advanced.interactions: {', '.join(rt.advanced.interactions)} with engine {rt.engine!r}",
-            expected="rt.engine: sionna (or --engine sionna), or reflection alone",
-            cause="the image engine searches reflections exactly and knows no other interaction",
-        )

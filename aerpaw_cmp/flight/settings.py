@@ -37,7 +37,6 @@ from ..propagation.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
-from ..propagation.search.interactions import Interaction
 from ..site.antennas import Isotropic
 from ..site.learned import BAND, Named, find_named, read_table
 from ..site.sphere_pattern import read_sphere_csv
@@ -66,6 +65,10 @@ class GroupedSettings(Settings):
     _old: dict[str, str] = PrivateAttr(default_factory=dict)
     """What became of the keys that stand at their old place, by key."""
 
+    @classmethod
+    def refuse_gone(cls, data: Mapping[str, Any]) -> None:
+        """Raise a ValueError where a key of an earlier release asks for what is gone."""
+
     @model_validator(mode="wrap")
     @classmethod
     def _from_old_places(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
@@ -73,6 +76,7 @@ class GroupedSettings(Settings):
             return handler(data)
         group = cls.model_fields.get("advanced")
         knobs = set(type(group.default).model_fields) if group else set()
+        cls.refuse_gone(data)
         moved = {key: data[key] for key in data if key in knobs}
         gone = [key for key in data if key in cls.WITHOUT_EFFECT]
         content = {key: value for key, value in data.items() if key not in moved and key not in gone}
@@ -398,12 +402,8 @@ class AdvancedRt(Settings):
 
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=100_000_000)] = "auto"
     """Rays per tower of Sionna; ``auto`` raises the number until two pilots find the same paths."""
-    interactions: Annotated[list[Interaction], Field(min_length=1)] = ["reflection"]
-    """Besides reflections, engine sionna: their power is added to RSS; H and ranks leave them out."""
     ridges: Literal["deygout", "bullington"] = "deygout"
     """With diffraction: loss of the straight path over terrain that blocks it."""
-    scattering_coefficient: Annotated[float, Field(gt=0, le=1)] | None = None
-    """Share of the reflected amplitude that every material scatters; needed with ``scattering``."""
     crown_reflections: bool = True
     """Opaque crowns reflect besides blocking."""
     gamma_db_per_m: Positive | None = None
@@ -428,7 +428,7 @@ class AdvancedRt(Settings):
 class RtSettings(GroupedSettings):
     """How the flight is replayed."""
 
-    WITHOUT_EFFECT = ("batch",)
+    WITHOUT_EFFECT = ("batch", "interactions", "scattering_coefficient")
 
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
@@ -448,27 +448,19 @@ class RtSettings(GroupedSettings):
     audit_links: Annotated[int, Field(ge=0)] = 200
     advanced: AdvancedRt = AdvancedRt()
 
-    @model_validator(mode="after")
-    def _possible_interactions(self) -> RtSettings:
-        asked, scattered = self.advanced.interactions, self.advanced.scattering_coefficient
-        if len(set(asked)) < len(asked) or "reflection" not in asked:
-            raise ValueError("interactions must name reflection, and each interaction once")
-        if self.other_interactions and self.max_depth == 0:
-            raise ValueError("interactions besides reflection need max_depth of 1 or more: each counts in it")
-        if self.diffraction != "none" and (self.advanced.visibility == "pairs" or "diffraction" in asked):
-            raise ValueError("diffraction goes with visibility: centre, and without interactions: diffraction")
-        if self.refraction and (self.advanced.visibility == "pairs" or "refraction" in asked):
-            raise ValueError("refraction goes with visibility: centre, and without interactions: refraction")
-        if "scattering" in asked and scattered is None:
-            raise ValueError("interactions: scattering needs scattering_coefficient (materials of P.2040 state none)")
-        if "scattering" not in asked and scattered is not None:
-            raise ValueError("scattering_coefficient belongs to interactions: scattering")
-        return self
+    @classmethod
+    def refuse_gone(cls, data: Mapping[str, Any]) -> None:
+        """Interactions that Sionna's search added to RSS."""
+        if data.get("interactions", ["reflection"]) != ["reflection"]:
+            raise ValueError(
+                "interactions of Sionna are no longer added to RSS; use diffraction: edges and refraction: true"
+            )
 
-    @property
-    def other_interactions(self) -> list[str]:
-        """Interactions besides reflections."""
-        return [name for name in self.advanced.interactions if name != "reflection"]
+    @model_validator(mode="after")
+    def _goes_together(self) -> RtSettings:
+        if self.advanced.visibility == "pairs" and (self.diffraction != "none" or self.refraction):
+            raise ValueError("diffraction and refraction go with advanced.visibility: centre")
+        return self
 
 
 class PortSettings(Settings):

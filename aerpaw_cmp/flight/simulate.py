@@ -336,8 +336,6 @@ class FlightSimulator:
             rt.engine,
             max_depth=rt.max_depth,
             samples=rt.advanced.samples,
-            interactions=rt.advanced.interactions,  # refused by the image engine
-            scattering_coefficient=rt.advanced.scattering_coefficient,
         )
         result = replay(self.site, link, self._poses(time_s), search)
         offset = plan.offsets_db.get(log.node, {}).get(log.channel, 0.0)

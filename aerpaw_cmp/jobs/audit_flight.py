@@ -40,9 +40,7 @@ from ..propagation.check.reference import (
     turned,
 )
 from ..propagation.drivers.moving import site_with_tower_at
-from ..propagation.field.sum import mean_pair_power
 from ..propagation.options import Field, Run, Search
-from ..propagation.search.interactions import summary
 from ..propagation.search.sionna import free_memory
 from ..site.site import Site
 from .audit_raw import raw_checked
@@ -101,14 +99,7 @@ def audit_replays(
         },
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
         audit=_audit(data, replays, results, progress) if rt.audit_links and now else None,
-        other_interactions=_other_interactions(replays) if rt.other_interactions else None,
     )
-
-
-def _other_interactions(replays: Sequence[Replayed]) -> dict[str, object]:
-    """What diffraction, scattering and refraction added, over all RSS series."""
-    with_others = [r.replay for r in replays if r.replay.other is not None]
-    return summary((mean_pair_power(f.h), f.other) for f in with_others if f.other is not None)
 
 
 def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, object]:

@@ -245,8 +245,9 @@ def _reference(
     if replayed.tower_m is not None or tower not in towers:
         account.leave(f"levels of {tower} (a node of the flight, or one that moves)")
         return None
-    if data.site.scene is not None or data.site.dem is not None or replayed.replay.other is not None:
-        account.leave("levels over terrain, in scenes of triangles, with diffraction or scattering")
+    rt = data.settings.rt
+    if data.site.scene is not None or data.site.dem is not None or rt.diffraction != "none" or rt.refraction:
+        account.leave("levels over terrain, in scenes of triangles, with diffraction or refraction")
         return None
     return Reference(replace(data.site, towers={tower: towers[tower]}), tower, expected.link, expected.loss)
 

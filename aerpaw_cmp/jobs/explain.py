@@ -51,30 +51,6 @@ class OtherEngine:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OtherPower:
-    """What diffraction, scattering and refraction add to a link: Sionna's paths, whose power alone counts.
-
-    Parameters
-    ----------
-    interactions : tuple of str
-        As asked for, without reflection.
-    paths : int
-    kinds : dict of str to int
-        Paths by what they are made of.
-    power_dbm : float, optional
-        Sum of their powers; None where there is none.
-    level_dbm : float, optional
-        Coherent level of the reflections with that power added; None out of coverage.
-    """
-
-    interactions: tuple[str, ...]
-    paths: int
-    kinds: dict[str, int]
-    power_dbm: float | None
-    level_dbm: float | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Explanation:
     """One link at one instant.
 
@@ -88,8 +64,6 @@ class Explanation:
         Line of sight or ground reflections that are not there, and why.
     differences : tuple of OtherEngine, optional
         Where both engines were asked.
-    other_interactions : OtherPower, optional
-        Where ``rt.advanced.interactions`` names more than reflections; ``level_dbm`` and ``paths`` leave them out.
     """
 
     flight: str
@@ -109,7 +83,6 @@ class Explanation:
     absent: tuple[tuple[str, str], ...]
     differences: tuple[OtherEngine, ...] | None
     notes: tuple[str, ...]
-    other_interactions: OtherPower | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -118,8 +91,6 @@ class Explanation:
         result["absent"] = [{"path": path, "reason": reason} for path, reason in self.absent]
         if self.differences is not None:
             result["differences"] = [dataclasses.asdict(one) for one in self.differences]
-        if self.other_interactions is not None:
-            result["other_interactions"] = dataclasses.asdict(self.other_interactions)
         for name in ("level_dbm", "power_sum_dbm", "measured_db"):
             if result[name] is not None and not np.isfinite(result[name]):
                 result[name] = None
@@ -172,9 +143,7 @@ def run_explain(
         data = dataclasses.replace(data, site=site_with_tower_at(data.site, tower, place[0]))
     rt = settings.rt.model_copy(update={"engine": "sionna"}) if engine == "sionna" else settings.rt
     chosen = rt.engine if engine in (None, "both") else engine
-    others = bool(rt.other_interactions) and chosen == "sionna" and isinstance(series, RssSeries)
-    replayed = replay_poses(data.site, rt, link, pose, engine=chosen, others=others, progress=progress)  # type: ignore[arg-type]
-    other, replayed = _other_power(replayed, link), replayed.of_reflections()
+    replayed = replay_poses(data.site, rt, link, pose, engine=chosen, progress=progress)  # type: ignore[arg-type]
     source = data.site.towers[tower].position_m
     if tower in data.nodes:
         notes.append(f"{tower} moves: it was at {source[0]:.1f} m east, {source[1]:.1f} m north, {source[2]:.1f} m up")
@@ -209,22 +178,6 @@ def run_explain(
         absent=tuple(_absent(replayed, source, pose.position_m[0])),
         differences=differences,
         notes=(*notes, *(f"left out: {what}" for what in replayed.left_out)),
-        other_interactions=other,
-    )
-
-
-def _other_power(replayed: Replay, link: Link) -> OtherPower | None:
-    """What other interactions than reflections add to the one link of a replay."""
-    other = replayed.other
-    if other is None:
-        return None
-    power = float(other.power[0, 0])
-    return OtherPower(
-        interactions=tuple(name for name in other.asked if name != "reflection"),
-        paths=int(other.paths[0, 0]),
-        kinds=dict(other.kinds),
-        power_dbm=_level(link.transmit_power_dbm + 10.0 * float(np.log10(power))) if power > 0.0 else None,
-        level_dbm=_level(float(replayed.rss_dbm[0, 0])),
     )
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from ..common.versions import version
 from .options import Search
 from .paths import PathSet
 from .scene import Scene
-from .search.interactions import OtherPaths, OtherSearch
 
 LAYOUT = 4
 """Raised whenever the entries or the search change."""
@@ -55,7 +53,6 @@ class PathCache:
         targets_m: FloatArray,
         carrier_hz: float,
         search: Search,
-        others: OtherSearch | None = None,
     ) -> str:
         """Digest of everything that decides the paths.
 
@@ -69,8 +66,6 @@ class PathCache:
             Counts for Sionna alone: an image path is the same at every frequency.
         search : Search
             Engine, depth, samples and the rest.
-        others : OtherSearch, optional
-            Of an entry that holds paths with these interactions.
 
         Returns
         -------
@@ -84,8 +79,6 @@ class PathCache:
             versions += [str(carrier_hz), *scene.faces.material]
         text = "\n".join([*versions, *(f"{k}={v}" for k, v in sorted(search.deciding.items()))])
         digest.update(text.encode())
-        if others is not None:
-            digest.update(f"\n{others}".encode())
         faces = scene.faces
         for polygon in faces.polygon:
             digest.update(b"-" if polygon is None else polygon.wkb)
@@ -102,11 +95,6 @@ class PathCache:
         if columns is None:
             return None
         return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
-
-    def load_others(self, key: str) -> OtherPaths | None:
-        """Paths with other interactions; None as for :meth:`load`."""
-        columns = self._columns(key)
-        return None if columns is None else OtherPaths(**columns)
 
     def _columns(self, key: str) -> dict[str, AnyArray] | None:
         place = self.folder / f"{key}.npz"
@@ -125,10 +113,6 @@ class PathCache:
     def save(self, key: str, paths: PathSet, seconds: float) -> None:
         """Write an entry; another process sees either nothing or all of it."""
         self._write(key, {"seconds": np.float64(seconds), **{column: getattr(paths, column) for column in _COLUMNS}})
-
-    def save_others(self, key: str, paths: OtherPaths) -> None:
-        """Write an entry of :meth:`load_others`."""
-        self._write(key, {one.name: getattr(paths, one.name) for one in fields(paths)})
 
     def _write(self, key: str, columns: dict[str, Any]) -> None:
         entry = io.BytesIO()

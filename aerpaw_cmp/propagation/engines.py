@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,7 +21,6 @@ from .paths import PathSet
 from .scene import Scene, within_reach
 from .search import mirror
 from .search.effort import Estimate
-from .search.interactions import SCATTERING_SAMPLES, OtherPaths, OtherSearch
 from .search.power_cut import ROUNDING, longest_m, within_cut
 from .search.samples import Choice, enough_samples, spread
 
@@ -141,43 +139,6 @@ def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run)
         scene.faces, links, sionna.Rays(**search.rays),
         carrier_hz=link.carrier_hz, surfaces=scene.surfaces, progress=run.progress,
     )  # fmt: skip
-
-
-def other_paths(
-    scene: Scene, link: Link, poses: Poses, search: Search, other: OtherSearch, cache: PathCache | None
-) -> Iterator[OtherPaths]:
-    """Paths with other interactions, batch by batch; scattered ones, of which a link has hundreds, are not cached.
-
-    Parameters
-    ----------
-    scene, link, poses, search, cache
-        As for :func:`search_or_read`.
-    other : OtherSearch
-
-    Yields
-    ------
-    OtherPaths
-    """
-    cache = None if other.scattering else cache
-    key = cache.key(scene, poses.position_m, link.carrier_hz, search, other) if cache else ""
-    entry = cache.load_others(key) if cache else None
-    if entry is not None:
-        yield entry
-        return
-    from .search import sionna
-
-    rays = sionna.Rays(**search.rays)
-    if other.scattering:
-        rays = replace(rays, samples=min(rays.samples, SCATTERING_SAMPLES))
-    batches = sionna.find_others(
-        scene.faces, scene.links_to(poses), rays, other, carrier_hz=link.carrier_hz, surfaces=scene.surfaces
-    )
-    if cache is None:
-        yield from batches
-        return
-    joined = OtherPaths.joined(batches, search.max_depth)
-    cache.save_others(key, joined)
-    yield joined
 
 
 def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +13,6 @@ from .field.ridges import Ridges
 from .paths import PathSet
 from .search.crowns import Crowns
 from .search.effort import SearchRun
-from .search.interactions import OtherSearch, other_searches
 from .search.samples import Samples
 
 Engine = Literal["image", "sionna"]
@@ -54,11 +53,6 @@ class Search:
         where the horizons meet.
     refraction : bool
         Paths straight through walls and roofs, in H, levels and ranks.
-    interactions : sequence of {"reflection", "diffraction", "scattering", "refraction"}
-        ``sionna`` only, but for reflections: the others' power is added to RSS, never to H
-        (:mod:`aerpaw_cmp.propagation.search.interactions`).
-    scattering_coefficient : float, optional
-        Of every material, where "scattering" is asked for.
     device : {"auto", "cpu", "cuda"}
         Of Sionna's search; "auto" is a GPU where Dr.Jit finds one.
     links : (towers, poses) bool, optional
@@ -75,8 +69,6 @@ class Search:
     diffraction: Diffraction = "none"
     ridges: Ridges = "deygout"
     refraction: bool = False
-    interactions: Sequence[str] = ("reflection",)
-    scattering_coefficient: float | None = None
     device: Device = "auto"
     links: BoolArray | None = None
 
@@ -96,37 +88,19 @@ class Search:
         names = ("engine", "max_depth", "samples", "batch", "power_cut_db", "variant")
         return {name: getattr(self, name) for name in names}
 
-    def others(self) -> tuple[OtherSearch, ...]:
-        """Searches for other interactions than reflections.
+    def check(self) -> None:
+        """Refuse what no engine knows.
 
         Raises
         ------
         UsageError
-            An unknown engine or interaction, other interactions than reflections with ``image``, a ``power_cut_db``
-            that is not positive.
+            An unknown engine or diffraction, a ``power_cut_db`` that is not positive.
         """
         if self.engine not in ("image", "sionna"):
             raise UsageError(f"unknown engine {self.engine!r}", expected="'image' or 'sionna'")
         if self.diffraction not in ("none", "edges", "all"):
             raise UsageError(f"unknown diffraction {self.diffraction!r}", expected="'none', 'edges' or 'all'")
-        if self.diffraction != "none" and "diffraction" in self.interactions:
-            raise UsageError(
-                "diffraction by edges and by Sionna", expected="one of them: its power would be added twice"
-            )
-        if self.refraction and "refraction" in self.interactions:
-            raise UsageError(
-                "refraction by slabs and by Sionna", expected="one of them: its power would be added twice"
-            )
         _check_positive("power_cut_db", self.power_cut_db)
-        searches = other_searches(self.interactions, self.scattering_coefficient)
-        if searches and (self.engine != "sionna" or self.max_depth == 0):
-            raise UsageError(
-                f"interactions {', '.join(self.interactions)} with "
-                + (f"engine {self.engine!r}" if self.engine != "sionna" else "max_depth 0"),
-                expected="engine 'sionna' and a max_depth of 1 or more, or reflections alone",
-                cause="the image engine knows reflections; every interaction counts in max_depth",
-            )
-        return searches
 
 
 @dataclass(frozen=True, slots=True)

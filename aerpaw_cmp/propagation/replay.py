@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import UsageError
-from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, power_from_db, wavelength_m
+from ..common.units import BoolArray, ComplexArray, FloatArray, wavelength_m
 from ..site.site import Site
 from .arrays import Link, Poses
 from .cache import PathCache
 from .edges import EdgePaths, Edges
-from .engines import chosen_samples, other_paths, path_cache, search_or_read
+from .engines import chosen_samples, path_cache, search_or_read
 from .field.edges import edge_channels
 from .field.relevance import idle_objects, in_words
 from .field.ridges import ridge_loss_db
@@ -26,7 +25,6 @@ from .paths import Faces, PathSet
 from .scene import Scene, buried_towers, within_reach
 from .search import mirror
 from .search.edges import find_edge_paths
-from .search.interactions import OtherInteractions, OtherSearch, path_powers
 from .search.power_cut import CHECKED_POSES, loss_in_words, within_cut
 from .search.samples import spread
 from .search.terrain import on_terrain
@@ -35,8 +33,6 @@ from .surfaces import Surfaces
 
 LEVELS_AT_ONCE = 1024
 """Poses of which levels are made at once."""
-
-NOT_IN_RANKS = "other interactions than reflections in H and ranks: their power is added to RSS alone"
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -77,9 +73,6 @@ class Replay:
         Paths over edges, where diffraction was asked for; they are in H and both levels.
     through : ThroughWalls, optional
         Paths through walls, where refraction was asked for; they are in H and both levels.
-    other : OtherInteractions, optional
-        What diffraction, scattering and refraction add to both levels and to ``has_path``, where they were asked for;
-        ``h`` and ``paths`` are of reflections alone.
     """
 
     rss_dbm: FloatArray
@@ -100,22 +93,12 @@ class Replay:
     surfaces: Surfaces | None = None
     edge_paths: EdgePaths | None = None
     through: ThroughWalls | None = None
-    other: OtherInteractions | None = None
 
     @property
     def per_link(self) -> tuple[str, ...]:
         """Names of the arrays (poses, towers, ...)."""
         names = ("rss_dbm", "rss_power_dbm", "h", "has_path", "pairs_differ")
         return names if self.pairs_differ is not None else names[:-1]
-
-    def of_reflections(self) -> Replay:
-        """The replay without what other interactions add: what its paths and H are."""
-        other = self.other
-        if other is None:
-            return self
-        return replace(
-            self, rss_dbm=other.rss_dbm, rss_power_dbm=other.rss_power_dbm, has_path=other.has_path, other=None
-        )
 
     def __repr__(self) -> str:
         """One line: the arrays are too large to be shown."""
@@ -195,9 +178,10 @@ def replay(
     Raises
     ------
     UsageError
-        Unknown tower or engine, a scene too large for ``image``, other interactions than reflections with ``image``.
+        Unknown tower or engine, a scene too large for ``image``.
     """
-    started, searches = time.perf_counter(), search.others()
+    started = time.perf_counter()
+    search.check()
     poses, notes = within_reach(site, poses)
     scene = Scene.of(site, link, poses)
     if search.links is not None:
@@ -216,10 +200,6 @@ def replay(
     result, idle = _evaluated(scene, link, poses, paths, search, field, run, more)
     result = replace(result, edge_paths=bent, through=through)
     notes += [*stopped, *unmodelled]
-    if searches:
-        power = _other_powers(site, scene, link, poses, search, searches, field, cache)
-        result = _with_others(result, link, tuple(search.interactions), *power)
-        notes.append(NOT_IN_RANKS)
     return replace(
         result,
         seconds=time.perf_counter() - started,
@@ -377,7 +357,7 @@ def _passing(
     if scene.surfaces is not None:
         raise UsageError(
             "refraction in a scene of triangles",
-            expected="buildings with footprints, or interactions: [reflection, refraction] with engine sionna",
+            expected="buildings with footprints",
             cause="a triangle does not say where its wall ends",
         )
     through = paths_through(scene.faces, scene.links_to(poses), search.max_depth)
@@ -454,61 +434,3 @@ def _levels(fields: Fields, has_path: BoolArray, link: Link) -> tuple[FloatArray
             h[part][~above_floor] = 0.0
         has_path[part] &= above_floor
     return level_dbm, power_dbm
-
-
-def _other_powers(
-    site: Site,
-    scene: Scene,
-    link: Link,
-    poses: Poses,
-    search: Search,
-    searches: tuple[OtherSearch, ...],
-    field: Field,
-    cache: PathCache | None,
-) -> tuple[FloatArray, IntArray, dict[str, int]]:
-    """Power and number (poses, towers) of the paths with other interactions, and what they are made of."""
-    shape = (len(poses), len(scene.sources_m))
-    power, count, kinds = np.zeros(shape), np.zeros(shape, dtype=np.int64), Counter[str]()
-    for others in (o for one in searches for o in other_paths(scene, link, poses, search, one, cache)):
-        paths = others.select(_clear_of_terrain(site, scene, poses, others.geometry))
-        loss_db = field.loss_db(paths.reflections, scene.sources_m, poses.position_m)
-        if loss_db is not None:
-            paths, loss_db = paths.select(np.isfinite(loss_db)), loss_db[np.isfinite(loss_db)]
-        np.add.at(power, (paths.pose, paths.tower), path_powers(paths, link, poses, loss_db))
-        np.add.at(count, (paths.pose, paths.tower), 1)
-        kinds.update(paths.named())
-    return power, count, dict(sorted(kinds.items()))
-
-
-def _with_others(
-    result: Replay,
-    link: Link,
-    asked: tuple[str, ...],
-    power: FloatArray,
-    count: IntArray,
-    kinds: dict[str, int],
-) -> Replay:
-    """Levels with the power of other interactions: a level never falls by it."""
-    other = OtherInteractions(
-        asked=asked,
-        power=power,
-        paths=count,
-        kinds=kinds,
-        rss_dbm=result.rss_dbm,
-        rss_power_dbm=result.rss_power_dbm,
-        has_path=result.has_path,
-    )
-
-    def raised(known: FloatArray) -> FloatArray:
-        own = np.where(np.isfinite(known), power_from_db(np.nan_to_num(known) - link.transmit_power_dbm), 0.0)
-        summed = rss_dbm(own + power, link.transmit_power_dbm, link.noise_floor_dbm)
-        return np.asarray(np.where(power > 0.0, summed, known))
-
-    level = raised(result.rss_dbm)
-    return replace(
-        result,
-        rss_dbm=level,
-        rss_power_dbm=raised(result.rss_power_dbm),
-        has_path=result.has_path | np.isfinite(level),
-        other=other,
-    )

@@ -150,7 +150,6 @@ def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
     audit = engine.audit
     return {
         **_named(engine, "engine links seconds paths left_out"),
-        **({} if engine.other_interactions is None else {"other_interactions": engine.other_interactions}),
         "audit": None
         if audit is None
         else {

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 
@@ -58,3 +59,9 @@ def test_todays_file_has_no_such_note(tmp_path: Path) -> None:
 def test_a_dotted_key_of_an_earlier_campaign_reaches_the_knob(tmp_path: Path) -> None:
     settings = overridden(written(tmp_path, "rt: {advanced: {maximum_gap_s: 9}}\n"), {"rt.maximum_gap_s": 4.0})
     assert settings.rt.advanced.maximum_gap_s == 4.0
+
+
+def test_interactions_of_sionna_are_refused_with_what_to_write_instead(tmp_path: Path) -> None:
+    assert "rt.interactions" in written(tmp_path, "rt: {interactions: [reflection]}\n").flight.notes[0]
+    with pytest.raises(UsageError, match=r"flight\.yaml, line 3: rt: .*use diffraction: edges and refraction: true"):
+        written(tmp_path, "rt: {engine: sionna, interactions: [reflection, diffraction]}\n")

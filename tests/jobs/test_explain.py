@@ -12,13 +12,8 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.flight import simulate
-from aerpaw_cmp.flight.settings import AdvancedRt
 from aerpaw_cmp.jobs import explain
 from aerpaw_cmp.jobs.explain import run_explain
-from aerpaw_cmp.propagation import replay as replay_module
-from aerpaw_cmp.propagation.field.sum import mean_pair_power
-from aerpaw_cmp.propagation.options import Search
 from tests.json_page import unlisted
 
 ANTENNA = {"layout": "single", "antenna": {"model": "dipole"}}
@@ -143,76 +138,3 @@ def test_paths_that_one_engine_lacks_are_named_with_the_reason(flown, monkeypatc
     (one,) = found.differences
     assert (one.found_by, one.path, one.reason) == ("sionna", "line of sight", "no reason found")
     assert found.absent[0][0] == "line of sight"
-
-
-def test_other_interactions_are_counted_beside_the_reflections(flown, monkeypatch, capsys):
-    """Their power is made up here: half of that of the reflections, so the level rises by 10 log10(1.5)."""
-    path, _ = flown
-    plain = run_explain(path, time="4", tower="LW1")
-    settings = yaml.safe_load(path.read_text())
-    settings["rt"] |= {"engine": "sionna", "advanced": {"interactions": ["reflection", "diffraction"]}}
-    other = path.with_name("others.yaml")
-    other.write_text(yaml.safe_dump(settings), encoding="utf-8")
-    true, asked = explain.replay_poses, []
-
-    def replay_poses(site, rt, link, pose, *, engine=None, others=None, **_):
-        asked.append((engine, others))
-        found = true(site, rt.model_copy(update={"advanced": AdvancedRt()}), link, pose, engine="image")
-        power = 0.5 * mean_pair_power(found.h)
-        kinds = {"diffraction": 2, "reflection + diffraction": 1}
-        added = replay_module._with_others(found, link, ("reflection", "diffraction"), power, np.array([[3]]), kinds)
-        return dataclasses.replace(added, engine="sionna")
-
-    monkeypatch.setattr(explain, "replay_poses", replay_poses)
-    assert main(["explain", str(other), "--time", "4", "--tower", "LW1", "--json", "--quiet"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert asked == [("sionna", True)]
-    assert found["level_dbm"] == pytest.approx(plain.level_dbm, abs=1e-9)  # of the reflections, as their terms add up
-    told = found["other_interactions"]
-    assert (told["interactions"], told["paths"]) == (["diffraction"], 3)
-    assert told["level_dbm"] == pytest.approx(plain.level_dbm + 10 * np.log10(1.5), abs=1e-9)
-    assert told["power_dbm"] == pytest.approx(plain.level_dbm + 10 * np.log10(0.5), abs=1e-9)
-    assert main(["explain", str(other), "--time", "4", "--tower", "LW1", "--quiet"]) == 0
-    assert "diffraction by Sionna: 2 diffraction, 1 reflection + diffraction;" in capsys.readouterr().out
-    assert plain.other_interactions is None
-
-
-def test_interactions_that_the_image_engine_has_not_are_refused_by_explain_and_simulate(flown, capsys):
-    path, _ = flown
-    settings = yaml.safe_load(path.read_text())
-    settings["rt"]["interactions"] = ["reflection", "diffraction"]
-    other = path.with_name("refused.yaml")
-    other.write_text(yaml.safe_dump(settings), encoding="utf-8")
-    for command in (["explain", str(other), "--time", "4", "--tower", "LW1"],
-                    ["simulate", str(other), "-o", str(path.parent / "never")]):  # fmt: skip
-        assert main([*command, "--quiet"]) == 2
-        said = capsys.readouterr().err
-        assert "diffraction" in said
-        assert "engine 'image'" in said
-        assert "Traceback" not in said
-    assert not (path.parent / "never").exists()
-
-
-def test_simulate_logs_the_level_with_other_interactions(flown, monkeypatch):
-    path, _ = flown
-    true, asked = simulate.replay, []
-
-    def replay(site, link, poses, search, *options, **named):
-        asked.append((search.engine, tuple(search.interactions)))
-        found = true(site, link, poses, Search(max_depth=search.max_depth))
-        more = 5.0 * (len(search.interactions) > 1)
-        return dataclasses.replace(found, rss_dbm=found.rss_dbm + more, rss_power_dbm=found.rss_power_dbm + more)
-
-    monkeypatch.setattr(simulate, "replay", replay)
-    levels = {}
-    for name, names in (("plain", ["reflection"]), ("others", ["reflection", "refraction"])):
-        settings = yaml.safe_load(path.read_text())
-        settings["rt"] |= {"engine": "sionna", "advanced": {"interactions": names}}
-        other = path.with_name(f"{name}.yaml")
-        other.write_text(yaml.safe_dump(settings), encoding="utf-8")
-        assert main(["simulate", str(other), "-o", str(path.parent / name), "--quiet"]) == 0
-        text = (path.parent / name / "small" / "USRP1.txt").read_text().splitlines()
-        levels[name] = np.array([float(line.split()[-1]) for line in text if line[:1] == "["])
-    assert ("sionna", ("reflection", "refraction")) in asked
-    assert levels["others"].size > 5
-    np.testing.assert_allclose(levels["others"] - levels["plain"], 5.0, atol=1e-3)

@@ -198,9 +198,6 @@ def test_what_is_not_modelled_is_said_or_refused() -> None:
     assert any("two edges" in text for text in result.left_out)
     with pytest.raises(UsageError, match="unknown diffraction"):
         trace(place(BARN), LINK, poses((70.0, 3.0, 2.0)), diffraction="some")  # type: ignore[arg-type]
-    both = Search("sionna", diffraction="edges", interactions=("reflection", "diffraction"))
-    with pytest.raises(UsageError, match="added twice"):
-        both.others()
 
 
 def test_without_buildings_nothing_changes() -> None:

@@ -10,9 +10,9 @@ import pytest
 from shapely.affinity import rotate
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.flight.replay import part_of
 from aerpaw_cmp.propagation import compiled
 from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.drivers.moving import replay_moving
@@ -156,9 +156,24 @@ def test_compiled_code_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fields[0] == pytest.approx(fields[1], abs=1e-12 * np.abs(fields[0]).max())
 
 
-def test_refraction_twice_is_refused() -> None:
-    with pytest.raises(UsageError, match="added twice"):
-        run(town(), PLACES[0], engine="sionna", max_depth=1, interactions=("reflection", "refraction"))
+def test_a_part_of_a_replay_is_the_replay_of_its_poses() -> None:
+    """Channels of one tower are replayed together and cut apart: their paths through walls and over edges as well."""
+    link = Link(CARRIER, {"T": single_element()}, single_element())
+    search = Search(max_depth=1, diffraction="edges", refraction=True)
+
+    def of(places: Any) -> Replay:
+        return replay(town(), link, Poses(places, np.tile(np.eye(3), (len(places), 1, 1))), search, Field(), Run())
+
+    part, alone = part_of(of(PLACES), 4, 9), of(PLACES[4:9])
+    assert part.edge_paths is not None
+    assert alone.edge_paths is not None
+    assert part.through is not None
+    assert alone.through is not None
+    assert min(len(alone.edge_paths.pose), len(alone.through.paths.pose)) > 2
+    assert part.edge_paths.pose.tolist() == alone.edge_paths.pose.tolist()
+    assert part.through.paths.pose.tolist() == alone.through.paths.pose.tolist()
+    assert part.paths.pose.tolist() == alone.paths.pose.tolist()
+    assert np.array_equal(part.h, alone.h)
 
 
 def test_parts_and_moving_towers_keep_the_paths() -> None:

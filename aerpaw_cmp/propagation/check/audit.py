@@ -163,7 +163,6 @@ def audit(
     Audit
     """
     complete = second.complete and search.power_cut_db is None
-    replay = replay.of_reflections()  # the others have no second implementation: they are listed apart
     chosen = _spread(poses, None if second.links is None else -(-second.links // max(1, len(replay.towers))))
     other: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
     search = replace(search, engine=other, check_power_cut=False)

@@ -37,7 +37,6 @@ from ..faces import inside, triangles
 from ..paths import Faces, Links, PathSet, path_lengths
 from ..surfaces import Surfaces
 from .effort import Progress
-from .interactions import DIFFRACTED, REFLECTED, OtherPaths, OtherSearch
 from .mirror import (
     MINIMUM_LENGTH_M,
     images_of,
@@ -148,8 +147,7 @@ class _Scene:
 class _Builder:
     """Scenes of some of the faces: one mesh per material.
 
-    ``own_table`` takes Sionna's own constants of P.2040. ``wedges`` lets triangles share the corners in which they
-    meet, which is how Sionna knows an edge. ``scattering`` is the scattering coefficient of every material.
+    ``own_table`` takes Sionna's own constants of P.2040.
     """
 
     faces: Faces
@@ -157,8 +155,6 @@ class _Builder:
     carrier_hz: float
     surfaces: Surfaces | None
     own_table: bool = False
-    wedges: bool = False
-    scattering: float = 0.0
 
     def scene(self, chosen: IntArray) -> _Scene:
         """Scene of the faces ``chosen``."""
@@ -177,7 +173,7 @@ class _Builder:
             members = [i for i in chosen if faces.material[i] == name]
             rows = np.flatnonzero(np.isin(owner, members))
             plain = f"faces-{_plain(name)}"
-            material = _material(name, self.carrier_hz, self.own_table, self.scattering)
+            material = _material(name, self.carrier_hz, self.own_table)
             mesh = self._mesh(plain, vertices, triangle[rows])
             objects.append(rt.SceneObject(mi_mesh=mesh, name=plain, radio_material=material))
             owners.append(owner[rows])
@@ -189,9 +185,6 @@ class _Builder:
 
         corners, place = np.unique(triangle, return_inverse=True)
         points = vertices[corners]
-        if self.wedges:
-            _, first, same = np.unique(np.round(points / WELD_M), axis=0, return_index=True, return_inverse=True)
-            points, place = points[first], same.reshape(-1)[place]
         mesh = mi.Mesh(name, vertex_count=len(points), face_count=len(triangle))
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(points, np.float32).ravel())
@@ -205,7 +198,7 @@ def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9_]+", "-", name)
 
 
-def _material(name: str, carrier_hz: float, own_table: bool, scattering: float = 0.0) -> Any:
+def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
     import sionna.rt as rt
 
     what = material(name)
@@ -222,7 +215,6 @@ def _material(name: str, carrier_hz: float, own_table: bool, scattering: float =
         thickness=thick,
         relative_permittivity=float(eta.real),
         conductivity=float(conductivity),
-        scattering_coefficient=scattering,
     )
 
 
@@ -297,8 +289,6 @@ class _Finder:
         Plane waves over the arrays, or each element its own end.
     patterns : (str, str)
         Sionna's names of the elements' patterns at the sources and at the targets.
-    flags : dict of str to bool
-        Arguments of PathSolver that switch interactions on.
     """
 
     def __init__(
@@ -310,13 +300,11 @@ class _Finder:
         *,
         synthetic: bool = True,
         patterns: tuple[str, str] = ("iso", "iso"),
-        flags: dict[str, bool] | None = None,
     ) -> None:
         import sionna.rt as rt
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
         self.built, self.batch, self.synthetic = built, batch, synthetic
-        self.flags = {"diffuse_reflection": False, "refraction": False, "diffraction": False} | (flags or {})
         scene = built.scene
         arrays = (("tx_array", sources.elements_m, patterns[0]), ("rx_array", elements_m, patterns[1]))
         for name, elements, kind in arrays:
@@ -396,7 +384,9 @@ class _Finder:
             synthetic_array=self.synthetic,
             los=True,
             specular_reflection=max_depth > 0,
-            **self.flags,
+            diffuse_reflection=False,
+            refraction=False,
+            diffraction=False,
         )
 
     def _more_room(self) -> bool:
@@ -531,31 +521,6 @@ def find_paths(
     return paths if links.excluded is None else paths.select(~links.excluded[paths.tower, paths.pose])
 
 
-def find_others(
-    faces: Faces, links: Links, rays: Rays, other: OtherSearch, *, carrier_hz: float, surfaces: Surfaces | None = None
-) -> Iterator[OtherPaths]:
-    """Paths with an interaction that is no reflection, as Sionna has them: float32, nothing refined.
-
-    Parameters
-    ----------
-    faces, links, rays, carrier_hz, surfaces
-        As in :func:`find_paths`; ``max_depth`` counts every interaction.
-    other : OtherSearch
-        Interactions besides the reflections, and the scattering coefficient.
-
-    Yields
-    ------
-    OtherPaths
-        Of each batch.
-    """
-
-    def take(traced: Any, raw: dict[str, Any], built: _Scene, poses: IntArray, towers: IntArray) -> OtherPaths:
-        part = _others(traced, raw, built.face_of, poses, towers)
-        return part if links.excluded is None else part.select(~links.excluded[part.tower, part.pose])
-
-    yield from _in_batches(take, faces, links, rays, carrier_hz=carrier_hz, surfaces=surfaces, other=other)
-
-
 def _in_batches(
     take: Callable[[Any, dict[str, Any], _Scene, IntArray, IntArray], Taken],
     faces: Faces,
@@ -565,7 +530,6 @@ def _in_batches(
     carrier_hz: float,
     surfaces: Surfaces | None,
     progress: Progress | None = None,
-    other: OtherSearch = OtherSearch(),  # noqa: B008 - frozen
 ) -> Iterator[Taken]:
     """What ``take(paths of Sionna, arrays, scene, poses, towers)`` makes of each batch.
 
@@ -575,14 +539,10 @@ def _in_batches(
     if not 1 <= batch <= LARGEST_BATCH:
         raise UsageError(f"batch {batch}", expected=f"1 to {LARGEST_BATCH} poses per call")
     load_variant(rays.variant)
-    scattering = other.scattering_coefficient if other.scattering else 0.0
-    builder = _Builder(
-        faces=faces, links=links, carrier_hz=carrier_hz, surfaces=surfaces, wedges=other.diffraction,
-        scattering=scattering,
-    )  # fmt: skip
+    builder = _Builder(faces=faces, links=links, carrier_hz=carrier_hz, surfaces=surfaces)
 
     def make(towers: IntArray, chosen: IntArray) -> _Finder:
-        return _Finder(builder.scene(chosen), _Ends.points(sources_m[towers]), _CENTRE, batch, flags=_flags(other))
+        return _Finder(builder.scene(chosen), _Ends.points(sources_m[towers]), _CENTRE, batch)
 
     groups, alive, done = list(_groups(faces, sources_m, links.usable)), searched_links(links), 0
     count = sum(int(alive[towers].any(axis=0).sum()) for towers, _ in groups)
@@ -595,47 +555,6 @@ def _in_batches(
         done += len(some)
         if progress:
             progress(done / count)
-
-
-def _flags(other: OtherSearch) -> dict[str, bool]:
-    """Switches of PathSolver for interactions besides reflections."""
-    flags = {
-        "diffraction": other.diffraction,
-        "refraction": other.refraction,
-        "diffuse_reflection": other.scattering,
-    }
-    # where the direct path is there, phases would decide
-    return flags | ({"diffraction_lit_region": False} if other.diffraction else {})
-
-
-def _others(
-    traced: Any, raw: dict[str, Any], face_of: dict[int, IntArray], poses: IntArray, towers: IntArray
-) -> OtherPaths:
-    """The paths of one batch that are no chain of reflections."""
-    kind, shape, primitive = raw["kind"], raw["shape"], raw["primitive"]
-    receiver, tower, path = np.nonzero(raw["valid"] & (kind > REFLECTED).any(axis=0))
-    kinds = kind[:, receiver, tower, path].T.astype(np.int64)
-    hit = np.full(kinds.shape, -1, dtype=np.int64)
-    for number, owner in face_of.items():
-        # a diffracted path names a triangle beside the edge, which is no mirror
-        here = (kinds > 0) & (kinds != DIFFRACTED) & np.equal(shape[:, receiver, tower, path].T, number)
-        hit[here] = owner[primitive[:, receiver, tower, path].T[here]]
-    vertices = np.moveaxis(traced.vertices.numpy()[:, receiver, tower, path], 0, 1).astype(np.float64)
-    vertices[kinds == 0] = np.nan
-    real, imaginary = (np.asarray(part.numpy())[receiver, :, tower, :, path] for part in traced.a)
-    angles = [
-        getattr(traced, f"{name}_{end}").numpy()[receiver, tower, path] for end in "tr" for name in ("theta", "phi")
-    ]
-    return OtherPaths(
-        pose=poses[receiver],
-        tower=towers[tower],
-        kinds=kinds,
-        faces=hit,
-        vertices_m=vertices,
-        jones=(real + 1j * imaginary).astype(np.complex128),
-        departure_rad=np.stack(angles[:2], axis=1).astype(np.float64),
-        arrival_rad=np.stack(angles[2:], axis=1).astype(np.float64),
-    ).once()
 
 
 @dataclass(frozen=True, slots=True)
@@ -905,7 +824,6 @@ def _relocate(
 __all__ = [
     "Coefficients",
     "engine_versions",
-    "find_others",
     "find_paths",
     "load_variant",
     "own_channels",

@@ -43,8 +43,8 @@ EDGE_M = 1e-6
 SOLID_MARGIN = 1e-6
 """Share of a triangle's height by which a segment must meet it to cut it beyond doubt."""
 
-FIRST_CHUNK = 64
-"""First faces whose search gives the estimate for the others."""
+POOL, FEWEST_TRIED, CERTAIN = 1024, 24, 0.12
+"""First faces that an estimate draws from, the fewest that it tries, and the standard error at which it stops."""
 
 
 class _Mirrors(NamedTuple):
@@ -137,7 +137,7 @@ def grow_paths(
 def estimate(
     surfaces: Surfaces, links: Links, *, max_depth: int = 2, threads: int | None = None, solids: bool = False
 ) -> Estimate | None:
-    """What :func:`grow_paths` would take, from the first 64 faces of the first source; None where nothing is searched.
+    """What :func:`grow_paths` would take, from some faces of the first source; None where nothing is searched.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ class _Search:
         longest: FloatArray,
         rules: _Rules,
     ) -> None:
-        self.mirrors, self.source, self.rules = tuple(mirrors), np.ascontiguousarray(source), tuple(rules)
+        self.mirrors, self.source, self.rules = tuple(mirrors), np.ascontiguousarray(source), rules
         self.targets = np.ascontiguousarray(targets)
         self.longest, self.window = np.ascontiguousarray(longest), mirrors.window
         self.corners, self.tree = surfaces.corners_m, tuple(surfaces.tree)
@@ -218,13 +218,13 @@ class _Search:
 
     def direct(self) -> _Level:
         """Lines of sight."""
-        free = _direct(self.corners, self.tree, self.source, self.targets, self.rules)
+        free = _direct(self.corners, self.tree, self.source, self.targets, tuple(self.rules))
         pose = np.flatnonzero(free)
         return pose, np.zeros((len(pose), 0), np.int64), np.zeros((len(pose), 0, 3))
 
     def first_faces(self) -> IntArray:
         """First faces worth following, in an order whose beginning is a fair sample."""
-        good = _first_faces(self.mirrors, self.face_tree, self.source, self.rules) & self._near_enough()
+        good = _first_faces(self.mirrors, self.face_tree, self.source, tuple(self.rules)) & self._near_enough()
         return np.random.default_rng(0).permutation(np.flatnonzero(good))
 
     def _near_enough(self) -> BoolArray:
@@ -240,27 +240,54 @@ class _Search:
 
     def follow(self, some: IntArray) -> tuple[IntArray, IntArray, FloatArray, int]:
         """Paths whose first face is one of some, and how many sequences there were."""
+        return self._follow(some, self.rules.depth)
+
+    def _follow(self, some: IntArray, depth: int) -> tuple[IntArray, IntArray, FloatArray, int]:
         return _follow(  # type: ignore[no-any-return]
             self.mirrors, self.face_tree, self.corners, self.tree, self.targets, self.target_tree, self.longest,
-            self.source, some, self.rules,
+            self.source, some, tuple(self.rules._replace(depth=depth)),
         )  # fmt: skip
 
     def estimate(self, first: IntArray, threads: int) -> Estimate:
-        """What it will take to follow the faces ``first``; some of them are tried."""
-        some = first[:FIRST_CHUNK]
-        self.follow(some[:1])  # the first call compiles, or loads what was compiled
-        begun = time.thread_time()  # what others do on this machine is not told beforehand
-        sequences = self.follow(some)[3]
-        seconds = time.thread_time() - begun
-        share = len(first) / max(1, len(some))
+        """What it will take to follow the faces ``first``; some of them are tried.
+
+        Notes
+        -----
+        A tenth of the first faces leads to most sequences. Of three reflections, faces are drawn in proportion to
+        their sequences of two, and weigh less in that measure (M. H. Hansen, W. N. Hurwitz, Ann. Math. Stat. 14
+        (1943) 333, doi:10.1214/aoms/1177731356): 24 of them tell munich to 13 %, where plain draws take 500.
+        """
+        pool = first[:POOL]
+        size = np.ones(len(pool))
+        if self.rules.depth > 2:
+            size = np.array([max(1, self._tried(face, self.rules.depth - 1)[0]) for face in pool], dtype=np.float64)
+        tried: list[tuple[float, float]] = []
+        for at in np.random.default_rng(0).choice(len(pool), len(pool), p=size / size.sum()) if len(pool) else ():
+            sequences, seconds = self._tried(pool[at], self.rules.depth)
+            tried.append((sequences / size[at], seconds / size[at]))
+            known = np.array(tried)[:, 0]
+            if len(known) >= FEWEST_TRIED and known.std() < CERTAIN * known.mean() * np.sqrt(len(known)):
+                break
+        share = size.sum() * len(first) / max(1, len(pool))
+        sequences, seconds = share * np.mean(tried or [(0.0, 0.0)], axis=0)
         arrays = (self.corners, self.targets, *self.tree, *self.face_tree, *self.target_tree, *self.mirrors)
         return Estimate(
-            seconds=seconds * share / max(1, threads if len(first) > FIRST_CHUNK else 1),
+            seconds=float(seconds) / max(1, threads),
             sources=1,
             first_faces=len(first),
-            sequences=int(sequences * share),
+            sequences=round(float(sequences)),
             memory_mib=sum(array.nbytes for array in arrays) / 2**20,
         )
+
+    def _tried(self, face: int, depth: int) -> tuple[int, float]:
+        """Sequences of at most ``depth`` that begin with a face, and the CPU seconds that they take."""
+        some = np.array([face])
+        self._follow(some[:0], depth)  # the first call compiles, or loads what was compiled
+        begun = time.thread_time()  # what others do on this machine is not told beforehand
+        self._follow(some[:0], depth)
+        called = time.thread_time()
+        sequences = self._follow(some, depth)[3]
+        return sequences, max(0.0, time.thread_time() - called - (called - begun))
 
     def run(self, first: IntArray, threads: int, share: Progress) -> list[_Level]:
         """Follow all sequences that begin with the faces ``first``."""
@@ -274,11 +301,8 @@ class _Search:
 
 
 def _chunks(first: IntArray, threads: int) -> Iterator[tuple[list[IntArray], int]]:
-    """A first sample alone, then rounds of chunks for all threads."""
-    if len(first):
-        yield [first[:FIRST_CHUNK]], len(first[:FIRST_CHUNK])
-    at = FIRST_CHUNK
-    each = max(16, min(1024, (len(first) - at) // (8 * threads) + 1))
+    """Rounds of chunks for all threads."""
+    at, each = 0, max(16, min(1024, len(first) // (8 * threads) + 1))
     while at < len(first):
         parts = [first[k : k + each] for k in range(at, min(at + each * 4 * threads, len(first)), each)]
         yield parts, sum(len(p) for p in parts)

@@ -45,7 +45,7 @@ FRAMES: dict[str, tuple[str, str]] = {
     ),
     "not separable": (
         "Antenna and place are not separable: {where} the error differs by {size:.1f} dB, not significantly.",
-        "fly the same places with other headings",
+        "",
     ),
     "no interval": ("Antenna and place are not separable with two flights.", ""),
 }
@@ -101,12 +101,14 @@ def sentences(
     verdict, turned = helps(left_out), frame(controls)
     worst = max(left_out, key=lambda one: one.rmse_db)
     ends = sorted(map(abs, turned.interval))
+    helped, _, step = said_of(verdict, HELPS).partition(" Next: ")
     first = (
         f"Flights left out: RMSE {mean_rmse(left_out):.1f} dB with learned antennas; "
         f"{BASELINES[verdict.where]}: {mean_rmse(left_out, verdict.where):.1f} dB.",
-        said_of(verdict, HELPS),
+        helped,
         f"Largest error: {worst.flight}, {worst.tower} {worst.channel}, {worst.rmse_db:.1f} dB.",
         said_of(turned, FRAMES, near=ends[0], far=ends[1]),
+        f"Next: {step}" if turned.cause != "place" else "",
     )
     return (" ".join(text for text in first if text), *_further(scores, ground_m), *_of_curve(curve))
 

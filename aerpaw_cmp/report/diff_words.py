@@ -21,15 +21,26 @@ DIFFERENCE = {
 }
 """Sentence on two reports, by the verdict of the paired interval. No other sentence of a diff says better or worse."""
 
+KEEP = {
+    "better": "keep the second report's",
+    "worse": "keep the first report's",
+    "not significant": "keep either; this flight does not decide",
+    "no interval": "compare on a longer flight",
+}
+"""Next step by the word of the paired interval."""
+
+NAMED = 3
+"""Settings, inputs or versions that a sentence names."""
+
 CAUSES: dict[str, tuple[str, str]] = {
     "none": ("{listed} {verb}.", ""),
     "measured": (
         "The measured levels differ by up to {moved:.2g} dB.",
         "compare reports of the same logs to judge a model",
     ),
-    "setting": ("Likely cause: {listed} {verb}.", ""),
-    "input": ("Likely cause: {listed} {verb}.", ""),
-    "version": ("Likely cause: {listed} {verb}.", "make both reports with one version to judge a setting"),
+    "setting": ("Likely cause: {listed} {verb} ({names}).", "{keep}"),
+    "input": ("Likely cause: {listed} {verb} ({names}).", "{keep}"),
+    "version": ("Likely cause: {listed} {verb} ({names}).", "make both reports with one version to judge a setting"),
     "several": ("{listed} {verb}, so no single cause is shown.", "change one of them at a time"),
     "unexplained": (
         "Settings, inputs and versions are the same.",
@@ -61,7 +72,10 @@ def _cause(diff: ReportDiff) -> str:
     verb = "differs" if sum(changed.values()) == 1 else "differ"
     if found.cause == "none" and not listed:
         return ""
-    return " " + said_of(found, CAUSES, listed=listed, verb=verb, moved=moved)
+    names = [str(getattr(one, "key", None) or getattr(one, "path", "")) for items in kinds.values() for one in items]
+    shown = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
+    keep = KEEP.get(found.where, KEEP["no interval"])
+    return " " + said_of(found, CAUSES, listed=listed, verb=verb, moved=moved, names=shown, keep=keep)
 
 
 def _level_verdict(diff: ReportDiff) -> str:

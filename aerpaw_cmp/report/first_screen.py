@@ -26,6 +26,7 @@ from .words import (
     local_error,
     lock_sentence,
     nearest_k,
+    next_step,
     pretty,
     training_sentence,
     trust,
@@ -59,7 +60,9 @@ def verdict(data: ReportData) -> tuple[str, ...]:
         most = max([panel.score.n for panel in data.rss], default=0)
         return (NOTHING_COMPARED if not most else TOO_FEW_COMPARED.format(n=most), trust(data))
     first = " ".join(part for part in (lock_sentence(scored), first, expected_sentence(scored)) if part)
-    return first, " ".join(part for part in (_causes(scored) or _fails(scored), trust(data)) if part)
+    cause = _causes(scored)
+    where = (cause,) if cause else (_fails(scored), next_step(data))
+    return first, " ".join(part for part in (*where, trust(data)) if part)
 
 
 def _training(data: ReportData) -> str:
@@ -204,7 +207,7 @@ def _fails(panels: Sequence[RssResult]) -> str:
         return f"Largest error of a channel: {worst.name}, {worst.score.rmse_db:.1f} dB."
     spans = [(panel, span) for panel in panels for span in panel.spans if span.end_s - span.start_s >= LONG_S]
     if not spans:
-        return ""
+        return f"Largest error of a channel: {worst.name}, {worst.score.rmse_db:.1f} dB." if len(panels) > 1 else ""
     panel, span = max(spans, key=lambda item: abs(item[1].mean_db))
     return local_error(panel, span)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from ..compare.ladder import LadderRow
 from ..compare.rss import PART_DB
@@ -136,6 +136,20 @@ def short(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
+def coded(text: str) -> Markup:
+    """Text whose parts between backquotes are commands or keys; all of it escaped.
+
+    Examples
+    --------
+    >>> str(coded("Next: `a < b`."))
+    'Next: <code>a &lt; b</code>.'
+    """
+    parts = str(text).split("`")
+    return Markup("").join(
+        Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in enumerate(parts)
+    )
+
+
 def policy(script: str = "") -> str:
     """The content policy of a page with one script, or none."""
     return CONTENT_POLICY.format(script=digest(script) if script else "'none'")
@@ -174,7 +188,8 @@ def environment() -> Any:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        num=number, interval=interval, percent=percent, duration=duration, minute=minute, data_uri=data_uri, k=k_key,
+        num=number, coded=coded,
+        interval=interval, percent=percent, duration=duration, minute=minute, data_uri=data_uri, k=k_key,
         flat=lambda s: list(flat(s)), clock=clock, picture_uri=picture_uri, more=more,
         audit_summary=words.audit_summary, further=further_numbers, instants=words.instants,
     )  # fmt: skip

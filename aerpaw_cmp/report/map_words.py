@@ -15,7 +15,7 @@ from .words import count
 LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
 
 CAUSES: dict[str, tuple[str, str]] = {
-    "none": (LEAST + ".", ""),
+    "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
     "trees": (LEAST + "; trees take most of the rest.", "fly higher, or map `--foliage attenuating` beside it"),
     "level": (
         LEAST + "; levels below {threshold:g} dBm take most of the rest.",
@@ -51,8 +51,8 @@ def first_words(data: MapsData) -> str:
     )
     best = max(heights, key=lambda one: one.covered)
     more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if len(heights) > 1 else ""
-    measured = "" if data.corrected else " Nothing here was measured."
-    return f"{more}{said}{measured}"
+    measured = "" if data.corrected else "Nothing here was measured. "
+    return f"{measured}{more}{said}"
 
 
 def coverage(data: MapsData) -> list[Coverage]:

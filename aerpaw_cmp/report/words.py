@@ -17,6 +17,9 @@ from ..compare.statistics import Interval
 from .data import ReportData
 from .phrases import filled
 
+AS_SET = "as set in flight.yaml"
+"""Name of the ladder's rung with the settings of the flight file."""
+
 FEW_SAMPLES = 30
 """Below this a panel is called too short for a verdict."""
 
@@ -305,6 +308,25 @@ def trust(data: ReportData) -> str:
     return f"Caution: {'; '.join(doubts)}." if doubts else "Every check of this report passed."
 
 
+def _recommended(data: ReportData) -> str:
+    """Model that the ladder recommends; nothing without a ladder."""
+    return next((row.model for row in data.ladder if row.recommended), "")
+
+
+NEXT: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
+    (lambda d: _recommended(d) not in ("", AS_SET), "Next: `report --recommend FILE` writes the recommended model."),
+    (lambda d: bool(d.audit_command), "Next: `{audit}`."),
+    (lambda d: bool(d.rss), "Next: `aerpaw-cmp calibrate` with two flights of this site."),
+)
+"""What to do next where no likely cause says it."""
+
+
+def next_step(data: ReportData) -> str:
+    """The first step whose condition holds."""
+    text = next((text for holds, text in NEXT if holds(data)), "")
+    return text.format(audit=data.audit_command)
+
+
 MOVED_DB = 0.3
 """Outlying samples that move an RMSE by more than this [dB] are named in the first words."""
 
@@ -331,10 +353,6 @@ def _listed(names: list[str]) -> str:
 def verdicts(rss: Sequence[RssResult], rank: Sequence[RankResult]) -> list[str]:
     """One or two sentences per panel: how well the ray tracing predicts, and against what."""
     return [rss_verdict(panel) for panel in rss] + [rank_verdict(panel) for panel in rank]
-
-
-AS_SET = "as set in flight.yaml"
-"""Name of the ladder's rung with the settings of the flight file."""
 
 
 def ladder_verdict(ladder: Sequence[LadderRow]) -> str:

@@ -36,7 +36,12 @@ def planted(maps_data: MapsData) -> Any:
 @pytest.mark.parametrize(
     ("covered", "reached", "change", "said"),
     [
-        ({"opaque": 0.99}, 0.99, {}, "Least coverage: 99.0 % of the positions at 30 m. Nothing here was measured."),
+        (
+            {"opaque": 0.99},
+            0.99,
+            {},
+            "Nothing here was measured. Least coverage: 99.0 % of the positions at 30 m. Next: ",
+        ),
         (
             {"opaque": 0.6, "none": 0.95},
             0.6,

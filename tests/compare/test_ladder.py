@@ -164,3 +164,18 @@ def test_the_slope_of_a_place_does_not_come_from_that_place() -> None:
     level = log_distance_level_db(bent, position[:, 0], position)
     last = position[:, 0] > 700.0
     assert np.polyfit(10.0 * np.log10(position[last, 0]), level[last], 1)[0] == pytest.approx(-2.0, abs=1e-6)
+
+
+def test_a_missing_level_or_place_leaves_the_line_of_the_others() -> None:
+    """What was not measured gets the line of all; where the ends coincide there is none."""
+    rng = np.random.default_rng(2)
+    distance = rng.uniform(50.0, 900.0, 400)
+    position = np.column_stack([distance, rng.uniform(-50.0, 50.0, 400), np.zeros(400)])
+    measured = -25.0 * np.log10(distance) + rng.normal(0.0, 1.0, 400)
+    measured[::7], distance[3] = np.nan, 0.0
+    level = log_distance_level_db(measured, distance, position)
+    good = np.isfinite(measured) & (distance > 0.0)
+    np.testing.assert_allclose(level[good], log_distance_level_db(measured[good], distance[good], position[good]))
+    assert np.isnan(level).tolist() == (distance == 0.0).tolist()
+    x = 10.0 * np.log10(distance[~good & (distance > 0.0)])
+    assert np.polyfit(x, level[~good & (distance > 0.0)], 1)[0] == pytest.approx(-2.5, abs=0.1)

@@ -55,3 +55,14 @@ def test_levels_that_are_no_numbers_and_old_ones_take_no_part():
     assert ahead.add(200.0, np.array([0.0, 0.0, 30.0]), np.nan, {"free space": 0.0}) is None
     assert len(ahead._bins.level) == before <= KEEP
     assert last is not None
+
+
+def test_a_route_may_be_entered_in_its_middle():
+    """The first prediction looks ahead over fifty points, not from the take-off on."""
+    t, place = route()
+    ahead, first = RouteAhead(place, {}), None
+    for now in np.arange(60.0, 100.0, 0.1):
+        here = np.array([np.interp(now, t, place[:, i]) for i in range(3)])
+        first = first or ahead.add(now, here, -80.0 + np.sin(now), {})
+    assert first is not None
+    assert abs(t[first.index[0]] - (60.0 + 2.0 * 8)) <= 4.0

@@ -81,3 +81,14 @@ def test_heavy_tails_widen_only_as_far_as_the_expansion_holds() -> None:
     assert width(0.0) < width(1.0) < width(1.99) < width(2.0)
     assert width(2.0) == width(3.0) == width(50.0)
     assert width(-2.0) == width(-9.0) < width(0.0)
+
+
+def test_fading_is_the_pooled_variance_about_the_means_of_bins() -> None:
+    """Of bins of any size, down to two samples; one alone says nothing."""
+    random = np.random.default_rng(9)
+    bins = [random.normal(10.0 * k, 1.0 + k, size) for k, size in enumerate((2, 3, 2, 7, 1, 2))]
+    time_s = np.concatenate([4.0 * k + np.linspace(0.5, 3.5, len(part)) for k, part in enumerate(bins)])
+    one = dataclasses.replace(samples(np.concatenate(bins)), time_s=time_s)
+    several = [part for part in bins if len(part) > 1]
+    pooled = sum(len(part) * part.var(ddof=1) for part in several) / sum(map(len, several))
+    assert fading_of([one], 4.0)[0] == pytest.approx(np.sqrt(pooled), rel=1e-12)

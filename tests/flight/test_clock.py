@@ -14,6 +14,7 @@ from aerpaw_cmp.flight.clock import (
     CANNOT_TELL,
     OK,
     SHIFTED,
+    STAMPS_S,
     Along,
     ClockChannel,
     _Bins,
@@ -221,3 +222,26 @@ def test_ratios_do_not_vote_on_the_clock_where_levels_do(monkeypatch):
     data = SimpleNamespace(track=track, nodes={})
     assert [c.name for c in flight_replay.clock_channels(data, series)] == ["power"]
     assert [c.name for c in flight_replay.clock_channels(data, series[1:])] == ["quality"]
+
+
+def test_a_mirrored_likelihood_has_the_mirrored_interval():
+    lags = np.arange(-15.0, 15.01, 0.5)
+    total = -0.8 * (lags - 3.0)[None] ** 2 - np.array([[0.1], [2.3]]) * np.abs(lags)
+    there, back = (_judged(lags, own, ["one", "two"], 15.0) for own in (total, total[:, ::-1]))
+    assert back.radio_minus_telemetry_s == -there.radio_minus_telemetry_s
+    assert back.ci95_s == (-there.ci95_s[1], -there.ci95_s[0])
+    assert back.channels_s == {name: -lag for name, lag in there.channels_s.items()}
+    assert (back.verdict, back.against_zero_nat) == (there.verdict, there.against_zero_nat)
+    alone = np.full((1, len(lags)), -30.0)
+    alone[0, 36] = 0.0  # 3 s alone: as far as the nearest lags that are excluded, and what stamps are off
+    assert _judged(lags, alone, ["one"], 15.0).ci95_s == (2.5 - STAMPS_S, 3.5 + STAMPS_S)
+
+
+def test_half_a_second_is_no_shift_on_any_grid():
+    """Lags are multiples of a tenth, which no float holds: 0.5 s is as good as 0."""
+    lags = np.arange(-150, 151) * 0.1
+    for sign in (1.0, -1.0):
+        total = np.full((1, 301), -30.0)
+        for lag, value in ((3.0, 0.0), (0.5, -3.9)):
+            total[0, np.argmin(np.abs(lags - sign * lag))] = value
+        assert _judged(lags, total, ["one"], 15.0).against_zero_nat == pytest.approx(3.9)

@@ -10,6 +10,7 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.flight.data import gather, read_logs
+from aerpaw_cmp.flight.draft import drafts
 from aerpaw_cmp.flight.grouping import flights
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.time_origin import origin_of
@@ -196,3 +197,14 @@ def test_no_origin_for_a_lap_of_a_route_that_is_flown_again() -> None:
     found = origin_of(stream_of(log.assign(longitude_deg=once["longitude_deg"].to_numpy()[20:210])), stream_of(once))
     assert found is not None
     assert abs(found.time - (np.datetime64("2025-03-02T15:00:20", "ns"))) <= np.timedelta64(150, "ms")
+
+
+def test_a_log_that_goes_with_no_flight_is_said_once_beside_the_first(tmp_path: Path) -> None:
+    write_flight(tmp_path / "morning", "2025-03-02T15:00:00")
+    write_flight(tmp_path / "noon", "2025-03-02T17:00:00", turn=0.5)
+    times = np.datetime64("2025-03-09T15:00:00", "ns") + np.arange(50) * np.timedelta64(1, "s")
+    (tmp_path / "LW2_power_log.txt").write_bytes(format_power_log(times, np.linspace(-40, -60, 50), ZONE))
+    made = drafts(ingest(tmp_path, options=OPTIONS), tmp_path, timezone=ZONE)
+    assert len({one.name for one in made}) == len(made) == 2
+    said = [[text for text in one.remarks if "it goes with no flight here" in text] for one in made]
+    assert said == [["left out: LW2_power_log.txt: it goes with no flight here"], []]

@@ -281,19 +281,19 @@ def test_correlation_never_exceeds_one_before_the_first_point():
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 10_000), st.floats(0.1, 2.0))
-def test_bounded_amplitudes_equal_a_quadratic_programme(seed, total):
+@given(st.integers(0, 10_000), st.floats(0.1, 2.0), st.sampled_from([0.0, -0.5]))
+def test_bounded_amplitudes_equal_a_quadratic_programme(seed, total, low):
     from scipy.optimize import minimize
 
     rng = np.random.default_rng(seed)
     basis, target = rng.uniform(0, 1, (9, 2)), rng.normal(0.5, 1, 9)
-    found = biexponential._candidate_amplitudes(basis, target, 0.0, 0.8, total)
+    found = biexponential._candidate_amplitudes(basis, target, low, 0.8, total)
     cost = ((found @ basis.T - target) ** 2).sum(axis=-1)
-    assert (found >= -1e-12).all()
+    assert (found >= low - 1e-12).all()
     assert (found <= 0.8 + 1e-12).all()
     assert (found.sum(axis=-1) <= total + 1e-12).all()
     peer = minimize(
-        lambda c: ((basis @ c - target) ** 2).sum(), [total / 4, total / 4], bounds=[(0, 0.8)] * 2, method="SLSQP",
+        lambda c: ((basis @ c - target) ** 2).sum(), [total / 4, total / 4], bounds=[(low, 0.8)] * 2, method="SLSQP",
         constraints={"type": "ineq", "fun": lambda c: total - c.sum()}, options={"ftol": 1e-14},
     )  # fmt: skip
     assert cost.min() <= peer.fun + 1e-7

@@ -1,0 +1,136 @@
+"""Memories of a sequence: covariances by numerical integration, likelihoods by SciPy, and what draws owe to the sequence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.stats import multivariate_normal
+
+from aerpaw_cmp.compare import memory
+from aerpaw_cmp.compare.memory import RATES, TERMS, WHITE_SHARES, cosine_terms, likelihoods, mean_draws, memories
+
+POINTS = 2000
+
+
+def integrated(rate: float, terms: int) -> np.ndarray:
+    """Covariance of mean and cosine terms of exp(-rate |s - t|), by the midpoint rule on a fine grid."""
+    at = (np.arange(POINTS) + 0.5) / POINTS
+    basis = np.sqrt(2.0) * np.cos(np.pi * np.outer(np.arange(terms + 1), at))
+    basis[0] = 1.0
+    return basis @ np.exp(-rate * np.abs(at[:, None] - at)) @ basis.T / POINTS**2
+
+
+@pytest.mark.parametrize("rate", [0.3, 4.0, 40.0])
+def test_the_covariance_of_cosine_terms_is_the_double_integral(rate: float) -> None:
+    np.testing.assert_allclose(memory._exponential(rate, 6), integrated(rate, 6), atol=2e-4 / rate)
+
+
+@pytest.mark.parametrize(("share", "rate"), [(0, 0), (0, 9), (1, 4), (2, 17)])
+def test_a_memory_whitens_its_terms_and_foretells_the_mean(share: int, rate: int) -> None:
+    """Rates run fastest; half the rate times the covariance has the power 1 of an endless sequence at its low end."""
+    white, known, at = WHITE_SHARES[share], memories(6), share * len(RATES) + rate
+    covariance = (1.0 - white) * 0.5 * RATES[rate] * memory._exponential(RATES[rate], 6) + white * np.eye(7)
+    inner, cross = covariance[1:, 1:], covariance[0, 1:]
+    whiten = known.whiten[at]
+    np.testing.assert_allclose(whiten @ inner @ whiten.T, np.eye(6), atol=1e-9)
+    np.testing.assert_allclose(known.slope[at], np.linalg.solve(inner, cross), atol=1e-9)
+    assert known.left[at] == pytest.approx(covariance[0, 0] - cross @ np.linalg.solve(inner, cross))
+    assert known.log_det[at] == pytest.approx(-0.5 * np.linalg.slogdet(inner)[1])
+    assert known.power[at] == pytest.approx(np.trace(covariance))
+
+
+def test_the_likelihood_is_that_of_a_normal_with_its_scale_integrated_out() -> None:
+    slow, known = np.random.default_rng(1).normal(size=5), memories(5)
+    found, square = likelihoods(slow)
+    scales = np.exp(np.linspace(-8.0, 8.0, 4001))
+    expected = []
+    for whiten in known.whiten[[0, 20, 53]]:
+        inner = np.linalg.inv(whiten.T @ whiten)
+        expected.append(np.sum([multivariate_normal(np.zeros(5), s**2 * inner).pdf(slow) for s in scales[::10]]))
+        assert square[np.flatnonzero((known.whiten == whiten).all(axis=(1, 2)))[0]] == pytest.approx(
+            slow @ np.linalg.solve(inner, slow)
+        )
+    np.testing.assert_allclose(found[[0, 20, 53]] / found[0], np.array(expected) / expected[0], rtol=1e-6)
+    assert found.max() == 1.0
+
+
+@pytest.mark.parametrize("kind", ["mean", "power", "ratio"])
+def test_before_any_sample_every_memory_is_possible_and_none_stands_out_from_its_neighbours(kind: memory.Kind) -> None:
+    drawn = memory.weights(kind)
+    assert drawn.sum() == pytest.approx(1.0)
+    assert len(drawn) == len(memories().power)
+    assert drawn.min() > 1e-7 * drawn.max()
+    bend = np.diff(np.log(drawn).reshape(len(WHITE_SHARES), len(RATES)), 2, axis=1)
+    assert np.abs(bend).max() < 5.0
+
+
+@pytest.mark.parametrize("n", [20, 33, 400])
+def test_cosine_terms_hold_the_whole_power(n: int) -> None:
+    values = np.random.default_rng(n).normal(3.0, 2.0, n)
+    terms = cosine_terms(values)
+    assert len(terms.slow) == min(TERMS, (n - 1) // 2)
+    assert np.square(terms.slow).sum() + terms.fast_power == pytest.approx(values.var())
+    wave = np.cos(np.pi * 3 * (np.arange(n) + 0.5) / n)
+    assert np.abs(np.delete(cosine_terms(5.0 + wave).slow, 2)).max() < 1e-12, "the third term alone"
+
+
+def test_white_noise_has_as_many_degrees_of_freedom_as_samples() -> None:
+    rng = np.random.default_rng(2)
+    every = [cosine_terms(rng.normal(size=200)) for _ in range(200)]
+    assert np.mean([terms.freedom for terms in every]) == pytest.approx(200, rel=0.05)
+    assert np.mean([terms.fast_freedom for terms in every]) == pytest.approx(200 - TERMS, rel=0.05)
+
+
+def test_draws_are_spread_as_their_distributions() -> None:
+    uniform, chi_squared, *normal = memory._random(7)
+    assert (uniform.mean(), uniform.var()) == pytest.approx((1 / 2, 1 / 12), rel=0.01)
+    assert (chi_squared.mean(), chi_squared.var()) == pytest.approx((7.0, 14.0), rel=0.03)
+    for unit in normal:
+        assert (unit.mean(), unit.var()) == pytest.approx((0.0, 1.0), abs=0.02)
+    together = np.corrcoef([uniform, chi_squared, *normal])
+    assert np.abs(together - np.eye(4)).max() < 0.03
+
+
+def test_draws_follow_unit_and_zero_and_do_not_know_the_direction_of_time() -> None:
+    values = np.cumsum(np.random.default_rng(3).normal(size=120))
+    mean, power = mean_draws(values), memory.power_draws(values)
+    np.testing.assert_allclose(mean_draws(7.0 + 3.0 * values), 3.0 * mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(np.sort(mean_draws(-values)), np.sort(-mean), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(memory.power_draws(5.0 + 3.0 * values), 9.0 * power, rtol=1e-9)
+    np.testing.assert_allclose(mean_draws(values[::-1]), mean, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(memory.power_draws(values[::-1]), power, rtol=1e-6)
+    assert not mean_draws(np.full(30, 2.0)).any()
+    assert not memory.power_draws(np.full(30, 2.0)).any()
+
+
+def test_draws_of_white_noise_have_the_spread_of_textbooks() -> None:
+    """Mean: sigma / sqrt(n); power: sigma^2 sqrt(2 / n); memories that explain no sample hardly widen them."""
+    rng, n = np.random.default_rng(4), 400
+    mean, power = [], []
+    for _ in range(40):
+        values = rng.normal(0.0, 2.0, n)
+        mean.append(np.diff(np.quantile(mean_draws(values), [0.25, 0.75]))[0] / 1.349)
+        power.append(np.diff(np.quantile(memory.power_draws(values), [0.25, 0.75]))[0] / 1.349)
+    assert np.median(mean) == pytest.approx(2.0 / np.sqrt(n), rel=0.5)
+    assert np.median(power) == pytest.approx(4.0 * np.sqrt(2.0 / n), rel=0.5)
+
+
+@pytest.mark.parametrize(("share", "widened"), [(0.99, False), (1.01, True)])
+def test_only_tails_beyond_chance_widen_the_power(share: float, widened: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The excess kurtosis of n normal samples has a standard error of sqrt(24 / n): only beyond it the last draw counts."""
+    signs = np.where(np.random.default_rng(5).random(400) < 0.5, -1.0, 1.0)
+
+    def sequence(large: float) -> np.ndarray:
+        values = signs * np.where(np.arange(400) % 40, 1.0, large)
+        return values - values.mean()
+
+    def beyond(large: float) -> float:
+        values = sequence(large)
+        excess = np.mean(values**4) / np.mean(values**2) ** 2 - 3.0
+        return float(excess - share * np.sqrt(24.0 / cosine_terms(values).freedom))
+
+    values = sequence(brentq(beyond, 1.0, 8.0))
+    usual, drawn = memory.power_draws(values), memory._random(TERMS)
+    monkeypatch.setattr(memory, "_random", lambda _: (*drawn[:2], 0.0 * drawn[2], drawn[3]))
+    assert np.array_equal(memory.power_draws(values), usual) != widened

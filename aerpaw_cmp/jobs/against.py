@@ -14,10 +14,13 @@ from ..common.provenance import KEY
 from ..common.units import FloatArray, IntArray
 from ..compare.calibration import Observed
 from ..compare.entries import LevelSeries, level_scores
+from ..compare.forecast import ForecastScore, score_forecast
 from ..flight.data import FlightData
 from ..flight.training import common, flight_logs
 from ..report.against import Against, AgainstSeries
 from .calibrate import observe
+from .calibrate_rank import RankSamples, rank_samples
+from .predict import RANKS
 
 NEAR_M = 30.0
 NEAR_UP_M = 15.0
@@ -42,6 +45,7 @@ def score_against(data: FlightData, folder: Path) -> Against:
         table = pd.read_csv(folder / "prediction.csv", low_memory=False)
         learned, sentence = list(about[KEY]), str(about["sentence"])
         groups = dict(iter(table[table["level_db"].notna()].groupby(["tower", "channel"])))
+        forecasts = dict(iter(table[table["channel"] == "rank"].groupby("tower")))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"no prediction ({getattr(error, 'strerror', None) or error})",
@@ -54,14 +58,18 @@ def score_against(data: FlightData, folder: Path) -> Against:
             expected="a prediction made before the flight, or from other flights",
             path=folder,
         )
-    observed, _ = observe([data])
     series = [
         one
-        for o in observed
+        for o in (observe([data])[0] if data.rss else ())
         if (part := groups.get((o.samples.tower, o.samples.channel))) is not None
         and (one := _matched(o, part)) is not None
     ]
-    if not series:
+    ranks = {
+        s.tower: score
+        for s in data.rank
+        if s.tower in forecasts and (score := _rank_score(rank_samples(data, s), forecasts[s.tower])) is not None
+    }
+    if not series and not ranks:
         raise UsageError(
             f"no tower and channel of the flight has {FEWEST} samples within {NEAR_M:g} m of predicted points",
             expected="a prediction of this route: " + ", ".join(" ".join(map(str, key)) for key in groups),
@@ -74,6 +82,7 @@ def score_against(data: FlightData, folder: Path) -> Against:
         flights=tuple(map(str, about.get("flights", ()))),
         series=tuple(series),
         scores={f"{s.tower} {s.channel}": _scores(s) for s in series},
+        ranks=ranks,
     )
 
 
@@ -81,7 +90,7 @@ def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
     """Samples near predicted points, each with the level that was predicted there."""
     good = np.isfinite(o.samples.residual_db)
     one = o.part(good)
-    index, near = _nearest(one, part)
+    index, near = _nearest(one.samples.position_m, one.heading_deg, part)
     if near.sum() < FEWEST:
         return None
     said, s = part.iloc[index[near]], one.samples.part(near)
@@ -100,7 +109,19 @@ def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
     )
 
 
-def _nearest(o: Observed, part: pd.DataFrame) -> tuple[IntArray, Any]:
+def _rank_score(samples: RankSamples, part: pd.DataFrame) -> ForecastScore | None:
+    """Score of predicted probabilities; the constant forecast beside it is their mean over the predicted points."""
+    nose = samples.poses.rotation[:, :, 0]
+    heading_deg = np.degrees(np.arctan2(nose[:, 0], nose[:, 1]))
+    index, near = _nearest(samples.poses.position_m, heading_deg, part)
+    if near.sum() < FEWEST:
+        return None
+    every = part[list(RANKS)].to_numpy(np.float64)
+    said = every[index[near]]
+    return score_forecast(samples.rank[near], said, said.argmax(axis=1) + 1, every.mean(axis=0))
+
+
+def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame) -> tuple[IntArray, Any]:
     """Predicted point (n,) of each sample, and which of them are near."""
     from scipy.spatial import cKDTree
 
@@ -113,8 +134,8 @@ def _nearest(o: Observed, part: pd.DataFrame) -> tuple[IntArray, Any]:
         return np.asarray(np.column_stack([place, np.nan_to_num(nose)]) / scale)
 
     points = coordinates(part[["east_m", "north_m", "height_m"]].to_numpy(), part["yaw_deg"].to_numpy())
-    heading = o.heading_deg if part["yaw_deg"].notna().all() else np.full(len(o.heading_deg), np.nan)
-    away, index = cKDTree(points).query(coordinates(o.samples.position_m, heading))
+    heading = heading_deg if part["yaw_deg"].notna().all() else np.full(len(heading_deg), np.nan)
+    away, index = cKDTree(points).query(coordinates(position_m, heading))
     return np.asarray(index), away <= np.sqrt(2.0)
 
 

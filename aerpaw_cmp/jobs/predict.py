@@ -32,7 +32,7 @@ from ..site.learned import folder_of, read_learned
 from ..site.site import Site
 from ..site.siteyaml import load_site
 from .calibrate import observe
-from .calibrate_rank import RankSamples, read_receiver
+from .calibrate_rank import FittedReceiver, RankSamples, read_receiver
 from .entrants import learned_base
 from .where import Asked, Targets, find_targets, flight_of, is_settings, level_samples
 
@@ -194,7 +194,8 @@ def predict(
         ]
         table = pd.concat(parts, ignore_index=True)
         table["p_serving"] = _serving(table, len(targets), len(parts))
-        ranks = _ranks(targets, known, site)
+        receivers = _receivers(known, site)
+        ranks = _ranks(targets, receivers, site)
         table = pd.concat([table, *ranks], ignore_index=True).reindex(columns=_columns(table, bool(ranks)))
     notes = [w for w in warnings if "scored" not in w]
     return Prediction(
@@ -203,7 +204,7 @@ def predict(
         table=table,
         correction=correction,
         sources=sources,
-        trained_on=union(*map(flight_logs, known)),
+        trained_on=union(*map(flight_logs, known), *(one.trained_on for one, _ in receivers.values())),
         flights=tuple(data.settings.flight.name for data in known),
         threshold_db=threshold_db,
         warnings=(*said, *notes, *targets.remarks),
@@ -422,23 +423,30 @@ def _serving(table: pd.DataFrame, n: int, series: int) -> FloatArray:
 # --- ranks ---------------------------------------------------------------------------------------------------------
 
 
-def _ranks(targets: Targets, known: Sequence[FlightData], site: Site) -> list[pd.DataFrame]:
-    """Rows of every tower whose receiver the flights name or the site remembers."""
-    receivers: dict[str, tuple[Any, FlightData]] = {}
+def _receivers(known: Sequence[FlightData], site: Site) -> dict[str, tuple[FittedReceiver, FlightData]]:
+    """Receivers that the flights name or the site remembers, by tower, with the flight that says the arrays."""
+    out: dict[str, tuple[FittedReceiver, FlightData]] = {}
     for data in known:
         if data.settings.rank.receiver is not None:
             for tower, one in read_receiver(data.folder / data.settings.rank.receiver).items():
-                receivers.setdefault(tower, (one, data))
+                out.setdefault(tower, (one, data))
     memory = read_learned(known[0].settings.site.file)
     for entry in memory.entries.values():
         for remembered in entry.receivers:
             path = folder_of(known[0].settings.site.file) / remembered.file
             for tower, one in read_receiver(path).items():
-                receivers.setdefault(tower, (one, known[0]))
+                out.setdefault(tower, (one, known[0]))
+    return {tower: one for tower, one in out.items() if tower in site.towers}
+
+
+def _ranks(
+    targets: Targets, receivers: Mapping[str, tuple[FittedReceiver, FlightData]], site: Site
+) -> list[pd.DataFrame]:
+    """Rows of every tower with a receiver."""
     out = []
     rows = np.flatnonzero(targets.known)
     for tower, (receiver, data) in receivers.items():
-        if tower not in site.towers or not len(rows):
+        if not len(rows):
             continue
         position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
         link = data.settings.link.rank.build([tower], data.folder)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ..common.units import FloatArray
+from ..compare.forecast import ForecastScore
 from ..compare.verdicts import Verdict, stated_errors
-from .prediction_words import after_flight
+from .prediction_words import after_flight, rank_after_flight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,11 +56,14 @@ class Against:
     flights: tuple[str, ...]
     series: tuple[AgainstSeries, ...]
     scores: Mapping[str, Mapping[str, float]]
+    ranks: Mapping[str, ForecastScore] = field(default_factory=dict)
+    """By tower."""
 
     @property
     def words(self) -> str:
         """What the flight says of the prediction."""
-        return after_flight(self.scores, [one.stated for one in self.series])
+        said = [after_flight(self.scores, [one.stated for one in self.series])] if self.series else []
+        return " ".join([*said, *(rank_after_flight(tower, score) for tower, score in self.ranks.items())])
 
     def metrics(self) -> dict[str, Any]:
         """``against`` of metrics.json."""
@@ -69,4 +73,5 @@ class Against:
             "flights": list(self.flights),
             "sentence": self.words,
             "scores": {name: dict(row) for name, row in self.scores.items()},
+            "rank": {tower: score.as_dict() for tower, score in self.ranks.items()},
         }

@@ -29,6 +29,8 @@ def against_specs(against: Against) -> Iterator[FigureSpec]:
             "Band: 90 % interval of one sample as it was predicted. Nothing of this flight was used.",
             partial(_over_time, s),
         )  # fmt: skip
+    if not against.series:
+        return
     yield FigureSpec(
         "against_reliability", "against", "Reliability and sharpness",
         "Left: share of samples inside intervals of a nominal share; on the diagonal intervals hold what they say. "

@@ -9,6 +9,7 @@ import numpy as np
 from ..common.units import FloatArray
 from ..compare.correction import OFF, Correction
 from ..compare.entries import crps_normal
+from ..compare.forecast import ForecastScore
 from ..compare.statistics import mean_interval, paired_difference, paired_verdict
 from ..compare.verdicts import Verdict, stated_errors
 from .phrases import said_of
@@ -179,4 +180,12 @@ def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Ver
         f"Predicted before this flight: RMSE {mean['rmse_db']:.1f} dB as predicted ({mean['rmse_4s_db']:.1f} dB over "
         f"4 s), {mean['own_offset_rmse_db']:.1f} dB after the flight's own offset. The 90 % intervals hold "
         f"{100 * mean['coverage_90']:.0f} % of the samples. {said_of(told, FLOWN)}"
+    )
+
+
+def rank_after_flight(tower: str, score: ForecastScore) -> str:
+    """What a flight says of the ranks that were predicted before it."""
+    return (
+        f"Rank at {tower}, predicted before this flight: kappa {score.kappa:.2f} (0 is chance), log score "
+        f"{score.log_score:.2f}; the mean of the prediction, without positions: {score.constant_log_score:.2f}."
     )

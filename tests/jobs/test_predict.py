@@ -18,10 +18,12 @@ from aerpaw_cmp.jobs import corrected_map
 from aerpaw_cmp.jobs import predict as job
 from aerpaw_cmp.jobs.against import score_against
 from aerpaw_cmp.jobs.calibrate import observe
+from aerpaw_cmp.jobs.calibrate_rank import rank_samples
 from aerpaw_cmp.jobs.predict_run import page_of
 from aerpaw_cmp.jobs.where import Asked, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
+from aerpaw_cmp.report.against_figures import against_specs
 from aerpaw_cmp.report.prediction_html import write_prediction
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted
@@ -146,6 +148,30 @@ def test_a_flown_route_is_scored_by_what_was_said(said):
     assert scores["rmse_db"] == pytest.approx(np.sqrt(np.mean(error**2)))
     assert scores["coverage_90"] == np.mean(np.abs(error) <= 4.935)
     assert against.metrics()["sentence"].startswith("Predicted before this flight: RMSE")
+
+
+@pytest.mark.parametrize("levels", [True, False])
+def test_predicted_ranks_are_scored_where_they_were_flown(said, levels):
+    data, folder = said
+    ranked = rank_samples(data, data.rank[0])
+    keep = np.isfinite(ranked.rank) & (ranked.rank >= 1)
+    place = dict(zip(("east_m", "north_m", "height_m"), ranked.poses.position_m[keep].T, strict=True))
+    right = ranked.rank[keep].astype(int)
+    p = np.full((len(right), 4), 0.1)
+    p[np.arange(len(right)), right - 1] = 0.7
+    said_ranks = pd.DataFrame({**place, "yaw_deg": np.nan, "tower": ranked.tower, "channel": "rank",
+                               **dict(zip(job.RANKS, p.T, strict=True))})  # fmt: skip
+    table = pd.read_csv(folder / "prediction.csv")
+    pd.concat([table if levels else table[:0], said_ranks]).to_csv(folder / "prediction.csv", index=False)
+    against = score_against(data, folder)
+    score = against.ranks[ranked.tower]
+    assert score.kappa > 0.9  # where the flight waits, a neighbour's rank stands for its own
+    assert score.log_score == pytest.approx(-np.log(0.7), abs=0.1)
+    assert score.constant_log_score > score.log_score
+    assert len(against.series) == int(levels)
+    assert f"Rank at {ranked.tower}, predicted before this flight: kappa" in against.metrics()["sentence"]
+    assert against.metrics()["rank"][ranked.tower]["kappa"] == score.kappa
+    assert len(list(against_specs(against))) >= int(levels)
 
 
 def test_a_prediction_that_learned_from_the_flight_is_refused(said):

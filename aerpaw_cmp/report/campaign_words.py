@@ -66,20 +66,7 @@ def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
 
 def headline(data: CampaignData) -> list[str]:
     """The result in a few sentences."""
-    out = []
-    table = mean_rmse(data)
-    means = {s: np.array([v for v in by.values() if np.isfinite(v)]) for s, by in table.items()}
-    means = {s: v for s, v in means.items() if len(v)}
-    if means:
-        best = min(means, key=lambda s: float(means[s].mean()))
-        spread = np.ptp([v.mean() for v in means.values()])
-        shown = means if len(means) <= FEW_SETTINGS else {best: means[best], data.reference: means.get(data.reference)}
-        out.append(
-            ("Mean RMSE over flights and links" + ("" if shown is means else f", {len(means)} settings") + ": ")
-            + "; ".join(f"{s}: {v.mean():.2f} dB" for s, v in shown.items() if v is not None)
-            + (f". Least: {best}." if spread > 0.005 else ".")
-        )
-    out += _ranked_words(data)
+    out = _ranked_words(data)
     for setting in data.settings:
         moved = [t for t in data.rank_transfers if t.setting == setting]
         if moved:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
-import sys
 import time
 import traceback
 from collections.abc import Mapping, Sequence
@@ -20,18 +19,15 @@ import numpy as np
 from ..common.errors import AerpawCmpError
 from ..common.units import AnyArray, FloatArray
 from ..common.versions import versions
-from ..compare import offset, rank, result, rss, statistics
+from ..compare import offset
 from ..compare.result import FlightResult, RankResult, RssResult
 from ..flight.data import FlightData, gather, read_logs
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, RssSettings, load_flight
 from ..flight.training import logs_of
-from ..report import campaign_data
 from ..report.campaign_data import Failure, FlownRank, FlownTrack, RankRow, RssRow
 from .flight_run import run_flight
 from .outcomes import OutcomeStore, code_digest, records_of, task_inputs, task_key
-
-_this = sys.modules[__name__]
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +260,7 @@ def task_facts(task: Task) -> Facts:
 
 def outcome_store(keep: Path) -> OutcomeStore:
     """The outcomes of campaigns in a folder."""
-    return OutcomeStore(keep, records_of(_this, campaign_data, offset, rank, result, rss, statistics))
+    return OutcomeStore(keep, records_of(Outcome))
 
 
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:

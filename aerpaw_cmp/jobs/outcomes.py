@@ -14,8 +14,7 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module, metadata
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
@@ -199,14 +198,17 @@ def _text(manifest: Mapping[str, Any]) -> bytes:
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 
 
-def records_of(*modules: ModuleType) -> set[type]:
-    """The dataclasses that some modules define."""
-    return {
-        kind
-        for module in modules
-        for kind in vars(module).values()
-        if isinstance(kind, type) and dataclasses.is_dataclass(kind) and kind.__module__ == module.__name__
-    }
+def records_of(kind: Any) -> set[type]:
+    """The dataclasses that a value of some type may hold, its own included, by the types of their fields."""
+    found: set[type] = set()
+    open_: list[Any] = [kind]
+    while open_:
+        one = open_.pop()
+        open_ += get_args(one)
+        if isinstance(one, type) and dataclasses.is_dataclass(one) and one not in found:
+            found.add(one)
+            open_ += get_type_hints(one).values()
+    return found
 
 
 _WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links": True, "advanced": {"cache"}}}

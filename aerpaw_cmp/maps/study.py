@@ -179,6 +179,9 @@ class HeldOutStudy:
     learning_mae: FloatArray
 
 
+LEARNING_SIZES = (25, 50, 100, 200, 400, 800, 1600)
+
+
 def held_out_study(
     grid: Grid,
     altitudes_m: Sequence[float],
@@ -187,7 +190,6 @@ def held_out_study(
     *,
     trajectory_m: ArrayLike | None = None,
     block_m: float = 300.0,
-    learning_sizes: Sequence[int] = (25, 50, 100, 200, 400, 800, 1600),
     neighbours: int = 20,
     seed: int = 0,
 ) -> HeldOutStudy:
@@ -205,15 +207,14 @@ def held_out_study(
         A flight [m].
     block_m : float
         Side of the blocks.
-    learning_sizes : sequence of int
-        Those not below the number of positions are left out.
     neighbours, seed
         M; seed of the learning curve.
 
     Returns
     -------
     HeldOutStudy
-        Scores by block, by altitude and along the flight, and the learning curve.
+        Scores by block, by altitude and along the flight, and the learning curve at those of
+        :data:`LEARNING_SIZES` below the number of positions.
     """
     points = grid.points_m
     wide = OrdinaryKriging(fit, neighbours, outside="nearest")
@@ -223,7 +224,7 @@ def held_out_study(
     varies = np.isfinite(across.correlation[1:]).any()
     scale = fit_vertical_scale(in_space, across) if varies else 1.0
     space = OrdinaryKriging(in_space, neighbours, np.inf, vertical_scale=scale)
-    sizes = tuple(size for size in learning_sizes if size < len(grid))
+    sizes = tuple(size for size in LEARNING_SIZES if size < len(grid))
     return HeldOutStudy(
         blocked=blocked(wide, points, values, block_m),
         altitude_held_out=altitude_held_out(space, points, altitudes_m, values),

@@ -79,22 +79,25 @@ def report_data(
 
 def clock_warnings(clocks: Mapping[str, ClockResult]) -> tuple[str, ...]:
     """Clocks that were corrected, should be, or cannot be judged; a correction that was not made comes first."""
-    asked, other = [], []
-    for receiver, clock in clocks.items():
-        low, high = clock.ci95_s
-        side = "ahead of" if clock.radio_minus_telemetry_s > 0 else "behind"
-        shown = f"{abs(clock.radio_minus_telemetry_s):.2f} s {side} the telemetry clock [{low:+.2f}, {high:+.2f}]"
-        if clock.applied == NOT_APPLIED:
-            asked.append(
-                f"{receiver}: rss.lag: apply was asked for, but the radio clock was not corrected: {clock.reason}."
-            )
-        elif clock.applied == APPLIED:
-            other.append(f"{receiver}: the radio clock is {shown}; it was corrected.")
-        elif clock.verdict == "shifted":
-            other.append(f"{receiver}: the radio clock is {shown}; it was not corrected (rss.lag: apply would).")
-        elif clock.verdict == "cannot tell":
-            other.append(f"{receiver}: the radio clock could not be checked: {clock.reason}.")
-    return (*asked, *other)
+    asked = sorted(clocks, key=lambda receiver: clocks[receiver].applied != NOT_APPLIED)
+    found = {receiver: clock_warning(clocks[receiver]) for receiver in asked}
+    return tuple(f"{receiver}: {text}" for receiver, text in found.items() if text)
+
+
+def clock_warning(clock: ClockResult) -> str:
+    """What one receiver's clock does to its numbers, as a sentence; "" when there is nothing to know."""
+    if clock.applied == NOT_APPLIED:
+        return f"rss.lag: apply was asked for, but the radio clock was not corrected: {clock.reason}."
+    low, high = clock.ci95_s
+    side = "ahead of" if clock.radio_minus_telemetry_s > 0 else "behind"
+    shown = f"{abs(clock.radio_minus_telemetry_s):.2f} s {side} the telemetry clock [{low:+.2f}, {high:+.2f}]"
+    if clock.applied == APPLIED:
+        return f"the radio clock is {shown}; it was corrected."
+    if clock.verdict == "shifted":
+        return f"the radio clock is {shown}; it was not corrected (rss.lag: apply would)."
+    if clock.verdict == "cannot tell":
+        return f"the radio clock could not be checked: {clock.reason}."
+    return ""
 
 
 def rss_warnings(result: RssResult) -> tuple[str, ...]:

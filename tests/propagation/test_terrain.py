@@ -13,6 +13,7 @@ from shapely.geometry import box
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.paths import path_lengths
 from aerpaw_cmp.propagation.replay import Replay, replay
@@ -166,3 +167,16 @@ def test_behind_a_ridge_the_level_is_that_of_free_space_less_a_knife_edge(site: 
     free = 40.0 - 20 * np.log10(4 * np.pi * direct / wavelength_m(3.3e9))
     expected = free - 6.9 - 20 * np.log10(np.sqrt((nu - 0.1) ** 2 + 1) + nu - 0.1)
     assert lit.rss_dbm[0, 0] == pytest.approx(expected - (10.02 if ridges == "bullington" else 0.0), abs=0.3)
+
+
+def test_the_audit_checks_level_ground_and_names_links_over_shaped_ground() -> None:
+    link, places = (
+        Link(3.3e9, {"T": single_element()}, single_element()),
+        np.array([[300.0, 40.0, 30.0], [-500, 9, 60]]),
+    )
+    poses = Poses(places, np.tile(np.eye(3), (2, 1, 1)))
+    for site, named in ((shaped(lambda e, _: 0 * e), 0), (shaped(lambda e, n: 8 * np.sin(e / 150) + 0.01 * n), 1)):
+        replayed = replay(site, link, poses)
+        found = against_reference(site, poses, replayed, np.arange(2), Expected.of(link), ks=(10.0,), max_depth=2)
+        assert found.failures == ()
+        assert len(found.not_covered) == named

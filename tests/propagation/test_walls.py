@@ -15,6 +15,7 @@ from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.flight.replay import part_of
 from aerpaw_cmp.propagation import compiled
 from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
+from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
 from aerpaw_cmp.propagation.drivers.moving import replay_moving
 from aerpaw_cmp.propagation.drivers.parts import replay_in_parts
 from aerpaw_cmp.propagation.field.fresnel import coefficients, transmission
@@ -187,3 +188,19 @@ def test_parts_and_moving_towers_keep_the_paths() -> None:
         assert other.h == pytest.approx(whole.h, rel=1e-9)
         assert other.through is not None
         assert np.array_equal(np.bincount(other.through.paths.pose), np.bincount(whole.through.paths.pose))
+
+
+def test_the_audit_names_links_with_paths_through_walls_and_checks_the_others() -> None:
+    link = Link(CARRIER, {"T": single_element()}, single_element())
+    places = np.concatenate([PLACES[:4], PLACES[:4] * [-1.0, 1.0, 1.0]])
+    poses = Poses(places, np.tile(np.eye(3), (8, 1, 1)))
+    replayed = replay(town(), link, poses, Search(max_depth=1, refraction=True))
+    found = against_reference(town(), poses, replayed, np.arange(8), Expected.of(link), ks=(10.0,), max_depth=1)
+    assert found.failures == ()
+    assert found.not_covered == ("paths through walls",)
+    assert replayed.through is not None
+    open_links = np.setdiff1d(np.arange(8), replayed.through.paths.pose)
+    planted = dataclasses.replace(replayed, h=1.01 * replayed.h)
+    seen = against_reference(town(), poses, planted, open_links, Expected.of(link), ks=(10.0,), max_depth=1)
+    assert len(open_links) > 0
+    assert seen.failures

@@ -105,10 +105,9 @@ def _summary_starts(path: Path) -> list[tuple[str, datetime, str, timedelta]]:
 def _tables_beside(path: Path) -> Iterator[tuple[str, str]]:
     """Names and beginnings of the CSVs in a log's folder, or in the folder of the archive that holds it."""
     if path.parent.is_dir():
-        for beside in sorted(path.parent.glob("*.csv")):
-            if beside != path and beside.is_file():
-                with beside.open("rb") as stream:
-                    yield beside.name, stream.read(_HEAD_BYTES).decode("utf-8", "replace")
+        for table in (table for table in sorted(path.parent.glob("*.csv")) if table != path and table.is_file()):
+            with table.open("rb") as stream:
+                yield table.name, stream.read(_HEAD_BYTES).decode("utf-8", "replace")
     elif (part := archives.inside(path)) is not None:
         place, own = part
         for name, member in archives.members(read_bytes(place)[0], place).items():

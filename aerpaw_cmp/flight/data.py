@@ -168,47 +168,43 @@ def ground_nodes(
             raise UsageError(
                 f"towers.{name}: site {site.name!r} has a tower of this name", expected="a name of its own"
             )
-        if node.track is None:
-            assert node.latitude_deg is not None
-            assert node.longitude_deg is not None
-            latitude, longitude, source = node.latitude_deg, node.longitude_deg, "flight.yaml"
-        else:
-            place = _node_track(name, node, folder, settings, site)
-            latitude, longitude, source = place.latitude_deg, place.longitude_deg, node.track.path
-            if place.track is not None:
-                nodes[name] = place.track
-                if warnings is not None:
-                    warnings += [f"towers.{name}: {text}" for text in place.said]
-        east, north = site.frame.to_local(np.array([latitude]), np.array([longitude]))
-        height = node.antenna_height_m
-        if node.height == "logged":
-            height = place.height_m
+        place = _node_place(name, node, folder, settings, site)
+        if place.track is not None:
+            nodes[name] = place.track
+        if warnings is not None:
+            warnings += [f"towers.{name}: {text}" for text in place.remarks]
+        east, north = site.frame.to_local(np.array([place.latitude_deg]), np.array([place.longitude_deg]))
         towers[name] = Tower(
             name=name,
-            latitude_deg=latitude,
-            longitude_deg=longitude,
+            latitude_deg=place.latitude_deg,
+            longitude_deg=place.longitude_deg,
             east_m=float(east[0]),
             north_m=float(north[0]),
-            antenna_height_m=height,
-            source=source,
+            antenna_height_m=place.height_m,
+            source="flight.yaml" if node.track is None else node.track.path,
         )
     return dataclasses.replace(site, towers=towers), nodes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _NodeTrack:
+class _NodePlace:
     """Middle of a node's positions, and its track where it moves."""
 
     latitude_deg: float
     longitude_deg: float
     height_m: float
-    track: Track | None
-    said: tuple[str, ...] = ()
+    track: Track | None = None
+    remarks: tuple[str, ...] = ()
 
 
-def _node_track(name: str, node: GroundNode, folder: Path, settings: FlightFile, site: Site) -> _NodeTrack:
+def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile, site: Site) -> _NodePlace:
     """Where a node stands, or how it moves."""
-    assert node.track is not None
+    if node.track is None:
+        assert node.latitude_deg is not None
+        assert node.longitude_deg is not None
+        return _NodePlace(
+            latitude_deg=node.latitude_deg, longitude_deg=node.longitude_deg, height_m=node.antenna_height_m
+        )
     path, logged = folder / node.track.path, node.height == "logged"
     frame = _node_positions(name, node.track, path, settings.timezone)
     latitude, longitude = (frame[key].to_numpy(np.float64) for key in ("latitude_deg", "longitude_deg"))
@@ -223,7 +219,9 @@ def _node_track(name: str, node: GroundNode, folder: Path, settings: FlightFile,
             "no heights in this log", expected=f"those of towers.{name}, which has height: logged", path=path
         )
     rises = float(np.nanmax(np.abs(up - height))) if logged else 0.0
-    stands = _NodeTrack(latitude_deg=middle[0], longitude_deg=middle[1], height_m=height, track=None)
+    stands = _NodePlace(
+        latitude_deg=middle[0], longitude_deg=middle[1], height_m=height if logged else node.antenna_height_m
+    )
     if max(away, rises) <= STANDS_STILL_M:
         return stands
     track = Track(
@@ -239,9 +237,9 @@ def _node_track(name: str, node: GroundNode, folder: Path, settings: FlightFile,
             cause="relative times want 'time_origin', local ones 'timezone', beside the track's path",
             path=path,
         )
-    said = [f"moves {away:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
-    said += [text for text in track.account.warnings if "attitude" not in text]
-    return dataclasses.replace(stands, track=track, said=tuple(said))
+    remarks = [f"moves {away:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
+    remarks += [text for text in track.account.warnings if "attitude" not in text]
+    return dataclasses.replace(stands, track=track, remarks=tuple(remarks))
 
 
 def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | None) -> pd.DataFrame:

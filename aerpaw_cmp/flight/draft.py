@@ -517,25 +517,28 @@ class _Entries:
 
         ``dated`` says that relative times have an origin now.
         """
-        refused = {}
         leading = _leading(streams)
-        for stream in sorted(streams, key=_missing):
+
+        def reason(stream: Stream) -> str | None:
             span = stream_span(stream)
             if span is None:
-                refused[stream.name] = "no samples"
-            elif stream.name in leading:
-                refused[stream.name] = f"of the same receiver and cell as {leading[stream.name]}, which is compared"
-            elif reason := self._reason(stream, span, dated=dated):
-                refused[stream.name] = reason
-            elif stream.kind != "telemetry":
-                key = _key(stream, entry)
-                same = [other for when, other in self.taken.get(key, []) if _meet(span, when)]
-                if same:
-                    where = "another stream of the log" if same[0] == shown else same[0]
-                    refused[stream.name] = f"{where} has {key[1]} of that tower and time already"
-                else:
-                    self.taken.setdefault(key, []).append((span, shown))
-        return refused
+                return "no samples"
+            if stream.name in leading:
+                return f"of the same receiver and cell as {leading[stream.name]}, which is compared"
+            why = self._reason(stream, span, dated=dated)
+            return why or (None if stream.kind == "telemetry" else self._taken(_key(stream, entry), span, shown))
+
+        ordered = sorted(streams, key=_missing)
+        return {stream.name: why for stream in ordered if (why := reason(stream)) is not None}
+
+    def _taken(self, key: tuple[str, ...], span: Span, shown: str) -> str | None:
+        """Enter a series; the reason where one of that tower, channel and time is there already."""
+        same = [other for when, other in self.taken.get(key, []) if _meet(span, when)]
+        if same:
+            where = "another stream of the log" if same[0] == shown else same[0]
+            return f"{where} has {key[1]} of that tower and time already"
+        self.taken.setdefault(key, []).append((span, shown))
+        return None
 
     def _reason(self, stream: Stream, span: Span, *, dated: bool) -> str | None:
         relative = not has_wall_clock(span[0])
@@ -615,20 +618,15 @@ def _samples(file: IngestedFile) -> int:
 
 def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
     """The telemetry that most levels and ranks go with, first and last time; of equals, the longest."""
-    telemetry: list[tuple[Stream, Span]] = []
-    relative: list[tuple[Stream, Span]] = []
-    others: list[Span] = []
-    for file in files:
-        measured = any(stream.kind in ("rss", "rank") for stream in file.result.streams)
-        for stream in file.result.streams:
-            if (span := stream_span(stream)) is None:
-                continue
-            if stream.kind != "telemetry":
-                others += [span] if has_wall_clock(span[0]) else []
-            elif has_wall_clock(span[0]):
-                telemetry.append((stream, span))
-            elif measured:
-                relative.append((stream, span))
+    timed = [(stream, span, file) for file in files for stream in file.result.streams if (span := stream_span(stream))]
+    others = [span for s, span, _ in timed if s.kind != "telemetry" and has_wall_clock(span[0])]
+    tracks = [(s, span, file) for s, span, file in timed if s.kind == "telemetry"]
+    telemetry = [(s, span) for s, span, _ in tracks if has_wall_clock(span[0])]
+    relative = [
+        (s, span)
+        for s, span, file in tracks
+        if not has_wall_clock(span[0]) and any(other.kind in ("rss", "rank") for other in file.result.streams)
+    ]
 
     def worth(flight: tuple[Stream, Span]) -> tuple[int, np.timedelta64]:
         return sum(_meet(flight[1], other) for other in others), flight[1][1] - flight[1][0]

@@ -53,14 +53,14 @@ _MOST_BYTES = 20_000
 
 def listed_places(folders: Iterable[Path]) -> list[ListedPlace]:
     """Places that position lists in some folders name: text files with ``position`` in the name, a pair a line."""
+    paths = [path for folder in sorted(set(folders)) for path in sorted(folder.glob("*[Pp]osition*"))]
     places = []
-    for folder in sorted(set(folders)):
-        for path in sorted(folder.glob("*[Pp]osition*")):
-            if path.suffix not in (".txt", ".csv", "") or not path.is_file() or path.stat().st_size > _MOST_BYTES:
-                continue
-            for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-                if (pair := _PAIR.fullmatch(line)) is not None:
-                    places.append(ListedPlace(path.name, number, float(pair[1]), float(pair[2])))
+    for path in paths:
+        if path.suffix not in (".txt", ".csv", "") or not path.is_file() or path.stat().st_size > _MOST_BYTES:
+            continue
+        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+            if (pair := _PAIR.fullmatch(line)) is not None:
+                places.append(ListedPlace(path.name, number, float(pair[1]), float(pair[2])))
     return places
 
 

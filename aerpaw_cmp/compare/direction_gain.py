@@ -368,6 +368,13 @@ def shared_knots(series: Sequence[LinkSamples], model: GainModel) -> dict[str, F
     return out
 
 
+def _knots_of(term: Term, own: Sequence[LinkSamples], pairs: Pairs) -> FloatArray | None:
+    """Knots of a term over places, or over both directions; None of one over a single direction."""
+    if term.frame == "place":
+        return _knots(np.concatenate([s.position_m for s in own]), 0.7 * term.length)
+    return _pair_knots_of(own, term.length, pairs) if term.frame == "pair" else None
+
+
 def _layout(model: GainModel, binned: Sequence[LinkSamples], pairs: Pairs) -> tuple[_Block, ...]:
     """Columns of every term."""
     antennas: list[str | None] = list(dict.fromkeys(s.antenna for s in binned))
@@ -375,12 +382,7 @@ def _layout(model: GainModel, binned: Sequence[LinkSamples], pairs: Pairs) -> tu
     start = 0
     for term in model.terms:
         for antenna in antennas if term.per == "antenna" else [None]:
-            own = [s for s in binned if antenna is None or s.antenna == antenna]
-            knots = None
-            if term.frame == "place":
-                knots = _knots(np.concatenate([s.position_m for s in own]), 0.7 * term.length)
-            elif term.frame == "pair":
-                knots = _pair_knots_of(own, term.length, pairs)
+            knots = _knots_of(term, [s for s in binned if antenna is None or s.antenna == antenna], pairs)
             width = len(knots) if knots is not None else gaussian_features(np.eye(3)[:1], term.length).shape[1]
             blocks.append(_Block(term, antenna, start, start + width, knots))
             start += width

@@ -79,15 +79,9 @@ class FieldAudit:
 
     def __add__(self, other: FieldAudit) -> FieldAudit:
         """Both together: counts add up, the worst stays."""
-        values: dict[str, Any] = {}
-        for name in self.__slots__:
-            mine, theirs = getattr(self, name), getattr(other, name)
-            if name in ("failures", "not_covered"):
-                values[name] = tuple(dict.fromkeys((*mine, *theirs)))
-            elif name.endswith(("_max_db", "_max_m", "_max_rad", "_max_error", "_max_error_db")):
-                values[name] = max(mine, theirs)
-            elif not name.endswith(("_rms_db", "_rms_rad")):
-                values[name] = mine + theirs
+        values: dict[str, Any] = {
+            name: _together(name, getattr(self, name), getattr(other, name)) for name in self.__slots__
+        }
         values["power_rms_db"] = _rms(self.paths, self.power_rms_db, other.paths, other.power_rms_db)
         values["phase_rms_rad"] = _rms(self.phases, self.phase_rms_rad, other.phases, other.phase_rms_rad)
         return FieldAudit(**values)
@@ -101,6 +95,14 @@ class FieldAudit:
             "failures": list(self.failures),
             "not_covered": list(self.not_covered),
         }
+
+
+def _together(name: str, mine: Any, theirs: Any) -> Any:
+    """Texts once each, the larger of two errors, the sum of two counts."""
+    if isinstance(mine, tuple):
+        return tuple(dict.fromkeys((*mine, *theirs)))
+    worst = name.endswith(("_max_db", "_max_m", "_max_rad", "_max_error", "_max_error_db"))
+    return max(mine, theirs) if worst else mine + theirs
 
 
 def _rms(n: int, rms: float, m: int, other_rms: float) -> float:

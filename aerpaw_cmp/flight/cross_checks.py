@@ -108,7 +108,8 @@ def _tables_beside(path: Path) -> Iterator[tuple[str, str]]:
         for table in (table for table in sorted(path.parent.glob("*.csv")) if table != path and table.is_file()):
             with table.open("rb") as stream:
                 yield table.name, stream.read(_HEAD_BYTES).decode("utf-8", "replace")
-    elif (part := archives.inside(path)) is not None:
+        return
+    if (part := archives.inside(path)) is not None:
         place, own = part
         for name, member in archives.members(read_bytes(place)[0], place).items():
             if name != own and name.endswith(".csv") and PurePosixPath(name).parent == PurePosixPath(own).parent:

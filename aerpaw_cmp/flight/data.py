@@ -337,21 +337,18 @@ def gather(
     rank: list[tuple[str, RankSeries]] = []
     for number, (log, file) in enumerate(zip(settings.logs, files, strict=True)):
         warnings += [f"{log.path}: {text}" for text in file.result.warnings]
-        for stream in file.result.streams:
-            if stream.name in log.skip:
-                continue
-            if stream.kind == "telemetry":
-                telemetry.append((log.path, stream))
-            elif stream.kind == "rss" and not _unnamed_cell(log, stream):
-                beside = [*file.result.streams, *(s for one in files if one is not file for s in one.result.streams)]
-                locked, said = lock_of(stream, beside)
-                warnings += [f"{log.path}: {said}"] if said else []
-                rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number, locked=locked)))
-            elif stream.kind == "rank":
-                tower = log.node or settings.rank.tower
-                rank.append((log.path, _rank_series(log, stream, site, tower=tower, number=number)))
-        if others := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
-            warnings.append(f"{log.path}: {len(others)} cells that 'cells' does not name are left out")
+        streams = [stream for stream in file.result.streams if stream.name not in log.skip]
+        telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
+        for stream in (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s)):
+            others = (other for source in files if source is not file for other in source.result.streams)
+            locked, remark = lock_of(stream, [*file.result.streams, *others])
+            warnings += [f"{log.path}: {remark}"] if remark else []
+            rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number, locked=locked)))
+        tower = log.node or settings.rank.tower
+        ranked = (stream for stream in streams if stream.kind == "rank")
+        rank += [(log.path, _rank_series(log, stream, site, tower=tower, number=number)) for stream in ranked]
+        if unnamed := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
+            warnings.append(f"{log.path}: {len(unnamed)} cells that 'cells' does not name are left out")
         names = [s.name for s in file.result.streams]
         if unknown := [name for name in log.skip if name not in names]:
             warnings.append(

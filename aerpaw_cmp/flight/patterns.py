@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -239,13 +239,8 @@ def with_turns(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
     out: list[Waypoint] = []
     for i, w in enumerate(waypoints):
         if i in at:
-            out += [
-                Waypoint(
-                    east_m=w.east_m, north_m=w.north_m, height_m=w.height_m,
-                    yaw_deg=(w.yaw_deg + 360.0 / TURN_STEPS * k) % 360.0, hold_s=TURN_HOLD_S,
-                )
-                for k in range(TURN_STEPS)
-            ]  # fmt: skip
+            turns = [(w.yaw_deg + 360.0 / TURN_STEPS * k) % 360.0 for k in range(TURN_STEPS)]
+            out += [replace(w, yaw_deg=yaw, hold_s=TURN_HOLD_S) for yaw in turns]
         out.append(w)
     return out
 
@@ -333,9 +328,8 @@ def cut(route: Route, most_s: float, speed_mps: float) -> Route:
         needed = float(np.linalg.norm(step)) / speed_mps
         if clock + needed > most_s:
             end = np.array([w.east_m, w.north_m, w.height_m]) + max(most_s - clock, 0.0) / max(needed, 1e-9) * step
-            kept.append(
-                Waypoint(east_m=float(end[0]), north_m=float(end[1]), height_m=float(end[2]), yaw_deg=w.yaw_deg)
-            )
+            east, north, up = end.tolist()
+            kept.append(replace(w, east_m=east, north_m=north, height_m=up, hold_s=0.0))
             break
         clock += needed
     return flown(route.name, kept, speed_mps, most_s)

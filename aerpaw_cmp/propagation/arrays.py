@@ -167,16 +167,23 @@ def _centred_line(along_m: FloatArray) -> FloatArray:
     return positions
 
 
+def _mounted(
+    positions_m: FloatArray,
+    slant_deg: tuple[float, ...],
+    pattern: Pattern | None,
+    yaw_deg: float,
+    roll_deg: float = 0.0,
+) -> Array:
+    """Elements of one pattern in a device that is turned and rolled."""
+    mount = rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, 0.0, roll_deg]))
+    return Array(positions_m, np.radians(np.array(slant_deg)), (pattern or Isotropic(),), mount)
+
+
 def tower_comparison_array(
     yaw_deg: float = 45.0, slant_deg: tuple[float, ...] = (45.0, -45.0, 45.0, -45.0), pattern: Pattern | None = None
 ) -> Array:
     """Tower array of the comparison: 4 ports, 60 mm / 1.68 m / 60 mm, horizontal, ports slanted alternately."""
-    return Array(
-        _centred_line(np.array(TOWER_PORTS_M)),
-        np.radians(np.array(slant_deg)),
-        (pattern or Isotropic(),),
-        rotation_from_yaw_pitch_roll(np.radians(yaw_deg), 0.0, 0.0),  # type: ignore[arg-type]
-    )
+    return _mounted(_centred_line(np.array(TOWER_PORTS_M)), slant_deg, pattern, yaw_deg)
 
 
 def uav_comparison_array(
@@ -210,12 +217,7 @@ def uav_comparison_array(
     """
     half = wavelength_m / 4
     positions = np.array([[0, half, half], [0, half, -half], [0, -half, half], [0, -half, -half]])
-    return Array(
-        positions,
-        np.radians(np.array(slant_deg)),
-        (pattern or Isotropic(),),
-        rotation_from_yaw_pitch_roll(np.radians(yaw_deg), 0.0, np.radians(roll_deg)),  # type: ignore[arg-type]
-    )
+    return _mounted(positions, slant_deg, pattern, yaw_deg, roll_deg)
 
 
 def linear_array(elements: int, spacing_m: float, yaw_deg: float = 90.0, pattern: Pattern | None = None) -> Array:
@@ -237,12 +239,7 @@ def linear_array(elements: int, spacing_m: float, yaw_deg: float = 90.0, pattern
         Centred on its position, boresight horizontal.
     """
     along = np.arange(elements, dtype=np.float64) * spacing_m
-    return Array(
-        _centred_line(along),
-        np.zeros(elements),
-        (pattern or Isotropic(),),
-        rotation_from_yaw_pitch_roll(np.radians(yaw_deg), 0.0, 0.0),  # type: ignore[arg-type]
-    )
+    return _mounted(_centred_line(along), (0.0,) * elements, pattern, yaw_deg)
 
 
 def single_element(pattern: Pattern | None = None, mount: FloatArray | None = None) -> Array:

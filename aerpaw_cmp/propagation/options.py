@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
 from .field.ridges import Ridges
@@ -142,6 +144,12 @@ class Whole:
     extent_m: FloatArray
     links: int
     pairs: int
+
+    @classmethod
+    def of(cls, points_m: FloatArray, links: int, pairs: int) -> Whole:
+        """The box of the points (n, 3) that are known."""
+        known = points_m[np.isfinite(points_m).all(axis=1)]
+        return cls(np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known, links, pairs)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -88,20 +89,13 @@ def every_geometry(
     """
     return tuple(
         Geometry(
-            uav_yaw_deg=yaw,
-            uav_pitch_deg=pitch,
-            uav_roll_deg=roll,
-            tower_slant_deg=tower,
-            uav_slant_deg=uav,
-            ground=ground,
-            sum=how,
+            uav_yaw_deg=yaw, uav_pitch_deg=pitch, uav_roll_deg=roll, tower_slant_deg=tower, uav_slant_deg=uav,
+            ground=ground, sum=how,
         )
-        for yaw, pitch, roll in mounts_deg
-        for tower in tower_slants_deg
-        for uav in uav_slants_deg
-        for how in sums
-        for ground in grounds
-    )
+        for (yaw, pitch, roll), tower, uav, how, ground in product(
+            mounts_deg, tower_slants_deg, uav_slants_deg, sums, grounds
+        )
+    )  # fmt: skip
 
 
 def singular_values_of(

@@ -154,11 +154,9 @@ def replay_moving(
 
 def _whole(link: Link, poses: Poses, sources_m: FloatArray) -> Whole:
     """What a block must know of the others: one tolerance, and whether compiled code is worth loading."""
-    good = poses.position_m[np.isfinite(poses.position_m).all(axis=1)]
-    points = np.concatenate([good, sources_m])
     pairs = len(poses) * len(link.uav_array) * sum(map(len, link.tower_arrays.values()))
-    extent = np.stack([points.min(axis=0), points.max(axis=0)])
-    return Whole(extent, 0, pairs * WORK_PER_POSE)  # each place has few faces in reach: mirror images
+    points = np.concatenate([poses.position_m, sources_m])
+    return Whole.of(points, 0, pairs * WORK_PER_POSE)  # each place has few faces in reach: mirror images
 
 
 def _one_tower(link: Link) -> tuple[str, ...]:

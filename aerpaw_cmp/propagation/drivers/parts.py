@@ -44,11 +44,9 @@ def replay_in_parts(
     rows = np.array_split(np.arange(len(poses)), max(1, -(-len(poses) // size)))
     if len(rows) == 1:
         return each(site, link, poses, search, field, run)
-    good = poses.position_m[np.isfinite(poses.position_m).all(axis=1)]
     links = len(poses) * len(link.tower_arrays)
     pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
-    whole = Whole(np.stack([good.min(axis=0), good.max(axis=0)]) if len(good) else good, links, pairs)
-    progress, run = run.progress, replace(run, progress=None, whole=whole)
+    progress, run = run.progress, replace(run, progress=None, whole=Whole.of(poses.position_m, links, pairs))
     parts: list[Replay] = []
     for at in rows:
         parts.append(each(site, link, Poses(poses.position_m[at], poses.rotation[at]), search, field, run))

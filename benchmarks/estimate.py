@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 from aerpaw_cmp.jobs import run
+from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.jobs.plan import PROBE_S, probe
 
 SAMPLE = Path(__file__).parents[1] / "sample_logs" / "flight.yaml"
@@ -32,13 +33,13 @@ def main() -> None:
     for flight in options.flights:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "report"
-            given = {"out": out, "logs_root": options.logs_root, "audit": options.audit}
+            given = run.ReportOptions(audit=options.audit), RunOptions(out=out, logs_root=options.logs_root)
             start = time.process_time()
-            plan = run.plan_report(flight, **given)
+            plan = run.plan_report(flight, *given)
             planning = time.process_time() - start
             os.environ["AERPAW_CMP_CACHE"] = str(Path(folder) / "cache")
             start = time.process_time()
-            metrics = run.run_report(flight, **given).metrics
+            metrics = run.run_report(flight, *given).metrics
             took = time.process_time() - start
         guess: dict[str, float] = {}
         for stage in plan.stages:

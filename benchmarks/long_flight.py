@@ -110,9 +110,10 @@ def peak_mib() -> float:
 def measure(flight: str, out: str) -> dict:
     """One report in this process."""
     meter = Meter()
-    from aerpaw_cmp.jobs.run import run_report
+    from aerpaw_cmp.jobs.options import RunOptions
+    from aerpaw_cmp.jobs.run import ReportOptions, run_report
 
-    outcome = run_report(Path(flight), out=Path(out), audit="none", progress=meter)
+    outcome = run_report(Path(flight), ReportOptions(audit="none"), RunOptions(out=Path(out), progress=meter))
     meter.close()
     metrics, files = outcome.metrics, sorted(p for p in Path(out).rglob("*") if p.is_file())
     channels = [m for tower in metrics["rss"].values() for m in tower.values()]

@@ -131,6 +131,7 @@ def report(hours: float) -> dict[str, float]:
 
 def flights(count: int, workers: int = 1) -> dict[str, float]:
     """A campaign; its flights are simulated before."""
+    from aerpaw_cmp.jobs.options import RunOptions
     from aerpaw_cmp.jobs.run import run_campaign, run_simulate
 
     with tempfile.TemporaryDirectory() as name:
@@ -146,7 +147,7 @@ def flights(count: int, workers: int = 1) -> dict[str, float]:
             "settings": {"as written": {}, "line of sight": {"rt.max_depth": 0}},
         }
         (folder / "campaign.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
-        return timed(lambda: run_campaign(folder / "campaign.yaml", out=folder / "out", workers=workers))
+        return timed(lambda: run_campaign(folder / "campaign.yaml", RunOptions(out=folder / "out", workers=workers)))
 
 
 def short_flight(number: int) -> dict[str, Any]:

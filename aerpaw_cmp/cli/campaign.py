@@ -9,6 +9,7 @@ import typer
 
 from ..common.errors import UsageError
 from ..common.stages import duration
+from ..jobs.options import RunOptions
 from .app import Export, Force, Json, LogsRoot, Scheduler, Workers, command
 from .shown import number, print_json, say, table
 
@@ -56,31 +57,21 @@ def campaign(
     from ..jobs import run
 
     action, campaign_yaml = _action(words)
+    options = RunOptions(out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say)
     if dry_run or action != "run":
-        status = run.campaign_status(campaign_yaml, logs_root=logs_root, keep=keep, fresh=fresh, workers=workers)
+        status = run.campaign_status(campaign_yaml, options, keep=keep, fresh=fresh)
         if action != "resume" or dry_run:
             print_json(status.metrics()) if as_json else _print_status(status)
             return 0
         say(_one_line(status))
-    outcome = run.run_campaign(
-        campaign_yaml,
-        out=out,
-        logs_root=logs_root,
-        workers=workers,
-        scheduler=scheduler,
-        keep=keep,
-        fresh=fresh,
-        force=force,
-        export=export or (),
-        progress=say,
-    )
+    outcome = run.run_campaign(campaign_yaml, options, keep=keep, fresh=fresh, export=export or ())
     if as_json:
         print_json(outcome.metrics)
     else:
         _print_campaign_summary(outcome)
     for check in outcome.failed_checks:
         say.warn(f"failed: {check}")
-    if outcome.nothing_done:
+    if not (outcome.metrics["rss"] or outcome.metrics["rank"]):
         return 3
     return 1 if strict and outcome.failed_checks else 0
 

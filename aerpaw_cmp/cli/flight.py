@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Optional
 import typer
 
 from ..common.errors import one_line
+from ..jobs.options import RunOptions
 from .app import DryRun, Export, Force, Json, LogsRoot, command
 from .shown import number, print_files, print_json, print_plan, say, table
 
@@ -70,34 +71,21 @@ def report(
     """Replay a flight, calibrate, compare, report."""
     from ..jobs import run
 
-    if dry_run:
-        plan = run.plan_report(
-            flight,
-            out=out,
-            logs_root=logs_root,
-            engine=engine,
-            audit=audit,
-            figures=figures,
-            learned=learned,
-            force=force,
-        )
-        print_plan(plan, as_json)
-        return 0
-    outcome = run.run_report(
-        flight,
-        out=out,
-        logs_root=logs_root,
+    asked = run.ReportOptions(
         engine=engine,
         audit=audit,
         recommend=recommend,
         learned=learned,
         against=against,
-        force=force,
-        export=export or (),
         figures=figures,
         style=style,
-        progress=say,
+        export=export or (),
     )
+    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
+    if dry_run:
+        print_plan(run.plan_report(flight, asked, options), as_json)
+        return 0
+    outcome = run.run_report(flight, asked, options)
     if as_json:
         print_json(outcome.metrics)
     else:
@@ -149,7 +137,8 @@ def audit(
     """Fill the audit into a report."""
     from ..jobs import run
 
-    outcome = run.run_audit(target, out=out, logs_root=logs_root, links=links, force=force, progress=say)
+    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
+    outcome = run.run_audit(target, options, links=links)
     if as_json:
         print_json(outcome.metrics)
         return _verdict(outcome, strict)
@@ -290,15 +279,8 @@ def calibrate(
     """Learn antennas and ground from several flights."""
     from ..jobs import run
 
-    outcome = run.run_calibrate(
-        calibration_yaml,
-        out=out,
-        logs_root=logs_root,
-        into_site=into_site,
-        score=score or (),
-        force=force,
-        progress=say,
-    )
+    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
+    outcome = run.run_calibrate(calibration_yaml, options, into_site=into_site, score=score or ())
     if as_json:
         print_json(outcome.metrics)
         return
@@ -326,7 +308,7 @@ def calibrate(
         table(heads, rows, "Rank on what was left out")
     for text in [*m["words"], *m["warnings"]]:
         print(text)
-    print(outcome.file)
+    print(outcome.files[0])
     page = outcome.folder / "calibration.html"
     print(page if page.exists() else outcome.folder)
 

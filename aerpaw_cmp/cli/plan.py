@@ -7,6 +7,7 @@ from typing import Annotated, Any, Optional
 
 import typer
 
+from ..jobs.options import RunOptions
 from .app import Force, Json, LogsRoot, command
 from .shown import print_json, say, table
 
@@ -72,11 +73,12 @@ def plan(
         fence=geofence,
         avoid=tuple(avoid or ()),
         routes=tuple(routes or ()),
+        site=site,
         towers=tuple(tower or ()),
         target=Asked(heights_m=tuple(target_height or (40.0,)), spacing_m=60.0),
     )
     outcome = run_plan(
-        target, flights or (), asked, site_name=site, out=out, logs_root=logs_root, force=force, progress=say
+        target, flights or (), asked, RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
     )
     print_json(outcome.metrics) if as_json else _print_summary(outcome)
 

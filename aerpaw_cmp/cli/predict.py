@@ -7,6 +7,7 @@ from typing import Annotated, Any, Optional
 
 import typer
 
+from ..jobs.options import RunOptions
 from .app import Force, Json, LogsRoot, command
 from .shown import number, print_json, say, table
 
@@ -61,11 +62,8 @@ def predict(
         where,
         flights or (),
         Asked(heights_m=tuple(height or (40.0,)), spacing_m=spacing, heading_deg=heading),
+        RunOptions(out=out, logs_root=logs_root, force=force, progress=say),
         threshold_db=threshold,
-        out=out,
-        logs_root=logs_root,
-        force=force,
-        progress=say,
     )
     print_json(outcome.metrics) if as_json else _print_summary(outcome)
 

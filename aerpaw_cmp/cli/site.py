@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Optional
 
 import typer
 
+from ..jobs.options import RunOptions
 from .app import DryRun, Force, Json, LogsRoot, Scheduler, Workers, command, site_app
 from .shown import print_files, print_json, print_plan, say, table
 
@@ -219,6 +220,7 @@ def map_(
 ) -> None:
     """Coverage and rank maps of a site, Kriging of rank."""
     from ..jobs import run
+    from ..jobs.coverage_map import map_settings
 
     modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
     wanted: dict[str, Any] = {
@@ -235,22 +237,12 @@ def map_(
         "threshold_dbm": threshold_dbm,
         "study": study,
     }
+    settings = map_settings(wanted, quick=quick)
+    options = RunOptions(out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say)
     if dry_run:
-        print_plan(run.plan_map(site, out=out, quick=quick, flight=flight, force=force, **wanted), as_json)
+        print_plan(run.plan_map(site, settings, options, flight=flight), as_json)
         return
-    outcome = run.run_map(
-        site,
-        out=out,
-        quick=quick,
-        flight=flight,
-        flights=flights or (),
-        logs_root=logs_root,
-        workers=workers,
-        scheduler=scheduler,
-        force=force,
-        progress=say,
-        **wanted,
-    )
+    outcome = run.run_map(site, settings, options, flight=flight, flights=flights or ())
     if as_json:
         print_json(outcome.metrics)
         return

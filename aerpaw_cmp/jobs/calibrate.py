@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -123,7 +123,6 @@ class Calibration:
     """By antenna, of receivers that lose their lock."""
     warnings: tuple[str, ...]
     words: tuple[str, ...]
-    rank: Any = field(default=None)
 
     @property
     def trained_on(self) -> tuple[str, ...]:
@@ -142,20 +141,23 @@ def load_calibration(path: Path) -> CalibrationFile:
 
 
 def calibrate(
-    path: Path,
-    *,
+    settings: CalibrationFile,
+    flights: Sequence[FlightData],
+    folder: Path,
     logs_root: Path | None = None,
+    *,
     stages: Stages | None = None,
     score: Sequence[Path] = (),
 ) -> Calibration:
-    """Read the flights, learn, score.
+    """Learn from flights, score.
 
     Parameters
     ----------
-    path : Path
-        calibration.yaml.
-    logs_root : Path, optional
-        Folder against which logs resolve.
+    settings : CalibrationFile
+    flights : sequence of FlightData
+        As :func:`read_flights` gives them.
+    folder, logs_root : Path
+        Against which patterns resolve, and logs of ``score`` in place of their flight file's folder.
     stages : Stages, optional
     score : sequence of Path
         Further flight files, scored with all that was learned.
@@ -173,12 +175,8 @@ def calibrate(
         Logs that cannot be read; flights without RSS.
     """
     stages = stages or Stages()
-    settings = load_calibration(path)
-    with stages("read"):
-        flights, copies = read_flights(settings, path.parent, logs_root)
     observed, warnings = observe(flights)
-    warnings = [*copies, *warnings]
-    recipe = recipe_of(settings, observed, logs_root or path.parent)
+    recipe = recipe_of(settings, observed, logs_root or folder)
     series = [o.samples for o in observed]
     with stages("fit"):
         learned = calibration.learn(series, recipe)

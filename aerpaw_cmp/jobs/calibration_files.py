@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.training import flight_logs
 from ..logs.records import has_wall_clock
 from ..report.calibration_data import AntennaMap, CalibrationData
-from ..report.calibration_html import write_calibration
+from ..report.calibration_html import calibration_metrics, write_calibration
 from ..report.export import write_file
 from ..report.names import safe_name
 from ..site.learned import Entry, Errors, LearnedLock, LearnedReceiver, LearnedSeries
@@ -229,7 +231,6 @@ def record_of(
         one_more_rmse_db=with_one_more(calibration.curve),
         antennas=tuple(maps.values()),
         place=None if calibration.place is None else _place(calibration, calibration.place),
-        rank=calibration.rank,
         settings_text=text,
         versions=versions(),
         stages_s=stages_s,
@@ -247,12 +248,25 @@ def _place(calibration: Calibration, place: Learned) -> dict[str, FloatArray]:
     return {"east_m": position[:, 0], "north_m": position[:, 1], "gain_db": np.concatenate(gain)}
 
 
-def write_files(calibration: Calibration, folder: Path, name: str, stages_s: Mapping[str, float]) -> tuple[Any, str]:
-    """Fill the folder of a calibration; gives its record and the text of calibrated.yaml.
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """What was learned from the flights of a calibration, and what is to be said of their logs."""
+
+    settings: CalibrationFile
+    flights: tuple[FlightData, ...]
+    said: tuple[str, ...]
+    calibration: Calibration | None
+    ranked: RankCalibration | None
+
+
+def write_files(
+    found: Calibrated, folder: Path, name: str, stages_s: Mapping[str, float]
+) -> tuple[dict[str, Any], str]:
+    """Fill the folder of a calibration; gives its metrics and the text of calibrated.yaml.
 
     Parameters
     ----------
-    calibration : Calibration
+    found : Calibrated
     folder : Path
         Exists, and is swapped for the old one by the caller.
     name : str
@@ -262,18 +276,48 @@ def write_files(calibration: Calibration, folder: Path, name: str, stages_s: Map
 
     Returns
     -------
-    record : CalibrationData
+    metrics : dict
     text : str
         calibrated.yaml.
     """
-    maps = antenna_maps(calibration)
-    carrier = next(s.link.carrier_hz for data in calibration.flights for s in data.rss)
-    for file, content in antenna_files(calibration, maps, carrier).items():
-        write_file(folder / file, content)
-    text = settings_text(calibration, name)
-    record = record_of(calibration, maps, text, stages_s)
-    write_calibration(record, folder)
-    return record, text
+    calibration, ranked = found.calibration, found.ranked
+    rank, said = (None, ()) if ranked is None else (ranked.metrics(), ranked.warnings)
+    if calibration is not None:
+        maps = antenna_maps(calibration)
+        carrier = next(s.link.carrier_hz for data in found.flights for s in data.rss)
+        for file, content in antenna_files(calibration, maps, carrier).items():
+            write_file(folder / file, content)
+        text = settings_text(calibration, name)
+        record = dataclasses.replace(
+            record_of(calibration, maps, text, stages_s),
+            rank=rank,
+            warnings=(*found.said, *calibration.warnings, *said),
+        )
+        write_calibration(record, folder)
+        metrics = calibration_metrics(record)
+    else:
+        text = MARK + "\n"
+        metrics = {
+            "scores": {}, "controls": {}, "words": [], "antennas": [], "calibration": found.settings.calibration,
+            "rank": rank, "warnings": [*found.said, *said], "flights": found.settings.flights,
+            KEY: list(union(*map(flight_logs, found.flights))),
+        }  # fmt: skip
+        (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+    if ranked is not None:
+        (folder / "receiver.json").write_text(ranked.text(), encoding="utf-8")
+        text += f"rank:\n  receiver: {name}/receiver.json\n"
+    return metrics, text
+
+
+def site_entries(found: Calibrated, command: str) -> list[tuple[str, Entry, dict[str, bytes]]]:
+    """What a site remembers of a calibration: names of entries, the entries, and their tables by name."""
+    name, out = found.settings.calibration, []
+    if found.calibration is not None:
+        out.append((name, *site_entry(found.calibration, command)))
+    if found.ranked is not None:
+        own = f"{name}_rank" if out else name
+        out.append((own, *receiver_entry(found.settings, found.flights, found.ranked, command)))
+    return out
 
 
 def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str, bytes]]:

@@ -6,8 +6,7 @@ A campaign.yaml names flight files and, optionally, settings: labels with overri
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from ..common.errors import AerpawCmpError, InputError, UsageError
-from ..common.stages import Progress, silent
+from ..common.stages import Progress, Stages
 from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
 from ..compare.rss import LEARNED_HERE
@@ -28,10 +27,9 @@ from .campaign_fit import fit_all
 from .campaign_plan import compute, kept_outcomes
 from .campaign_rank_fit import K_KEY, fit_rank_all
 from .campaign_tasks import Task, counted_once, flight_data, outcome_store
+from .options import DEFAULT, RunOptions
 from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
 from .workers import open_workers
-
-Stage = Callable[[str], Any]
 
 AS_WRITTEN = "as written"
 """Label of the only setting of a campaign that names none."""
@@ -113,13 +111,10 @@ def _check_key(key: str, lists: bool, *, of_rank: bool, path: Path) -> None:
 def run(
     campaign: CampaignFile,
     folder: Path,
+    options: RunOptions = DEFAULT,
     *,
-    logs_root: Path | None = None,
-    workers: int = 1,
-    scheduler: str | None = None,
     keep: Path | None = None,
-    stage: Stage = lambda _name: nullcontext(),
-    progress: Progress = silent,
+    stages: Stages | None = None,
 ) -> CampaignData:
     """All flights under all settings, and what can be said only of several flights.
 
@@ -128,16 +123,10 @@ def run(
     campaign : CampaignFile
     folder : Path
         Against which the paths of flight files resolve.
-    logs_root : Path, optional
-        Against which the paths of logs resolve, in place of each flight file's folder.
-    workers : int
-        On this machine; 1 computes in this process.
-    scheduler : str, optional
-        Address of a Dask scheduler, in place of workers here.
+    options : RunOptions
     keep : Path, optional
         Folder of outcomes, taken and added to.
-    stage, progress : callable
-        A context manager per named stage; lines of progress.
+    stages : Stages, optional
 
     Returns
     -------
@@ -149,32 +138,33 @@ def run(
     UsageError
         Overrides that no flight file could have, two flights of one name, an unknown flight in ``fit_on``.
     """
-    if scheduler is not None:  # workers may stand in another folder
+    stages, progress, logs_root = stages or Stages(), options.progress, options.logs_root
+    if options.scheduler is not None:  # workers may stand in another folder
         folder, logs_root = folder.absolute(), None if logs_root is None else logs_root.absolute()
     tasks, files, failures = campaign_tasks(campaign, folder, logs_root)
     settings = campaign.settings or {AS_WRITTEN: {}}
     store = None if keep is None else outcome_store(keep)
     if store is not None:
         store.check()
-    with stage("flights"):
+    with stages("flights"):
         outcomes, orders = kept_outcomes(tasks, store, progress)
     seen = _inputs_of(files, logs_root)
     with (
-        open_workers(workers, scheduler if orders else None, paths=seen, progress=progress) as crew,
-        stage("flights"),
+        open_workers(options.workers, options.scheduler if orders else None, paths=seen, progress=progress) as crew,
+        stages("flights"),
     ):
         compute(orders, crew, outcomes, store, progress)
     results = counted_once(tasks, [outcomes[number] for number in range(len(tasks))])
     rank = tuple(row for o in results for row in o.rank)
     flown = tuple(one for o in results for one in o.flown)
     failures += [o.failure for o in results if o.failure is not None]
-    with stage("pool"):
+    with stages("pool"):
         rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
         repeated = repeats([r for r in rows if r.setting == next(iter(settings))], campaign.repeatability)
         ranks_again = rank_repeats(flown, campaign.repeatability.radius_m)
     held_out = _Folds()
     if campaign.held_out is not None:
-        with stage("held-out"):
+        with stages("held-out"):
             held_out = _folds(campaign.held_out, tasks, rows, rank, progress)
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
     tracks = {o.track.flight: o.track for o in reversed(results) if o.track is not None}
@@ -203,7 +193,7 @@ def run(
         cell_m=campaign.repeatability.cell_m,
         site=flight_data(good[0]).site if good else None,
         synthetic=tuple(name for name, (_, f) in files.items() if f.flight.synthetic),
-        workers=workers,
+        workers=options.workers,
     )
 
 

@@ -153,6 +153,12 @@ QUICK: dict[str, Any] = {"spacing_m": 120.0, "rss_altitudes_m": (30.0, 110.0), "
 """A coarse map in seconds: what ``--quick`` puts in place of the paper's settings."""
 
 
+def map_settings(given: Mapping[str, Any], *, quick: bool = False) -> MapSettings:
+    """Settings of a map from fields that were given; None leaves the default."""
+    stated = {name: value for name, value in given.items() if value is not None}
+    return MapSettings(**({**QUICK, **stated} if quick else stated))
+
+
 # --- the engine ----------------------------------------------------------------------------------------------------
 
 

@@ -42,7 +42,7 @@ def with_later_audit(
     flight, folder, logs_root : Path
         The flight file, the folder of the report, ``--logs-root``.
     asked : mapping
-        Further arguments of :func:`aerpaw_cmp.jobs.run.run_report`.
+        Fields of :class:`aerpaw_cmp.jobs.run.ReportOptions`.
 
     Returns
     -------
@@ -96,7 +96,7 @@ class EarlierReport:
     audit_links : int
         As its settings ask; 200 where they ask for none.
     asked : mapping
-        Further arguments of :func:`aerpaw_cmp.jobs.run.run_report`.
+        Fields of :class:`aerpaw_cmp.jobs.run.ReportOptions`.
     inputs : sequence of mapping
         Of its metrics.json.
     """

@@ -70,6 +70,8 @@ class PlanAsked:
         KMLs of no-fly areas.
     routes : tuple of Path
         Further candidates.
+    site : str, optional
+        Where no flight names it.
     towers : tuple of str
         Whose antennas count, where no flight names them.
     target : Asked
@@ -83,6 +85,7 @@ class PlanAsked:
     fence: Path | None = None
     avoid: tuple[Path, ...] = ()
     routes: tuple[Path, ...] = ()
+    site: str | None = None
     towers: tuple[str, ...] = ()
     target: Asked = field(default_factory=lambda: Asked(spacing_m=60.0))
 
@@ -142,7 +145,6 @@ def plan_flight(
     flights: Sequence[Path],
     asked: PlanAsked,
     *,
-    site_name: str | None = None,
     logs_root: Path | None = None,
     stages: Stages | None = None,
 ) -> FlightPlan:
@@ -155,8 +157,6 @@ def plan_flight(
     flights : sequence of Path
         Flight files that were flown; none: antennas are unknown.
     asked : PlanAsked
-    site_name : str, optional
-        Where no flight names the site.
     logs_root : Path, optional
     stages : Stages, optional
 
@@ -175,7 +175,7 @@ def plan_flight(
     with stages("read"):
         datas, said = counted_once([load_data(load_flight(p), p.parent, logs_root) for p in flights])
         observed = observe(datas)[0] if datas else []
-        site = _site(target, site_name, datas)
+        site = _site(target, asked.site, datas)
         sources = sources_of(datas, observed) if datas else {}
         ends = {a: (s.series.tower, s.series.channel) for a, s in sources.items()} or _open_ends(site, asked)
         series = [o.samples for o in observed if o.samples.antenna in ends]

@@ -3,44 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..common.inputs import input_files
 from ..common.outputs import OutputFolder
-from ..common.stages import Progress, Stages, silent
+from ..common.stages import Stages
 from ..common.versions import versions
 from ..flight.route_files import kml_text, plan_text, waypoints_csv
 from ..flight.settings import load_flight
 from ..report.names import safe_name
 from ..report.plan_html import PlanPage, plan_metrics, write_plan
 from .next_flight import FlightPlan, PlanAsked, plan_flight
+from .options import DEFAULT, JobOutcome, RunOptions
 
 
-@dataclass(frozen=True, slots=True)
-class PlanOutcome:
-    """What ``aerpaw-cmp plan`` made: the folder, its files (the page first), metrics.json as a dict."""
-
-    folder: Path
-    files: tuple[Path, ...]
-    metrics: dict[str, Any]
-
-
-def run_plan(
-    target: str,
-    flights: Sequence[Path],
-    asked: PlanAsked,
-    *,
-    site_name: str | None = None,
-    out: Path | None = None,
-    logs_root: Path | None = None,
-    force: bool = False,
-    progress: Progress = silent,
-) -> PlanOutcome:
+def run_plan(target: str, flights: Sequence[Path], asked: PlanAsked, options: RunOptions = DEFAULT) -> JobOutcome:
     """Rank flights and write ``plan.html``, the chosen route, ``sd_map.csv``, ``metrics.json`` and figures.
 
     Parameters
@@ -49,16 +29,12 @@ def run_plan(
         As for :func:`.next_flight.plan_flight`.
     flights : sequence of Path
     asked : PlanAsked
-    site_name : str, optional
-    out : Path, optional
-        Output folder, by default ``reports/plan-TARGET``.
-    logs_root : Path, optional
-    force : bool
-    progress : Progress
+    options : RunOptions
+        ``out`` is ``reports/plan-TARGET`` by default.
 
     Returns
     -------
-    PlanOutcome
+    JobOutcome
 
     Raises
     ------
@@ -67,16 +43,17 @@ def run_plan(
     """
     inputs = [p for p in (Path(target), asked.fence, *asked.avoid, *asked.routes) if p is not None and p.is_file()]
     for path in flights:
-        inputs += input_files(load_flight(path), path, logs_root)
-    stages = Stages(progress)
-    folder = out or Path("reports") / f"plan-{safe_name(Path(target).stem)}"
-    with OutputFolder(folder, job="plan", inputs=inputs, force=force) as output:
-        plan = plan_flight(target, flights, asked, site_name=site_name, logs_root=logs_root, stages=stages)
+        inputs += input_files(load_flight(path), path, options.logs_root)
+    stages = Stages(options.progress)
+    folder = options.out or Path("reports") / f"plan-{safe_name(Path(target).stem)}"
+    with OutputFolder(folder, job="plan", inputs=inputs, force=options.force) as output:
+        plan = plan_flight(target, flights, asked, logs_root=options.logs_root, stages=stages)
         record = page_of(plan, stages.seconds)
         with output.filling() as place:
-            progress("page")
+            options.progress("page")
             written = write_plan(record, place)
-    return PlanOutcome(folder, tuple(folder / p.relative_to(place) for p in written), plan_metrics(record))
+    files = tuple(folder / path.relative_to(place) for path in written)
+    return JobOutcome(folder=folder, metrics=plan_metrics(record), files=files)
 
 
 def sentence(plan: FlightPlan) -> str:

@@ -26,6 +26,7 @@ from ..propagation.paths import PathSet
 from ..propagation.replay import require_xarray
 from ..site.site import Site
 from .compare_flight import compare_flight
+from .options import RunOptions
 
 Series = tuple[str, str]
 """Tower and channel of an RSS series; tower and ``"rank"`` of a rank series."""
@@ -194,7 +195,7 @@ class Flight:
             A report of this tool that stands there is replaced whole; anything else only with ``force``.
         force : bool
         options
-            Further arguments of :func:`aerpaw_cmp.jobs.run.run_report`.
+            Fields of :class:`aerpaw_cmp.jobs.run.ReportOptions`.
 
         Raises
         ------
@@ -207,10 +208,10 @@ class Flight:
                 expected="the flight file as it stands",
                 cause="open_flight(overrides=...): write them into a flight.yaml of their own",
             )
-        from .run import run_report
+        from .run import ReportOptions, run_report
 
         out = Path(folder)
-        run_report(self.path, out=out, logs_root=self.logs_root, force=force, **options)
+        run_report(self.path, ReportOptions(**options), RunOptions(out=out, logs_root=self.logs_root, force=force))
         return out / "report.html"
 
     def plot(self, axes: Any = None) -> Any:

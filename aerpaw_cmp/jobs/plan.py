@@ -15,8 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import InputError
-from ..common.outputs import OutputFolder
 from ..common.stages import Stages
 from ..flight.data import FlightData
 from ..flight.settings import FlightFile, RtSettings
@@ -124,14 +122,7 @@ def _measured_text(factor: float) -> str:
 
 
 def report_plan(
-    settings: FlightFile,
-    flight: Path,
-    *,
-    inputs: list[Path],
-    out: Path,
-    logs_root: Path | None = None,
-    figures: str = "page",
-    force: bool = False,
+    settings: FlightFile, folder: Path, logs_root: Path | None, *, inputs: list[Path], out: Path, figures: str = "page"
 ) -> Plan:
     """Stages, links, poses and time of a report; reads the logs and writes nothing.
 
@@ -139,15 +130,15 @@ def report_plan(
     ----------
     settings : FlightFile
         With what the command line says instead.
-    flight : Path
+    folder : Path
+        Of the flight file.
+    logs_root : Path, optional
     inputs : list of Path
         Files that the flight names.
     out : Path
         Folder of the results.
-    logs_root : Path, optional
     figures : str
         As for the report.
-    force : bool
 
     Returns
     -------
@@ -157,13 +148,12 @@ def report_plan(
     Raises
     ------
     UsageError, InputError
-        What the report itself would raise of its settings, logs and output.
+        What the report itself would raise of its settings and logs.
     """
     from ..flight.data import load_data
 
-    OutputFolder(out, job="report", inputs=inputs, force=force).refuse()
     start = time.process_time()
-    data = load_data(settings, flight.parent, logs_root)
+    data = load_data(settings, folder, logs_root)
     reading = time.process_time() - start
     factor = probe() / PROBE_S
     cost = {name: seconds * factor for name, seconds in MEASURED.items()}
@@ -277,9 +267,7 @@ def _map_by_first_faces(site: Site, settings: Any, heights: int) -> PlannedStage
     )
 
 
-def map_plan(
-    site: str, settings: Any, *, inputs: list[Path], out: Path, flight: Path | None = None, force: bool = False
-) -> Plan:
+def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan:
     """Stages, links and time of a map; a coarse grid is computed for the estimate, and nothing is written.
 
     Parameters
@@ -290,26 +278,15 @@ def map_plan(
     inputs : list of Path
     out : Path
         Folder of the results.
-    flight : Path, optional
-        Whose track trains the test "along a flight".
-    force : bool
 
     Returns
     -------
     Plan
         Stages with their work and time [s].
-
-    Raises
-    ------
-    UsageError
-        There is no such flight file; the output is an input, or holds files of others.
     """
     from ..maps.grid import Grid
     from .coverage_map import make_maps
 
-    if flight is not None and not flight.is_file():
-        raise InputError("no such file", cause="a misspelt path", path=flight)
-    OutputFolder(out, job="map", inputs=inputs, force=force).refuse()
     place = load_site(site)
     positions = len(Grid.over_area(place.area_m, settings.spacing_m))
     heights = len(set(settings.rss_altitudes_m) | set(settings.rank_altitudes_m))

@@ -3,44 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..common.inputs import input_files
 from ..common.outputs import OutputFolder
-from ..common.stages import Progress, Stages, silent
+from ..common.stages import Stages
 from ..common.versions import versions
 from ..flight.settings import load_flight
 from ..report.prediction_html import PredictionPage, prediction_metrics, write_prediction
 from ..report.prediction_words import TITLES
+from .options import DEFAULT, JobOutcome, RunOptions
 from .predict import Prediction, predict
 from .where import Asked
-
-
-@dataclass(frozen=True, slots=True)
-class PredictOutcome:
-    """What ``aerpaw-cmp predict`` made: the folder, its files (the page first), metrics.json as a dict."""
-
-    folder: Path
-    files: tuple[Path, ...]
-    metrics: dict[str, Any]
 
 
 def run_predict(
     where: Path,
     flights: Sequence[Path],
     asked: Asked,
+    options: RunOptions = DEFAULT,
     *,
     threshold_db: float | None = None,
-    out: Path | None = None,
-    logs_root: Path | None = None,
-    force: bool = False,
-    progress: Progress = silent,
-) -> PredictOutcome:
+) -> JobOutcome:
     """Predict and write ``prediction.csv``, ``.nc``, ``.html``, ``metrics.json`` and figures.
 
     Parameters
@@ -50,16 +38,13 @@ def run_predict(
     flights : sequence of Path
         Flight files to learn from.
     asked : Asked
+    options : RunOptions
+        ``out`` is ``reports/prediction-NAME`` by default.
     threshold_db : float, optional
-    out : Path, optional
-        Output folder, by default ``reports/prediction-NAME``.
-    logs_root : Path, optional
-    force : bool
-    progress : Progress
 
     Returns
     -------
-    PredictOutcome
+    JobOutcome
 
     Raises
     ------
@@ -68,17 +53,20 @@ def run_predict(
     """
     inputs = [where] if where.is_file() else []
     for path in flights:
-        inputs += input_files(load_flight(path), path, logs_root)
-    folder, stages = out or Path("reports") / f"prediction-{where.stem}", Stages(progress)
-    with OutputFolder(folder, job="predict", inputs=inputs, force=force) as output:
-        prediction = predict(where, flights, asked, threshold_db=threshold_db, logs_root=logs_root, stages=stages)
+        inputs += input_files(load_flight(path), path, options.logs_root)
+    folder, stages = options.out or Path("reports") / f"prediction-{where.stem}", Stages(options.progress)
+    with OutputFolder(folder, job="predict", inputs=inputs, force=options.force) as output:
+        prediction = predict(
+            where, flights, asked, threshold_db=threshold_db, logs_root=options.logs_root, stages=stages
+        )
         record = page_of(prediction, stages.seconds)
         with output.filling() as place:
-            progress("page")
+            options.progress("page")
             written, said = write_prediction(record, place)
         for text in said:
-            progress(text)
-    return PredictOutcome(folder, tuple(folder / p.relative_to(place) for p in written), prediction_metrics(record))
+            options.progress(text)
+    files = tuple(folder / path.relative_to(place) for path in written)
+    return JobOutcome(folder=folder, metrics=prediction_metrics(record), files=files)
 
 
 def page_of(prediction: Prediction, seconds: dict[str, float]) -> PredictionPage:

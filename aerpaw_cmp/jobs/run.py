@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -12,14 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..common.errors import AerpawCmpError, UsageError, noting_interrupts
+from ..common.errors import AerpawCmpError, InputError, UsageError, noting_interrupts
 from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
-from ..common.provenance import KEY, union
 from ..common.stages import Progress, Stages, silent
 from ..flight.settings import RtSettings
 from ..propagation.options import Search
 from ..site.site import Site
+from .options import DEFAULT, JobOutcome, RunOptions
 
 _KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
 
@@ -164,64 +163,70 @@ def run_simulate(
     return simulator.run(out or flight.parent, inputs=inputs, force=force, progress=progress)
 
 
-@dataclass(frozen=True, slots=True)
-class ReportOutcome:
-    """What ``aerpaw-cmp report`` made: the folder, metrics.json as a dict, and stated checks that failed."""
-
-    folder: Path
-    metrics: dict[str, Any]
-    failed_checks: tuple[str, ...]
-
-
-def run_report(
-    flight: Path,
-    *,
-    out: Path | None = None,
-    logs_root: Path | None = None,
-    engine: str | None = None,
-    audit: str | None = None,
-    recommend: Path | None = None,
-    learned: Path | str | None = None,
-    against: Path | str | None = None,
-    force: bool = False,
-    figures: str = "page",
-    style: str = "screen",
-    export: Sequence[str] = (),
-    same_inputs: Sequence[Mapping[str, Any]] | None = None,
-    progress: Progress = silent,
-) -> ReportOutcome:
-    """Replay a flight, calibrate, compare, report.
-
-    With ``recommend``, the flight file with the settings of the model that the ladder recommends is written there.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportOptions:
+    """What the command line says of one report.
 
     Parameters
     ----------
-    flight : Path
-    out, logs_root : Path, optional
-        Results folder (default ``reports/<flight>``), folder against which the paths of the logs resolve.
     engine, audit : str, optional
         In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number); with "later" the audit is
         left to :func:`run_audit`.
     recommend : Path, optional
-        Where to write it.
-    learned : Path, optional
+        Where the flight file with the settings of the recommended model is written.
+    learned : path, optional
         calibrated.yaml whose antennas, ground and receiver take the place of those of the flight file.
-    against : Path, optional
+    against : path, optional
         Output folder of ``predict``: what it said of this flight is scored.
-    force : bool
-        Replace what this tool did not write.
     figures : {"page", "none", "svg", "png", "pdf", "all"}
         What is drawn: what the page shows, nothing, or every figure in one format or in all.
     style : {"screen", "paper"}
     export : sequence of str
         Formats of the samples besides those of ``report.export``.
+    """
+
+    engine: str | None = None
+    audit: str | None = None
+    recommend: Path | None = None
+    learned: Path | str | None = None
+    against: Path | str | None = None
+    figures: str = "page"
+    style: str = "screen"
+    export: Sequence[str] = ()
+
+    def made_from(self, folder: Path) -> dict[str, Any]:
+        """For metrics.json in ``folder``, so that the report can be made again."""
+        asked = {"engine": self.engine, "figures": self.figures, "style": self.style, "export": list(self.export)}
+        for name in ("learned", "against"):
+            if (place := getattr(self, name)) is not None:
+                asked[name] = os.path.relpath(place, folder)
+        return asked
+
+
+AS_IT_COMES = ReportOptions()
+
+
+def run_report(
+    flight: Path,
+    asked: ReportOptions = AS_IT_COMES,
+    options: RunOptions = DEFAULT,
+    *,
+    same_inputs: Sequence[Mapping[str, Any]] | None = None,
+) -> JobOutcome:
+    """Replay a flight, calibrate, compare, report.
+
+    Parameters
+    ----------
+    flight : Path
+    asked : ReportOptions
+    options : RunOptions
+        ``out`` is ``reports/<flight>`` by default.
     same_inputs : sequence of mapping, optional
         ``inputs`` of the metrics.json of an earlier report: nothing is written if one of them has changed since.
-    progress : Progress
 
     Returns
     -------
-    ReportOutcome
+    JobOutcome
 
     Raises
     ------
@@ -240,125 +245,76 @@ def run_report(
     from .manifest import other_inputs
     from .report_record import report_record
 
-    for given, known in ((figures, FIGURES), (style, STYLES)):
+    for given, known in ((asked.figures, FIGURES), (asked.style, STYLES)):
         if given not in known:
             raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
-    if recommend is not None:
-        _beside(recommend, flight, logs_root)
-    learned = None if learned is None else Path(learned)
-    settings = _overridden(load_flight(flight, learned), engine, audit)
-    inputs = [*input_files(settings, flight, logs_root), *([] if learned is None else [learned])]
-    folder = out or Path("reports") / settings.flight.name
+    if asked.recommend is not None:
+        _beside(asked.recommend, flight, options.logs_root)
+    settings, inputs, folder = _report_inputs(flight, asked, options)
+    stages, learned = Stages(options.progress), None if asked.learned is None else Path(asked.learned)
     with ExitStack() as outputs:
-        output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=force))
+        output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=options.force))
         target = None
-        if recommend is not None:
-            target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
-        formats = chosen_formats(settings.report.export, export)
-        stages = Stages(progress)
+        if asked.recommend is not None:
+            file = OutputFile(asked.recommend, own=is_sealed, inputs=inputs, force=options.force)
+            target = outputs.enter_context(file)
+        formats = chosen_formats(settings.report.export, asked.export)
         with stages("read"):
-            data = load_data(settings, flight.parent, logs_root)
+            data = load_data(settings, flight.parent, options.logs_root)
             before = None
-            if against is not None:
+            if asked.against is not None:
                 from .against import score_against  # loads what calibration and prediction need
 
-                before = score_against(data, Path(against))
+                before = score_against(data, Path(asked.against))
         replays = replay_flight(data, stages)
         flight_run = run_flight(data, stages, replays=replays, ladder=True)
-        record = report_record(flight_run, other_inputs(settings, flight, logs_root, learned))
-        asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
-        asked |= {} if learned is None else {"learned": os.path.relpath(learned, folder)}
+        record = report_record(flight_run, other_inputs(settings, flight, options.logs_root, learned))
         if before is not None:
-            asked["against"] = os.path.relpath(Path(against or ""), folder)
             extra = {**record.extra_metrics, "against": before.metrics()}
             record = replace(record, against=before, extra_metrics=extra)
-        record = with_later_audit(record, settings, flight, folder, logs_root, asked)
+        record = with_later_audit(record, settings, flight, folder, options.logs_root, asked.made_from(folder))
         if same_inputs is not None:
             refuse_changed(same_inputs, record.inputs)
         if target is not None:
             target.write(sealed(recommended_text(load_flight(flight, learned), flight_run.ladder, flight.name)))
         with output.filling() as place:
-            record = write_report(record, place, drawn=figures, style=style, exports=formats, stages=stages).data
-    metrics = metrics_of(record)
-    return ReportOutcome(folder, metrics, _failed_checks(metrics))
+            written = write_report(
+                record, place, drawn=asked.figures, style=asked.style, exports=formats, stages=stages
+            )
+    metrics = metrics_of(written.data)
+    return JobOutcome(folder=folder, metrics=metrics, failed_checks=_failed_checks(metrics))
 
 
-def plan_report(
-    flight: Path,
-    *,
-    out: Path | None = None,
-    logs_root: Path | None = None,
-    engine: str | None = None,
-    audit: str | None = None,
-    figures: str = "page",
-    learned: Path | None = None,
-    force: bool = False,
-) -> Any:
-    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing.
-
-    Parameters
-    ----------
-    flight : Path
-    out, logs_root : Path, optional
-    engine, audit : str, optional
-    figures : str
-    learned : Path, optional
-    force : bool
-        As for :func:`run_report`.
-
-    Returns
-    -------
-    Plan
-
-    Raises
-    ------
-    UsageError, InputError
-        What the report itself would raise of its settings, logs and output.
-    """
+def _report_inputs(flight: Path, asked: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:
+    """Settings with what the command line says instead, files that they name, folder of the results."""
     from ..flight.settings import load_flight
+
+    learned = None if asked.learned is None else Path(asked.learned)
+    settings = _overridden(load_flight(flight, learned), asked.engine, asked.audit)
+    inputs = [*input_files(settings, flight, options.logs_root), *([] if learned is None else [learned])]
+    return settings, inputs, options.out or Path("reports") / settings.flight.name
+
+
+def plan_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOptions = DEFAULT) -> Any:
+    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing."""
     from .plan import report_plan
 
-    settings = _overridden(load_flight(flight, learned), engine, audit)
-    return report_plan(
-        settings,
-        flight,
-        inputs=[*input_files(settings, flight, logs_root), *([] if learned is None else [learned])],
-        out=out or Path("reports") / settings.flight.name,
-        logs_root=logs_root,
-        figures=figures,
-        force=force,
-    )
+    settings, inputs, folder = _report_inputs(flight, asked, options)
+    OutputFolder(folder, job="report", inputs=inputs, force=options.force).refuse()
+    return report_plan(settings, flight.parent, options.logs_root, inputs=inputs, out=folder, figures=asked.figures)
 
 
-def run_audit(
-    target: Path,
-    *,
-    out: Path | None = None,
-    logs_root: Path | None = None,
-    links: str | None = None,
-    force: bool = False,
-    progress: Progress = silent,
-) -> ReportOutcome:
+def run_audit(target: Path, options: RunOptions = DEFAULT, *, links: str | None = None) -> JobOutcome:
     """Fill the audit into an existing report, whose folder is exchanged as a whole.
 
     Parameters
     ----------
     target : Path
         Folder of a report, or the flight file that it was made from.
-    out : Path, optional
-        Folder of the report, where ``target`` is a flight file (default ``reports/<flight>``).
-    logs_root : Path, optional
-        In place of the one that the report was made with.
+    options : RunOptions
+        ``out`` is the folder of the report where ``target`` is a flight file (default ``reports/<flight>``).
     links : str, optional
         Number of audited links or "full", in place of ``rt.audit_links``.
-    force : bool
-        Replace also what was changed in the folder by hand.
-    progress : Progress
-
-    Returns
-    -------
-    ReportOutcome
-        Of the report made anew.
 
     Raises
     ------
@@ -371,20 +327,13 @@ def run_audit(
 
     if links is not None and links != "full" and not (links.isdecimal() and int(links)):
         raise UsageError(f"--links {links!r}", expected="a number of links above 0, or 'full'")
-    earlier = earlier_report(target, out)
-    return run_report(
-        earlier.flight,
-        out=earlier.folder,
-        logs_root=logs_root or earlier.logs_root,
-        audit=links or str(earlier.audit_links),
-        force=force,
-        same_inputs=earlier.inputs,
-        progress=progress,
-        **{
-            key: earlier.folder / value if key in ("learned", "against") else value
-            for key, value in earlier.asked.items()
-        },
-    )
+    earlier = earlier_report(target, options.out)
+    again = {
+        key: earlier.folder / value if key in ("learned", "against") else value for key, value in earlier.asked.items()
+    }
+    asked = ReportOptions(**again, audit=links or str(earlier.audit_links))
+    where = replace(options, out=earlier.folder, logs_root=options.logs_root or earlier.logs_root)
+    return run_report(earlier.flight, asked, where, same_inputs=earlier.inputs)
 
 
 def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
@@ -593,48 +542,30 @@ def _paths_of_pose(rt: RtSettings, site: Site, track: Any, pose: int, carrier_hz
     return tuple(lines)
 
 
-@dataclass(frozen=True, slots=True)
-class MapsOutcome:
-    """What ``aerpaw-cmp map`` made: the folder, its files (the page first) and metrics.json as a dict."""
-
-    folder: Path
-    files: tuple[Path, ...]
-    metrics: dict[str, Any]
-
-
 def run_map(
-    site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None,
-    flights: Sequence[Path] = (), logs_root: Path | None = None, workers: int = 1, scheduler: str | None = None,
-    force: bool = False, progress: Progress = silent, **options: Any,
-) -> MapsOutcome:  # fmt: skip
+    site: str,
+    settings: Any,
+    options: RunOptions = DEFAULT,
+    *,
+    flight: Path | None = None,
+    flights: Sequence[Path] = (),
+) -> JobOutcome:
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
     Parameters
     ----------
     site : str
         site.yaml, or the name of a packaged site.
-    out : Path, optional
-        Folder of the results.
-    quick : bool
-        A coarse map; what ``options`` state still counts.
+    settings : MapSettings
+    options : RunOptions
     flight : Path, optional
         flight.yaml whose track trains the test "along a flight".
     flights : sequence of Path
         Flight files that correct the levels (:mod:`.predict`).
-    logs_root : Path, optional
-        Folder against which its logs resolve.
-    workers, scheduler
-        Who evaluates the pieces of the grid: workers of this machine, or of a Dask scheduler.
-    force : bool
-        Write into a folder that holds files of others.
-    progress : Progress
-        Stage and share done.
-    options
-        Fields of :class:`aerpaw_cmp.jobs.coverage_map.MapSettings`; None leaves the default.
 
     Returns
     -------
-    MapsOutcome
+    JobOutcome
 
     Raises
     ------
@@ -648,24 +579,21 @@ def run_map(
     from .paper_table import paper_markdown, paper_rows
     from .workers import open_workers
 
-    settings = _map_settings(quick, options)
-    place = load_site(site)
-    name = Path(site).stem
-    folder = out or _map_folder(site)
+    place, progress, stages = load_site(site), options.progress, Stages(options.progress)
+    folder = options.out or _map_folder(site)
     inputs = [Path(site), *([] if flight is None else [flight]), *flights]
-    stages = Stages(progress)
-    with OutputFolder(folder, job="map", inputs=inputs, force=force) as output:
+    with OutputFolder(folder, job="map", inputs=inputs, force=options.force) as output:
         file = [Path(site).absolute()] if Path(site).is_file() else []
-        with open_workers(workers, scheduler, paths=file, progress=progress) as crew:
+        with open_workers(options.workers, options.scheduler, paths=file, progress=progress) as crew:
             outcome = mapping.make_maps(place, settings, stages, workers=crew, name=str(file[0] if file else site))
         if flights:
             from .corrected_map import corrected_maps
 
             heights = settings.rss_altitudes_m
-            outcome.corrected = corrected_maps(site, settings.spacing_m, heights, flights, logs_root, stages)
+            outcome.corrected = corrected_maps(site, settings.spacing_m, heights, flights, options.logs_root, stages)
         if settings.study:
             if flight is not None:
-                outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)
+                outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, options.logs_root)
             mapping.study_maps(outcome, stages)
         generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
         with output.filling() as part:
@@ -675,7 +603,7 @@ def run_map(
             progress("page")
             record = mapping.maps_record(
                 outcome,
-                name=name,
+                name=Path(site).stem,
                 generated=generated,
                 versions=versions(),
                 stages_s=stages.seconds,
@@ -685,33 +613,22 @@ def run_map(
             written.append(part / "paper.md")
             written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
     results = tuple(folder / path.relative_to(part) for path in (*written, *files))
-    return MapsOutcome(folder, results, maps_metrics(record))
-
-
-def _map_settings(quick: bool, options: dict[str, Any]) -> Any:
-    """The settings of a map from what was given; None leaves the default."""
-    from . import coverage_map as mapping
-
-    given = {name: value for name, value in options.items() if value is not None}
-    return mapping.MapSettings(**({**mapping.QUICK, **given} if quick else given))
+    return JobOutcome(folder=folder, metrics=maps_metrics(record), files=results)
 
 
 def _map_folder(site: str) -> Path:
     return Path("reports") / f"map-{Path(site).stem}"
 
 
-def plan_map(
-    site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None, force: bool = False,
-    **options: Any,
-) -> Any:  # fmt: skip
+def plan_map(site: str, settings: Any, options: RunOptions = DEFAULT, *, flight: Path | None = None) -> Any:
     """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a map: what :func:`run_map` would do; writes nothing.
 
     Parameters
     ----------
     site : str
-    out, flight : Path, optional
-    quick, force : bool
-    options
+    settings : MapSettings
+    options : RunOptions
+    flight : Path, optional
         As for :func:`run_map`.
 
     Returns
@@ -720,14 +637,16 @@ def plan_map(
 
     Raises
     ------
-    UsageError
-        What the map itself would raise of its settings and output.
+    UsageError, InputError
+        What the map itself would raise of its settings and output; no such flight.
     """
     from .plan import map_plan
 
-    inputs = [Path(site), *([] if flight is None else [flight])]
-    settings = _map_settings(quick, options)
-    return map_plan(site, settings, inputs=inputs, out=out or _map_folder(site), flight=flight, force=force)
+    inputs, folder = [Path(site), *([] if flight is None else [flight])], options.out or _map_folder(site)
+    if flight is not None and not flight.is_file():
+        raise InputError("no such file", cause="a misspelt path", path=flight)
+    OutputFolder(folder, job="map", inputs=inputs, force=options.force).refuse()
+    return map_plan(site, settings, inputs=inputs, out=folder)
 
 
 def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
@@ -746,16 +665,6 @@ def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
     return line[np.isfinite(line).all(axis=1)], settings.flight.name
 
 
-@dataclass(frozen=True, slots=True)
-class CampaignOutcome:
-    """What ``aerpaw-cmp campaign`` made: the folder, campaign.json as a dict, failures, and whether all failed."""
-
-    folder: Path
-    metrics: dict[str, Any]
-    failed_checks: tuple[str, ...]
-    nothing_done: bool
-
-
 def outcomes_folder() -> Path:
     """Where outcomes are kept by default: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
     return Path(os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp") / "outcomes"
@@ -763,53 +672,36 @@ def outcomes_folder() -> Path:
 
 def run_campaign(
     path: Path,
+    options: RunOptions = DEFAULT,
     *,
-    out: Path | None = None,
-    logs_root: Path | None = None,
-    workers: int = 1,
-    scheduler: str | None = None,
     keep: Path | None = None,
     fresh: bool = False,
-    force: bool = False,
     export: Sequence[str] = (),
-    progress: Progress = silent,
-) -> CampaignOutcome:
+) -> JobOutcome:
     """Many flights and settings: replay, compare, pool, hold out, report.
 
     Parameters
     ----------
     path : Path
         campaign.yaml.
-    out : Path, optional
-        Folder of the results.
-    logs_root : Path, optional
-        Folder against which logs resolve.
-    workers : int
-        On this machine.
-    scheduler : str, optional
-        Address of a Dask scheduler, in place of workers here.
+    options : RunOptions
     keep : Path, optional
         Folder of the outcomes of single tasks, in place of what campaign.yaml says: a rerun, or one after an
         interruption, computes only what is missing.
     fresh : bool
         Keep nothing and take nothing.
-    force : bool
-        Write into a folder that holds files of others.
     export : sequence of str
         Formats of the samples of the first setting, besides those that campaign.yaml names.
-    progress : Progress
 
     Returns
     -------
-    CampaignOutcome
+    JobOutcome
 
     Raises
     ------
     UsageError
         A campaign.yaml that is wrong; a flight that cannot be read is a row of the result instead.
     """
-    from dataclasses import replace
-
     from ..flight.settings import load_flight
     from ..report.campaign_html import campaign_metrics, write_campaign
     from ..report.campaign_words import warnings
@@ -818,38 +710,29 @@ def run_campaign(
     from .campaign import run as run_all
     from .season import find_reports, with_season
 
-    stages = Stages(progress)
+    stages = Stages(options.progress)
     campaign = load_campaign(path)
     formats = chosen_formats(campaign.export, export)
     inputs = input_files(campaign, path)
     for entry in campaign.flights:
         with suppress(AerpawCmpError):  # a flight file that cannot be read is a row of the result
-            inputs += input_files(load_flight(path.parent / entry), path.parent / entry, logs_root)
-    folder = out or Path("reports") / campaign.campaign
+            inputs += input_files(load_flight(path.parent / entry), path.parent / entry, options.logs_root)
+    folder = options.out or Path("reports") / campaign.campaign
     kept = None if fresh else campaign_keep(campaign, path, keep)
     left = f"finished tasks are kept in {kept}, and the same command computes the rest" if kept else "nothing is kept"
-    with OutputFolder(folder, job="campaign", inputs=inputs, force=force) as output, noting_interrupts(left):
-        data = run_all(
-            campaign,
-            path.parent,
-            logs_root=logs_root,
-            workers=workers,
-            scheduler=scheduler,
-            keep=kept,
-            stage=stages,
-            progress=progress,
-        )
+    with OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output, noting_interrupts(left):
+        data = run_all(campaign, path.parent, options, keep=kept, stages=stages)
         data = with_season(data, find_reports(data.flights, folder, [folder.parent, Path("reports")]))
         with stages("report"), output.filling() as place:
             finished = replace(data, stages_s=dict(stages.seconds))
-            write_campaign(finished, place, exports=formats, progress=progress)
+            write_campaign(finished, place, exports=formats, progress=options.progress)
             write_tracebacks(data.failures, place)
-    edges = [text for text in warnings(data) if "edge of the searched span" in text]
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
     if data.held_out_failure:
         failed.append(f"held-out fit: {data.held_out_failure}")
+    failed += [text for text in warnings(data) if "edge of the searched span" in text]
     metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
-    return CampaignOutcome(folder, metrics, tuple(failed + edges), not (data.rss or data.rank))
+    return JobOutcome(folder=folder, metrics=metrics, failed_checks=tuple(failed))
 
 
 def campaign_keep(campaign: Any, path: Path, keep: Path | None = None) -> Path:
@@ -872,84 +755,51 @@ def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
             target.write_text(f"{one.flight}, {one.setting}: {one.message}\n\n{one.traceback}", encoding="utf-8")
 
 
-def campaign_status(
-    path: Path, *, logs_root: Path | None = None, keep: Path | None = None, fresh: bool = False, workers: int = 1
-) -> Any:
+def campaign_status(path: Path, options: RunOptions = DEFAULT, *, keep: Path | None = None, fresh: bool = False) -> Any:
     """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaign_plan.CampaignStatus`).
 
     Parameters
     ----------
     path : Path
-        campaign.yaml.
-    logs_root : Path, optional
-        Folder against which logs resolve.
+    options : RunOptions
     keep : Path, optional
-        Folder of the outcomes, in place of what campaign.yaml says.
     fresh : bool
-        As though nothing were kept.
-    workers : int
-        Tasks side by side, for the time.
+        As for :func:`run_campaign`.
 
     Returns
     -------
     CampaignStatus
-
-    Raises
-    ------
-    UsageError
-        A campaign.yaml that is wrong.
     """
     from . import campaign_plan
     from .campaign import campaign_tasks, load_campaign
     from .campaign_tasks import outcome_store
 
     campaign = load_campaign(path)
-    tasks, _, failures = campaign_tasks(campaign, path.parent, logs_root)
+    tasks, _, failures = campaign_tasks(campaign, path.parent, options.logs_root)
     store = None if fresh else outcome_store(campaign_keep(campaign, path, keep))
-    return campaign_plan.campaign_status(campaign.campaign, tasks, failures, store, workers=workers)
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrateOutcome:
-    """What ``aerpaw-cmp calibrate`` made: the settings file, its folder, metrics.json as a dict."""
-
-    file: Path
-    folder: Path
-    metrics: dict[str, Any]
+    return campaign_plan.campaign_status(campaign.campaign, tasks, failures, store, workers=options.workers)
 
 
 def run_calibrate(
-    path: Path,
-    *,
-    out: Path | None = None,
-    logs_root: Path | None = None,
-    into_site: str | None = None,
-    score: Sequence[Path] = (),
-    force: bool = False,
-    progress: Progress = silent,
-) -> CalibrateOutcome:
+    path: Path, options: RunOptions = DEFAULT, *, into_site: str | None = None, score: Sequence[Path] = ()
+) -> JobOutcome:
     """Learn antennas from flights; write ``calibrated.yaml`` and, in the folder of its name, antennas and page.
 
     Parameters
     ----------
     path : Path
         calibration.yaml.
-    out : Path, optional
-        The file to write; the folder lies beside it.
-    logs_root : Path, optional
-        Where the paths of logs and antennas resolve.
+    options : RunOptions
+        ``out`` is the file to write; the folder lies beside it.
     into_site : str, optional
         Site (site.yaml or packaged) whose memory gets what was learned, as an entry of the calibration's name.
     score : sequence of Path
         Flight files that are scored with all that was learned; those of training logs are named and not scored.
-    force : bool
-        Replace also what this tool did not write; never an input.
-    progress : Progress
-        Stage and share done.
 
     Returns
     -------
-    CalibrateOutcome
+    JobOutcome
+        The settings file is the first of its ``files``.
 
     Raises
     ------
@@ -957,71 +807,38 @@ def run_calibrate(
         With what was found, expected, and the likely cause.
     """
     from ..flight.settings import load_flight
-    from ..report.calibration_html import calibration_metrics
     from ..site.learned import remember
-    from .calibrate import calibrate, load_calibration
-    from .calibration_files import MARK, receiver_entry, site_entry, write_files
+    from .calibrate import calibrate, load_calibration, read_flights
+    from .calibrate_rank import fit_rank
+    from .calibration_files import Calibrated, site_entries, write_files
 
     settings = load_calibration(path)
-    target = out or Path(f"{settings.calibration}.calibrated.yaml")
+    target = options.out or Path(f"{settings.calibration}.calibrated.yaml")
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError("the output is no YAML file", expected="-o NAME.yaml", path=target)
-    inputs = input_files(settings, path, logs_root)
+    inputs = input_files(settings, path, options.logs_root)
     for name in settings.flights:
-        inputs += input_files(load_flight(path.parent / name), path.parent / name, logs_root)
+        inputs += input_files(load_flight(path.parent / name), path.parent / name, options.logs_root)
 
-    folder = target.with_suffix("")
-    stages = Stages(progress)
+    stages, folder = Stages(options.progress), target.with_suffix("")
     with (
-        OutputFile(target, own=is_sealed, inputs=inputs, force=force) as file,
-        OutputFolder(folder, job="calibrate", inputs=inputs, force=force) as output,
+        OutputFile(target, own=is_sealed, inputs=inputs, force=options.force) as file,
+        OutputFolder(folder, job="calibrate", inputs=inputs, force=options.force) as output,
     ):
-        ranked, flights = _calibrated_rank(settings, path, logs_root, stages)
-        has_rss = ranked is None or any(data.rss for data in flights)
-        command = f"aerpaw-cmp calibrate {path.name} --into-site {into_site}"
-        learned: list[tuple[str, Any, dict[str, bytes]]] = []
-        if not has_rss and ranked is not None:
-            text, metrics = MARK + "\n", {**_RANK_ALONE, "calibration": settings.calibration}
-            with output.filling() as place:
-                metrics |= {"rank": ranked.metrics(), "warnings": list(ranked.warnings), "flights": settings.flights}
-                metrics[KEY] = list(union(*(one.trained_on for one in ranked.receivers.values())))
-                (place / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-                (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
-        else:
-            calibration = calibrate(path, logs_root=logs_root, stages=stages, score=score)
-            if ranked is not None:
-                calibration = replace(
-                    calibration, rank=ranked.metrics(), warnings=(*calibration.warnings, *ranked.warnings)
-                )
-            with output.filling() as place:
-                record, text = write_files(calibration, place, folder.name, stages.seconds)
-                if ranked is not None:
-                    (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
-            metrics = calibration_metrics(record)
-            learned.append((settings.calibration, *site_entry(calibration, command)))
-        if ranked is not None:
-            name = settings.calibration if not learned else f"{settings.calibration}_rank"
-            learned.append((name, *receiver_entry(settings, flights, ranked, command)))
-            text += f"rank:\n  receiver: {folder.name}/receiver.json\n"
+        with stages("read"):
+            flights, said = read_flights(settings, path.parent, options.logs_root)
+        ranked, calibration = None, None
+        if settings.rank is not None:
+            with stages("rank"):
+                ranked = fit_rank(flights, settings.rank)
+        if ranked is None or any(data.rss for data in flights):
+            calibration = calibrate(settings, flights, path.parent, options.logs_root, stages=stages, score=score)
+        found = Calibrated(settings, tuple(flights), tuple(said), calibration, ranked)
+        with output.filling() as place:
+            metrics, text = write_files(found, place, folder.name, stages.seconds)
         file.write(sealed(text))
     if into_site is not None:
-        metrics["into_site"] = [str(f) for entry in learned for f in remember(into_site, *entry)]
-    return CalibrateOutcome(target, folder, metrics)
-
-
-_RANK_ALONE: dict[str, Any] = {"scores": {}, "controls": {}, "words": [], "antennas": []}
-"""What a calibration of flights without RSS has instead of antennas."""
-
-
-def _calibrated_rank(settings: Any, path: Path, logs_root: Path | None, stages: Stages) -> tuple[Any, list[Any]]:
-    """The receiver, where calibration.yaml asks for one, and the flights that it was fitted on."""
-    if settings.rank is None:
-        return None, []
-    from .calibrate import read_flights
-    from .calibrate_rank import fit_rank
-
-    with stages("rank"):
-        flights, copies = read_flights(settings, path.parent, logs_root)
-        ranked = fit_rank(flights, settings.rank)
-        ranked = replace(ranked, warnings=(*copies, *ranked.warnings))
-        return ranked, flights
+        command = f"aerpaw-cmp calibrate {path.name} --into-site {into_site}"
+        entries = site_entries(found, command)
+        metrics["into_site"] = [str(f) for entry in entries for f in remember(into_site, *entry)]
+    return JobOutcome(folder=folder, metrics=metrics, files=(target,))

@@ -12,9 +12,10 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.calibration import BASELINES, SPLITS, mean_rmse
-from aerpaw_cmp.jobs.calibrate import calibrate, load_calibration, observe, read_flights, recipe_of
+from aerpaw_cmp.jobs.calibrate import load_calibration, observe, read_flights, recipe_of
 from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
+from tests.jobs.calibrated import calibrated
 from tests.json_page import unlisted
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -156,7 +157,7 @@ def test_a_report_has_the_level_of_the_fit_itself(folder: Path, metrics: dict) -
     """Antenna files, the gain towards both ends in their comments, and the replay against the fit along the flight."""
     del metrics
     report = pd.read_csv(folder / "report_learned" / "rss.csv")
-    found = calibrate(folder / "calibration.yaml")
+    found, _ = calibrated(folder / "calibration.yaml")
     (aside,) = observe(read_flights(load_calibration(folder / "aside_calibration.yaml"), folder, None)[0])[0]
     gain, sd = found.learned.predict(aside.samples)
     level = report.dropna(subset=["residual_db"])
@@ -194,7 +195,7 @@ def test_bad_input_is_one_message(folder: Path, capsys: pytest.CaptureFixture[st
 
 def test_one_flight_is_learned_and_not_scored(folder: Path) -> None:
     path = write(folder / "single.yaml", {"calibration": "single", "flights": ["first.yaml"]})
-    found = calibrate(path)
+    found, _ = calibrated(path)
     assert found.learned.fit is not None
     assert not any(found.scores.values())
     assert any("one flight alone" in text for text in found.warnings)

@@ -24,6 +24,7 @@ from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import campaign_fit
 from aerpaw_cmp.jobs.campaign import load_campaign, run
 from aerpaw_cmp.jobs.campaign_fit import goes_round, search
+from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.jobs.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 from tests.json_page import unlisted
@@ -272,7 +273,7 @@ def test_a_planted_clock_shift_is_recovered_on_the_other_flight(folder: Path) ->
         flights=["late_first.yaml", "late_second.yaml"],
         held_out={"fit": {"rss.lag": [-1.5, 0.0, 0.5, 1.0, 1.5, 2.0]}, "fit_on": ["second"], "samples": 100},
     )
-    (fold,) = run(load_campaign(path), folder, logs_root=folder / "late").held_out
+    (fold,) = run(load_campaign(path), folder, RunOptions(logs_root=folder / "late")).held_out
     assert fold.parameters == {"rss.lag": 1.5}
     held = [r for r in fold.rows if not r.fitted_here]
     assert len(held) == 2
@@ -292,7 +293,7 @@ def test_a_lag_estimated_on_the_scored_samples_is_told(folder: Path) -> None:
     campaign = load_campaign(
         write_campaign(folder, "apply", flights=flights, held_out={"fit": {YAW: [YAW_DEG]}, "fit_on": ["first"]})
     )
-    data = run(campaign, folder, logs_root=folder / "applied")
+    data = run(campaign, folder, RunOptions(logs_root=folder / "applied"))
     (fold,) = data.held_out
     by = {(r.flight, r.channel): r.fitted for r in data.rss}
     assert {(r.flight, r.channel): r.own for r in fold.rows} == by

@@ -14,6 +14,7 @@ from aerpaw_cmp.cli import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.jobs import audit_flight, run
 from aerpaw_cmp.jobs.later_audit import earlier_report
+from aerpaw_cmp.jobs.options import RunOptions
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 
@@ -32,7 +33,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for log in content["logs"]:
         (folder / log["path"]).parent.mkdir(exist_ok=True)
         shutil.copy(SAMPLE / log["path"], folder / log["path"])
-    run.run_report(folder / "flight.yaml", out=folder / "first", figures="none")
+    run.run_report(folder / "flight.yaml", run.ReportOptions(figures="none"), RunOptions(out=folder / "first"))
     return folder
 
 
@@ -94,7 +95,7 @@ def test_audit_fills_it_in_and_keeps_the_numbers(report: Path, no_other_engine: 
 
 
 def test_audit_of_a_flight_file_finds_its_report(report: Path, no_other_engine: list[int]) -> None:
-    run.run_audit(report.parent / "flight.yaml", out=report, links="7")
+    run.run_audit(report.parent / "flight.yaml", RunOptions(out=report), links="7")
     assert no_other_engine == [7]
 
 
@@ -113,7 +114,7 @@ def test_what_is_no_report_is_named(report: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="links"):
         run.run_audit(report, links="none")
     with pytest.raises(UsageError, match="-o beside the folder"):
-        run.run_audit(report, out=tmp_path)
+        run.run_audit(report, RunOptions(out=tmp_path))
     (report.parent / "flight.yaml").rename(tmp_path / "elsewhere.yaml")
     with pytest.raises(InputError, match="there is no such flight file"):
         run.run_audit(report)

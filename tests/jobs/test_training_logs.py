@@ -21,9 +21,9 @@ from aerpaw_cmp.common.provenance import trained_on
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.training import counted_once, flight_logs
-from aerpaw_cmp.jobs.calibrate import calibrate
 from aerpaw_cmp.jobs.calibrate_rank import FittedReceiver, RankSamples
 from aerpaw_cmp.jobs.diff_reports import run_diff
+from tests.jobs.calibrated import calibrated
 from tests.jobs.test_calibrate import YAW_DEG, settings, write
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -154,11 +154,11 @@ def test_settings_that_were_learned_count_as_antennas_do(folder: Path) -> None:
 @pytest.mark.parametrize("copy", COPIES)
 def test_calibrate_counts_a_copy_once(folder: Path, copy: Callable[[Path], str]) -> None:
     flights = ["first.yaml", copy_of(folder, copy).name]
-    found = calibrate(write(folder / "twice.yaml", {"calibration": "twice", "flights": flights}))
+    found, said = calibrated(write(folder / "twice.yaml", {"calibration": "twice", "flights": flights}))
     assert [data.settings.flight.name for data in found.flights] == ["first"]
     assert not any(found.scores.values())
-    assert "nobody_knows_me holds the same log as first (SHA-256 " in found.warnings[0]
-    three = calibrate(write(folder / "three.yaml", {"calibration": "three", "flights": [*flights, "second.yaml"]}))
+    assert "nobody_knows_me holds the same log as first (SHA-256 " in said[0]
+    three, _ = calibrated(write(folder / "three.yaml", {"calibration": "three", "flights": [*flights, "second.yaml"]}))
     assert {score.flight for score in three.scores["flight_left_out"]} == {"first", "second"}
 
 

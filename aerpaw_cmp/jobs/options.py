@@ -1,0 +1,61 @@
+"""What every job is told besides its own settings, and what every job gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..common.stages import Progress, silent
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOptions:
+    """Where results go and logs lie, what may be replaced, who computes, who is told.
+
+    Parameters
+    ----------
+    out : Path, optional
+        Results; each job has a default.
+    logs_root : Path, optional
+        Folder against which the paths of logs resolve.
+    force : bool
+        Replace also what this tool did not write, or what was changed since; never an input.
+    workers : int
+        Of this machine; 1 computes in this process.
+    scheduler : str, optional
+        Address of a Dask scheduler, in place of workers here.
+    progress : Progress
+        Gets stages and the share done.
+    """
+
+    out: Path | None = None
+    logs_root: Path | None = None
+    force: bool = False
+    workers: int = 1
+    scheduler: str | None = None
+    progress: Progress = silent
+
+
+DEFAULT = RunOptions()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobOutcome:
+    """What a job made.
+
+    Parameters
+    ----------
+    folder : Path
+    metrics : dict
+        Its metrics.json.
+    files : tuple of Path
+        What was written, the page first.
+    failed_checks : tuple of str
+        Stated checks that did not hold.
+    """
+
+    folder: Path
+    metrics: dict[str, Any]
+    files: tuple[Path, ...] = ()
+    failed_checks: tuple[str, ...] = ()

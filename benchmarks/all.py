@@ -39,12 +39,11 @@ found = {
     "path search, image engine / PathSolver with 1e5 samples": search["at"]["1e+05"]["ratio"],
     "ingest / pandas (C engine), 1 000 000 lines": p.ingest_vs_pandas(1_000_000, 1)["ratio"],
 }
-kriging, pairs = p.kriging_shared_weights(), p.kriging_vs_pykrige(60)
-if kriging is not None and pairs is not None:
+kriging = p.kriging_shared_weights()
+if kriging is not None:
     found |= {
         "Kriging / PyKrige's C back end, one field": kriging["ratio_one_field"],
         "Kriging / PyKrige's C back end, 27 fields": kriging["ratio"],
-        "Kriging, leave one out / PyKrige": pairs["ratio"],
     }
 print(json.dumps(found))
 """

@@ -166,7 +166,7 @@ def rank_result(tower: str, time: Any, position_m: FloatArray, measured: FloatAr
         n_flagged={}, kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
         commonest=commonest_rank(measured), repeat={},
     )  # fmt: skip
-    given: dict[str, Any] = {"sinr_db": None, "level_dbm": np.full(len(time), -80.25), "foliage_rank": {}}
+    given: dict[str, Any] = {"sinr_db": None, "level_dbm": np.full(len(time), -80.25)}
     return RankResult(
         tower=tower, n_samples=len(time), time=time, position_m=position_m, measured=measured, sigma=singular_values(h),
         rank={k: channel_rank(h, k) for k in score.simulated}, score=score, further=further, **(given | more),

@@ -94,23 +94,16 @@ def test_site_import_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 def test_site_show_takes_the_flights_own_site(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flight = ["--flight", SAMPLE / "flight.yaml"]
-    page = out_of(capsys, "site", "show", "-o", tmp_path / "own", *flight, "--pose", "60").split("\n")[0]
+    page = out_of(capsys, "site", "show", "-o", tmp_path / "own", *flight).split("\n")[0]
     scene = json.loads(Path(page).read_text().split('id="scene">')[1].split("</script>")[0])
     assert len(scene["flight"]) > 50
-    tower = {t["name"]: [*t["at"][:2], t["top"]] for t in scene["towers"]}
-    assert len(scene["paths"]) >= 2 * len(tower), "line of sight and ground reflection of each tower"
-    ends = {tuple(path["points"][-1]) for path in scene["paths"]}
-    assert len(ends) == 1, "all paths end at the pose"
-    for path in scene["paths"]:
-        assert path["points"][0] == pytest.approx(tower[path["label"].split(",")[0]], abs=0.1)
+    tower = [t["name"] for t in scene["towers"]]
     other = tmp_path / "other.yaml"
     towers = "".join(
         f"  {n}: {{latitude_deg: {35.7275 + 0.001 * i}, longitude_deg: -78.696}}\n" for i, n in enumerate(tower)
     )
     other.write_text(f"name: Other\norigin: {{latitude_deg: 35.7275, longitude_deg: -78.696}}\ntowers:\n{towers}")
     assert "Other_plan.png" in out_of(capsys, "site", "show", other, "-o", tmp_path / "other", *flight)
-    assert main(["site", "show", "--pose", "3", "-o", str(tmp_path)]) == 2
-    assert "--flight" in capsys.readouterr().err
 
 
 def polygon(ring: list[list[float]]) -> dict[str, object]:

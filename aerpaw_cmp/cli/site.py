@@ -69,17 +69,10 @@ def site_import(
 
     files = files or []
     if len(files) == 1 and site_scene.is_scene(files[0]):
-        actions = site_scene.run_scene_import(
-            files[0],
-            out,
-            origin=origin,
-            base=base,
-            towers=tower or (),
-            materials=material or (),
-            turn_deg=turn,
-            merge_m=merge_m,
-            force=force,
+        asked = site_scene.SceneOptions(
+            origin=origin, base=base, towers=tower or (), materials=material or (), turn_deg=turn, merge_m=merge_m
         )
+        actions = site_scene.run_scene_import(files[0], out, asked, force=force)
     else:
         base = base or "lake_wheeler"
         actions = run.run_site_import(
@@ -120,7 +113,7 @@ def site_export(
     examples=[
         "aerpaw-cmp site show",
         "aerpaw-cmp site show site.yaml -o reports/site --export",
-        "aerpaw-cmp site show --flight sample_logs/flight.yaml --pose 60",
+        "aerpaw-cmp site show --flight sample_logs/flight.yaml",
     ],
 )
 def site_show(
@@ -133,7 +126,6 @@ def site_show(
     ] = None,
     flight: Annotated[Optional[Path], typer.Option(help="Draw the track of this flight.yaml.")] = None,  # noqa: UP045
     logs_root: LogsRoot = None,
-    pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045
     export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
     force: Force = False,
     as_json: Json = False,
@@ -141,7 +133,7 @@ def site_show(
     """Look at a site."""
     from ..jobs import run
 
-    shown = run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export, force=force)
+    shown = run.run_site_show(site, out, flight=flight, logs_root=logs_root, export=export, force=force)
     if not as_json and flight is None:
         from ..site.learned import memory_lines
 

@@ -103,27 +103,6 @@ class SnrScore:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FoliageLoss:
-    """What trees take from the level per pose [dB]; ``n_blocked`` poses have a path without trees only."""
-
-    n: int
-    n_blocked: int
-    mean_loss_db: float
-    largest_loss_db: float
-    share_above_1_db: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FoliageRankChange:
-    """Poses at which trees change the rank."""
-
-    share_changed: float
-    mean_change: float
-    n_lower: int
-    n_higher: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RssFurther:
     """Numbers of a tower and channel beside offset, RMSE and correlation, as metrics.json names them.
 
@@ -156,7 +135,6 @@ class RssFurther:
     snr: SnrScore | None = None
     """Of a ratio to the noise whose receiver's bandwidth is given."""
     repeatability: Mapping[str, Repeated]
-    foliage: Mapping[str, FoliageLoss] | None = None
     explained_by: Mapping[str, float]
     likely_cause: Cause | None = None
     """Of the error, where one is shown."""
@@ -291,7 +269,6 @@ class RankFurther:
     receiver: ForecastScore | None = None
     trained_on: tuple[str, ...] | None = None
     """SHA-256 of the logs of these reports that the receiver was fitted on: then it has no score."""
-    foliage: Mapping[str, Mapping[str, FoliageRankChange]] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -316,8 +293,6 @@ class RankResult:
         Of rank 1 to 4, by the fitted receiver that ``rank.receiver`` names.
     rank : mapping of float to (n,) int
         Simulated, per K; 0: no path.
-    foliage_rank : mapping of str to mapping of float to (n,) int
-        The same without trees, in leaf and out of leaf; empty without a paired run.
     score : RankComparison
     further : RankFurther
     """
@@ -331,7 +306,6 @@ class RankResult:
     sigma: FloatArray
     level_dbm: FloatArray
     rank: Mapping[float, IntArray]
-    foliage_rank: Mapping[str, Mapping[float, IntArray]]
     score: RankComparison
     further: RankFurther
     probability: FloatArray | None = None

@@ -409,8 +409,6 @@ class AdvancedRt(Settings):
     gamma_db_per_m: Positive | None = None
     maximum_loss_db: Positive | None = None
     """Replace P.833's specific attenuation and largest loss at the carrier."""
-    paired_foliage: bool = False
-    """Also replay without trees and out of leaf, and report the differences."""
     relevance_db: Positive | None = None
     power_cut_db: Positive | None = None
     """Leave out reflections that their length alone puts this far below free space over their link."""
@@ -428,7 +426,7 @@ class AdvancedRt(Settings):
 class RtSettings(GroupedSettings):
     """How the flight is replayed."""
 
-    WITHOUT_EFFECT = ("batch", "interactions", "scattering_coefficient")
+    WITHOUT_EFFECT = ("batch", "interactions", "paired_foliage", "scattering_coefficient")
 
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2

@@ -7,6 +7,7 @@ Taken from this package are the settings and, per sample, which paths there are:
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import hashlib
 import math
@@ -24,6 +25,7 @@ from ..compare.result import APPLIED, GIVEN, RssResult
 from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.replay import Replayed, attitude_rotation
 from ..flight.settings import LogSettings
+from ..logs.ingest import IngestedFile
 from ..propagation.check.field_audit import Expected
 from ..propagation.check.raw import LOWEST_M, Log, Matrix, Pose, RawPath, Reading, east_north_m, level, read_log
 from ..propagation.check.reference import Mirror, Reference
@@ -138,23 +140,23 @@ def raw_checked(
 
 def _logs(data: FlightData, account: _Account) -> list[Log | None]:
     """Each log of the flight, read a second time; None with a word where it cannot be."""
-    out: list[Log | None] = []
-    for settings, file in zip(data.settings.logs, data.files, strict=True):
-        log, zone = None, "UTC" if settings.clock == "utc" else settings.timezone or data.settings.timezone
-        content = _content(data.folder / settings.path, file.sha256)
-        if content is None:
-            account.leave(f"{settings.path} (packed, larger than 32 MiB, or read in pieces)")
-        elif zone is None or settings.clock == "local_as_utc" or settings.time_origin or settings.columns:
-            account.leave(f"{settings.path} (the flight file states its times or columns)")
-        else:
-            try:
-                log = read_log(content, zone)
-            except (ValueError, KeyError, IndexError, NotImplementedError):
-                log = None
-            if log is None:
-                account.leave(f"{settings.path} (a format that the second way does not know)")
-        out.append(log)
-    return out
+    return [_log(data, *pair, account) for pair in zip(data.settings.logs, data.files, strict=True)]
+
+
+def _log(data: FlightData, settings: LogSettings, file: IngestedFile, account: _Account) -> Log | None:
+    zone = "UTC" if settings.clock == "utc" else settings.timezone or data.settings.timezone
+    content = _content(data.folder / settings.path, file.sha256)
+    if content is None:
+        account.leave(f"{settings.path} (packed, larger than 32 MiB, or read in pieces)")
+        return None
+    if zone is None or settings.clock == "local_as_utc" or settings.time_origin or settings.columns:
+        account.leave(f"{settings.path} (the flight file states its times or columns)")
+        return None
+    with contextlib.suppress(ValueError, KeyError, IndexError, NotImplementedError):
+        if (log := read_log(content, zone)) is not None:
+            return log
+    account.leave(f"{settings.path} (a format that the second way does not know)")
+    return None
 
 
 def _content(path: Path, sha256: str) -> bytes | None:

@@ -181,9 +181,13 @@ class Bench:
     def _loaded(self) -> dict[str, Any]:
         return {}
 
+    def logs_of(self, flight: str) -> list[str]:
+        """Names of a flight's files."""
+        return [log["path"] for log in self.manifest.flights[flight]["logs"]]
+
     def missing(self, flight: str) -> list[str]:
         """Files of a flight that are not at hand."""
-        return [log["path"] for log in self.manifest.flights[flight]["logs"] if log["path"] not in self.places]
+        return [name for name in self.logs_of(flight) if name not in self.places]
 
     def data(self, flight: str) -> FlightData:
         """A flight, read once."""
@@ -436,19 +440,16 @@ def read_entry(path: Path) -> Entry:
 def check_training(bench: Bench, entry: Entry, tasks: Sequence[str]) -> None:
     """UsageError where the entrant declares a test file among what it was trained on."""
     declared = set(entry.head.get("trained_on", "").replace(",", " ").split())
-    for task in tasks:
-        one = bench.manifest.tasks[task]
-        if not one.own_offset:
-            continue
-        for flight in one.test:
-            for log in bench.manifest.flights[flight]["logs"]:
-                file = bench.manifest.files[log["path"]]
-                if declared & {file.sha256, *file.also}:
-                    raise UsageError(
-                        f"trained on {flight}, a test flight of {task}",
-                        expected="predictions of a model that never saw the test flights",
-                        cause="'# trained_on:' at the top of the file names its SHA-256",
-                    )
+    held = [(task, flight) for task in tasks for flight in bench.manifest.tasks[task].test]
+    for task, flight in held if declared else ():
+        files = [bench.manifest.files[name] for name in bench.logs_of(flight)]
+        known = declared & {digest for file in files for digest in (file.sha256, *file.also)}
+        if known and bench.manifest.tasks[task].own_offset:
+            raise UsageError(
+                f"trained on {flight}, a test flight of {task}",
+                expected="predictions of a model that never saw the test flights",
+                cause="'# trained_on:' at the top of the file names its SHA-256",
+            )
 
 
 def score_task(
@@ -584,7 +585,7 @@ def leaderboard_row(bench: Bench, entry: Entry, scores: Mapping[str, Any], versi
     -------
     dict
     """
-    used = sorted({f for task in scores for flight in bench.tests(task) for f in _files_of(bench, flight)})
+    used = sorted({f for task in scores for flight in bench.tests(task) for f in bench.logs_of(flight)})
     return {
         "entrant": entry.head.get("entrant", "unnamed"),
         "who": entry.head.get("who", ""),
@@ -595,10 +596,6 @@ def leaderboard_row(bench: Bench, entry: Entry, scores: Mapping[str, Any], versi
         "test_files_sha256": {name: bench.manifest.files[name].sha256 for name in used},
         "scores": {task: {k: _plain(v) for k, v in one.items()} for task, one in scores.items()},
     }
-
-
-def _files_of(bench: Bench, flight: str) -> list[str]:
-    return [log["path"] for log in bench.manifest.flights[flight]["logs"]]
 
 
 def _plain(value: Any) -> Any:

@@ -72,19 +72,17 @@ def repeat_of(bench: Bench, task: str) -> Repeat:
     flights = [f for f in dict.fromkeys((*one.test, *one.train)) if not bench.missing(f)]
     visits = [visit for flight in flights for visit in _visits(bench, flight, rank=rank)]
     pairs, repeated, samples = [np.empty((0, 2))], 0, 0
-    for asked in visits:
-        if asked.flight not in one.test:
-            continue
+    for asked in [visit for visit in visits if visit.flight in one.test]:
+        others = [known for known in visits if known.series == asked.series]
         again = np.zeros(len(asked.value), dtype=np.bool_)
-        for known in visits:
-            if known.series == asked.series and np.linalg.norm(known.tower_m - asked.tower_m) <= WITHIN_M:
-                other = _other_visit(asked, known)
-                met = np.isfinite(other)
-                both = np.column_stack([asked.value, other])[met]
-                if not rank and known.flight != asked.flight and len(both):
-                    both[:, 1] += float(np.mean(both[:, 0] - both[:, 1]))  # gains of two flights are not the same
-                pairs.append(both)
-                again |= met
+        for known in [v for v in others if np.linalg.norm(v.tower_m - asked.tower_m) <= WITHIN_M]:
+            other = _other_visit(asked, known)
+            met = np.isfinite(other)
+            both = np.column_stack([asked.value, other])[met]
+            if not rank and known.flight != asked.flight and len(both):
+                both[:, 1] += float(np.mean(both[:, 0] - both[:, 1]))  # gains of two flights are not the same
+            pairs.append(both)
+            again |= met
         repeated, samples = repeated + int(again.sum()), samples + len(again)
     values = np.concatenate(pairs)
     if not len(values):

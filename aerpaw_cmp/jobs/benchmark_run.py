@@ -104,27 +104,23 @@ def run_benchmark(
     wanted = chosen_tasks(bench.manifest, tasks)
     skipped = {task: lack for task in wanted if (lack := bench.skipped(task, training=True))}
     with OutputFolder(out, job="benchmark", inputs=list(bench.places.values()), force=force) as output:
-        scores: Scores = {}
         cost: dict[tuple[str, str], dict[str, float]] = {}
         written: dict[str, list[Any]] = {name: [] for name in names}
-        for task in wanted:
-            if not bench.tests(task) or any(bench.missing(f) for f in bench.manifest.tasks[task].train):
-                continue
-            for name in names:
-                progress(f"{task}: {name}")
-                started = _started()
-                frame = _predicted(bench, task, name)
-                cost[task, name] = {"seconds": time.process_time() - started, "peak_mib": _peak_mib()}
-                if frame is not None:
-                    written[name].append(frame)
+        runnable = [t for t in wanted if t not in skipped and bench.tests(t)]
+        for task, name in ((task, name) for task in runnable for name in names):
+            progress(f"{task}: {name}")
+            started = _started()
+            frame = _predicted(bench, task, name)
+            cost[task, name] = {"seconds": time.process_time() - started, "peak_mib": _peak_mib()}
+            if frame is not None:
+                written[name].append(frame)
         with output.filling() as folder:
             (folder / "predictions").mkdir()
             entries = {}
-            for name, frames in written.items():
-                if frames:
-                    path = folder / "predictions" / f"{name}.csv"
-                    path.write_text(_entry_text(name, frames), encoding="utf-8")
-                    entries[name] = read_entry(path)
+            for name in [name for name in names if written[name]]:
+                path = folder / "predictions" / f"{name}.csv"
+                path.write_text(_entry_text(name, written[name]), encoding="utf-8")
+                entries[name] = read_entry(path)
             scores = _score_all(bench, entries, cost)
             rows = [leaderboard_row(bench, e, _of(scores, n), __version__) for n, e in entries.items()]
             (folder / "leaderboard.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")

@@ -263,26 +263,12 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
     observed: list[Observed] = []
     warnings: list[str] = []
     carriers: dict[str, dict[str, float]] = {}
-    for data in flights:
-        name = data.settings.flight.name
-        has_level = any(s.channel.lower() not in RATIOS for s in data.rss)
-        for series in data.rss:
-            if series.channel.lower() == SNR and not has_level:
-                warnings.append(f"{name}: {series.tower} {SNR} stands for a level: the noise is taken as constant")
-            elif series.channel.lower() in RATIOS:
-                warnings.append(f"{name}: {series.channel} is a ratio, no level: left out")
-                continue
-            one, guessed = _observe(data, series)
-            if not np.isfinite(one.samples.residual_db).any():
-                warnings.append(f"{name}: {series.tower} {series.channel} has no level at a known pose and is left out")
-                continue
-            if guessed > 0.01:
-                warnings.append(
-                    f"{name}: {100 * guessed:.0f} % of the attitudes at {series.tower} {series.channel} are unknown: "
-                    "heading from the track, level flight"
-                )
-            carriers.setdefault(one.samples.antenna, {})[name] = series.link.carrier_hz
-            observed.append(one)
+    for data, series in [(flight, one) for flight in flights for one in flight.rss]:
+        seen, said = _observed_level(data, series)
+        warnings += said
+        if seen is not None:
+            carriers.setdefault(seen.samples.antenna, {})[data.settings.flight.name] = series.link.carrier_hz
+            observed.append(seen)
     if not observed:
         raise InputError("none of the flights has RSS at known poses", expected="RSS logs with telemetry")
     for antenna, per_flight in carriers.items():
@@ -305,6 +291,24 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
     elif lonely:
         warnings.append(f"only one flight has {', '.join(lonely)}: learned, but not scored")
     return observed, warnings
+
+
+def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | None, list[str]]:
+    """One series of levels at known poses; None for ratios and without any, and what is to be said of it."""
+    name, said = f"{data.settings.flight.name}: {series.tower} {series.channel}", []
+    if series.channel.lower() in RATIOS:
+        if series.channel.lower() != SNR or any(s.channel.lower() not in RATIOS for s in data.rss):
+            return None, [f"{data.settings.flight.name}: {series.channel} is a ratio, no level: left out"]
+        said.append(
+            f"{data.settings.flight.name}: {series.tower} {SNR} stands for a level: the noise is taken as constant"
+        )
+    one, guessed = _observe(data, series)
+    if not np.isfinite(one.samples.residual_db).any():
+        return None, [*said, f"{name} has no level at a known pose and is left out"]
+    if guessed > 0.01:
+        share = f"{100 * guessed:.0f} % of the attitudes at {series.tower} {series.channel} are unknown"
+        said.append(f"{data.settings.flight.name}: {share}: heading from the track, level flight")
+    return one, said
 
 
 def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:

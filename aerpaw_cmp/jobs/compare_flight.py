@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -55,14 +56,8 @@ from .levels import Levels, at_samples, levels_of, stated_spread
 from .likely_cause import cause_of
 from .what_if import (
     expected_offset,
-    foliage_rank_difference,
-    foliage_ranks,
-    foliage_rss_difference,
     rss_alternatives,
 )
-
-FOLIAGE_RUNS = ("without trees", "trees in leaf", "trees out of leaf")
-"""Runs of ``rt.advanced.paired_foliage``; each is a column of rss.csv and, per K, of rank.csv."""
 
 AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
 """Both sides are averaged over these windows to see how much of the error is fading."""
@@ -125,22 +120,38 @@ def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> Ser
 # --- RSS -----------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Case:
+    """One tower and channel with what every number of it is computed from.
+
+    ``simple`` are the baselines at the samples, ``alternatives`` the same paths under other assumptions; ``trained``
+    names logs of this flight that its antennas were learned from: then nothing is scored.
+    """
+
+    data: FlightData
+    series: RssSeries
+    replayed: Replayed
+    levels: Levels
+    position_m: FloatArray
+    geometry: Mapping[str, FloatArray]
+    simple: Mapping[str, FloatArray]
+    alternatives: Mapping[str, FloatArray]
+    trained: tuple[str, ...]
+
+    @property
+    def settings(self) -> RssSettings:
+        return self.data.settings.rss
+
+
 def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> RssResult:
     """Offset, RMSE, correlation, intervals, baselines and alternatives of one tower and channel."""
-    settings, clock = data.settings.rss, replayed.clock
-    levels = levels_of(series, replayed, settings)
-    geometry = link_geometry(data.site, series.tower, replayed, data.settings.rt)
-    simple = {
-        name: at_samples(series, replayed, level, settings)
-        for name, level in baseline_levels(data.site, series.tower, replayed).items()
-    }
-    position = _positions(replayed)
-    simple |= _fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
+    settings, case = data.settings.rss, _case(data, series, replayed)
+    levels, clock = case.levels, replayed.clock
     score = rss.compare_rss(
         series.time,
         levels.measured_db,
         levels.simulated_db,
-        baselines=simple,
+        baselines=case.simple,
         posed=levels.posed,
         step_db=settings.advanced.step_db,
         span_db=settings.span_db,
@@ -149,27 +160,17 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         also = ("lag_s",) if clock.result.applied == APPLIED else ()
         lag_s = clock.result.radio_minus_telemetry_s
         score = dataclasses.replace(score, lag_s=lag_s, fitted_on_scored=(*score.fitted_on_scored, *also))
-    wild = rss.outliers(levels.measured_db)
-    without = score.rmse_db
-    if wild.any():
-        kept = np.where(wild, np.nan, levels.measured_db)
-        rest = offsets.grid_offset(
-            kept, levels.simulated_db, step_db=settings.advanced.step_db, span_db=settings.span_db
-        )
-        without = rest.rmse_db
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
-    other = rss_alternatives(data.site, data.settings.rt, replayed, settings.field)
-    alternatives = {name: at_samples(series, replayed, level, settings) for name, level in other.items()}
-    stated = stated_spread(replayed, settings.window_s)
-    passes = _halves(series.time, position, levels.measured_db, geometry.get("heading_deg"))
-    quantities = {**geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
+    quantities = {**case.geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
     residual_by = {name: rss.bin_residual(score.residual_db, values) for name, values in quantities.items()}
     curve_offset_db, curve_rmse_db = offsets.offset_curve(
         levels.measured_db, levels.simulated_db, step_db=settings.advanced.step_db, span_db=settings.span_db
     )
-    if trained := learned_here(data, series, replayed.link):
-        score, alternatives, residual_by = rss.without_errors(score), {}, {}
+    spans = _worst(series.time, score.residual_db, case.position_m, case.geometry, direct)
+    if case.trained:
+        score, residual_by, spans = rss.without_errors(score), {}, []
         curve_offset_db = curve_rmse_db = np.zeros(0)
+    stated = stated_spread(replayed, settings.window_s)
     return RssResult(
         tower=series.tower,
         channel=series.channel,
@@ -178,47 +179,111 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         measured_db=levels.measured_db,
         simulated_dbm=np.where(levels.posed, levels.simulated_db, np.nan),
         posed=levels.posed,
-        position_m=position,
+        position_m=case.position_m,
         tower_m=tower_places(replayed),
         line_of_sight=direct,
-        geometry=geometry,
+        geometry=case.geometry,
         score=score,
-        baselines=_baselines(simple, score),
-        variants=_variants(settings, levels, alternatives),
+        baselines=_baselines(case.simple, score),
+        variants=_variants(settings, levels, case.alternatives),
         curve_offset_db=curve_offset_db,
         curve_rmse_db=curve_rmse_db,
-        spans=() if trained else tuple(_worst(series.time, score.residual_db, position, geometry, direct)),
+        spans=tuple(spans),
         residual_by=residual_by,
-        further=RssFurther(
-            n_measured_out=score.n_measured_out,
-            n_simulated_out=score.n_simulated_out,
-            block_length=score.intervals.autocorrelation.block_length,
-            identifiable_db=score.identifiable_db,
-            trimmed=Fit(offset_db=score.trimmed.offset_db, rmse_db=score.trimmed.rmse_db, n=score.trimmed.n),
-            n_too_low=int((replayed.valid & ~levels.posed).sum()),
-            n_no_pose=int((~replayed.valid).sum()),
-            n_outliers=int(wild.sum()),
-            rmse_without_outliers_db=without,
-            n_flagged=dict(series.flagged),
-            clock=None if clock is None else clock.result,
-            baseline_rmse_ci95_db=score.baseline_intervals,
-            compared_with={} if trained else _paired(levels, {**simple, **alternatives}),
-            averaged={} if trained else _averaged(series, replayed, levels, position, settings),
-            censored=None if trained else _censored(settings, levels),
-            detection=None if trained else _detection(data, series, levels, simple["free_space"]),
-            snr=None if trained else _snr(series, levels),
-            expected_offset=_expected(settings.reference_powers, data.folder, series, score.offset_db),
-            repeatability={name: repeatability(*pair, PASSES_WITHIN_M) for name, pair in passes.items()},
-            foliage=foliage_rss_difference(alternatives) or None,
-            explained_by={name: table.explained for name, table in residual_by.items()},
-            likely_cause=None if trained else _cause(data.site, series, replayed, levels, simple["free_space"]),
-            simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
-            error_bars=None if stated is None else _error_bars(stated, None if trained else score.residual_db),
-            elsewhere=_elsewhere(data, series),
-            trained_on=trained or None,
-        ),
+        further=_further(case, score, stated, {name: table.explained for name, table in residual_by.items()}),
         stated=stated,
     )
+
+
+def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
+    settings, trained = data.settings.rss, learned_here(data, series, replayed.link)
+    levels = levels_of(series, replayed, settings)
+    geometry = link_geometry(data.site, series.tower, replayed, data.settings.rt)
+    simple = {
+        name: at_samples(series, replayed, level, settings)
+        for name, level in baseline_levels(data.site, series.tower, replayed).items()
+    }
+    position = _positions(replayed)
+    simple |= _fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
+    other = {} if trained else rss_alternatives(data.site, data.settings.rt, replayed, settings.field)
+    return _Case(
+        data=data,
+        series=series,
+        replayed=replayed,
+        levels=levels,
+        position_m=position,
+        geometry=geometry,
+        simple=simple,
+        alternatives={name: at_samples(series, replayed, level, settings) for name, level in other.items()},
+        trained=trained,
+    )
+
+
+def _further(
+    case: _Case, score: rss.RssComparison, stated: StatedSpread | None, explained_by: Mapping[str, float]
+) -> RssFurther:
+    """Counts, conditions and, where it may be scored, further views of the error.
+
+    Parameters
+    ----------
+    case : _Case
+    score : RssComparison
+    stated : StatedSpread, optional
+        Error bars that learned antennas state.
+    explained_by : mapping of str to float
+        Share of the residual's variance by quantity.
+
+    Returns
+    -------
+    RssFurther
+    """
+    settings, levels, series, replayed = case.settings, case.levels, case.series, case.replayed
+    wild = rss.outliers(levels.measured_db)
+    passes = _halves(series.time, case.position_m, levels.measured_db, case.geometry.get("heading_deg"))
+    further = RssFurther(
+        n_measured_out=score.n_measured_out,
+        n_simulated_out=score.n_simulated_out,
+        block_length=score.intervals.autocorrelation.block_length,
+        identifiable_db=score.identifiable_db,
+        trimmed=Fit(offset_db=score.trimmed.offset_db, rmse_db=score.trimmed.rmse_db, n=score.trimmed.n),
+        n_too_low=int((replayed.valid & ~levels.posed).sum()),
+        n_no_pose=int((~replayed.valid).sum()),
+        n_outliers=int(wild.sum()),
+        rmse_without_outliers_db=_rmse_without(wild, settings, levels, score),
+        n_flagged=dict(series.flagged),
+        clock=None if replayed.clock is None else replayed.clock.result,
+        baseline_rmse_ci95_db=score.baseline_intervals,
+        compared_with={},
+        averaged={},
+        explained_by=explained_by,
+        expected_offset=_expected(settings.reference_powers, case.data.folder, series, score.offset_db),
+        repeatability={name: repeatability(*pair, PASSES_WITHIN_M) for name, pair in passes.items()},
+        simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
+        error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
+        elsewhere=_elsewhere(case.data, series),
+        trained_on=case.trained or None,
+    )
+    if case.trained:
+        return further
+    return dataclasses.replace(
+        further,
+        compared_with=_paired(levels, {**case.simple, **case.alternatives}),
+        averaged=_averaged(series, replayed, levels, case.position_m, settings),
+        censored=_censored(settings, levels),
+        detection=_detection(case.data, series, levels, case.simple["free_space"]),
+        snr=_snr(series, levels),
+        likely_cause=_cause(case.data.site, series, replayed, levels, case.simple["free_space"]),
+    )
+
+
+def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score: rss.RssComparison) -> float:
+    """RMSE after an own offset where some samples do not count."""
+    if not wild.any():
+        return score.rmse_db
+    kept = np.where(wild, np.nan, levels.measured_db)
+    return offsets.grid_offset(
+        kept, levels.simulated_db, step_db=settings.advanced.step_db, span_db=settings.span_db
+    ).rmse_db
 
 
 def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
@@ -570,9 +635,9 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         sinr_db=sinr_db,
         replicates=max(settings.advanced.bootstrap, 1),
     )
-    paired = foliage_ranks(data.site, data.settings.rt, replayed, kept, settings.k)
     sigma, towers = ranks.singular_values(h), tower_places(replayed)
     probability, forecast, trained = _receiver_forecast(data, series)
+    heading = None if replayed.track is None else replayed.spread(replayed.track.heading_deg)[rows]
     return RankResult(
         tower=series.tower,
         n_samples=len(series.rank),
@@ -584,16 +649,14 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         sigma=sigma,
         level_dbm=replayed.replay.rss_dbm[kept, 0],
         rank={k: ranks.rank_from_singular_values(sigma, k) for k in score.simulated},
-        foliage_rank=paired,
         score=score,
         further=RankFurther(
             n_flagged=dict(series.flagged),
             kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
             commonest=ranks.commonest_rank(series.rank[rows]),
-            repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], replayed, rows),
+            repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], heading),
             receiver=forecast,
             trained_on=trained or None,
-            foliage=foliage_rank_difference(paired) or None,
         ),
         probability=probability,
     )
@@ -623,9 +686,8 @@ def _receiver_forecast(
 
 
 def _repeated_rank(
-    time: Any, position_m: FloatArray, rank: FloatArray, replayed: Replayed, rows: IntArray
+    time: Any, position_m: FloatArray, rank: FloatArray, heading_deg: FloatArray | None
 ) -> dict[str, ranks.RankRepeat]:
     """How well the modem agrees with itself where the second half of the flight passes places of the first."""
-    heading = None if replayed.track is None else replayed.spread(replayed.track.heading_deg)[rows]
-    passes = _halves(time, position_m, rank, heading)
+    passes = _halves(time, position_m, rank, heading_deg)
     return {name: ranks.repeat_rank(*pair, PASSES_WITHIN_M) for name, pair in passes.items()}

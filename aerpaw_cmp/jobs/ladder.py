@@ -38,6 +38,7 @@ from ..site.installed import InstalledPattern
 from ..site.site import Site
 from ..site.sphere_pattern import SpherePattern
 from .levels import Levels, levels_of
+from .what_if import with_patterns, without_added_gain
 
 WEAK_GROUND_DB = 10.0
 """Loss of the weakened ground reflection: a smooth half-space reflects more than any field."""
@@ -365,17 +366,9 @@ def _arrays(link: Link) -> list[Any]:
 
 
 def _link(link: Link, antennas: Antennas) -> Link:
-    def pattern(p: Any) -> Any:
-        if antennas == "isotropic":
-            return Isotropic()
-        return p.base if antennas == "measured" and isinstance(p, InstalledPattern) else p
-
-    def other(array: Any) -> Any:
-        return dataclasses.replace(array, patterns=tuple(pattern(p) for p in array.patterns))
-
-    return dataclasses.replace(
-        link, tower_arrays={name: other(a) for name, a in link.tower_arrays.items()}, uav_array=other(link.uav_array)
-    )
+    if antennas == "isotropic":
+        return with_patterns(link, lambda _: Isotropic())
+    return with_patterns(link, without_added_gain) if antennas == "measured" else link
 
 
 def recommended_settings(

@@ -418,20 +418,22 @@ def _curve(
 ) -> list[CurvePoint]:
     """What shorter and longer flights of the best candidates leave; of files, shorter ones."""
     out: list[CurvePoint] = []
+    best = [r for r in ranked if not r.refused][:CURVE_OF]
     for share in SHARES:
         tried = []
-        for one in [r for r in ranked if not r.refused][:CURVE_OF]:
-            if one.pattern is not None:
-                route = route_of(one.pattern, area, asked.speed_mps, 60.0 * share * asked.minutes)
-            elif share <= 1.0:
-                whole = flown(one.route.name, one.route.waypoints, asked.speed_mps)
-                route = cut(whole, share * whole.duration_s, asked.speed_mps)
-            else:
-                continue
-            route = _raised(route, site)
-            sd = leaves_db(route)
-            tried.append(CurvePoint(minutes=route.duration_s / 60.0, length_m=route.length_m, sd_db=sd))
+        for route in filter(None, (_of_length(one, share, area, asked) for one in best)):
+            raised = _raised(route, site)
+            sd = leaves_db(raised)
+            tried.append(CurvePoint(minutes=raised.duration_s / 60.0, length_m=raised.length_m, sd_db=sd))
         for point in sorted(tried, key=lambda point: point.sd_db)[:1]:
             least = min([point.sd_db, *(p.sd_db for p in out)])  # a longer flight may hold the shorter one
             out.append(replace(point, sd_db=least))
     return out
+
+
+def _of_length(one: Ranked, share: float, area: Any, asked: PlanAsked) -> Route | None:
+    """A candidate that takes this share of the battery; None of a file for more than it has."""
+    if one.pattern is not None:
+        return route_of(one.pattern, area, asked.speed_mps, 60.0 * share * asked.minutes)
+    whole = flown(one.route.name, one.route.waypoints, asked.speed_mps)
+    return cut(whole, share * whole.duration_s, asked.speed_mps) if share <= 1.0 else None

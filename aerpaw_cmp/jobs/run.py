@@ -15,9 +15,6 @@ from ..common.errors import AerpawCmpError, InputError, UsageError, noting_inter
 from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import Progress, Stages, silent
-from ..flight.settings import RtSettings
-from ..propagation.options import Search
-from ..site.site import Site
 from .options import DEFAULT, JobOutcome, RunOptions
 
 _KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
@@ -439,11 +436,10 @@ def run_site_show(
     *,
     flight: Path | None = None,
     logs_root: Path | None = None,
-    pose: int | None = None,
     export: bool = False,
     force: bool = False,
 ) -> list[Path]:
-    """Plan view and a page of the scene in 3-D; with a flight its track, with a pose its paths.
+    """Plan view and a page of the scene in 3-D; with a flight its track.
 
     Without a site the flight's own is shown; with neither, the packaged one.
 
@@ -457,8 +453,6 @@ def run_site_show(
         flight.yaml whose track is drawn.
     logs_root : Path, optional
         Folder against which its logs resolve.
-    pose : int, optional
-        Point of the track whose paths are drawn.
     export : bool
         Also the scene as PLY and Mitsuba XML.
     force : bool
@@ -468,17 +462,10 @@ def run_site_show(
     -------
     list of Path
         Files written.
-
-    Raises
-    ------
-    UsageError
-        A pose without a flight, or one that the track does not have.
     """
     from ..report.site_view import write_site_view
     from ..site.siteyaml import load_site
 
-    if pose is not None and flight is None:
-        raise UsageError(f"--pose {pose} without a flight", expected="--flight flight.yaml, whose track has the pose")
     settings, inputs = None, [Path(site)] if site is not None else []
     if flight is not None:
         from ..flight.settings import load_flight
@@ -488,7 +475,7 @@ def run_site_show(
             file = str(Path(site).resolve()) if Path(site).is_file() else site
             settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
         inputs += input_files(settings, flight, logs_root)
-    track, paths = None, ()
+    track = None
     if out is None:
         out = Path("reports") / f"site-{Path(site or (settings.site.file if settings else 'lake_wheeler')).stem}"
     with OutputFolder(out, job="site show", inputs=inputs, force=force) as output:
@@ -500,46 +487,13 @@ def run_site_show(
 
             data = load_data(settings, flight.parent, logs_root)
             place, track = data.site, track_of(data)
-            if pose is not None:
-                paths = _paths_of_pose(settings.rt, place, track, pose, settings.link.rss.carrier_hz)
         with output.filling() as folder:
-            written = write_site_view(place, folder, track=track, paths=paths)
+            written = write_site_view(place, folder, track=track)
             if export:
                 from ..site.export import export_scene
 
                 written += export_scene(place, folder / "scene")
     return [out / path.relative_to(folder) for path in written]
-
-
-def _paths_of_pose(rt: RtSettings, site: Site, track: Any, pose: int, carrier_hz: float) -> Any:
-    """Propagation paths of all towers to one point of the track, as polylines."""
-    import numpy as np
-
-    from ..flight.losses import path_loss, reflecting_crowns
-    from ..propagation.arrays import Link, Poses, single_element
-    from ..propagation.replay import replay
-    from ..report.site_view import PathLine
-
-    if track is None or not 0 <= pose < len(track.time):
-        raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
-    point = np.array([[track.east_m[pose], track.north_m[pose], track.up_m[pose]]])
-    # paths join the centres of the arrays: which elements they have does not matter
-    link = Link(carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
-    crowns, depth = reflecting_crowns(site.trees, rt), rt.max_depth
-    paths = replay(site, link, Poses(point, np.eye(3)[None]), Search(max_depth=depth, crowns=crowns)).paths
-    towers = list(site.towers)
-    loss = path_loss(site, rt, link.carrier_hz)
-    if rt.foliage == "opaque" and loss is not None:
-        sources = np.array([site.towers[name].position_m for name in towers])
-        paths = paths.select(np.isfinite(loss(paths, sources, point)))
-    lines = []
-    for index in range(len(paths)):
-        corners = paths.vertices_m[index][np.isfinite(paths.vertices_m[index]).all(axis=1)]
-        source = site.towers[towers[paths.tower[index]]].position_m
-        count, off = int(paths.depth[index]), ", one off a crown" if paths.off_crown[index] else ""
-        label = f"{towers[paths.tower[index]]}, {count} reflection{'' if count == 1 else 's'}{off}"
-        lines.append(PathLine(points_m=np.vstack([source, corners, point[0]]), label=label))
-    return tuple(lines)
 
 
 def run_map(

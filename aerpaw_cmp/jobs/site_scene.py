@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,26 +30,12 @@ def is_scene(path: Path) -> bool:
     return path.suffix.lower() == ".xml" and b"<scene" in head and b"<osm" not in head
 
 
-def run_scene_import(
-    path: Path,
-    out: Path,
-    *,
-    origin: str | None = None,
-    base: str | None = None,
-    towers: Sequence[str] = (),
-    materials: Sequence[str] = (),
-    turn_deg: float = 0.0,
-    merge_m: float = 1e-3,
-    force: bool = False,
-) -> list[str]:
-    """Write a site.yaml that names a Mitsuba scene; gives what was done.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneOptions:
+    """What a Mitsuba scene does not say of itself.
 
     Parameters
     ----------
-    path : Path
-        The XML file; it stays where it is.
-    out : Path
-        The site.yaml to write.
     origin : str, optional
         ``latitude,longitude[,ground height]`` of the scene's (0, 0, 0), or ``local``. Default: the origin of ``base``.
     base : str, optional
@@ -61,6 +48,26 @@ def run_scene_import(
         How far the scene is turned counter-clockwise from above: 0 where x is east and y north.
     merge_m : float
         How far from one plane the corners of a face may lie [m].
+    """
+
+    origin: str | None = None
+    base: str | None = None
+    towers: Sequence[str] = ()
+    materials: Sequence[str] = ()
+    turn_deg: float = 0.0
+    merge_m: float = 1e-3
+
+
+def run_scene_import(path: Path, out: Path, asked: SceneOptions, *, force: bool = False) -> list[str]:
+    """Write a site.yaml that names a Mitsuba scene; gives what was done.
+
+    Parameters
+    ----------
+    path : Path
+        The XML file; it stays where it is.
+    out : Path
+        The site.yaml to write.
+    asked : SceneOptions
     force : bool
         Replace a file that this tool did not write.
 
@@ -74,11 +81,11 @@ def run_scene_import(
     UsageError
         Where the scene lies, or where its towers stand, is not said.
     """
-    named = dict(_pair(text, "--material", "wall=concrete") for text in materials)
-    given = None if base is None else site_model(base)
-    start = _origin(origin, given)
+    named = dict(_pair(text, "--material", "wall=concrete") for text in asked.materials)
+    given = None if asked.base is None else site_model(asked.base)
+    start = _origin(asked.origin, given)
     with OutputFile(out, own=is_sealed, inputs=[path], force=force) as output:
-        scene = placed_scene(path, materials=named, turn_deg=turn_deg)
+        scene = placed_scene(path, materials=named, turn_deg=asked.turn_deg)
         actions = [_summary(scene), *scene.notes]
         share = ground_share(scene)
         ground_plane = share < GROUND_SHARE
@@ -96,15 +103,17 @@ def run_scene_import(
         content["scene"] = SceneModel(
             path=Path(os.path.relpath(path.resolve(), out.resolve().parent)).as_posix(),
             sha256=scene.sha256,
-            turn_deg=turn_deg,
+            turn_deg=asked.turn_deg,
             materials=named,
-            merge_m=merge_m,
+            merge_m=asked.merge_m,
             ground_plane=ground_plane,
         ).model_dump(mode="json", exclude_defaults=True)
-        if given is None or towers:
-            content["towers"] = _towers(towers, SiteFrame(start["latitude_deg"], start["longitude_deg"]), low, high)
+        if given is None or asked.towers:
+            content["towers"] = _towers(
+                asked.towers, SiteFrame(start["latitude_deg"], start["longitude_deg"]), low, high
+            )
         content.setdefault("area_m", [round(float(v), 2) for v in (low[0], high[0], low[1], high[1])])
-        if origin == "local":
+        if asked.origin == "local":
             content["notes"] = [*content.get("notes", []), LOCAL_NOTE]
             actions.append(LOCAL_NOTE)
         model = SiteModel.model_validate(content)

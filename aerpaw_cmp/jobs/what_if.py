@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from ..common.units import ComplexArray, FloatArray, IntArray
+from ..common.units import FloatArray
 from ..compare.offset import expected_offset_db, read_reference_powers, reference_power_dbm
-from ..compare.rank import rank_from_singular_values, singular_values
-from ..compare.result import FoliageLoss, FoliageRankChange
 from ..flight.data import RssSeries
 from ..flight.learned_gain import pair_db
 from ..flight.losses import path_loss
@@ -25,9 +23,6 @@ from ..propagation.options import Loss
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern
 from ..site.site import Site
-
-LEAVES = ("in", "out")
-
 
 RssField = Literal["coherent", "power", "local_mean"]
 """Which simulated level is compared: values of ``rss.field``."""
@@ -86,9 +81,9 @@ def rss_alternatives(site: Site, rt: RtSettings, replayed: Replayed, field: RssF
     changed: dict[str, tuple[Link, Poses]] = {}
     arrays = [*link.tower_arrays.values(), link.uav_array]
     if any(isinstance(p, InstalledPattern) for a in arrays for p in a.patterns):
-        changed["antennas as measured, without added gain"] = (_with_patterns(link, _alone), replayed.poses)
+        changed["antennas as measured, without added gain"] = (with_patterns(link, without_added_gain), replayed.poses)
     if any(p.name != "iso" for a in arrays for p in a.patterns):
-        changed["isotropic antennas"] = (_with_patterns(link, lambda _: Isotropic()), replayed.poses)
+        changed["isotropic antennas"] = (with_patterns(link, lambda _: Isotropic()), replayed.poses)
     if replayed.track is not None and any(p.name != "iso" for p in link.uav_array.patterns):
         for mode, name in (("logged", "logged attitude"), ("level", "heading only"), ("ignored", "attitude ignored")):
             if mode != rt.attitude:
@@ -99,12 +94,12 @@ def rss_alternatives(site: Site, rt: RtSettings, replayed: Replayed, field: RssF
         + pair_db(other, poses, replayed.source_m(site))
         for name, (other, poses) in changed.items()
     }
-    for name, fields in foliage_alternatives(site, rt, replayed).items():
-        levels[name] = level_dbm(link, fields, field) + pair_db(link, replayed.poses, replayed.source_m(site))
     return levels
 
 
-def _with_patterns(link: Link, change: Any) -> Link:
+def with_patterns(link: Link, change: Callable[[Any], Any]) -> Link:
+    """A link whose elements have changed patterns."""
+
     def other(array: Array) -> Array:
         return dataclasses.replace(array, patterns=tuple(change(p) for p in array.patterns))
 
@@ -112,34 +107,19 @@ def _with_patterns(link: Link, change: Any) -> Link:
     return dataclasses.replace(link, tower_arrays=arrays, uav_array=other(link.uav_array))
 
 
-def _alone(pattern: Any) -> Any:
+def without_added_gain(pattern: Any) -> Any:
+    """The pattern as measured, without the gain that mast or airframe adds."""
     return pattern.base if isinstance(pattern, InstalledPattern) else pattern
-
-
-def foliage_alternatives(site: Site, rt: RtSettings, replayed: Replayed) -> dict[str, Fields]:
-    """Fields without trees, in leaf and out of leaf, where ``paired_foliage`` asks and the site has trees."""
-    if not rt.advanced.paired_foliage or not site.wooded:
-        return {}
-
-    def with_trees(foliage: str, leaves: str | None = None) -> Fields:
-        loss = path_loss(site, rt, replayed.link.carrier_hz, foliage=foliage, leaves=leaves)
-        return evaluate(site, replayed, loss)
-
-    foliage = "attenuating" if rt.foliage == "none" else rt.foliage
-    fields = {"without trees": with_trees("none")}
-    for leaves in LEAVES:
-        fields[f"trees {leaves} leaf".replace("out leaf", "out of leaf")] = with_trees(foliage, leaves)
-    return fields
 
 
 def foliage_notes(trees: int, rt: RtSettings, carriers_hz: Collection[float]) -> tuple[str, ...]:
     """What a report must say of its foliage models, where the site has trees: how far they are stretched or assumed."""
-    if not trees or not (rt.foliage == "attenuating" or (rt.advanced.paired_foliage and rt.foliage != "opaque")):
+    if not trees or rt.foliage != "attenuating":
         return ()
     notes = []
     if rt.foliage_model == "p833" and (rt.advanced.gamma_db_per_m is None or rt.advanced.maximum_loss_db is None):
         notes += [note for carrier in sorted(carriers_hz) if (note := p833_note(carrier))]
-    if rt.leaves == "out" or rt.advanced.paired_foliage:
+    if rt.leaves == "out":
         what = "gamma" if rt.foliage_model == "p833" else "the loss"
         notes.append(
             f"Trees out of leaf: {what} in leaf divided by {1 / LEAFLESS_FACTOR:g}. That is an assumption of this "
@@ -159,79 +139,6 @@ def p833_note(carrier_hz: float) -> str | None:
         f"to {high:g} MHz. Continued it gives gamma = {model.gamma_db_per_m:.2f} dB/m and A_m = {model.maximum_db:.0f} "
         "dB in leaf; other continuations give 0.45 to 0.7 dB/m at 3.4 GHz, so treat gamma as a sensitivity."
     )
-
-
-def foliage_rss_difference(levels: Mapping[str, FloatArray]) -> dict[str, FoliageLoss]:
-    """What the trees take from the RSS per pose, in leaf and out of leaf [dB]; empty without a paired run."""
-    bare = levels.get("without trees")
-    if bare is None:
-        return {}
-    losses = {}
-    for name in ("trees in leaf", "trees out of leaf"):
-        with np.errstate(invalid="ignore"):
-            loss = bare - levels[name]
-        known = np.isfinite(loss)
-        losses[name.replace(" ", "_")] = FoliageLoss(
-            n=int(known.sum()),
-            n_blocked=int((np.isfinite(bare) & ~np.isfinite(levels[name])).sum()),
-            mean_loss_db=float(loss[known].mean()) if known.any() else float("nan"),
-            largest_loss_db=float(loss[known].max()) if known.any() else float("nan"),
-            share_above_1_db=float((np.abs(loss[known]) > 1.0).mean()) if known.any() else float("nan"),
-        )
-    return losses
-
-
-PairedRanks = dict[str, dict[float, IntArray]]
-"""Ranks (n,) per K of each run of a paired replay."""
-
-
-def foliage_ranks(site: Site, rt: RtSettings, replayed: Replayed, keep: IntArray, ks: Sequence[float]) -> PairedRanks:
-    """Ranks without trees, in leaf and out of leaf.
-
-    Parameters
-    ----------
-    site : Site
-    rt : RtSettings
-        ``paired_foliage`` asks for the runs.
-    replayed : Replayed
-        One rank series.
-    keep : (m,) int
-        Replayed poses that count.
-    ks : sequence of float
-        Singular-value ratios.
-
-    Returns
-    -------
-    dict of str to dict of float to (m,) int
-        By run and K; empty without a paired run.
-    """
-    return {name: _ranks(fields.h[keep, 0], ks) for name, fields in foliage_alternatives(site, rt, replayed).items()}
-
-
-def foliage_rank_difference(paired: PairedRanks) -> dict[str, dict[str, FoliageRankChange]]:
-    """Poses at which trees change the rank, per K; empty without a paired run."""
-    if not paired:
-        return {}
-    ranks = dict(paired)
-    bare = ranks.pop("without trees")
-    keep = next(iter(bare.values()))
-    return {
-        name.replace(" ", "_"): {
-            f"{k:g}": FoliageRankChange(
-                share_changed=float((rank[k] != bare[k]).mean()) if len(keep) else float("nan"),
-                mean_change=float((rank[k] - bare[k]).mean()) if len(keep) else float("nan"),
-                n_lower=int((rank[k] < bare[k]).sum()),
-                n_higher=int((rank[k] > bare[k]).sum()),
-            )
-            for k in bare
-        }
-        for name, rank in ranks.items()
-    }
-
-
-def _ranks(h: ComplexArray, ks: Sequence[float]) -> dict[float, IntArray]:
-    sigma = singular_values(h)
-    return {k: rank_from_singular_values(sigma, k) for k in ks}
 
 
 def expected_offset(

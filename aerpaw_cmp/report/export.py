@@ -12,7 +12,7 @@ import numpy as np
 from ..common.cells import guarded
 from ..common.jsonable import fields_of, json_safe
 from ..common.provenance import KEY, union
-from ..common.units import FloatArray, IntArray
+from ..common.units import FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult, EngineResult, RankResult, RssResult
 from ..compare.statistics import Interval
 from ..logs.records import has_wall_clock
@@ -198,10 +198,6 @@ _ROWS = 50_000
 """Rows that are text at once."""
 
 
-FOLIAGE_RUNS = ("without trees", "trees in leaf", "trees out of leaf")
-"""Variants that are columns of rss.csv, too."""
-
-
 def rss_tables(series: Sequence[RssResult]) -> Iterator[_Table]:
     """Times and further columns of rss.csv by tower and channel, not yet rounded; one that a series lacks is NaN."""
     models = list(dict.fromkeys(name for one in series for name in one.baselines))
@@ -228,10 +224,8 @@ def rss_tables(series: Sequence[RssResult]) -> Iterator[_Table]:
 
 
 def _rss_columns(one: RssResult) -> dict[str, FloatArray]:
-    """Columns that not every series has: runs with and without trees, stated intervals, the place of a moving tower."""
+    """Columns that not every series has: stated intervals, the place of a moving tower."""
     return {
-        **{f"simulated_{name.replace(' ', '_')}_dbm": model.level_dbm
-           for name, model in one.variants.items() if name in FOLIAGE_RUNS},
         **({} if one.stated is None else one.stated.columns(one.simulated_dbm)),
         **({} if one.tower_m is None else _places(one.tower_m, "tower_")),
     }  # fmt: skip
@@ -250,9 +244,8 @@ def rank_tables(series: Sequence[RankResult]) -> Iterator[_Table]:
         return pd.Series(values, dtype="float64").astype("Int64").array  # NaN becomes an empty cell, 2.0 becomes 2
 
     ks = sorted({k for one in series for k in one.rank})
-    ranks = [_rank_columns(one) for one in series]
     numbers = [_number_columns(one) for one in series]
-    for one, foliage, own in zip(series, ranks, numbers, strict=True):
+    for one, own in zip(series, numbers, strict=True):
         nowhere = np.full(len(one.time), np.nan)
         yield (
             one.time,
@@ -261,19 +254,9 @@ def rank_tables(series: Sequence[RankResult]) -> Iterator[_Table]:
                 **_places(one.position_m),
                 "measured_rank": integers(one.measured),
                 **{f"simulated_rank_k{k_key(k)}": integers(one.rank.get(k, nowhere)) for k in ks},
-                **{n: integers(foliage.get(n, nowhere)) for n in dict.fromkeys(n for other in ranks for n in other)},
                 **{name: own.get(name, nowhere) for name in dict.fromkeys(name for other in numbers for name in other)},
             },
         )
-
-
-def _rank_columns(one: RankResult) -> dict[str, IntArray]:
-    """Simulated ranks with and without trees."""
-    return {
-        f"rank_{name.replace(' ', '_')}_k{k_key(k)}": rank
-        for name, per_k in one.foliage_rank.items()
-        for k, rank in per_k.items()
-    }
 
 
 def _number_columns(one: RankResult) -> dict[str, FloatArray]:

@@ -5,8 +5,6 @@ The page is one file with its script inside; it draws on a canvas and loads noth
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,28 +27,8 @@ if TYPE_CHECKING:
 TREES_IN_PAGE = 5000
 FLIGHT_POINTS = 2000
 
-PATH_COLOURS = ("#111111", "#D55E00", "#009E73", "#CC79A7")
-"""By number of reflections: none, one, two, more."""
-UAV_MARK: dict[str, Any] = {
-    "marker": "o", "markersize": 7, "color": "#F0C000", "markeredgecolor": "black", "linestyle": "none", "zorder": 8,
-}  # fmt: skip
-PATH_DASHES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PathLine:
-    """One propagation path to draw: ``points_m`` (n, 3) from tower to UAV, and its words."""
-
-    points_m: FloatArray
-    label: str
-
-    @property
-    def reflections(self) -> int:
-        """Number of inner vertices."""
-        return len(self.points_m) - 2
-
-
-def view_limits(site: Site, track: Track | None, paths: Sequence[PathLine] = ()) -> FloatArray:
+def view_limits(site: Site, track: Track | None) -> FloatArray:
     """(3, 2) lowest and highest east, north, up of everything that stands or flies, with a margin [m]."""
     points = [tower.position_m for tower in site.towers.values()]
     for building in drawn_buildings(site):
@@ -64,7 +42,6 @@ def view_limits(site: Site, track: Track | None, paths: Sequence[PathLine] = ())
         points += list(np.column_stack([trees.east_m, trees.north_m, trees.ground_m + trees.height_m]))
     if track is not None and len(track.time):
         points += list(np.stack([track.east_m, track.north_m, track.up_m], axis=1)[:: max(1, len(track.time) // 500)])
-    points += [vertex for path in paths for vertex in path.points_m]
     if not points:
         return np.array([[-100.0, 100.0], [-100.0, 100.0], [0.0, 50.0]])
     cloud = np.array(points)
@@ -77,14 +54,9 @@ def view_limits(site: Site, track: Track | None, paths: Sequence[PathLine] = ())
     )
 
 
-def uav_of(paths: Sequence[PathLine]) -> FloatArray | None:
-    """Where the paths of one pose end (3,), or None without paths."""
-    return np.asarray(paths[0].points_m[-1], dtype=np.float64) if paths else None
-
-
-def plan(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> Figure:
+def plan(site: Site, track: Track | None = None) -> Figure:
     """Plan view with everything on it, to scale."""
-    limits = view_limits(site, track, paths)
+    limits = view_limits(site, track)
     width, height = np.ptp(limits[:2], axis=1)
     shape = float(np.clip(width / height, 0.45, 2.2))
     fig = canvas.figure((7.0 * min(shape, 1.0) + 2.4, 7.0 / max(shape, 1.0) + 0.6))
@@ -94,16 +66,6 @@ def plan(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ())
         ax.plot(
             *canvas.thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.3, label="flight", zorder=4
         )
-    seen: set[int] = set()
-    for path in paths:
-        kind = min(path.reflections, len(PATH_COLOURS) - 1)
-        ax.plot(
-            path.points_m[:, 0], path.points_m[:, 1], color=PATH_COLOURS[kind], linestyle=PATH_DASHES[kind],
-            linewidth=1.2, zorder=4.5, label=None if kind in seen else reflections_label(kind),
-        )  # fmt: skip
-        seen.add(kind)
-    if (uav := uav_of(paths)) is not None:
-        ax.plot(*uav[:2], **UAV_MARK, label=f"UAV, {uav[2]:.0f} m up")
     ax.set_axisbelow(True)
     ax.set_xlim(*limits[0])
     ax.set_ylim(*limits[1])
@@ -113,12 +75,7 @@ def plan(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ())
     return fig
 
 
-def reflections_label(kind: int) -> str:
-    """Legend entry of a path."""
-    return ("line of sight", "one reflection", "two reflections", "more reflections")[kind]
-
-
-def view_of(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> dict[str, Any]:
+def view_of(site: Site, track: Track | None = None) -> dict[str, Any]:
     """The site as plain lists for the page, rounded to 0.1 m."""
     flight: list[Any] = []
     if track is not None and len(track.time):
@@ -129,29 +86,25 @@ def view_of(site: Site, track: Track | None = None, paths: Sequence[PathLine] = 
     return {
         **shown,
         "buildings": [{"name": b.name, "height": b.height_m, "faces": faces} for b, faces in walled],
-        "limits": listed(view_limits(site, track, paths)),
+        "limits": listed(view_limits(site, track)),
         "fences": [listed(g.area.exterior.coords) for g in site.geofences],
         "flight": flight,
-        "paths": [{"label": p.label, "kind": min(p.reflections, 3), "points": listed(p.points_m)} for p in paths],
     }
 
 
-def viewer(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> str:
+def viewer(site: Site, track: Track | None = None) -> str:
     """The page that shows the site in 3-D."""
-    content = view_of(site, track, paths)
+    content = view_of(site, track)
     return rendered(
         "site_view",
         site=site,
         scene=embedded(content),
         trees_shown=len(content["trees"]),
-        paths=paths,
         has_flight=bool(content["flight"]),
     )
 
 
-def write_site_view(
-    site: Site, folder: str | Path, *, track: Track | None = None, paths: Sequence[PathLine] = ()
-) -> list[Path]:
+def write_site_view(site: Site, folder: str | Path, *, track: Track | None = None) -> list[Path]:
     """Write ``<site>.html`` and ``<site>_plan.svg|png``.
 
     Parameters
@@ -161,8 +114,6 @@ def write_site_view(
         Made when missing.
     track : Track, optional
         A flight to draw.
-    paths : sequence of PathLine
-        The propagation paths of one pose.
 
     Returns
     -------
@@ -170,7 +121,7 @@ def write_site_view(
         The page first.
     """
     folder, stem = Path(folder), safe_name(site.name)
-    written = [write_file(folder / f"{stem}.html", viewer(site, track, paths))]
+    written = [write_file(folder / f"{stem}.html", viewer(site, track))]
     with canvas.style():
-        drawn = canvas.save_as(plan(site, track, paths), ("svg", "png"))
+        drawn = canvas.save_as(plan(site, track), ("svg", "png"))
     return [*written, *(write_file(folder / f"{stem}_plan.{form}", picture) for form, picture in drawn.items())]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,10 +21,8 @@ from aerpaw_cmp.flight.track import body_rotation
 from aerpaw_cmp.jobs.audit_flight import audit_replays
 from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series, pairs_of
 from aerpaw_cmp.jobs.flight_run import run_flight
-from aerpaw_cmp.jobs.run import _paths_of_pose
 from aerpaw_cmp.jobs.what_if import foliage_notes
 from aerpaw_cmp.report.build import rank_warnings, rss_warnings, track_of
-from aerpaw_cmp.report.export import rank_tables, rss_tables
 from aerpaw_cmp.report.words import instants
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
@@ -259,45 +256,7 @@ def test_channels_without_common_instants_make_no_pair(tmp_path: Path) -> None:
     assert pairs_of(compared_rss(path)) == []
 
 
-def test_paired_foliage_reports_loss_and_rank_changes(tmp_path: Path) -> None:
-    at = np.arange(0, 120, 0.5)
-    path = flight(tmp_path, 120, rss={"USRP1": (at, free_space_db(at))}, rank=(at, np.full(len(at), 2.0)),
-                  rt=", advanced: {paired_foliage: true}")  # fmt: skip
-    data = gathered(path)
-    # a wood on the line of sight: the track runs east of LW1 at 40 m, crowns reach 60 m here
-    trees = data.site.trees
-    rng = np.random.default_rng(3)
-    east = rng.uniform(20, 480, len(trees))
-    wood = dataclasses.replace(
-        trees, east_m=east, north_m=east * 0.13 + rng.uniform(-20, 20, len(trees)),
-        height_m=np.full(len(trees), 60.0), crown_base_m=np.full(len(trees), 1.0), ground_m=np.zeros(len(trees)),
-    )  # fmt: skip
-    data = dataclasses.replace(data, site=dataclasses.replace(data.site, trees=wood))
-    (replayed,) = replay_rss(data)
-    panel = compare_rss_series(data, data.rss[0], replayed)
-    names = list(panel.variants)
-    assert names[-3:] == ["without trees", "trees in leaf", "trees out of leaf"]
-    # the flight itself has none
-    assert panel.variants["without trees"].rmse_db == pytest.approx(panel.score.rmse_db, abs=1e-9)
-    found = panel.further.foliage
-    assert found["trees_in_leaf"].mean_loss_db > found["trees_out_of_leaf"].mean_loss_db > 0.0
-    assert found["trees_in_leaf"].share_above_1_db > 0.1
-    (ranked,) = replay_rank(data)
-    ((_, per_pose),) = rss_tables([panel])
-    loss = per_pose["simulated_without_trees_dbm"] - per_pose["simulated_trees_in_leaf_dbm"]
-    assert np.nanmean(loss) == pytest.approx(found["trees_in_leaf"].mean_loss_db)
-    ranks = compare_rank_series(data, data.rank[0], ranked)
-    ((_, per_k),) = rank_tables([ranks])
-    changed = per_k["rank_trees_in_leaf_k10"] != per_k["rank_without_trees_k10"]
-    changes = ranks.further.foliage
-    assert changed.mean() == pytest.approx(changes["trees_in_leaf"]["10"].share_changed)
-    assert set(changes) == {"trees_in_leaf", "trees_out_of_leaf"}
-    for by_k in changes.values():
-        for one in by_k.values():
-            assert one.share_changed == pytest.approx((one.n_lower + one.n_higher) / len(at))
-
-
-def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) -> None:
+def test_opaque_crowns_reflect_in_the_flight(tmp_path: Path) -> None:
     at = np.arange(0, 120, 0.5)
 
     def replayed(rt: str) -> tuple[Any, Any]:
@@ -314,28 +273,13 @@ def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) 
         return data, replay_rss(data)[0]
 
     bare_data, bare = replayed("")
-    data, found = replayed(", foliage: opaque, advanced: {paired_foliage: true}")
+    data, found = replayed(", foliage: opaque")
     off_data, off = replayed(", foliage: opaque, advanced: {crown_reflections: false}")
     bounced = int(found.replay.paths.off_crown.sum())
     assert bounced > 20
     assert (found.replay.rss_dbm != off.replay.rss_dbm).any()
     assert not off.replay.paths.off_crown.any()
     np.testing.assert_array_equal(off.replay.paths.faces, bare.replay.paths.faces)
-    # the picture of a pose has them, too, and no path that trees stop
-    pose = int(found.replay.paths.pose[found.replay.paths.off_crown][0])
-    east, north, up = found.poses.position_m.T
-    track = SimpleNamespace(time=np.arange(len(east)), east_m=east, north_m=north, up_m=up)
-    shown = _paths_of_pose(data.settings.rt, data.site, track, pose, data.settings.link.rss.carrier_hz)
-    lines = [line.label for line in shown if line.label.startswith("LW1")]
-    here = found.replay.paths.select(found.replay.paths.pose == pose)
-    assert sum("one off a crown" in label for label in lines) == here.off_crown.sum()
-    assert len(lines) <= len(here)
-    # the run without trees has lost the paths over crowns as well
-    panel = compare_rss_series(data, data.rss[0], found)
-    ((_, columns),) = rss_tables([panel])
-    bare_dbm = bare.spread(bare.replay.rss_dbm[:, 0])
-    np.testing.assert_allclose(columns["simulated_without_trees_dbm"], bare_dbm, atol=1e-9)
-    np.testing.assert_allclose(columns["simulated_trees_in_leaf_dbm"], panel.simulated_dbm, atol=1e-9)
     for some, one, expected in (
         (data, found, {"crown_reflections": True, "paths_off_crowns": bounced}),
         (off_data, off, {"crown_reflections": False, "paths_off_crowns": 0}),
@@ -366,7 +310,7 @@ def test_the_report_says_where_foliage_models_are_stretched_or_assumed(tmp_path:
     assert notes(", foliage: attenuating, advanced: {gamma_db_per_m: 0.6, maximum_loss_db: 40}", 3.4e9) == ""
     assert "divided by 1.2. That is an assumption" in notes(", foliage: attenuating, leaves: out", 2e9)
     assert "the loss in leaf divided by 1.2" in notes(
-        ", advanced: {paired_foliage: true}, foliage_model: weissberger", 2e9
+        ", foliage: attenuating, leaves: out, foliage_model: weissberger", 2e9
     )
 
 

@@ -12,7 +12,7 @@ pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.jobs.site_scene import is_scene, run_scene_import, run_site_export
+from aerpaw_cmp.jobs.site_scene import SceneOptions, is_scene, run_scene_import, run_site_export
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.siteyaml import load_site
@@ -52,7 +52,7 @@ def test_in_and_out_and_in_again(room: Path, tmp_path: Path, capsys: pytest.Capt
     assert main(["site", "export", str(out), "--sionna", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.split()[-1] == str(tmp_path / "out" / "scene.xml")
     again = tmp_path / "again.yaml"
-    run_scene_import(tmp_path / "out" / "scene.xml", again, origin="35.7,-78.7", towers=["T=-5,3,10"])
+    run_scene_import(tmp_path / "out" / "scene.xml", again, SceneOptions(origin="35.7,-78.7", towers=["T=-5,3,10"]))
     second = paths_of(again)
     assert second.faces.material == first.faces.material
     assert np.array_equal(second.paths.faces, first.paths.faces)
@@ -62,20 +62,20 @@ def test_in_and_out_and_in_again(room: Path, tmp_path: Path, capsys: pytest.Capt
 def test_what_a_scene_does_not_say_is_asked_for(room: Path, tmp_path: Path) -> None:
     out = tmp_path / "site.yaml"
     with pytest.raises(UsageError, match="does not say where on Earth it lies"):
-        run_scene_import(room, out)
+        run_scene_import(room, out, SceneOptions())
     with pytest.raises(UsageError, match=r"has no towers.*from -50 to 50 m east"):
-        run_scene_import(room, out, origin="local")
+        run_scene_import(room, out, SceneOptions(origin="local"))
     with pytest.raises(UsageError, match="the two are swapped"):
-        run_scene_import(room, out, origin="-118.7,35.7")
+        run_scene_import(room, out, SceneOptions(origin="-118.7,35.7"))
     with pytest.raises(UsageError, match="--tower A"):
-        run_scene_import(room, out, origin="local", towers=["A=1,2"])
+        run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2"]))
     assert not out.exists()
-    told = run_scene_import(room, out, origin="local", towers=["A=1,2,3"])
+    told = run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2,3"]))
     assert any("no georeference" in line for line in told)
 
 
 def test_towers_of_a_base_site_are_kept(room: Path, tmp_path: Path) -> None:
-    run_scene_import(room, tmp_path / "s.yaml", base="lake_wheeler")
+    run_scene_import(room, tmp_path / "s.yaml", SceneOptions(base="lake_wheeler"))
     site, base = load_site(tmp_path / "s.yaml"), load_site("lake_wheeler")
     assert set(site.towers) == set(base.towers)
     assert site.scene is not None
@@ -84,7 +84,7 @@ def test_towers_of_a_base_site_are_kept(room: Path, tmp_path: Path) -> None:
 
 def test_a_scene_that_changed_or_went_is_said(room: Path, tmp_path: Path) -> None:
     out = tmp_path / "site.yaml"
-    run_scene_import(room, out, origin="local", towers=["A=1,2,3"])
+    run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2,3"]))
     room.write_text(ROOM.replace("marble", "brick"))
     with pytest.raises(UsageError, match="they changed since the site was made") as told:
         load_site(out)
@@ -129,7 +129,7 @@ FLIGHT = {
 
 @pytest.fixture
 def flown(room: Path, tmp_path: Path) -> Path:
-    run_scene_import(room, tmp_path / "site.yaml", origin="35.7,-78.7", towers=["T=-5,3,10"])
+    run_scene_import(room, tmp_path / "site.yaml", SceneOptions(origin="35.7,-78.7", towers=["T=-5,3,10"]))
     (tmp_path / "flight.yaml").write_text(yaml.safe_dump(FLIGHT))
     assert main(["simulate", str(tmp_path / "flight.yaml"), "--quiet"]) == 0
     return tmp_path / "flight.yaml"

@@ -9,25 +9,15 @@ import pytest
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.report import canvas, shapes, site_view
-from aerpaw_cmp.report.site_view import PathLine
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Trees
-
-
-@pytest.fixture
-def paths(report_data):
-    tower, uav = report_data.site.towers["LW1"].position_m, np.array([100.0, 200.0, 40.0])
-    return (
-        PathLine(points_m=np.array([tower, uav]), label="direct"),
-        PathLine(points_m=np.array([tower, [20, 40, 0], uav]), label="ground"),
-    )
 
 
 def scene_of(page: str):
     return json.loads(re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S).group(1))
 
 
-def test_writes_plan_picture_and_page(report_data, paths, tmp_path):
-    files = site_view.write_site_view(report_data.site, tmp_path, track=report_data.track, paths=paths)
+def test_writes_plan_picture_and_page(report_data, tmp_path):
+    files = site_view.write_site_view(report_data.site, tmp_path, track=report_data.track)
     assert [f.suffix for f in files] == [".html", ".svg", ".png"]
     for file in files:
         if file.suffix == ".png":
@@ -37,7 +27,6 @@ def test_writes_plan_picture_and_page(report_data, paths, tmp_path):
     assert "illustrative" in page
     scene = scene_of(page)
     assert [t["name"] for t in scene["towers"]] == list(report_data.site.towers)
-    assert scene["paths"][1]["kind"] == 1
     assert len(scene["flight"]) <= 2 * site_view.FLIGHT_POINTS
 
 
@@ -45,7 +34,7 @@ def test_a_hostile_name_stays_a_name(report_data):
     name = "</script><script>alert(1)</script>"
     tower = dataclasses.replace(report_data.site.towers["LW1"], name=name)
     site = dataclasses.replace(report_data.site, name=name, towers={name: tower})
-    page = site_view.viewer(site, paths=[PathLine(points_m=np.zeros((2, 3)), label=name)])
+    page = site_view.viewer(site)
     assert page.count("<script") == 2
     assert "alert(1)<" not in page
     assert scene_of(page)["towers"][0]["name"] == name
@@ -60,14 +49,14 @@ def test_walls_enclose_the_prism():
     assert {z for f in faces for z in f[:, 2]} == {2.0, 7.0}
 
 
-def test_limits_hold_everything(report_data, paths):
-    far = PathLine(points_m=np.array([[0.0, 0, 0], [5000.0, -9000.0, 300.0]]), label="far")
-    limits = site_view.view_limits(report_data.site, report_data.track, (*paths, far))
+def test_limits_hold_everything(report_data):
+    far = dataclasses.replace(report_data.track, east_m=report_data.track.east_m + 5000.0)
+    limits = site_view.view_limits(report_data.site, far)
     for tower in report_data.site.towers.values():
         assert (limits[:, 0] <= tower.position_m).all()
         assert (tower.position_m <= limits[:, 1]).all()
-    assert (limits[:, 1] >= [5000.0, 830.0, 300.0]).all()
-    assert limits[1, 0] <= -9000.0
+    flown = np.stack([far.east_m, far.north_m, far.up_m])
+    assert (limits[:, 1] >= np.nanmax(flown, axis=1)).all()
 
 
 def test_an_empty_site_can_be_shown(report_data):
@@ -118,13 +107,6 @@ def test_holes_stay_empty_and_fences_are_drawn(report_data):
     with canvas.style():
         labels = site_view.plan(site).axes[0].get_legend_handles_labels()[1]
     assert "geofence" in labels
-
-
-def test_the_pose_of_the_paths_is_marked(report_data, paths):
-    with canvas.style():
-        labels = site_view.plan(report_data.site, report_data.track, paths).axes[0].get_legend_handles_labels()[1]
-    assert "UAV, 40 m up" in labels
-    assert {"line of sight", "one reflection", "flight", "tower"} <= set(labels)
 
 
 def test_crowns_on_the_plan_are_to_scale(report_data):

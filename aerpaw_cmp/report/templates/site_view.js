@@ -110,14 +110,6 @@ function draw() {
   pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.lineJoin = "round";
   pen.fillStyle = "#fff"; pen.fillRect(0, 0, w, h);
   prepare(); ground(); solids();
-  if (on("paths")) for (const path of scene.paths)
-    polyline(path.points.map(shape), ["#111111", "#D55E00", "#009E73", "#CC79A7"][path.kind], 1.6, [[], [9, 4], [2, 4], [9, 3, 2, 3]][path.kind]);
-  if (on("paths") && scene.paths.length) {
-    const uav = shape(scene.paths[0].points[scene.paths[0].points.length - 1]);
-    pen.beginPath(); pen.arc(uav[0], uav[1], 5, 0, 7); pen.fillStyle = "#F0C000"; pen.fill();
-    pen.strokeStyle = "#000"; pen.lineWidth = 1; pen.stroke();
-    label("UAV", uav, "#333");
-  }
   scene.towers.forEach(t => label(t.name, shape([t.at[0], t.at[1], t.top]), "#8f0f18"));
   const n = [0, 1].map(i => centre[i] + (i ? eye.north : eye.east)), a = shape([n[0], n[1], 0]), b = shape([n[0], n[1] + size * 0.05, 0]);
   const k = 26 / (Math.hypot(b[0] - a[0], b[1] - a[1]) || 1), x = 40, y = h - 40;

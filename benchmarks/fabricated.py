@@ -128,7 +128,7 @@ def rss_result(
     )  # fmt: skip
     given: dict[str, Any] = {
         "unit": "dB re full scale", "posed": np.ones(len(time), bool), "line_of_sight": np.ones(len(time)),
-        "geometry": {}, "variants": {}, "residual_by": {}, "further": further,
+        "geometry": {}, "residual_by": {}, "further": further,
         "spans": tuple(error_spans(time, score.residual_db, position_m=position_m, largest=1)),
     }  # fmt: skip
     return RssResult(

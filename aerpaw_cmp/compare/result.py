@@ -169,8 +169,8 @@ class RssResult:
         Distance [m] and angles [deg] of the link, by name with unit.
     score : RssComparison
         Offset, RMSE, correlation and their intervals.
-    baselines, variants : mapping of str to ModelLevel
-        Free space and two-ray; the same paths under other assumptions.
+    baselines : mapping of str to ModelLevel
+        Free space, two-ray and lines.
     curve_offset_db, curve_rmse_db : (m,)
         RMSE against candidate offset.
     spans : tuple of ErrorSpan
@@ -192,7 +192,6 @@ class RssResult:
     geometry: Mapping[str, FloatArray]
     score: RssComparison
     baselines: Mapping[str, ModelLevel]
-    variants: Mapping[str, ModelLevel]
     curve_offset_db: FloatArray
     curve_rmse_db: FloatArray
     spans: tuple[ErrorSpan, ...]

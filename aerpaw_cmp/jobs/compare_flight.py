@@ -47,17 +47,13 @@ from ..flight.lock import LOCK_FLOOR_DB
 from ..flight.losses import direct_foliage_m
 from ..flight.remembered import errors_elsewhere, lock_elsewhere
 from ..flight.replay import FlightReplay, Replayed
-from ..flight.settings import ReferencePowers, RssSettings, RtSettings
+from ..flight.settings import PortSettings, ReferencePowers, RssSettings, RtSettings
 from ..flight.training import learned_here
 from ..propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, levels_of, stated_spread
 from .likely_cause import cause_of
-from .what_if import (
-    expected_offset,
-    rss_alternatives,
-)
 
 AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
 """Both sides are averaged over these windows to see how much of the error is fading."""
@@ -124,8 +120,8 @@ def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> Ser
 class _Case:
     """One tower and channel with what every number of it is computed from.
 
-    ``simple`` are the baselines at the samples, ``alternatives`` the same paths under other assumptions; ``trained``
-    names logs of this flight that its antennas were learned from: then nothing is scored.
+    ``simple`` are the baselines at the samples; ``trained`` names logs of this flight that its antennas were learned
+    from: then nothing is scored.
     """
 
     data: FlightData
@@ -135,7 +131,6 @@ class _Case:
     position_m: FloatArray
     geometry: Mapping[str, FloatArray]
     simple: Mapping[str, FloatArray]
-    alternatives: Mapping[str, FloatArray]
     trained: tuple[str, ...]
 
     @property
@@ -144,7 +139,7 @@ class _Case:
 
 
 def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> RssResult:
-    """Offset, RMSE, correlation, intervals, baselines and alternatives of one tower and channel."""
+    """Offset, RMSE, correlation, intervals and baselines of one tower and channel."""
     settings, case = data.settings.rss, _case(data, series, replayed)
     levels, clock = case.levels, replayed.clock
     score = rss.compare_rss(
@@ -185,7 +180,6 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         geometry=case.geometry,
         score=score,
         baselines=_baselines(case.simple, score),
-        variants=_variants(settings, levels, case.alternatives),
         curve_offset_db=curve_offset_db,
         curve_rmse_db=curve_rmse_db,
         spans=tuple(spans),
@@ -205,7 +199,6 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
     }
     position = _positions(replayed)
     simple |= _fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
-    other = {} if trained else rss_alternatives(data.site, data.settings.rt, replayed, settings.field)
     return _Case(
         data=data,
         series=series,
@@ -214,7 +207,6 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
         position_m=position,
         geometry=geometry,
         simple=simple,
-        alternatives={name: at_samples(series, replayed, level, settings) for name, level in other.items()},
         trained=trained,
     )
 
@@ -267,7 +259,7 @@ def _further(
         return further
     return dataclasses.replace(
         further,
-        compared_with=_paired(levels, {**case.simple, **case.alternatives}),
+        compared_with=_paired(levels, case.simple),
         averaged=_averaged(series, replayed, levels, case.position_m, settings),
         censored=_censored(settings, levels),
         detection=_detection(case.data, series, levels, case.simple["free_space"]),
@@ -350,20 +342,6 @@ def _paired(levels: Levels, others: Mapping[str, FloatArray]) -> dict[str, stati
     return {name: statistics.paired_difference(error_db, levels.measured_db - level) for name, level in others.items()}
 
 
-def _variants(settings: RssSettings, levels: Levels, alternatives: Mapping[str, FloatArray]) -> dict[str, ModelLevel]:
-    """Each alternative over the samples it has, with an offset of its own."""
-    out = {}
-    for name, level in alternatives.items():
-        both = np.isfinite(levels.measured_db) & np.isfinite(level)
-        measured, simulated = levels.measured_db[both], level[both]
-        fit = offsets.grid_offset(measured, simulated, step_db=settings.advanced.step_db, span_db=settings.span_db)
-        bounds = statistics.error_intervals(measured, simulated)
-        out[name] = ModelLevel(
-            level_dbm=level, offset_db=fit.offset_db, rmse_db=fit.rmse_db, rmse_ci95_db=bounds.rmse_db
-        )
-    return out
-
-
 def _averaged(
     series: RssSeries, replayed: Replayed, levels: Levels, position_m: FloatArray, settings: RssSettings
 ) -> dict[str, dict[str, Fit]]:
@@ -394,10 +372,49 @@ def _averaged(
 def _expected(
     budget: ReferencePowers | None, folder: Path, series: RssSeries, offset_db: float
 ) -> ExpectedOffset | None:
-    budgeted = expected_offset(budget, folder, series)
-    if budgeted is None:
+    """Offset that the USRP reference powers predict; None where ``rss.reference_powers`` has none for the channel.
+
+    Parameters
+    ----------
+    budget : ReferencePowers, optional
+    folder : Path
+        Against which its table resolves.
+    series : RssSeries
+    offset_db : float
+        As fitted.
+
+    Returns
+    -------
+    ExpectedOffset or None
+
+    Raises
+    ------
+    InputError
+        If the table cannot be read.
+    """
+    receiver = None if budget is None else budget.receivers.get(series.channel)
+    if budget is None or receiver is None:
         return None
-    expected, received, sent = budgeted
+    table = offsets.read_reference_powers(folder / budget.file)
+
+    def reference(port: PortSettings, category: Any) -> float:
+        return offsets.reference_power_dbm(
+            table, node=port.node, category=category, channel=port.channel, gain_db=port.gain_db,
+            frequency_hz=series.link.carrier_hz, amplifier=port.amplifier,
+        )  # fmt: skip
+
+    received = reference(receiver, "rx")
+    if budget.receiver_gain_removed:  # the log holds dB re full scale minus the gain setting
+        received += receiver.gain_db
+    sent = reference(budget.transmitter, "tx") if budget.transmitter else series.link.transmit_power_dbm
+    expected = offsets.expected_offset_db(
+        receiver_reference_dbm=received,
+        transmitter_reference_dbm=sent,
+        simulated_transmit_dbm=series.link.transmit_power_dbm,
+        transmit_amplitude_dbfs=budget.transmit_amplitude_dbfs,
+        transmit_gain_db=budget.transmitter.extra_gain_db if budget.transmitter else 0.0,
+        receive_gain_db=receiver.extra_gain_db,
+    )
     return ExpectedOffset(
         expected_db=expected,
         receiver_reference_dbm=received,

@@ -63,7 +63,7 @@ from ..report import maps_data as page
 from ..site.site import Site
 from ..site.siteyaml import load_site
 from .corrected_map import CorrectedMaps
-from .what_if import p833_note
+from .foliage_notes import p833_note
 from .workers import Lost, Workers
 
 FOLIAGE = ("none", "attenuating", "opaque")

@@ -38,7 +38,6 @@ from ..site.installed import InstalledPattern
 from ..site.site import Site
 from ..site.sphere_pattern import SpherePattern
 from .levels import Levels, levels_of
-from .what_if import with_patterns, without_added_gain
 
 WEAK_GROUND_DB = 10.0
 """Loss of the weakened ground reflection: a smooth half-space reflects more than any field."""
@@ -366,9 +365,18 @@ def _arrays(link: Link) -> list[Any]:
 
 
 def _link(link: Link, antennas: Antennas) -> Link:
-    if antennas == "isotropic":
-        return with_patterns(link, lambda _: Isotropic())
-    return with_patterns(link, without_added_gain) if antennas == "measured" else link
+    """The link with isotropic elements, with measured ones without added gain, or as it is."""
+
+    def pattern(p: Any) -> Any:
+        if antennas == "isotropic":
+            return Isotropic()
+        return p.base if antennas == "measured" and isinstance(p, InstalledPattern) else p
+
+    def other(array: Any) -> Any:
+        return dataclasses.replace(array, patterns=tuple(pattern(p) for p in array.patterns))
+
+    towers = {name: other(array) for name, array in link.tower_arrays.items()}
+    return dataclasses.replace(link, tower_arrays=towers, uav_array=other(link.uav_array))
 
 
 def recommended_settings(

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from ..report.build import report_data
 from ..report.data import InputFile, ReportData
 from .flight_run import FlightRun
+from .foliage_notes import foliage_notes
 from .pose_paths import pose_paths
-from .what_if import foliage_notes
 
 
 def report_record(flight_run: FlightRun, others: Sequence[InputFile]) -> ReportData:

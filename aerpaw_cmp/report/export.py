@@ -83,16 +83,9 @@ def _rss_metrics(one: RssResult) -> dict[str, Any]:
         "unit": one.unit,
         "fitted": score.fitted_on_scored,
         "baselines": {name: _named(model, "offset_db rmse_db") for name, model in one.baselines.items()},
-        "variants": {
-            name: {**_named(model, "offset_db rmse_db"), "fitted": FITTED} for name, model in one.variants.items()
-        },
         **fields_of(one.further),
         "residual_by": {name: table.as_dict() for name, table in one.residual_by.items()},
     }
-
-
-FITTED = "offset, on this flight"
-"""What every other model of the same samples has fitted."""
 
 
 def clock_metrics(clock: ClockResult) -> dict[str, Any]:

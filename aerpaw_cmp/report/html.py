@@ -26,7 +26,7 @@ from . import words
 from .canvas import FigureSpec, Picture, start_of, write_figures
 from .data import RANKS, ReportData
 from .explorer import as_json, payload
-from .export import FITTED, further_numbers, json_text, write_file
+from .export import further_numbers, json_text, write_file
 from .first_screen import headlines, verdict
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
@@ -292,7 +292,6 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         files=files,
         notes=list(dict.fromkeys([*data.site.notes, *data.notes])),  # a flight repeats what its site says
         ranks=RANKS,
-        fitted=FITTED,
         parted_db=PART_DB,
         headline=words.headline(data),
         verdicts=words.verdicts(data.rss, data.rank),

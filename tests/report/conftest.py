@@ -9,7 +9,7 @@ import pytest
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.compare.result import AuditResult, EngineResult, ModelLevel, PairResult, RankResult, RssResult
+from aerpaw_cmp.compare.result import AuditResult, EngineResult, PairResult, RankResult, RssResult
 from aerpaw_cmp.compare.rss import ChannelDifference
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report.data import InputFile, ReportData, Track, Waypoint
@@ -98,11 +98,9 @@ def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> R
     silent = (np.arange(len(d)) > 5900) & (tower == "LW4")
     measured = np.where(silent, np.nan, measured)
     levels = {"measured": measured, "simulated": simulated, "free_space": free, "two_ray": two}
-    worse = ModelLevel(level_dbm=free, offset_db=40.0, rmse_db=7.5, rmse_ci95_db=(6.0, 8.0))
     return rss_result(
         tower, channel, track.time, position, levels, line_of_sight=np.where(blocked, 0.0, 1.0),
         geometry={"distance_m": d, "azimuth_deg": azimuth, "elevation_deg": np.degrees(np.arcsin((track.up_m - t[2]) / d)), "altitude_m": track.up_m},
-        variants={"iso arrays": worse, "patterns, attitude": worse},
     )  # fmt: skip
 
 

@@ -44,7 +44,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 EQUIVALENT = Path(__file__).with_name("mutation_equivalent.txt")
 ROOMS = ("propagation", "compare", "flight", "maps")
-RULES = ("calibrate", "compare_flight", "levels", "audit_flight", "ladder", "what_if", "flight_run", "over_flights")
+RULES = ("calibrate", "compare_flight", "levels", "audit_flight", "ladder", "flight_run", "over_flights")
 """Modules of the room `jobs` that decide what is scored, and on what."""
 
 TESTS = (

@@ -25,9 +25,7 @@ def reflecting_crowns(trees: Trees, rt: RtSettings) -> Crowns | None:
     return Crowns(trees) if crowns_reflect(trees, rt) else None
 
 
-def path_loss(
-    site: Site, rt: RtSettings, carrier_hz: float, *, foliage: str | None = None, leaves: str | None = None
-) -> Loss | None:
+def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     """Loss per path besides the field's own: foliage and reflections, a function of paths and their ends.
 
     Parameters
@@ -38,8 +36,6 @@ def path_loss(
         ``foliage``, ``foliage_model``, ``gamma_db_per_m``, ``maximum_loss_db``, ``leaves``, ``reflection_loss_db``,
         ``ground_roughness_m``.
     carrier_hz : float
-    foliage, leaves : str, optional
-        In place of those of ``rt``.
 
     Returns
     -------
@@ -52,7 +48,7 @@ def path_loss(
     UsageError
         ``rt.ground_roughness_m`` with a scene of triangles.
     """
-    through = _foliage_loss(site, rt, carrier_hz, foliage or rt.foliage, leaves or rt.leaves)
+    through = _foliage_loss(site, rt, carrier_hz)
     per_reflection, rough = rt.reflection_loss_db, roughness_loss(site, rt, carrier_hz)
     if per_reflection == 0.0 and rough is None:
         return through
@@ -128,17 +124,15 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
     return loss
 
 
-def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float, foliage: str, leaves: str) -> Loss | None:
-    if not site.wooded or (foliage == "none" and rt.foliage != "opaque"):
-        return None  # where opaque crowns reflect, a run without trees has to lose those paths
-    name = rt.foliage_model if foliage == "attenuating" else foliage
-    own = leaves == rt.leaves  # numbers of the flight file belong to its own season
+def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
+    if not site.wooded or rt.foliage == "none":
+        return None
     model = foliage_model(
-        name,
+        rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
         carrier_hz,
-        in_leaf=leaves == "in",
-        gamma_db_per_m=rt.advanced.gamma_db_per_m if own else None,
-        maximum_db=rt.advanced.maximum_loss_db if own else None,
+        in_leaf=rt.leaves == "in",
+        gamma_db_per_m=rt.advanced.gamma_db_per_m,
+        maximum_db=rt.advanced.maximum_loss_db,
     )
     index, wavelength = crown_index(site.trees), wavelength_m(carrier_hz)
 

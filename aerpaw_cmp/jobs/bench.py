@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from shapely import affinity
@@ -41,6 +41,8 @@ LINES = 20_523
 """Lines of a real channel-sounder flight."""
 
 T = TypeVar("T")
+
+Row: TypeAlias = "dict[str, Any]"
 
 
 def run_bench(
@@ -73,7 +75,7 @@ def run_bench(
     about = {"poses": poses, "towers": list(link.tower_arrays), "buildings": len(site.buildings)}
     return {
         "conditions": {**about, "cpus": os.cpu_count()},
-        "replay": {"rows": [row.as_dict() for row in rows]},
+        "replay": {"rows": rows},
         "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None},
         "details": measured,
     }
@@ -99,63 +101,6 @@ def _against_peers(progress: Progress) -> dict[str, Any]:
 # --- speed against error --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One way to replay the same poses, and how far it is from the reference.
-
-    The reference is the image engine at the chosen depth on all poses. ``None`` where a column has no meaning:
-    Sionna's own explicit arrays and thinned poses give no path list to compare.
-
-    Parameters
-    ----------
-    engine : {"image", "sionna"}
-    samples : int or None
-        Rays per tower and batch.
-    arrays : {"float64", "synthetic", "explicit"}
-        Who evaluates H: this package, or Sionna with plane waves or with every element traced.
-    depth : int
-    thinning : int
-        Every n-th pose is replayed; RSS is interpolated, rank taken from the nearest.
-    seconds : float
-        Wall time, warm: kernels were compiled and one batch run before.
-    links_per_s : float
-        Pose-tower pairs answered per second.
-    peak_mib : float
-        Largest resident memory of the whole process during the run; 0 where the system does not say it.
-    missing_paths, extra_paths : int or None
-    rss_max_error_db, rss_rms_error_db : float
-        Over links that both cover; NaN when there is none.
-    coverage_differs : int
-        Links that only one of the two covers.
-    rank_disagreement : dict of float to float
-        Share of links whose rank differs, for each K.
-    """
-
-    engine: str
-    samples: int | None
-    arrays: str
-    depth: int
-    thinning: int
-    seconds: float
-    links_per_s: float
-    peak_mib: float
-    missing_paths: int | None
-    extra_paths: int | None
-    rss_max_error_db: float
-    rss_rms_error_db: float
-    coverage_differs: int
-    rank_disagreement: dict[float, float]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON: NaN becomes None, K becomes text."""
-        result: dict[str, Any] = {name: getattr(self, name) for name in self.__slots__}
-        for name, value in result.items():
-            if isinstance(value, float) and not np.isfinite(value):
-                result[name] = None
-        result["rank_disagreement"] = {f"{k:g}": share for k, share in self.rank_disagreement.items()}
-        return result
-
-
 def speed_against_error(
     site: Site,
     link: Link,
@@ -167,7 +112,7 @@ def speed_against_error(
     explicit_poses: int = 50,
     progress: Progress = silent,
 ) -> list[Row]:
-    """Rows of speed against error.
+    """Rows of speed against error: ways to replay the same poses, each held against the image engine at depth 2.
 
     Parameters
     ----------
@@ -184,8 +129,14 @@ def speed_against_error(
 
     Returns
     -------
-    list of Row
-        Image engine first: once Sionna is loaded the process stays larger.
+    list of dict
+        Image engine first: once Sionna is loaded the process stays larger. Each row has ``engine``, ``samples`` (rays
+        per tower and batch), ``arrays`` (who evaluates H: this package in ``float64``, Sionna with ``synthetic`` plane
+        waves or with every element traced, ``explicit``), ``depth``, ``thinning`` (every n-th pose is replayed; RSS is
+        interpolated, rank taken from the nearest), ``seconds`` (wall time, warm), ``links_per_s`` (pose-tower pairs
+        answered), ``peak_mib`` (of the whole process; 0 where the system does not say it), ``missing_paths`` and
+        ``extra_paths`` (None where there is no path list), ``rss_max_error_db`` and ``rss_rms_error_db`` over links
+        that both cover (None without one), ``coverage_differs`` (links that one covers) and ``rank_disagreement`` by K.
     """
     case = _Case(site, link, poses, replay(site, link, poses, Search(max_depth=DEPTH)))
     every = np.arange(len(poses))
@@ -279,14 +230,16 @@ class _Case:
 
     def _row(self, difference: Difference, spent: Mapping[str, Any], poses: int | None = None, **about: Any) -> Row:
         plain: dict[str, Any] = {"engine": "image", "samples": None, "arrays": "float64", "depth": DEPTH, "thinning": 1}
-        names = ("rss_max_error_db", "rss_rms_error_db", "coverage_differs", "rank_disagreement")
         links = (len(self.poses) if poses is None else poses) * len(self.link.tower_arrays)
-        return Row(
+        errors = {name: getattr(difference, name) for name in ("rss_max_error_db", "rss_rms_error_db")}
+        return {
             **{**plain, "missing_paths": None, "extra_paths": None, **about},
-            **{name: getattr(difference, name) for name in names},
+            **{name: value if np.isfinite(value) else None for name, value in errors.items()},
             **spent,
-            links_per_s=links / max(spent["seconds"], 1e-9),
-        )
+            "coverage_differs": difference.coverage_differs,
+            "rank_disagreement": {f"{k:g}": share for k, share in difference.rank_disagreement.items()},
+            "links_per_s": links / max(spent["seconds"], 1e-9),
+        }
 
 
 def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:

@@ -488,6 +488,8 @@ def maps_record(
     s, result, flown = outcome.settings, outcome.shown, outcome.corrected
     rss = tuple(one for mode, maps in outcome.ordered() for one in _rss_maps(maps, mode))
     rank = tuple(one for mode, maps in outcome.ordered() for one in _rank_maps(maps, mode))
+    towers = result.tower_names if len(result.tower_names) > 1 else ()
+    by_tower = (one for mode, maps in outcome.ordered() for tower in towers for one in _rank_maps(maps, mode, tower))
     return page.MapsData(
         title=f"Coverage and rank maps, {outcome.site.name}",
         name=name,
@@ -502,7 +504,7 @@ def maps_record(
         outside_flown=0.0 if flown is None else flown.outside,
         corrected_words="" if flown is None else flown.sentence,
         rank=rank,
-        rank_by_tower=tuple(one for mode, maps in outcome.ordered() for one in _tower_rank_maps(maps, mode)),
+        rank_by_tower=tuple(by_tower),
         layers=tuple(_further_layers(outcome)),
         further=(*(() if flown is None else flown.page_layers(result.grid)), *_linked_layers(outcome)),
         correlation=tuple(_correlation_panels(outcome)),
@@ -534,29 +536,18 @@ def _rss_maps(result: MapResult, mode: str) -> Iterator[page.RssMap]:
                 )
 
 
-def _rank_maps(result: MapResult, mode: str) -> Iterator[page.RankMap]:
-    ranks, shares = result.ranks(), result.rank_shares()
-    for column, k in enumerate(result.ks):
-        for row, height in enumerate(result.rank_altitudes_m):
-            yield page.RankMap(
-                k=k,
-                altitude_m=height,
-                rank=result.grid.raster(ranks[row, column]).astype(np.int64),
-                share=shares[row, column],
-                foliage=mode,
-            )
-
-
-def _tower_rank_maps(result: MapResult, mode: str) -> Iterator[page.RankMap]:
-    """Rank to each tower alone."""
-    for tower in result.tower_names if len(result.tower_names) > 1 else ():
-        ranks, shares = result.ranks(tower), result.rank_shares(tower)
-        for column, k in enumerate(result.ks):
-            for row, height in enumerate(result.rank_altitudes_m):
-                yield page.RankMap(
-                    k=k, altitude_m=height, rank=result.grid.raster(ranks[row, column]).astype(np.int64),
-                    share=shares[row, column], foliage=mode, tower=tower,
-                )  # fmt: skip
+def _rank_maps(result: MapResult, mode: str, tower: str | None = None) -> Iterator[page.RankMap]:
+    """Rank to the serving tower, or to one."""
+    ranks, shares = result.ranks(tower), result.rank_shares(tower)
+    for (column, k), (row, height) in itertools.product(enumerate(result.ks), enumerate(result.rank_altitudes_m)):
+        yield page.RankMap(
+            k=k,
+            altitude_m=height,
+            rank=result.grid.raster(ranks[row, column]).astype(np.int64),
+            share=shares[row, column],
+            foliage=mode,
+            **({} if tower is None else {"tower": tower}),
+        )
 
 
 def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:

@@ -50,7 +50,7 @@ TRIED_POSES = (32, 160)
 """Of the two replays that a time is extrapolated from."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class PlannedStage:
     """A stage: what it works on, and CPU seconds, None where they cannot be told beforehand."""
 
@@ -161,28 +161,28 @@ def report_plan(
     rss, rank = _tried_replays(data)
     rt = settings.rt
     stages = [
-        PlannedStage(name="imports", work="libraries", seconds=cost["imports"]),
-        PlannedStage(name="read", work=f"{len(inputs)} files", seconds=reading),
+        PlannedStage("imports", "libraries", cost["imports"]),
+        PlannedStage("read", f"{len(inputs)} files", reading),
     ]
     if n_rss and settings.rss.lag in ("estimate", "apply"):
         towers = len({series.tower for series in data.rss})
         seconds = towers * cost["clocks, per receiver"]
-        stages.append(PlannedStage(name="clocks", work=f"{towers} receivers", seconds=seconds))
+        stages.append(PlannedStage("clocks", f"{towers} receivers", seconds))
     stages += [*rss, *rank]
     seconds = n_rss * cost["compare, per RSS sample"] + n_rank * cost["compare, per rank sample"]
-    stages.append(PlannedStage(name="compare", work=f"{n_rss} RSS and {n_rank} rank samples", seconds=seconds))
+    stages.append(PlannedStage("compare", f"{n_rss} RSS and {n_rank} rank samples", seconds))
     if rt.audit_links > 0 and settings.report.audit == "now":
         links = min(rt.audit_links, n_rss + n_rank)
         seconds = cost["audit"] + len(rss + rank) * cost["audit, per tower and array"]
-        stages.append(PlannedStage(name="audit", work=f"{links} links by the other engine", seconds=seconds))
+        stages.append(PlannedStage("audit", f"{links} links by the other engine", seconds))
     if n_rss and rt.engine == "image":
         known_s = [stage.seconds for stage in rss if stage.seconds is not None]
         seconds = MEASURED["ladder, replays of the RSS"] * sum(known_s)
-        stages.append(PlannedStage(name="ladder", work="simpler and richer models", seconds=seconds))
+        stages.append(PlannedStage("ladder", "simpler and richer models", seconds))
     drawn = 0 if figures == "none" else len(data.rss) + len(data.rank)
     drawing = (cost["figures"] + drawn * cost["figures, per channel"]) * (3.0 if figures == "all" else 1.0)
     seconds = cost["page"] + (drawing if drawn else 0.0)
-    stages.append(PlannedStage(name="report", work=f"page, figures of {drawn} channels", seconds=seconds))
+    stages.append(PlannedStage("report", f"page, figures of {drawn} channels", seconds))
     return Plan(job="report", inputs=tuple(inputs), output=out, stages=tuple(stages), measured=_measured_text(factor))
 
 
@@ -215,9 +215,11 @@ def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> P
 
     work, n = f"{len(poses)} poses, engine {rt.engine}", len(poses)
     if rt.engine != "image" or n == 0:
-        return PlannedStage(name=name, work=work, seconds=None if n else 0.0)
-    if (planned := _by_first_faces(site, rt, name, work, link, poses)) is not None:
-        return planned
+        return PlannedStage(name, work, None if n else 0.0)
+    search = Search(max_depth=rt.max_depth, power_cut_db=rt.advanced.power_cut_db)
+    if (searched := _searched(site, link, poses, search)) is not None:
+        setup, estimate = searched
+        return PlannedStage(name, f"{work}; path search {estimate}", setup + estimate.seconds)
 
     def tried(count: int) -> float:
         few = np.unique(np.linspace(0, n - 1, min(n, count)).astype(int))
@@ -226,45 +228,37 @@ def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> P
 
     few, more = TRIED_POSES
     if n <= more:
-        return PlannedStage(name=name, work=work, seconds=tried(n))
+        return PlannedStage(name, work, tried(n))
     small, large = tried(few), tried(more)
     per_pose = max(large - small, 0.2 * large) / (more - few)  # a hiccup in the small one does not make poses free
-    return PlannedStage(name=name, work=work, seconds=large + per_pose * (n - more))
+    return PlannedStage(name, work, large + per_pose * (n - more))
 
 
-def _by_first_faces(site: Site, rt: RtSettings, name: str, work: str, link: Link, poses: Poses) -> PlannedStage | None:
-    """The stage of a replay among thousands of faces, from the search of the first ones; None among few."""
+def _searched(site: Site, link: Link, poses: Poses, search: Search) -> tuple[float, Any] | None:
+    """CPU seconds to prepare a search among thousands of faces, which are spent once, and its estimate; None among few.
+
+    The estimate is extrapolated from the first faces.
+    """
     start = time.process_time()
-    estimate = estimate_search(
-        site, link, poses, Search(max_depth=rt.max_depth, power_cut_db=rt.advanced.power_cut_db), threads=1
-    )
-    if estimate is None:
-        return None
-    setup = time.process_time() - start  # reading, merging and trees, which are kept for the next stage
-    return PlannedStage(name=name, work=f"{work}; path search {estimate}", seconds=setup + estimate.seconds)
+    estimate = estimate_search(site, link, poses, search, threads=1)
+    return None if estimate is None else (time.process_time() - start, estimate)
 
 
-def _map_by_first_faces(site: Site, settings: Any, heights: int) -> PlannedStage | None:
+def _map_searched(site: Site, settings: Any, heights: int) -> PlannedStage | None:
     """The path search of a map among thousands of faces, from that of one piece of it; None among few."""
     from ..maps.grid import Grid
     from ..maps.job import CHUNK
     from .coverage_map import SiteChannels
 
-    start = time.process_time()
     spots = Grid.over_area(site.area_m, settings.spacing_m).positions_m(max(settings.rss_altitudes_m))
     piece = spots[:: max(1, len(spots) // CHUNK)][:CHUNK]
     poses = Poses(piece, np.tile(np.eye(3), (len(piece), 1, 1)))
-    estimate = estimate_search(
-        site, SiteChannels(site, settings).siso, poses, Search(max_depth=settings.max_depth), threads=1
-    )
-    if estimate is None:
+    searched = _searched(site, SiteChannels(site, settings).siso, poses, Search(max_depth=settings.max_depth))
+    if searched is None:
         return None
-    setup, pieces = time.process_time() - start, heights * -(-len(spots) // CHUNK)
-    return PlannedStage(
-        name="path search",
-        work=f"path search in {pieces} pieces, each {estimate}",
-        seconds=setup + pieces * estimate.seconds,
-    )
+    pieces = heights * -(-len(spots) // CHUNK)
+    work = f"path search in {pieces} pieces, each {searched[1]}"
+    return PlannedStage("path search", work, searched[0] + pieces * searched[1].seconds)
 
 
 def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan:
@@ -293,8 +287,8 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
     links = positions * heights * len(place.towers)
     factor = probe() / PROBE_S
     cost = {name: seconds * factor for name, seconds in MEASURED.items()}
-    stages = [PlannedStage(name="imports", work="libraries", seconds=cost["imports"])]
-    searched = _map_by_first_faces(place, settings, heights) if settings.engine == "image" else None
+    stages = [PlannedStage("imports", "libraries", cost["imports"])]
+    searched = _map_searched(place, settings, heights) if settings.engine == "image" else None
     for mode in settings.foliage:
         work = f"{links} links: {positions} positions, {heights} heights, {len(place.towers)} towers"
         seconds: float | None = None
@@ -307,11 +301,11 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
             )
             tried = len(Grid.over_area(place.area_m, coarse.spacing_m))
             seconds = _cpu_seconds(lambda one=coarse: make_maps(place, one, Stages())) * positions / tried
-        stages.append(PlannedStage(name=f"maps, foliage {mode}", work=work, seconds=seconds))
+        stages.append(PlannedStage(f"maps, foliage {mode}", work, seconds))
     if settings.study:
         seconds = positions * cost["study, per position"]
-        stages.append(PlannedStage(name="study", work="correlation and interpolation", seconds=seconds))
+        stages.append(PlannedStage("study", "correlation and interpolation", seconds))
     layers = heights * len(place.towers) * len(settings.foliage) * (1 + len(settings.ks))
     seconds = cost["map pages"] + positions * layers * cost["export, per layer and position"]
-    stages.append(PlannedStage(name="export, page", work=f"some {layers} layers", seconds=seconds))
+    stages.append(PlannedStage("export, page", f"some {layers} layers", seconds))
     return Plan(job="map", inputs=tuple(inputs), output=out, stages=tuple(stages), measured=_measured_text(factor))

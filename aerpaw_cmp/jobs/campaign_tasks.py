@@ -27,7 +27,7 @@ from ..flight.settings import FlightFile, RssSettings, load_flight
 from ..flight.training import logs_of
 from ..report.campaign_data import Failure, FlownRank, FlownTrack, RankRow, RssRow
 from .flight_run import run_flight
-from .outcomes import OutcomeStore, code_digest, records_of, task_inputs, task_key
+from .outcomes import OutcomeStore, code_digest, task_inputs, task_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +260,7 @@ def task_facts(task: Task) -> Facts:
 
 def outcome_store(keep: Path) -> OutcomeStore:
     """The outcomes of campaigns in a folder."""
-    return OutcomeStore(keep, records_of(Outcome))
+    return OutcomeStore(keep, Outcome)
 
 
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:

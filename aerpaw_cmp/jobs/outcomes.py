@@ -8,15 +8,15 @@ import hashlib
 import io
 import json
 import os
-import re
 import zipfile
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module, metadata
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter
 
 from ..common.errors import UsageError
 from ..common.files import atomic_path, seal, unseal
@@ -42,8 +42,8 @@ class OutcomeStore:
     ----------
     folder : Path
         Made when the first entry is written.
-    types : iterable of type
-        Frozen dataclasses that an entry may hold (:func:`records_of`); nothing else is ever built from a file.
+    kind : type
+        Dataclass of an outcome; an entry is held against its fields, and nothing else is ever built from a file.
 
     Attributes
     ----------
@@ -51,9 +51,10 @@ class OutcomeStore:
         Damaged entries that were not used.
     """
 
-    def __init__(self, folder: Path, types: Iterable[type]) -> None:
+    def __init__(self, folder: Path, kind: type) -> None:
         self.folder = folder
-        self._types = {kind.__name__: kind for kind in types}
+        # a list, since pydantic takes no configuration beside a dataclass
+        self._kind = TypeAdapter(list[kind], config=ConfigDict(arbitrary_types_allowed=True, extra="forbid"))  # type: ignore[valid-type]
         self.warnings: list[str] = []
 
     def check(self) -> None:
@@ -87,7 +88,7 @@ class OutcomeStore:
         try:
             with np.load(io.BytesIO(content), allow_pickle=False) as parts:
                 arrays = {name: parts[name] for name in parts.files}
-            return self._decode(json.loads(arrays["content"].tobytes()), arrays)
+            return self._kind.validate_python([_with_arrays(json.loads(arrays["content"].tobytes()), arrays)])[0]
         except (ValueError, LookupError, TypeError, ArithmeticError, AttributeError, *_TORN):
             self.warnings.append(f"an outcome that this tool did not write was not used: {file}")
             return None
@@ -95,7 +96,8 @@ class OutcomeStore:
     def save(self, key: str, outcome: Any, manifest: Mapping[str, Any] | None = None) -> None:
         """Write an entry whole or not at all, then its manifest; nothing where the disk does not take it."""
         arrays = _Arrays()
-        content = np.frombuffer(json.dumps(self._encode(outcome, arrays)).encode(), dtype=np.uint8)
+        text = json.dumps(_plain(outcome, arrays), default=lambda number: number.item())
+        content = np.frombuffer(text.encode(), dtype=np.uint8)
         entry = io.BytesIO()
         np.savez(entry, content=content, **arrays.by_name)  # type: ignore[arg-type]
         with contextlib.suppress(OSError):
@@ -119,55 +121,28 @@ class OutcomeStore:
         """Whether there is an entry."""
         return (self.folder / f"{key}.npz").is_file()
 
-    def _encode(self, value: Any, arrays: _Arrays) -> Any:
-        if value is None or type(value) in _AS_THEY_ARE:
-            return value
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            if self._types.get(type(value).__name__) is not type(value):
-                raise TypeError(f"{type(value).__name__} is no record that an outcome may hold")
-            fields = {name: self._encode(getattr(value, name), arrays) for name in _field_names(type(value))}
-            return {"is": type(value).__name__, "of": fields}
-        if isinstance(value, np.ndarray):
-            if value.dtype.hasobject:  # these would be pickled
-                raise TypeError("an outcome holds no arrays of objects")
-            return {"is": "array", "of": arrays.put(value)}
-        if isinstance(value, (tuple, list)):
-            return {"is": type(value).__name__, "of": [self._encode(item, arrays) for item in value]}
-        if isinstance(value, Mapping):
-            pairs = [[self._encode(k, arrays), self._encode(v, arrays)] for k, v in value.items()]
-            return {"is": "dict", "of": pairs}
-        return value.item() if isinstance(value, np.generic) else value
 
-    def _decode(self, value: Any, arrays: Mapping[str, AnyArray]) -> Any:
-        if not isinstance(value, dict):
-            return value
-        kind, content = value["is"], value["of"]
-        if kind == "array":
-            return arrays[content]
-        if kind in ("tuple", "list"):
-            items = [self._decode(item, arrays) for item in content]
-            return tuple(items) if kind == "tuple" else items
-        if kind == "dict":
-            return {self._decode(k, arrays): self._decode(v, arrays) for k, v in content}
-        fields = {name: self._decode(item, arrays) for name, item in content.items()}
-        for field in dataclasses.fields(self._types[kind]):
-            if field.name in fields and not _may_be(fields[field.name], str(field.type)):
-                raise TypeError(f"{kind}.{field.name} is no {field.type}")
-        return self._types[kind](**fields)
+_ARRAY = "array of the entry"
+"""Key of the name of an array, in its place in the JSON."""
 
 
-_KINDS: dict[str, type | tuple[type, ...]] = {
-    "float": (int, float), "int": int, "str": str, "bool": bool, "tuple": tuple, "dict": dict, "Mapping": dict,
-    "AnyArray": np.ndarray, "FloatArray": np.ndarray, "IntArray": np.ndarray, "BoolArray": np.ndarray,
-}  # fmt: skip
+def _plain(value: Any, arrays: _Arrays) -> Any:
+    """A record as JSON takes it."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name), arrays) for field in dataclasses.fields(value)}
+    if isinstance(value, np.ndarray):
+        return {_ARRAY: arrays.put(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item, arrays) for key, item in value.items()}
+    return [_plain(item, arrays) for item in value] if isinstance(value, (tuple, list)) else value
 
 
-def _may_be(value: Any, annotation: str) -> bool:
-    """Whether a value can stand in a field: a forged entry must not fail where its numbers are used."""
-    kinds = [_KINDS.get(part.strip().split("[")[0]) for part in re.split(r"\|(?![^\[]*\])", annotation)]
-    if value is None:
-        return "None" in annotation or None in kinds
-    return None in kinds or any(isinstance(value, kind) for kind in kinds if kind is not None)
+def _with_arrays(value: Any, arrays: Mapping[str, AnyArray]) -> Any:
+    """JSON with the arrays in their places."""
+    if isinstance(value, dict):
+        named = value.get(_ARRAY)
+        return arrays[named] if named else {key: _with_arrays(item, arrays) for key, item in value.items()}
+    return [_with_arrays(item, arrays) for item in value] if isinstance(value, list) else value
 
 
 class _Arrays:
@@ -179,36 +154,17 @@ class _Arrays:
 
     def put(self, array: AnyArray) -> str:
         """The name of an array."""
+        if array.dtype.hasobject:  # these would be pickled
+            raise TypeError("an outcome holds no arrays of objects")
         name = self._names.setdefault((array.dtype.str, array.shape, array.tobytes()), f"a{len(self._names)}")
         self.by_name[name] = array
         return name
-
-
-_AS_THEY_ARE = frozenset({str, int, float, bool})
-
-
-@cache
-def _field_names(kind: type) -> tuple[str, ...]:
-    return tuple(field.name for field in dataclasses.fields(kind) if field.init)
 
 
 def _text(manifest: Mapping[str, Any]) -> bytes:
     """A manifest as JSON, a line per entry: indented, it would cost as much as all else that keeps an outcome."""
     lines = [f"{json.dumps(str(key))}: {json.dumps(value, default=str)}" for key, value in manifest.items()]
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
-
-
-def records_of(kind: Any) -> set[type]:
-    """The dataclasses that a value of some type may hold, its own included, by the types of their fields."""
-    found: set[type] = set()
-    open_: list[Any] = [kind]
-    while open_:
-        one = open_.pop()
-        open_ += get_args(one)
-        if isinstance(one, type) and dataclasses.is_dataclass(one) and one not in found:
-            found.add(one)
-            open_ += get_type_hints(one).values()
-    return found
 
 
 _WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links": True, "advanced": {"cache"}}}

@@ -56,6 +56,10 @@ Scheduler = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--scheduler", "--cluster", help="Address of a Dask scheduler, instead of local workers."),
 ]
+Flights = Annotated[
+    Optional[list[Path]],  # noqa: UP045
+    typer.Option("--with", metavar="FLIGHT", help="Flown flight.yaml to learn from; repeatable."),
+]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print stages and time estimate; write nothing.")]
 Quiet = Annotated[
     bool,

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from ..jobs.options import RunOptions
-from .app import Force, Json, LogsRoot, command
+from .app import Flights, Force, Json, LogsRoot, command
 from .shown import print_json, say, table
 
 _FENCE = typer.Option(metavar="KML", help="Area that may be flown  [default: the area of the site]")
@@ -29,10 +29,7 @@ def plan(
         str,
         typer.Argument(help="Target: sphere (all directions), a site (a grid), a route, or points."),
     ],
-    flights: Annotated[
-        Optional[list[Path]],  # noqa: UP045
-        typer.Option("--with", metavar="FLIGHT", help="flight.yaml that was flown; repeatable."),
-    ] = None,
+    flights: Flights = None,
     site: Annotated[Optional[str], typer.Option(help="Site, where no flight names it.")] = None,  # noqa: UP045
     tower: Annotated[
         Optional[list[str]],  # noqa: UP045

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from ..jobs.options import RunOptions
-from .app import Force, Json, LogsRoot, command
+from .app import Flights, Force, Json, LogsRoot, command
 from .shown import number, print_json, say, table
 
 
@@ -29,10 +29,7 @@ def predict(
             "height_m), or a site (a grid).",
         ),
     ],
-    flights: Annotated[
-        Optional[list[Path]],  # noqa: UP045
-        typer.Option("--with", metavar="FLIGHT", help="flight.yaml to learn from; repeatable."),
-    ] = None,
+    flights: Flights = None,
     out: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/prediction-<WHERE>]"),

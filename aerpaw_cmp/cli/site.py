@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Optional
 import typer
 
 from ..jobs.options import RunOptions
-from .app import DryRun, Force, Json, LogsRoot, Scheduler, Workers, command, site_app
+from .app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, command, site_app
 from .shown import print_files, print_json, print_plan, say, table
 
 
@@ -192,10 +192,7 @@ def map_(
         Optional[Path],  # noqa: UP045
         typer.Option(help="flight.yaml whose track is the training set of the test 'along a flight'."),
     ] = None,
-    flights: Annotated[
-        Optional[list[Path]],  # noqa: UP045
-        typer.Option("--with", metavar="FLIGHT", help="flight.yaml that corrects the levels; repeatable."),
-    ] = None,
+    flights: Flights = None,
     logs_root: LogsRoot = None,
     threshold_dbm: Annotated[
         Optional[float],  # noqa: UP045

@@ -23,7 +23,7 @@ from ..compare.rss import LEARNED_HERE
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, Settings, load_flight
 from ..report.campaign_data import CampaignData, Failure, HeldOutFold, RankHeldOutFold, RankRow, RssRow
-from .campaign_fit import fit_all
+from .campaign_fit import HeldOutSettings, fit_all
 from .campaign_plan import compute, kept_outcomes
 from .campaign_rank_fit import K_KEY, fit_rank_all
 from .campaign_tasks import Task, counted_once, flight_data, outcome_store
@@ -33,22 +33,6 @@ from .workers import open_workers
 
 AS_WRITTEN = "as written"
 """Label of the only setting of a campaign that names none."""
-
-
-class HeldOutSettings(Settings):
-    """Parameters that are fitted on some flights and scored on all."""
-
-    fit: Annotated[dict[str, list[float] | list[list[float]]], Field(min_length=1)]
-    """Dotted flight key -> values to try, increasing. Keys below ``link``, ``rt`` or ``site``, or ``rss.lag``; for rank
-    also ``rank.k``, and lists as values (slants)."""
-    criterion: Literal["rmse", "kappa", "log_score", "total_variation"] = "rmse"
-    """What the fit lowers or raises: the RMSE of RSS, or a number of the reported rank."""
-    fit_on: list[str] | None = None
-    """Names of the flights to fit on; without it each flight is left out once."""
-    setting: str | None = None
-    """Label of the setting that the fit starts from; by default the first."""
-    samples: Annotated[int, Field(ge=50)] = 1000
-    """Evenly spread samples per series that the search looks at; all of them are scored."""
 
 
 class CampaignFile(Settings):
@@ -242,17 +226,13 @@ def _folds(
     progress: Progress,
 ) -> _Folds:
     """The held-out fit by its criterion; one that fails costs the other numbers of a campaign nothing."""
-    criterion = settings.criterion
-    label, of = _tasks_of_fit(settings, tasks, rows if criterion == "rmse" else rank)
-    about: dict[str, Any] = {"setting": label, "samples": settings.samples, "progress": progress}
+    of_rank = settings.criterion != "rmse"
+    label, of = _tasks_of_fit(settings, tasks, rank if of_rank else rows)
     try:
         flights = {flight: flight_data(task) for flight, task in of.items()}
-        if criterion != "rmse":
-            return _Folds(
-                rank=tuple(fit_rank_all(flights, settings.fit, settings.fit_on, criterion=criterion, **about))
-            )
-        grids = {key: [float(v) for v in values if not isinstance(v, list)] for key, values in settings.fit.items()}
-        return _Folds(rss=tuple(fit_all(flights, grids, settings.fit_on, **about)))
+        if of_rank:
+            return _Folds(rank=tuple(fit_rank_all(flights, settings, label, progress)))
+        return _Folds(rss=tuple(fit_all(flights, settings, label, progress)))
     except AerpawCmpError as error:
         return _Folds(failure=str(error))
 

@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from math import prod
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from ..common.errors import InputError, UsageError
 from ..common.stages import Progress, silent
@@ -24,7 +25,7 @@ from ..compare.result import APPLIED
 from ..flight.data import FlightData, choose_site
 from ..flight.overrides import overridden
 from ..flight.replay import Clock, estimate_clocks, replay_rss
-from ..flight.settings import FlightFile, RssSettings
+from ..flight.settings import FlightFile, RssSettings, Settings
 from ..report.campaign_data import HeldOutFold, HeldOutRow
 from .levels import levels_of
 
@@ -39,6 +40,22 @@ NO_EFFECT_DB = 0.01
 
 SWEEPS = 6
 """Rounds over all parameters, at most; it ends earlier when a round changes nothing."""
+
+
+class HeldOutSettings(Settings):
+    """Parameters that are fitted on some flights and scored on all."""
+
+    fit: Annotated[dict[str, list[float] | list[list[float]]], Field(min_length=1)]
+    """Dotted flight key -> values to try, increasing. Keys below ``link``, ``rt`` or ``site``, or ``rss.lag``; for rank
+    also ``rank.k``, and lists as values (slants)."""
+    criterion: Literal["rmse", "kappa", "log_score", "total_variation"] = "rmse"
+    """What the fit lowers or raises: the RMSE of RSS, or a number of the reported rank."""
+    fit_on: list[str] | None = None
+    """Names of the flights to fit on; without it each flight is left out once."""
+    setting: str | None = None
+    """Label of the setting that the fit starts from; by default the first."""
+    samples: Annotated[int, Field(ge=50)] = 1000
+    """Evenly spread samples per series that the search looks at; all of them are scored."""
 
 
 # --- the search -----------------------------------------------------------------------------------------------------
@@ -96,9 +113,8 @@ def _by_key(
 def fitted_folds(
     kind: str,
     names: Sequence[str],
-    fit_on: Sequence[str] | None,
+    settings: HeldOutSettings,
     loss: Callable[[Sequence[str], Point], float],
-    grids: Mapping[str, Sequence[Any]],
     progress: Progress,
 ) -> Iterator[tuple[list[str], list[str], Search]]:
     """The fit on the named flights, or, without names, on all but one, each left out in turn.
@@ -108,13 +124,10 @@ def fitted_folds(
     kind : {"RSS", "rank"}
         What is fitted.
     names : sequence of str
-        Flights that gave it.
-    fit_on : sequence of str, optional
-        Those to fit on; names that gave nothing are passed over.
+        Flights that gave it; other names in ``fit_on`` are passed over.
+    settings : HeldOutSettings
     loss : callable
         Of training flights at a point.
-    grids : mapping of str to sequence
-        Values to try.
     progress : Progress
 
     Yields
@@ -129,18 +142,18 @@ def fitted_folds(
     InputError
         No sample could be compared under any of the values.
     """
-    if fit_on is None:
+    if settings.fit_on is None:
         if len(names) < 2:
             raise UsageError(f"{len(names)} flights with {kind}", expected="two or more, to leave one out at a time")
         trainings = [[name for name in names if name != left] for left in names]
     else:
-        trainings = [[name for name in fit_on if name in names]]
+        trainings = [[name for name in settings.fit_on if name in names]]
         if not trainings[0]:
             known = ", ".join(names) or "none has"
             raise UsageError(f"no flight of held_out.fit_on gave {kind}", expected=f"a flight that has {kind}: {known}")
     for train in trainings:
         progress(f"held-out {kind}: fit on " + ", ".join(train))
-        found = search(lambda point, train=train: loss(train, point), grids)  # type: ignore[misc]
+        found = search(lambda point, train=train: loss(train, point), settings.fit)  # type: ignore[misc]
         if not np.isfinite(found.tried[0][1]):
             raise InputError(
                 f"nothing can be fitted on {', '.join(train)}",
@@ -230,13 +243,7 @@ def bench_of(data: FlightData) -> Bench:
 
 
 def fit_all(
-    flights: Mapping[str, FlightData],
-    grids: Mapping[str, Sequence[float]],
-    fit_on: Sequence[str] | None,
-    *,
-    setting: str = "",
-    samples: int = 1000,
-    progress: Progress = silent,
+    flights: Mapping[str, FlightData], settings: HeldOutSettings, setting: str = "", progress: Progress = silent
 ) -> list[HeldOutFold]:
     """Least mean over flights of the mean square residual.
 
@@ -244,14 +251,9 @@ def fit_all(
     ----------
     flights : mapping of str to FlightData
         Flights with RSS, by name.
-    grids : mapping of str to sequence of float
-        Values to try, increasing, by dotted flight key.
-    fit_on : sequence of str, optional
-        Names; those that are not in ``flights`` (they failed) are passed over.
+    settings : HeldOutSettings
     setting : str
         Label, for the record.
-    samples : int
-        Evenly spread samples per series that the search looks at; all are scored.
     progress : Progress
 
     Returns
@@ -265,13 +267,14 @@ def fit_all(
         As :func:`fitted_folds`.
     """
     full = {name: bench_of(data) for name, data in flights.items()}
-    few = {name: bench.thinned(samples) for name, bench in full.items()}
+    few = {name: bench.thinned(settings.samples) for name, bench in full.items()}
+    grids: Mapping[str, Sequence[Any]] = settings.fit
 
     def loss(train: Sequence[str], point: Point) -> float:
         return float(np.mean([rmse(few[name].residual_db(point)) ** 2 for name in train]))
 
     folds = []
-    for train, test, found in fitted_folds("RSS", list(flights), fit_on, loss, grids, progress):
+    for train, test, found in fitted_folds("RSS", list(flights), settings, loss, progress):
         curves = _curves(few, grids, found.point)
         ends = {name: (values[0], values[-1]) for name, values in grids.items() if len(values) > 1}
         folds.append(

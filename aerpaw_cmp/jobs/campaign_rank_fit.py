@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,7 @@ from ..flight.data import FlightData, choose_site
 from ..flight.overrides import overridden
 from ..flight.replay import replay_rank
 from ..report.campaign_data import RankHeldOutFold, RankHeldOutRow
-from .campaign_fit import Point, Search, fitted_folds
-
-Criterion = Literal["kappa", "log_score", "total_variation"]
+from .campaign_fit import HeldOutSettings, Point, Search, fitted_folds
 
 K_KEY = "rank.k"
 """The one key of the fit that is no key of a replay: a single singular-value ratio."""
@@ -95,7 +93,7 @@ def shares_by_rank(reported: IntArray, simulated: IntArray) -> FloatArray:
     return np.asarray(table / table.sum(axis=1, keepdims=True))
 
 
-def loss(benches: Sequence[RankBench], point: Point, criterion: Criterion) -> float:
+def loss(benches: Sequence[RankBench], point: Point, criterion: str) -> float:
     """What the search lowers, mean over flights: 1 - kappa, total variation, or the log score [nats]."""
     pairs = [bench.pairs(point) for bench in benches]
     pairs = [(reported, simulated) for reported, simulated in pairs if len(reported)]
@@ -122,14 +120,7 @@ def _log_losses(pairs: Sequence[tuple[IntArray, IntArray]], scored: int) -> Floa
 
 
 def fit_rank_all(
-    flights: Mapping[str, FlightData],
-    grids: Mapping[str, Sequence[Any]],
-    fit_on: Sequence[str] | None,
-    *,
-    criterion: Criterion,
-    setting: str = "",
-    samples: int = 1000,
-    progress: Progress = silent,
+    flights: Mapping[str, FlightData], settings: HeldOutSettings, setting: str = "", progress: Progress = silent
 ) -> list[RankHeldOutFold]:
     """Fit on the named flights, or leave each flight out once.
 
@@ -137,16 +128,10 @@ def fit_rank_all(
     ----------
     flights : mapping of str to FlightData
         Flights with rank, by name.
-    grids : mapping of str to sequence
-        Values to try, by dotted flight key; ``rank.k`` is the singular-value ratio. A value may be a list (slants).
-    fit_on : sequence of str, optional
-        Names; those that are not in ``flights`` are passed over.
-    criterion : {"kappa", "log_score", "total_variation"}
+    settings : HeldOutSettings
         The log score takes the shares of reported ranks per simulated rank from the other flights of the fit.
     setting : str
         Label, for the record.
-    samples : int
-        Evenly spread reports per series that the search looks at; all are scored.
     progress : Progress
 
     Returns
@@ -160,15 +145,15 @@ def fit_rank_all(
         As :func:`~aerpaw_cmp.jobs.campaign_fit.fitted_folds`.
     """
     full = {name: RankBench(data) for name, data in flights.items()}
-    few = {name: bench.thinned(samples) for name, bench in full.items()}
+    few = {name: bench.thinned(settings.samples) for name, bench in full.items()}
 
     def lost(train: Sequence[str], point: Point) -> float:
-        return loss([few[name] for name in train], point, criterion)
+        return loss([few[name] for name in train], point, settings.criterion)
 
     return [
         RankHeldOutFold(
             setting=setting,
-            criterion=criterion,
+            criterion=settings.criterion,
             fitted_on=tuple(train),
             applied_to=tuple(test),
             parameters=found.point,
@@ -177,7 +162,7 @@ def fit_rank_all(
             ties=tuple(_ties([few[name] for name in train], found)),
             rows=tuple(_rows(full, train, test, found.point)),
         )
-        for train, test, found in fitted_folds("rank", list(flights), fit_on, lost, grids, progress)
+        for train, test, found in fitted_folds("rank", list(flights), settings, lost, progress)
     ]
 
 

@@ -15,7 +15,7 @@ from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.campaign import load_campaign
-from aerpaw_cmp.jobs.campaign_fit import search
+from aerpaw_cmp.jobs.campaign_fit import HeldOutSettings, search
 from aerpaw_cmp.jobs.campaign_rank_fit import RankBench, fit_rank_all, loss, shares_by_rank
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -23,6 +23,10 @@ pytestmark = pytest.mark.usefixtures("few_pictures")
 PLANTED = {"link.rank.uav.yaw_deg": 90.0, "rank.k": 20.0}
 GRIDS = {"link.rank.uav.yaw_deg": [0.0, 45.0, 90.0, 135.0], "rank.k": [5.0, 10.0, 20.0, 40.0]}
 REPORTS = 160
+
+
+def fitted(flights: dict[str, FlightData], fit: Any, fit_on: list[str] | None, criterion: str) -> list[Any]:
+    return fit_rank_all(flights, HeldOutSettings.model_validate({"fit": fit, "fit_on": fit_on, "criterion": criterion}))
 
 
 def flight(folder: Path, name: str, north_deg: float) -> FlightData:
@@ -57,7 +61,7 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FlightData]:
 
 @pytest.mark.parametrize("criterion", ["kappa", "log_score", "total_variation"])
 def test_planted_mount_and_k_are_found_on_the_other_flight(flights: dict[str, FlightData], criterion: str) -> None:
-    folds = fit_rank_all(flights, GRIDS, None, criterion=criterion)  # type: ignore[arg-type]
+    folds = fitted(flights, GRIDS, None, criterion=criterion)
     assert [fold.applied_to for fold in folds] == [("one",), ("two",)]
     for fold in folds:
         (held,) = [row for row in fold.rows if not row.fitted_here]
@@ -75,17 +79,15 @@ def test_planted_mount_and_k_are_found_on_the_other_flight(flights: dict[str, Fl
 
 def test_a_key_without_effect_is_among_what_cannot_be_told_apart(flights: dict[str, FlightData]) -> None:
     grids = {"link.rank.uav.yaw_deg": [90.0], "rank.k": [20.0], "rt.advanced.maximum_gap_s": [3.0, 4.0]}
-    (fold,) = fit_rank_all(flights, grids, ["one"], criterion="kappa")
+    (fold,) = fitted(flights, grids, ["one"], criterion="kappa")
     assert fold.ties == ({"link.rank.uav.yaw_deg": 90.0, "rank.k": 20.0, "rt.advanced.maximum_gap_s": 4.0},)
-    (other,) = fit_rank_all(
-        flights, {"rank.k": [20.0, 2.0], "link.rank.uav.yaw_deg": [90.0]}, ["one"], criterion="kappa"
-    )
+    (other,) = fitted(flights, {"rank.k": [20.0, 2.0], "link.rank.uav.yaw_deg": [90.0]}, ["one"], criterion="kappa")
     assert other.ties == ()  # a K of 2 misses most reports
 
 
 def test_values_may_be_lists_and_long_products_are_searched_key_by_key(flights: dict[str, FlightData]) -> None:
     slants = [[0.0, 0.0, 0.0, 0.0], [45.0, -45.0, -45.0, 45.0]]
-    (fold,) = fit_rank_all(flights, {"link.rank.uav.slant_deg": slants, **GRIDS}, ["one"], criterion="kappa")
+    (fold,) = fitted(flights, {"link.rank.uav.slant_deg": slants, **GRIDS}, ["one"], criterion="kappa")
     assert fold.parameters == {"link.rank.uav.slant_deg": slants[1], **PLANTED}
     many = {"rank.k": [20.0, *np.linspace(30, 300, 600).tolist()], "link.rank.uav.yaw_deg": [90.0]}
     few = [RankBench(flights["one"]).thinned(40)]
@@ -106,19 +108,19 @@ def test_the_log_score_of_a_flight_takes_the_shares_of_the_others(flights: dict[
 
 def test_refusals(flights: dict[str, FlightData]) -> None:
     with pytest.raises(UsageError, match="1 flights with rank"):
-        fit_rank_all({"one": flights["one"]}, GRIDS, None, criterion="kappa")
+        fitted({"one": flights["one"]}, GRIDS, None, criterion="kappa")
     with pytest.raises(UsageError, match="fit_on gave rank"):
-        fit_rank_all(flights, GRIDS, ["three"], criterion="kappa")
+        fitted(flights, GRIDS, ["three"], criterion="kappa")
     silent = dataclasses.replace(flights["one"].rank[0], rank=np.full(REPORTS, np.nan))
     none = {"one": dataclasses.replace(flights["one"], rank=(silent,)), "two": flights["two"]}
     with pytest.raises(InputError, match="nothing can be fitted on one"):
-        fit_rank_all(none, GRIDS, ["one"], criterion="kappa")
+        fitted(none, GRIDS, ["one"], criterion="kappa")
 
 
 def test_a_fit_takes_the_flights_that_gave_rows_under_its_own_setting() -> None:
     from types import SimpleNamespace as Row
 
-    from aerpaw_cmp.jobs.campaign import HeldOutSettings, _tasks_of_fit
+    from aerpaw_cmp.jobs.campaign import _tasks_of_fit
     from aerpaw_cmp.jobs.campaign_tasks import Task
 
     settings = HeldOutSettings.model_validate({"fit": {"rank.k": [10.0]}, "criterion": "kappa", "setting": "a"})

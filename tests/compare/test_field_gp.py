@@ -225,3 +225,12 @@ def test_white_noise_makes_no_field():
     model = fit_field([(rows, generator.normal(0.0, 2.0, len(rows)))])
     assert model.noise_sd_db == pytest.approx(2.0, abs=0.3)
     assert math.hypot(model.place_sd_db, model.drift_sd_db) < 1.0
+
+
+def test_levels_of_flights_need_no_neighbours():
+    """Mean and offsets alone are the same whether near rows are looked up or all are solved."""
+    rows = flights(np.random.default_rng(6), each=40)
+    fit = FieldFit(MOVING, rows, np.random.default_rng(7).normal(size=len(rows)))
+    near, every = (fit.predict(rows.part(slice(0, 80, 20)), ("mean", "offset"), exact=exact) for exact in (False, True))
+    np.testing.assert_allclose(near[0], every[0], atol=1e-6)
+    np.testing.assert_allclose(near[1], every[1], atol=1e-6)

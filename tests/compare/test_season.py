@@ -78,3 +78,11 @@ def test_a_drift_is_found_with_its_interval():
 def test_no_drift_without_dates(days):
     found = trend(days, np.arange(float(len(days))))
     assert np.isnan([found.slope, found.low, found.scatter]).all()
+
+
+def test_an_interval_follows_the_unit_of_the_differences():
+    drifting = np.cumsum(np.random.default_rng(8).normal(size=40))
+    usual, small = mean_of_flights(drifting), mean_of_flights(0.01 * drifting)
+    assert (small.mean, small.low, small.high) == pytest.approx(
+        (0.01 * usual.mean, 0.01 * usual.low, 0.01 * usual.high)
+    )

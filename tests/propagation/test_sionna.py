@@ -241,6 +241,22 @@ def test_versions_name_the_device(sionna):
     assert versions["variant"].startswith(("llvm", "cuda"))
 
 
+def test_sionnas_viewer_is_loaded_when_it_is_asked_for(sionna):
+    import subprocess
+    import sys
+
+    code = (
+        "import sys; from aerpaw_cmp.propagation.search import sionna; sionna.load_variant(); import sionna.rt as rt\n"
+        "assert 'pythreejs' not in sys.modules and 'IPython' not in sys.modules\n"
+        "scene = rt.load_scene(rt.scene.simple_reflector)\n"
+        "scene.preview()\n"
+        "scene.preview()\n"
+        "print(type(scene._preview_widget).__module__, 'pythreejs' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.split()[-2:] == ["sionna.rt.preview", "True"], done.stderr
+
+
 def test_cuda_and_llvm_agree(sionna, scenes, lone):
     import drjit as dr
     import mitsuba as mi

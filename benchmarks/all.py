@@ -54,7 +54,8 @@ COMMANDS: dict[str, list[str]] = {
     "peers": ["-c", PEERS],
     "report": ["benchmarks/report.py", "--quick", "--json"],
     "replay": ["benchmarks/replay.py", "--quick", "--no-sionna", "--json"],
-    "kriging": ["benchmarks/kriging.py", "--quick", "--pairs", "60", "--json"],
+    "kriging": ["benchmarks/kriging.py", "--pairs", "60", "--json"],
+    "town": ["benchmarks/scenes.py", "--scenes", "munich", "--depths", "2,3", "--sionna", "1e5,1e6", "--json", "-"],
     "pages": ["benchmarks/pages.py", "--only", "long,campaign", "--repeats", "1", "--json"],
 }
 """What is run, each in a process of its own; ``scaling`` an axis at a time."""

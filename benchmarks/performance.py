@@ -176,6 +176,57 @@ def peers(found: list[dict[str, Any]]) -> list[str]:
     return [*out, ""]
 
 
+def last_result(found: list[dict[str, Any]], name: str) -> tuple[str, dict[str, Any]]:
+    """The last result of a benchmark, and when and at what load it was measured; empty where there is none."""
+    for run in reversed(found):
+        one = run["benchmarks"].get(name, {})
+        if result := one.get("result"):
+            return f"{run['date'][:10]}, {run['version']}, load {one['load_before']} before", result
+    return "", {}
+
+
+def town(found: list[dict[str, Any]]) -> list[str]:
+    """The path search of a town, beside that of the bench scene: our search, and PathSolver on the same triangles."""
+    when, result = last_result(found, "town")
+    rows = [row for row in result.get("rows", []) if "failed" not in row]
+    ours = {row["depth"]: row["search_s"][1] for row in rows if row["kind"] == "image"}
+    if not rows:
+        return []
+    out = [
+        f"Munich of Sionna RT ({number(rows[0]['faces'])} faces, {rows[0]['receivers']} receivers, one tower; {when}); "
+        "PathSolver's time holds what its kernel cache lacks:", "",
+        "| search | depth | processor s | times ours | paths that it lacks |", "| --- | ---: | ---: | ---: | ---: |",
+    ]  # fmt: skip
+    for row in rows:
+        cpu = row["search_s"][1]
+        name = "image engine" if row["kind"] == "image" else f"PathSolver, {row['samples']:g} rays"
+        ratio = "1" if row["kind"] == "image" else number(cpu / ours[row["depth"]])
+        lacks = "none known" if row["kind"] == "image" else f"{row['extra']} of {sum(row['exact'])}"
+        out.append(f"| {name} | {row['depth']} | {number(cpu)} | {ratio} | {lacks} |")
+    return [*out, ""]
+
+
+def kriging(found: list[dict[str, Any]]) -> list[str]:
+    """Kriging in totals and by the marginal cost of a target, set-up apart."""
+    when, result = last_result(found, "kriging")
+    row = result.get("moving_window", {})
+    if "ours_100000_s" not in row:  # a quick run: too few targets for a slope
+        return []
+    counts = [int(key.split("_")[1]) for key in row if key.startswith("pykrige_") and key.endswith("_s")]
+    out = [
+        f"Kriging of one field, 20 neighbours ({when}). Totals hold what each side sets up; the last line does not:",
+        "",
+        "| targets | ours, processor s | PyKrige's C back end | times faster |", "| ---: | ---: | ---: | ---: |",
+        *(
+            f"| {number(n)} | {row[f'ours_{n}_s']:.3f} | {row[f'pykrige_{n}_s']:.3f} | {row[f'ratio_total_{n}']:.2f} |"
+            for n in counts
+        ),
+        f"| one more [us] | {row['ours_marginal_us']:.1f} | {row['pykrige_marginal_us']:.1f} "
+        f"| {row['ratio_marginal']:.2f} |", "",
+    ]  # fmt: skip
+    return out
+
+
 def reports(run: dict[str, Any]) -> list[str]:
     """What users run first: reports as they come, with their audit, and without it, against the imports they need."""
     result = run["benchmarks"].get("report", {}).get("result")
@@ -225,7 +276,7 @@ def page(found: list[dict[str, Any]]) -> str:
         *scaling_tables(scaling),
         "## Extrapolated", "",
         *long_flight(scaling), *season(scaling), *city(scaling), "",
-        *peers(found),
+        *peers(found), *town(found), *kriging(found),
     ]  # fmt: skip
     return "\n".join(lines).rstrip() + "\n"
 

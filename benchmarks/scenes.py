@@ -9,8 +9,9 @@ compiled code must have been compiled before (the first row says how long that t
 transmitter, half at street level, half 30 to 60 m up.
 
 --check     repeats a row with shadows off and says how many paths differ (and with every cut off on a crop)
---sionna    PathSolver with so many rays on the same triangles: its paths that we lack (missing), ours that it lacks
-            (extra), each of which is asked of Sionna's own scene: a ray test of every segment, shortened by 2 cm
+--sionna    PathSolver with so many rays on the same triangles, at the first of the depths: its paths that we lack
+            (missing), ours that it lacks (extra), each of which is asked of Sionna's own scene: a ray test of every
+            segment, shortened by 2 cm
 --limits, --slots   its max_num_paths_per_src and its table of candidates (2 to this power): each with each
 --growth    seconds against receivers, towers, faces and depth, fitted as powers
 """
@@ -340,7 +341,7 @@ def tasks_of(given: argparse.Namespace, names: list[str]) -> list[dict[str, Any]
         ]
     tasks += [{"kind": "prisms", "prisms": n, "depth": d, **common} for n in given.prisms for d in depths]
     tasks += [
-        {"kind": "sionna", "scene": n, "depth": max(depths), "samples": s, "limit": m, "slots": t, **common}
+        {"kind": "sionna", "scene": n, "depth": depths[0], "samples": s, "limit": m, "slots": t, **common}
         for n in names
         for s in given.sionna
         for m in given.limits
@@ -363,7 +364,7 @@ def main() -> None:
     parser.add_argument("--only-sionna", action="store_true")
     parser.add_argument("--growth", action="store_true")
     parser.add_argument("--figure", type=Path)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="- for standard output, last")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one:
@@ -392,7 +393,8 @@ def main() -> None:
         if given.figure:
             draw(found, names[0], given.figure)
     if given.json:
-        given.json.write_text(json.dumps({"rows": rows, "growth": found}, indent=1))
+        text = json.dumps({"rows": rows, "growth": found}, indent=1)
+        print(text) if str(given.json) == "-" else given.json.write_text(text)
 
 
 if __name__ == "__main__":

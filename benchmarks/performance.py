@@ -199,7 +199,7 @@ def town(found: list[dict[str, Any]]) -> list[str]:
     ]  # fmt: skip
     for row in rows:
         cpu = row["search_s"][1]
-        name = "image engine" if row["kind"] == "image" else f"PathSolver, {row['samples']:g} rays"
+        name = "image engine" if row["kind"] == "image" else f"PathSolver, {number(row['samples'])} rays"
         ratio = "1" if row["kind"] == "image" else number(cpu / ours[row["depth"]])
         lacks = "none known" if row["kind"] == "image" else f"{row['extra']} of {sum(row['exact'])}"
         out.append(f"| {name} | {row['depth']} | {number(cpu)} | {ratio} | {lacks} |")

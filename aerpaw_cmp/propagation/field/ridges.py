@@ -62,8 +62,8 @@ def _parameter(height_m: FloatArray, before_m: FloatArray, after_m: FloatArray, 
 def deygout_db(length_m: FloatArray, share: FloatArray, intrusion_m: FloatArray, wavelength_m: float) -> FloatArray:
     """Loss of up to three edges by Deygout's construction with Causebrook's correction.
 
-    Sources: Deygout, IEEE Trans. Antennas Propag. 14 (1966) 480, doi 10.1109/TAP.1966.1138719; Causebrook and Davies,
-    BBC Research Department report 1971/43.
+    Sources: Deygout, IEEE Trans. Antennas Propag. 14 (1966) 480, doi 10.1109/TAP.1966.1138719; Causebrook and Davis,
+    BBC Research Department report 1971/43, eq. 13 to 15.
 
     Parameters
     ----------

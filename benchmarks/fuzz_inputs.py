@@ -332,21 +332,13 @@ def _small_mat(data: bytes) -> bytes:
     """A MATLAB 5 file with the first rows of each array."""
     import scipy.io
 
+    from tests.parsers.samples import saved
+
     content = scipy.io.loadmat(io.BytesIO(data))
     arrays = {
         k: v[:6] if np.asarray(v).shape[0] > 6 else v[:, :6] for k, v in content.items() if not k.startswith("__")
     }
-    out = io.BytesIO()
-    scipy.io.savemat(out, arrays, do_compression=len(data) % 2 == 0)
-    return out.getvalue()
-
-
-def _mat_of(arrays: dict[str, Any]) -> bytes:
-    import scipy.io
-
-    out = io.BytesIO()
-    scipy.io.savemat(out, arrays)
-    return out.getvalue()
+    return saved(arrays, compressed=len(data) % 2 == 0)
 
 
 def _log_files() -> Iterator[Path]:
@@ -359,15 +351,15 @@ def _log_files() -> Iterator[Path]:
 
 def _log_seeds() -> dict[str, list[bytes]]:
     """Pieces of real logs and of the samples, by the reader that knows them."""
-    from tests.parsers.samples import NO_LOGS, SAMPLES
+    from tests.parsers.samples import NO_LOGS, SAMPLES, saved
 
     found: dict[str, list[bytes]] = {r.name: [] for r in catalogue()}
     for name, samples in SAMPLES.items():
         found[name] += [data for data, *_ in samples.values()]
     for name, data in NO_LOGS.items():
         found[name].append(data)
-    found["antenna_grid"].append(_mat_of({"rad_pat": np.zeros((3, 4))}))
-    found["matlab_other"].append(_mat_of({"other": np.ones((2, 2))}))
+    found["antenna_grid"].append(saved({"rad_pat": np.zeros((3, 4))}))
+    found["matlab_other"].append(saved({"other": np.ones((2, 2))}))
     for path in _log_files():
         data = path.read_bytes()
         if data.startswith(b"\x1f\x8b"):

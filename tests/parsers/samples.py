@@ -293,6 +293,13 @@ GENERIC = (
 )
 
 
+def saved(table: dict[str, object], *, compressed: bool = True) -> bytes:
+    """A MATLAB 5 file without the time of its writing: the same bytes every time."""
+    file = io.BytesIO()
+    scipy.io.savemat(file, table, do_compression=compressed)
+    return b"MATLAB 5.0 MAT-file".ljust(116) + file.getvalue()[116:]
+
+
 def mat_flight(**changes: object) -> bytes:
     """A merged flight of five rows, two channels; the epoch holds the local wall clock."""
     count = 5
@@ -311,9 +318,7 @@ def mat_flight(**changes: object) -> bytes:
         "timestamp_power_for_csv": np.array([str(time).replace("T", " ") for time in wall]),
     }
     table.update(changes)
-    file = io.BytesIO()
-    scipy.io.savemat(file, {name: value for name, value in table.items() if value is not None}, do_compression=True)
-    return file.getvalue()
+    return saved({name: value for name, value in table.items() if value is not None})
 
 
 def lte_flight() -> bytes:
@@ -333,9 +338,7 @@ def lte_flight() -> bytes:
         "timestamp_for_csv": np.array([f"2025-03-02 10:00:00.{250 + 100 * i:03d}" for i in range(count)]),
         "timestamp_meas": seconds[:, None],
     }
-    file = io.BytesIO()
-    scipy.io.savemat(file, table, do_compression=True)
-    return file.getvalue()
+    return saved(table)
 
 
 def processed_flight() -> bytes:
@@ -351,9 +354,7 @@ def processed_flight() -> bytes:
         "ori_s": np.full((4, 1), np.pi / 2),
         "x_f": np.zeros((9, 1)),
     }
-    file = io.BytesIO()
-    scipy.io.savemat(file, table, do_compression=True)
-    return file.getvalue()
+    return saved(table)
 
 
 def mat_73() -> bytes:
@@ -457,11 +458,8 @@ TAP_EXPORT = (
 def iq_mat() -> bytes:
     """A burst of two channels with amplitudes 0.1 and 0.01."""
     phase = np.exp(1j * np.linspace(0, 20, 400))
-    file = io.BytesIO()
-    scipy.io.savemat(
-        file, {"IQ": np.array([0.1 * phase, 0.01 * phase]).astype(np.complex64), "time_stamp": np.zeros((2, 1))}
-    )
-    return file.getvalue()
+    table = {"IQ": np.array([0.1 * phase, 0.01 * phase]).astype(np.complex64), "time_stamp": np.zeros((2, 1))}
+    return saved(table, compressed=False)
 
 
 IQ_NAME = "results_3320000000.0_2000000.0_2025_03_02_10_00_00_250.mat"

@@ -6,7 +6,6 @@ seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -16,7 +15,6 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pandas as pd
 import pytest
-import scipy.io
 
 from aerpaw_cmp.logs.chunks import whole_lines
 from aerpaw_cmp.logs.ingest import ingest
@@ -532,13 +530,6 @@ def exchange(n: int, place: str, query: str, decoded: str, status: str = "ok") -
     return samples.tap_line(EXCHANGE.format(query=query, status=status, n=n, times=times, decoded=decoded))
 
 
-def mat_of(**arrays: Any) -> bytes:
-    """A MATLAB 5 file."""
-    file = io.BytesIO()
-    scipy.io.savemat(file, arrays)
-    return file.getvalue()
-
-
 BINARY: dict[str, tuple[str, str, bytes, Truth, ReadOptions]] = {
     "dataflash": ("ardupilot_bin", "x.bin", autopilots.dataflash(), {"vehicle": POSE}, LOCAL),
     "dataflash of 2017, with positions of the receiver alone": (
@@ -575,11 +566,11 @@ BINARY: dict[str, tuple[str, str, bytes, Truth, ReadOptions]] = {
         {"USRP1": {"time": [0.25], "rss_db": [-20.0]}, "USRP2": {"time": [0.25], "rss_db": [-40.0]}}, LOCAL,
     ),
     "I/Q of one channel, one row; time in microseconds": (
-        "iq_burst", "results_3320000000_2000000_2025_03_02_10_00_01_500250.mat", mat_of(IQ=np.full((1, 64), 3 + 4j)),
+        "iq_burst", "results_3320000000_2000000_2025_03_02_10_00_01_500250.mat", samples.saved({"IQ": np.full((1, 64), 3 + 4j)}),
         {"USRP1": {"time": [1.50025], "rss_db": [10 * np.log10(25.0)]}}, LOCAL,
     ),
     "I/Q without a signal": (
-        "iq_burst", samples.IQ_NAME, mat_of(IQ=np.zeros((1, 8), dtype=complex)), {"USRP1": {"rss_db": [np.nan]}}, LOCAL,
+        "iq_burst", samples.IQ_NAME, samples.saved({"IQ": np.zeros((1, 8), dtype=complex)}), {"USRP1": {"rss_db": [np.nan]}}, LOCAL,
     ),
     "tap: cell, rank, no CSI, a torn line": ("tap_jsonl", "x.jsonl", samples.TAP, TAP, LOCAL),
     "tap: an answer that failed, then LTE": (

@@ -225,10 +225,13 @@ def _troubles(e: LevelEvidence) -> Iterator[tuple[float, str, _Estimate, str, _F
 
 
 def _profiled(name: str, fits: Mapping[float, _Fit]) -> _Found:
-    """The best of some values, and the range of those that are nearly as likely."""
+    """The best of some values, and the range of those that are nearly as likely, half way to the next that are not."""
     best = max(fits, key=lambda value: fits[value].log_likelihood)
-    near = [value for value, fit in fits.items() if fit.log_likelihood >= fits[best].log_likelihood - _NEAR]
-    return name, (best, min(near), max(near)), "", fits[best]
+    tried = sorted(fits)
+    near = [i for i, value in enumerate(tried) if fits[value].log_likelihood >= fits[best].log_likelihood - _NEAR]
+    low, high = max(near[0] - 1, 0), min(near[-1] + 1, len(tried) - 1)
+    ends = 0.5 * (tried[near[0]] + tried[low]), 0.5 * (tried[near[-1]] + tried[high])
+    return name, (best, *ends), "", fits[best]
 
 
 def _harmonics(e: LevelEvidence) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,11 @@ class Prediction:
     def sentence(self) -> str:
         """First words of terminal and page."""
         return first_words(self.correction, self.outside)
+
+    def _repr_html_(self) -> str:
+        """First words and the first points for notebooks."""
+        points = str(self.table.head(10).round(2).to_html(index=False, border=0))
+        return f"<p>{escape(self.sentence)}</p>{points}"
 
     @property
     def outside(self) -> float:

@@ -22,9 +22,9 @@ DIFFERENCE = {
 """Sentence on two reports, by the verdict of the paired interval. No other sentence of a diff says better or worse."""
 
 KEEP = {
-    "better": "keep the second report's",
-    "worse": "keep the first report's",
-    "not significant": "keep either; this flight does not decide",
+    "better": "go on as in the second report",
+    "worse": "go on as in the first report",
+    "not significant": "go on with either; this flight does not decide",
     "no interval": "compare on a longer flight",
 }
 """Next step by the word of the paired interval."""

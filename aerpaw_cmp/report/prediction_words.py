@@ -32,10 +32,13 @@ MANY = 0.2
 
 AGAINST_FREE_SPACE = {
     "better": (
-        "It is significantly better than free space ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
+        "The model is significantly better than free space ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
         "",
     ),
-    "worse": ("It is significantly worse than free space ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).", ""),
+    "worse": (
+        "The model is significantly worse than free space ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
+        "",
+    ),
     "not significant": ("The difference from free space of {effect:+.1f} dB is not significant (95 %).", ""),
     "no interval": ("Too few samples for an interval of the difference.", ""),
 }

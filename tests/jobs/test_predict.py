@@ -24,6 +24,7 @@ from aerpaw_cmp.jobs.where import Asked, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.against_figures import against_specs
+from aerpaw_cmp.report.html import coded
 from aerpaw_cmp.report.prediction_html import write_prediction
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted
@@ -91,6 +92,12 @@ def test_p_above_is_the_normal_probability(prediction):
     np.testing.assert_allclose(levels["p_above"], norm.sf((-60.0 - levels["level_db"]) / levels["sd_db"]), atol=1e-9)
 
 
+def test_a_notebook_shows_first_words_and_points(prediction):
+    shown = prediction._repr_html_()
+    assert "Expect an RMSE of " in shown
+    assert shown.count("<tr") == 11  # the heads and ten points
+
+
 def test_no_flight_that_shares_a_tower_is_one_message(small):
     other = small / "other.yaml"
     text = (small / "a.yaml").read_text().replace("node: LW1", "node: LW4").replace("node: LW2", "node: LW5")
@@ -116,7 +123,7 @@ def test_files_agree_with_each_other(tmp_path, prediction):
     assert unlisted("predict", metrics) == []
     assert metrics["trained_on"] == list(prediction.trained_on)
     assert metrics["sentence"].startswith("Expect an RMSE of")
-    assert metrics["sentence"] in files[0].read_text()
+    assert coded(metrics["sentence"]) in files[0].read_text()
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("netCDF4")
     with xarray.open_dataset(tmp_path / "prediction.nc") as book:

@@ -31,7 +31,7 @@ def test_a_model_that_beats_free_space_is_called_better_with_its_interval() -> N
     errors = {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.1}
     words = first_words(correction(LEARNED, errors, 3.0), outside=0.1)
     assert words.startswith("Expect an RMSE of 3.0 dB over 4 s means (flights left out; free space 6.0 dB).")
-    assert "It is significantly better than free space (\N{MINUS SIGN}" in words
+    assert "The model is significantly better than free space (\N{MINUS SIGN}" in words
     assert "90 % intervals hold " in words
     assert "too narrow" not in words
     assert "too wide" not in words

@@ -50,11 +50,6 @@ class Verdict:
     interval: Interval = NO_INTERVAL
     where: str = ""
 
-    @property
-    def known(self) -> bool:
-        """Whether there is an interval."""
-        return math.isfinite(self.interval[0]) and math.isfinite(self.interval[1])
-
 
 # --- campaign -------------------------------------------------------------------------------------------------------
 

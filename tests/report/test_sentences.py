@@ -154,7 +154,7 @@ def written() -> str:
 
 
 def test_the_table_is_that_of_the_code() -> None:
-    assert TABLE.read_text(encoding="utf-8") == written()
+    assert TABLE.read_text(encoding="utf-8") == written(), "python -m tests.report.test_sentences; read what changed"
     assert len(rows()) > 300
 
 

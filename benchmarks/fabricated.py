@@ -17,7 +17,7 @@ from aerpaw_cmp.compare.offset import offset_curve
 from aerpaw_cmp.compare.rank import channel_rank, commonest_rank, compare_rank, singular_values
 from aerpaw_cmp.compare.result import Fit, ModelLevel, RankFurther, RankResult, RssFurther, RssResult
 from aerpaw_cmp.compare.rss import compare_rss, error_spans
-from aerpaw_cmp.jobs.season import with_season
+from aerpaw_cmp.jobs.campaigns.season import with_season
 from aerpaw_cmp.report.campaign_data import CampaignData, Failure, FlownTrack, RssRow
 from aerpaw_cmp.report.data import ReportData, Track
 from aerpaw_cmp.site.siteyaml import load_site

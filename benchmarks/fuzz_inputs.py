@@ -436,7 +436,7 @@ def _flight(path: Path) -> bool:
 
 
 def _campaign(path: Path) -> bool:
-    from aerpaw_cmp.jobs.campaign import load_campaign
+    from aerpaw_cmp.jobs.campaigns.campaign import load_campaign
 
     return load_campaign(path) is not None
 

@@ -27,10 +27,10 @@ import yaml
 
 from aerpaw_cmp.compare.calibration import SPLITS, Learned, Score, flight_left_out, flights_of, learn
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.calibrate import Calibration, load_calibration, observe, read_flights, recipe_of
-from aerpaw_cmp.jobs.calibrate_lock import learned_locks
-from aerpaw_cmp.jobs.calibrate_rank import fit_rank
-from aerpaw_cmp.jobs.calibration_files import receiver_entry, site_entry
+from aerpaw_cmp.jobs.learning.calibrate import Calibration, load_calibration, observe, read_flights, recipe_of
+from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks
+from aerpaw_cmp.jobs.learning.calibrate_rank import fit_rank
+from aerpaw_cmp.jobs.learning.calibration_files import receiver_entry, site_entry
 from aerpaw_cmp.site.learned import folder_of, remember
 
 RECIPES = Path(__file__).parents[1] / "tests" / "field" / "learned"

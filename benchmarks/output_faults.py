@@ -143,7 +143,9 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
 
     from aerpaw_cmp.__main__ import main
     from aerpaw_cmp.flight import replay
-    from aerpaw_cmp.jobs import campaign, coverage_map, flight_run
+    from aerpaw_cmp.jobs.campaigns import campaign
+    from aerpaw_cmp.jobs.mapping import coverage_map
+    from aerpaw_cmp.jobs.reporting import flight_run
     from aerpaw_cmp.maps import export
     from aerpaw_cmp.report import campaign_figures, canvas, figures, maps_figures
 

@@ -276,7 +276,7 @@ def change(clean: Any, faulty: Any, clean_ranks: list[Any], faulty_ranks: list[A
 
 def failures(data: Any, replays: Any, *, sionna: bool = True) -> list[str]:
     """What ``report --strict`` would name, of the audit."""
-    from aerpaw_cmp.jobs import audit_flight
+    from aerpaw_cmp.jobs.reporting import audit_flight
 
     if sionna:
         found = audit_flight.audit_replays(data, replays).audit
@@ -289,7 +289,7 @@ def failures(data: Any, replays: Any, *, sionna: bool = True) -> list[str]:
 
 def reference_only(data: Any, replays: Any) -> Any:
     """The audit without Sionna: the second implementation and the attitude."""
-    from aerpaw_cmp.jobs.audit_flight import attitude_checked, expectations
+    from aerpaw_cmp.jobs.reporting.audit_flight import attitude_checked, expectations
     from aerpaw_cmp.propagation.check.field_audit import against_reference, spread_over_paths
 
     total = attitude_checked(data, replays)

@@ -180,7 +180,7 @@ def test_an_interrupted_campaign_says_where_its_outcomes_are(
     def stop(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("aerpaw_cmp.jobs.campaign.run", stop)
+    monkeypatch.setattr("aerpaw_cmp.jobs.campaigns.campaign.run", stop)
     file = tmp_path / "campaign.yaml"
     file.write_text(f"campaign: c\nflights: [{SAMPLE / 'flight.yaml'}]\n")
     line = ["campaign", str(file), "-o", str(tmp_path / "out")]

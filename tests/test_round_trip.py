@@ -13,7 +13,7 @@ from aerpaw_cmp.common.outputs import file_digest
 from aerpaw_cmp.compare.result import RssResult
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.flight_run import run_flight
+from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.report.build import report_data
 from aerpaw_cmp.report.export import metrics
 

@@ -58,7 +58,7 @@ def benchmark(
     as_json: Json = False,
 ) -> int:
     """Score channel models on published flights with frozen splits."""
-    from ..jobs import benchmark_run as job
+    from ..jobs.benchmarks import benchmark_run as job
 
     action, *rest = words or ["run"]
     if action not in ACTIONS or len(rest) != (1 if action == "score" else 0):

@@ -37,7 +37,7 @@ def explain(
     as_json: Json = False,
 ) -> int:
     """List every path of a link at an instant, term by term."""
-    from ..jobs.explain import run_explain
+    from ..jobs.reporting.explain import run_explain
 
     explanation = run_explain(
         flight, time=time, tower=tower, channel=channel, engine=engine, logs_root=logs_root, progress=say

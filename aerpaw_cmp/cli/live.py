@@ -94,7 +94,7 @@ def tap(
             print(exported)
         return 0
     _needs_posix("tap")
-    from ..jobs.live_tap import Shown, play_logs, tap_modems
+    from ..jobs.live.live_tap import Shown, play_logs, tap_modems
     from ..live.log import LogSettings
     from ..live.session import TapSettings
 
@@ -202,7 +202,7 @@ def modem_sim(
         raise UsageError("--flight or --telemetry stands alone", expected="both: the flight to fly, and its new log")
     flown = None
     if flight is not None and telemetry is not None:
-        from ..jobs.live_twin import FlownAgain
+        from ..jobs.live.live_twin import FlownAgain
 
         flown = FlownAgain(flight, telemetry)
     settings = ModemSimSettings(

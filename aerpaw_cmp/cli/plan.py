@@ -58,9 +58,9 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Rank candidate flights by the standard deviation that they would leave."""
-    from ..jobs.next_flight import PlanAsked
-    from ..jobs.next_flight_run import run_plan
-    from ..jobs.where import Asked
+    from ..jobs.prediction.next_flight import PlanAsked
+    from ..jobs.prediction.next_flight_run import run_plan
+    from ..jobs.prediction.where import Asked
 
     asked = PlanAsked(
         minutes=minutes,

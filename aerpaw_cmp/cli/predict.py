@@ -52,8 +52,8 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Predict level and rank with error bars where nobody has flown yet."""
-    from ..jobs.predict_run import run_predict
-    from ..jobs.where import Asked
+    from ..jobs.prediction.predict_run import run_predict
+    from ..jobs.prediction.where import Asked
 
     outcome = run_predict(
         where,

@@ -65,7 +65,8 @@ def site_import(
     as_json: Json = False,
 ) -> None:
     """Import footprints, or a scene."""
-    from ..jobs import run, site_scene
+    from ..jobs import run
+    from ..jobs.mapping import site_scene
 
     files = files or []
     if len(files) == 1 and site_scene.is_scene(files[0]):
@@ -100,7 +101,7 @@ def site_export(
     as_json: Json = False,
 ) -> None:
     """Write a site for Sionna."""
-    from ..jobs.site_scene import run_site_export
+    from ..jobs.mapping.site_scene import run_site_export
 
     files = run_site_export(site, out, trees=trees, force=force)
     print_files(files if as_json else files[:1], as_json)
@@ -209,7 +210,7 @@ def map_(
 ) -> None:
     """Coverage and rank maps of a site, Kriging of rank."""
     from ..jobs import run
-    from ..jobs.coverage_map import map_settings
+    from ..jobs.mapping.coverage_map import map_settings
 
     modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
     wanted: dict[str, Any] = {

@@ -25,8 +25,8 @@ from ..logs.ingest import ingest
 from ..propagation.paths import PathSet
 from ..propagation.replay import require_xarray
 from ..site.site import Site
-from .compare_flight import compare_flight
 from .options import RunOptions
+from .reporting.compare_flight import compare_flight
 
 Series = tuple[str, str]
 """Tower and channel of an RSS series; tower and ``"rank"`` of a rank series."""

@@ -248,7 +248,7 @@ def _map_searched(site: Site, settings: Any, heights: int) -> PlannedStage | Non
     """The path search of a map among thousands of faces, from that of one piece of it; None among few."""
     from ..maps.grid import Grid
     from ..maps.job import CHUNK
-    from .coverage_map import SiteChannels
+    from .mapping.coverage_map import SiteChannels
 
     spots = Grid.over_area(site.area_m, settings.spacing_m).positions_m(max(settings.rss_altitudes_m))
     piece = spots[:: max(1, len(spots) // CHUNK)][:CHUNK]
@@ -279,7 +279,7 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
         Stages with their work and time [s].
     """
     from ..maps.grid import Grid
-    from .coverage_map import make_maps
+    from .mapping.coverage_map import make_maps
 
     place = load_site(site)
     positions = len(Grid.over_area(place.area_m, settings.spacing_m))

@@ -236,11 +236,11 @@ def run_report(
     from ..report.export import metrics as metrics_of
     from ..report.exports.formats import chosen_formats
     from ..report.write import FIGURES, STYLES, write_report
-    from .flight_run import run_flight
-    from .ladder import recommended_text
-    from .later_audit import refuse_changed, with_later_audit
-    from .manifest import other_inputs
-    from .report_record import report_record
+    from .reporting.flight_run import run_flight
+    from .reporting.ladder import recommended_text
+    from .reporting.later_audit import refuse_changed, with_later_audit
+    from .reporting.report_record import report_record
+    from .tasks.manifest import other_inputs
 
     for given, known in ((asked.figures, FIGURES), (asked.style, STYLES)):
         if given not in known:
@@ -260,7 +260,7 @@ def run_report(
             data = load_data(settings, flight.parent, options.logs_root)
             before = None
             if asked.against is not None:
-                from .against import score_against  # loads what calibration and prediction need
+                from .prediction.against import score_against  # loads what calibration and prediction need
 
                 before = score_against(data, Path(asked.against))
         replays = replay_flight(data, stages)
@@ -320,7 +320,7 @@ def run_audit(target: Path, options: RunOptions = DEFAULT, *, links: str | None 
     InputError
         An input is gone, or has changed since.
     """
-    from .later_audit import earlier_report
+    from .reporting.later_audit import earlier_report
 
     if links is not None and links != "full" and not (links.isdecimal() and int(links)):
         raise UsageError(f"--links {links!r}", expected="a number of links above 0, or 'full'")
@@ -529,9 +529,9 @@ def run_map(
     from ..common.versions import versions
     from ..report.maps_html import maps_metrics, write_maps
     from ..site.siteyaml import load_site
-    from . import coverage_map as mapping
-    from .paper_table import paper_markdown, paper_rows
-    from .workers import open_workers
+    from .mapping import coverage_map as mapping
+    from .mapping.paper_table import paper_markdown, paper_rows
+    from .tasks.workers import open_workers
 
     place, progress, stages = load_site(site), options.progress, Stages(options.progress)
     folder = options.out or _map_folder(site)
@@ -541,7 +541,7 @@ def run_map(
         with open_workers(options.workers, options.scheduler, paths=file, progress=progress) as crew:
             outcome = mapping.make_maps(place, settings, stages, workers=crew, name=str(file[0] if file else site))
         if flights:
-            from .corrected_map import corrected_maps
+            from .prediction.corrected_map import corrected_maps
 
             heights = settings.rss_altitudes_m
             outcome.corrected = corrected_maps(site, settings.spacing_m, heights, flights, options.logs_root, stages)
@@ -660,9 +660,9 @@ def run_campaign(
     from ..report.campaign_html import campaign_metrics, write_campaign
     from ..report.campaign_words import warnings
     from ..report.exports.formats import chosen_formats
-    from .campaign import load_campaign
-    from .campaign import run as run_all
-    from .season import find_reports, with_season
+    from .campaigns.campaign import load_campaign
+    from .campaigns.campaign import run as run_all
+    from .campaigns.season import find_reports, with_season
 
     stages = Stages(options.progress)
     campaign = load_campaign(path)
@@ -710,7 +710,7 @@ def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
 
 
 def campaign_status(path: Path, options: RunOptions = DEFAULT, *, keep: Path | None = None, fresh: bool = False) -> Any:
-    """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaign_plan.CampaignStatus`).
+    """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaigns.campaign_plan.CampaignStatus`).
 
     Parameters
     ----------
@@ -724,9 +724,9 @@ def campaign_status(path: Path, options: RunOptions = DEFAULT, *, keep: Path | N
     -------
     CampaignStatus
     """
-    from . import campaign_plan
-    from .campaign import campaign_tasks, load_campaign
-    from .campaign_tasks import outcome_store
+    from .campaigns import campaign_plan
+    from .campaigns.campaign import campaign_tasks, load_campaign
+    from .campaigns.campaign_tasks import outcome_store
 
     campaign = load_campaign(path)
     tasks, _, failures = campaign_tasks(campaign, path.parent, options.logs_root)
@@ -762,9 +762,9 @@ def run_calibrate(
     """
     from ..flight.settings import load_flight
     from ..site.learned import remember
-    from .calibrate import calibrate, load_calibration, read_flights
-    from .calibrate_rank import fit_rank
-    from .calibration_files import Calibrated, site_entries, write_files
+    from .learning.calibrate import calibrate, load_calibration, read_flights
+    from .learning.calibrate_rank import fit_rank
+    from .learning.calibration_files import Calibrated, site_entries, write_files
 
     settings = load_calibration(path)
     target = options.out or Path(f"{settings.calibration}.calibrated.yaml")

@@ -28,7 +28,7 @@ def payload(data: CampaignData, most_rows: int = MOST_ROWS) -> dict[str, Any] | 
     Parameters
     ----------
     data : CampaignData
-        With its season (:func:`aerpaw_cmp.jobs.season.with_season`).
+        With its season (:func:`aerpaw_cmp.jobs.campaigns.season.with_season`).
     most_rows : int
     """
     kept, left_out = _settings_that_fit(data, most_rows)

@@ -119,7 +119,7 @@ def _numbers_of_a_report(path):
 
 
 def _receiver(path):
-    from aerpaw_cmp.jobs.calibrate_rank import read_receiver
+    from aerpaw_cmp.jobs.learning.calibrate_rank import read_receiver
 
     return read_receiver(path)
 

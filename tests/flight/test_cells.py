@@ -14,8 +14,8 @@ from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.draft import draft
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
-from aerpaw_cmp.jobs.compare_flight import serving_of
-from aerpaw_cmp.jobs.flight_run import run_flight
+from aerpaw_cmp.jobs.reporting.compare_flight import serving_of
+from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.report import figures

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from aerpaw_cmp.jobs.calibrate import Calibration, calibrate, load_calibration, read_flights
+from aerpaw_cmp.jobs.learning.calibrate import Calibration, calibrate, load_calibration, read_flights
 
 
 def calibrated(path: Path) -> tuple[Calibration, list[str]]:

@@ -21,8 +21,8 @@ from distributed.security import Security
 from worker_tasks import collected, dies  # beside this script
 
 from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.jobs import workers
-from aerpaw_cmp.jobs.workers import check_workers, open_workers
+from aerpaw_cmp.jobs.tasks import workers
+from aerpaw_cmp.jobs.tasks.workers import check_workers, open_workers
 
 SECURITY = Security.temporary()
 # as a user's configuration names them, there by files

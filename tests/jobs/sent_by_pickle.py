@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from typing import Any
 
-from aerpaw_cmp.jobs.workers import Here
+from aerpaw_cmp.jobs.tasks.workers import Here
 
 
 class SentByPickle(Here):

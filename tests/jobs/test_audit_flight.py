@@ -12,7 +12,7 @@ from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.flight import replay as replays
 from aerpaw_cmp.flight import track as tracks
 from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSettings, RtSettings
-from aerpaw_cmp.jobs import audit_flight
+from aerpaw_cmp.jobs.reporting import audit_flight
 from aerpaw_cmp.propagation.arrays import Poses
 
 FRAME = SiteFrame(35.7275, -78.696)

@@ -21,9 +21,9 @@ from aerpaw_cmp.flight import track as flight_track
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.replay import Clock, FlightReplay, replay_flight
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.audit_flight import expectations
-from aerpaw_cmp.jobs.audit_raw import raw_checked
-from aerpaw_cmp.jobs.compare_flight import compare_flight
+from aerpaw_cmp.jobs.reporting.audit_flight import expectations
+from aerpaw_cmp.jobs.reporting.audit_raw import raw_checked
+from aerpaw_cmp.jobs.reporting.compare_flight import compare_flight
 from aerpaw_cmp.site import antennas, site
 from aerpaw_cmp.site.sphere_pattern import sphere_csv, sphere_grid
 

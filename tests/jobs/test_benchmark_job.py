@@ -20,8 +20,8 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
-from aerpaw_cmp.jobs import benchmark, benchmark_run, entrants
-from aerpaw_cmp.jobs.benchmark_repeat import repeat_of
+from aerpaw_cmp.jobs.benchmarks import benchmark, benchmark_run, entrants
+from aerpaw_cmp.jobs.benchmarks.benchmark_repeat import repeat_of
 
 TOWER = np.array([0.0, 0.0, 10.0])
 FLIGHT = """

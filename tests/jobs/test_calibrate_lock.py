@@ -14,7 +14,7 @@ from aerpaw_cmp.flight.data import RssSeries
 from aerpaw_cmp.flight.lock import LOCK_FLOOR_DB
 from aerpaw_cmp.flight.remembered import lock_elsewhere
 from aerpaw_cmp.flight.settings import LinkSettings
-from aerpaw_cmp.jobs.calibrate_lock import learned_locks, lock_words
+from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks, lock_words
 from aerpaw_cmp.site.learned import Entry, LearnedLock, LearnedSeries, read_learned, remember
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.jobs.calibrate_rank import (
+from aerpaw_cmp.jobs.learning.calibrate_rank import (
     FittedReceiver,
     RankCalibration,
     RankFitSettings,

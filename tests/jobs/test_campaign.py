@@ -21,11 +21,11 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
-from aerpaw_cmp.jobs import campaign_fit
-from aerpaw_cmp.jobs.campaign import load_campaign, run
-from aerpaw_cmp.jobs.campaign_fit import goes_round, search
+from aerpaw_cmp.jobs.campaigns import campaign_fit
+from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, run
+from aerpaw_cmp.jobs.campaigns.campaign_fit import goes_round, search
+from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.jobs.options import RunOptions
-from aerpaw_cmp.jobs.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 from tests.json_page import unlisted
 

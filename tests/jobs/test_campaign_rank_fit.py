@@ -14,9 +14,9 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.campaign import load_campaign
-from aerpaw_cmp.jobs.campaign_fit import HeldOutSettings, search
-from aerpaw_cmp.jobs.campaign_rank_fit import RankBench, fit_rank_all, loss, shares_by_rank
+from aerpaw_cmp.jobs.campaigns.campaign import load_campaign
+from aerpaw_cmp.jobs.campaigns.campaign_fit import HeldOutSettings, search
+from aerpaw_cmp.jobs.campaigns.campaign_rank_fit import RankBench, fit_rank_all, loss, shares_by_rank
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -120,8 +120,8 @@ def test_refusals(flights: dict[str, FlightData]) -> None:
 def test_a_fit_takes_the_flights_that_gave_rows_under_its_own_setting() -> None:
     from types import SimpleNamespace as Row
 
-    from aerpaw_cmp.jobs.campaign import _tasks_of_fit
-    from aerpaw_cmp.jobs.campaign_tasks import Task
+    from aerpaw_cmp.jobs.campaigns.campaign import _tasks_of_fit
+    from aerpaw_cmp.jobs.campaigns.campaign_tasks import Task
 
     settings = HeldOutSettings.model_validate({"fit": {"rank.k": [10.0]}, "criterion": "kappa", "setting": "a"})
     tasks = [Task(Path(f"{f}.yaml"), f, s, {}, None) for s in ("a", "b") for f in ("one", "two")]

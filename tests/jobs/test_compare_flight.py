@@ -18,10 +18,10 @@ from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.replay import replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.track import body_rotation
-from aerpaw_cmp.jobs.audit_flight import audit_replays
-from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series, pairs_of
-from aerpaw_cmp.jobs.flight_run import run_flight
-from aerpaw_cmp.jobs.foliage_notes import foliage_notes
+from aerpaw_cmp.jobs.reporting.audit_flight import audit_replays
+from aerpaw_cmp.jobs.reporting.compare_flight import compare_rank_series, compare_rss_series, pairs_of
+from aerpaw_cmp.jobs.reporting.flight_run import run_flight
+from aerpaw_cmp.jobs.reporting.foliage_notes import foliage_notes
 from aerpaw_cmp.report.build import rank_warnings, rss_warnings, track_of
 from aerpaw_cmp.report.words import instants
 

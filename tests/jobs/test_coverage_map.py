@@ -17,7 +17,7 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.jobs import coverage_map as mapping
+from aerpaw_cmp.jobs.mapping import coverage_map as mapping
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import rank_of_singular_values
 from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element

@@ -12,8 +12,8 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.jobs import explain
-from aerpaw_cmp.jobs.explain import run_explain
+from aerpaw_cmp.jobs.reporting import explain
+from aerpaw_cmp.jobs.reporting.explain import run_explain
 from tests.json_page import unlisted
 
 ANTENNA = {"layout": "single", "antenna": {"model": "dipole"}}

@@ -14,8 +14,8 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.flight_run import run_flight
-from aerpaw_cmp.jobs.ladder import Model, _Climber, recommended_settings
+from aerpaw_cmp.jobs.reporting.flight_run import run_flight
+from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_settings
 from aerpaw_cmp.site.learned import Entry, Errors, LearnedSeries, folder_of, remember
 from aerpaw_cmp.site.sphere_pattern import sphere_csv
 

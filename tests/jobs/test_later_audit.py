@@ -12,9 +12,10 @@ import yaml
 
 from aerpaw_cmp.cli import main
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.jobs import audit_flight, run
-from aerpaw_cmp.jobs.later_audit import earlier_report
+from aerpaw_cmp.jobs import run
 from aerpaw_cmp.jobs.options import RunOptions
+from aerpaw_cmp.jobs.reporting import audit_flight
+from aerpaw_cmp.jobs.reporting.later_audit import earlier_report
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 

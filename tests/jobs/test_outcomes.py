@@ -20,11 +20,12 @@ from aerpaw_cmp.common.files import seal
 from aerpaw_cmp.common.stages import silent
 from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
-from aerpaw_cmp.jobs import campaign_tasks, sample
-from aerpaw_cmp.jobs.campaign_plan import campaign_status, compute, kept_outcomes
-from aerpaw_cmp.jobs.campaign_tasks import Done, Order, Outcome, Task, carry_out, outcome_store, task_facts
-from aerpaw_cmp.jobs.outcomes import OutcomeStore, task_inputs, task_key
-from aerpaw_cmp.jobs.workers import Here, Processes, Workers
+from aerpaw_cmp.jobs import sample
+from aerpaw_cmp.jobs.campaigns import campaign_tasks
+from aerpaw_cmp.jobs.campaigns.campaign_plan import campaign_status, compute, kept_outcomes
+from aerpaw_cmp.jobs.campaigns.campaign_tasks import Done, Order, Outcome, Task, carry_out, outcome_store, task_facts
+from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
+from aerpaw_cmp.jobs.tasks.workers import Here, Processes, Workers
 from aerpaw_cmp.report.campaign_data import Failure, FlownTrack
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -273,8 +274,8 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from aerpaw_cmp.jobs import campaign_tasks
-from aerpaw_cmp.jobs.campaign_plan import compute, kept_outcomes
-from aerpaw_cmp.jobs.workers import Here
+from aerpaw_cmp.jobs.campaigns.campaign_plan import compute, kept_outcomes
+from aerpaw_cmp.jobs.tasks.workers import Here
 from aerpaw_cmp.report.campaign_data import FlownTrack
 import numpy as np
 
@@ -330,8 +331,8 @@ def test_a_lost_worker_costs_its_own_task_one_more_try(
 ) -> None:
     """Fails on one pool for everything: there a killed worker loses all tasks."""
     monkeypatch.setenv("AERPAW_CMP_TEST_MARKS", str(tmp_path))
-    monkeypatch.setattr("aerpaw_cmp.jobs.campaign_plan.carry_out", lethal)
-    monkeypatch.setattr("aerpaw_cmp.jobs.workers.get_context", lambda _kind: multiprocessing.get_context("fork"))
+    monkeypatch.setattr("aerpaw_cmp.jobs.campaigns.campaign_plan.carry_out", lethal)
+    monkeypatch.setattr("aerpaw_cmp.jobs.tasks.workers.get_context", lambda _kind: multiprocessing.get_context("fork"))
     tasks = [*tasks_of(flight, 6), Task(flight, "poison", "as written", {}, None)]
     found = run_tasks(tasks, Processes(2))
     assert [one.failure is None for one in found] == [True] * 6 + [False]

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aerpaw_cmp.jobs import over_flights
-from aerpaw_cmp.jobs.campaign_plan import Outcomes
-from aerpaw_cmp.jobs.campaign_tasks import Outcome, Task
-from aerpaw_cmp.jobs.over_flights import pool_offsets, rank_repeats
+from aerpaw_cmp.jobs.campaigns import over_flights
+from aerpaw_cmp.jobs.campaigns.campaign_plan import Outcomes
+from aerpaw_cmp.jobs.campaigns.campaign_tasks import Outcome, Task
+from aerpaw_cmp.jobs.campaigns.over_flights import pool_offsets, rank_repeats
 from aerpaw_cmp.report.campaign_data import FlownRank, FlownTrack, RssRow
 
 

@@ -14,13 +14,13 @@ from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.compare.direction_gain import LinkSamples
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs import corrected_map
-from aerpaw_cmp.jobs import predict as job
-from aerpaw_cmp.jobs.against import score_against
-from aerpaw_cmp.jobs.calibrate import observe
-from aerpaw_cmp.jobs.calibrate_rank import rank_samples
-from aerpaw_cmp.jobs.predict_run import page_of, write_maps
-from aerpaw_cmp.jobs.where import Asked, find_targets
+from aerpaw_cmp.jobs.learning.calibrate import observe
+from aerpaw_cmp.jobs.learning.calibrate_rank import rank_samples
+from aerpaw_cmp.jobs.prediction import corrected_map
+from aerpaw_cmp.jobs.prediction import predict as job
+from aerpaw_cmp.jobs.prediction.against import score_against
+from aerpaw_cmp.jobs.prediction.predict_run import page_of, write_maps
+from aerpaw_cmp.jobs.prediction.where import Asked, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.against_figures import against_specs

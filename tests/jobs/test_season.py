@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aerpaw_cmp.jobs.season import drifts, find_reports, rank_settings, with_season
+from aerpaw_cmp.jobs.campaigns.season import drifts, find_reports, rank_settings, with_season
 from benchmarks import fabricated
 
 

@@ -12,7 +12,7 @@ pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.jobs.site_scene import SceneOptions, is_scene, run_scene_import, run_site_export
+from aerpaw_cmp.jobs.mapping.site_scene import SceneOptions, is_scene, run_scene_import, run_site_export
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.siteyaml import load_site
@@ -146,7 +146,7 @@ def test_the_plan_of_a_flight_in_a_scene_has_the_estimate(flown: Path, capsys: p
 def test_the_plan_of_a_map_of_a_scene_searches_one_piece_of_it(
     flown: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from aerpaw_cmp.jobs import coverage_map
+    from aerpaw_cmp.jobs.mapping import coverage_map
 
     def never(*_: object) -> None:
         raise AssertionError("a map was made for the plan")

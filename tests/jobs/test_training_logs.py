@@ -21,8 +21,8 @@ from aerpaw_cmp.common.provenance import trained_on
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.training import counted_once, flight_logs
-from aerpaw_cmp.jobs.calibrate_rank import FittedReceiver, RankSamples
 from aerpaw_cmp.jobs.diff_reports import run_diff
+from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankSamples
 from tests.jobs.calibrated import calibrated
 from tests.jobs.test_calibrate import YAW_DEG, settings, write
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from aerpaw_cmp.jobs import workers
-from aerpaw_cmp.jobs.workers import open_workers
+from aerpaw_cmp.jobs.tasks import workers
+from aerpaw_cmp.jobs.tasks.workers import open_workers
 from tests.jobs.worker_tasks import collected, dies
 
 
@@ -106,7 +106,7 @@ def test_workers_end_with_their_parent_and_leave_nothing(tmp_path: Path) -> None
     """SIGKILL in the middle of a task: no process and no temporary folder stays."""
     script = (
         "import sys, time; sys.path[:0] = sys.argv[2:]\n"
-        "from aerpaw_cmp.jobs.workers import open_workers\n"
+        "from aerpaw_cmp.jobs.tasks.workers import open_workers\n"
         "from tests.jobs.test_workers import sleeps\n"
         "if __name__ == '__main__':\n"
         "    with open_workers(2) as crew: crew.run(sleeps, [sys.argv[1]] * 2, print)\n"

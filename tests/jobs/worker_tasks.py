@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from aerpaw_cmp.jobs.workers import Lost
+from aerpaw_cmp.jobs.tasks.workers import Lost
 
 
 def dies(item: tuple[int, str]) -> int:

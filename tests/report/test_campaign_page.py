@@ -80,7 +80,7 @@ def test_two_flights_show_no_difference_and_the_words_say_so():
 def test_hostile_names_stay_text(data):
     bad = '</script><img src=x onerror="alert(1)">'
     row = dataclasses.replace(data.rss[0], flight=bad, setting=bad, tower=bad, channel=bad)
-    from aerpaw_cmp.jobs.season import with_season
+    from aerpaw_cmp.jobs.campaigns.season import with_season
 
     hostile = with_season(
         dataclasses.replace(data, rss=(row,), flights=(bad,), settings={bad: {bad: bad}}, tracks=(), failures=()),

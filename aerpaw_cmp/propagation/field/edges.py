@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...common.units import ComplexArray, FloatArray, IntArray, amplitude_from_db, wavelength_m
-from ...propagation import compiled
+from .. import compiled
 from ..arrays import Link, Poses
 from ..edges import EdgePaths, Edges
 from ..paths import Faces

@@ -21,7 +21,7 @@ import numpy as np
 
 from ...common.errors import UsageError
 from ...common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
-from ...propagation import compiled
+from .. import compiled
 from ..arrays import Array, Link, Poses
 from ..paths import Faces, PathSet
 from . import dyads

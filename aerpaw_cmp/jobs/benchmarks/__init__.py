@@ -1,0 +1,1 @@
+"""The public benchmark: tasks, entrants, scores."""

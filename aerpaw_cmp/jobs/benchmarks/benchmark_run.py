@@ -1,0 +1,366 @@
+"""Runs of the benchmark: our entrants, one table, one page; a stranger's file scored; data fetched."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import hashlib
+import json
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+from ... import __version__
+from ...common.cells import guarded
+from ...common.errors import InputError, OutputError, UsageError
+from ...common.outputs import OutputFile, OutputFolder, is_sealed
+from ...common.stages import Progress, silent
+from . import entrants
+from .benchmark import (
+    BASELINES,
+    Bench,
+    Entry,
+    Manifest,
+    check_training,
+    leaderboard_row,
+    load_manifest,
+    read_entry,
+    read_leaderboard,
+    score_task,
+    truth,
+)
+from .benchmark_repeat import repeat_of
+
+Scores = dict[str, dict[str, dict[str, Any]]]
+"""By task and entrant."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkResult:
+    """Scores by task and entrant, and what could not be run, with the sources of the files that lack."""
+
+    scores: Scores
+    skipped: dict[str, list[str]]
+    folder: Path | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {"scores": self.scores, "skipped": self.skipped}
+
+
+def open_bench(data: Path, manifest: Path | None = None) -> Bench:
+    """The benchmark with the logs below a folder."""
+    return Bench(load_manifest(manifest), data)
+
+
+def chosen_tasks(manifest: Manifest, names: Sequence[str]) -> list[str]:
+    """The named tasks, or all; UsageError for an unknown one."""
+    for name in names:
+        if name not in manifest.tasks:
+            raise UsageError(f"unknown task {name!r}", expected=", ".join(manifest.tasks))
+    return list(names or manifest.tasks)
+
+
+def run_benchmark(
+    data: Path,
+    out: Path,
+    *,
+    tasks: Sequence[str] = (),
+    only: Sequence[str] = (),
+    manifest: Path | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+) -> BenchmarkResult:
+    """Predict by our own entrants, score the files they write, make the page.
+
+    Parameters
+    ----------
+    data : Path
+        Folder of the published logs.
+    out : Path
+        Output folder: benchmark.html, scores.csv, leaderboard.json, predictions/ENTRANT.csv.
+    tasks, only : sequence of str
+        Tasks and entrants; empty for all (without those that take minutes per flight).
+    manifest : Path, optional
+    force : bool
+    progress : Progress
+
+    Returns
+    -------
+    BenchmarkResult
+    """
+    bench = open_bench(data, manifest)
+    known = {**entrants.LEVEL, **entrants.RANK}
+    for name in only:
+        if name not in known:
+            raise UsageError(f"unknown entrant {name!r}", expected=", ".join(known))
+    names = list(only) or [name for name in known if name not in entrants.ONLY_ON_DEMAND]
+    wanted = chosen_tasks(bench.manifest, tasks)
+    skipped = {task: lack for task in wanted if (lack := bench.skipped(task, training=True))}
+    with OutputFolder(out, job="benchmark", inputs=list(bench.places.values()), force=force) as output:
+        cost: dict[tuple[str, str], dict[str, float]] = {}
+        written: dict[str, list[Any]] = {name: [] for name in names}
+        runnable = [t for t in wanted if t not in skipped and bench.tests(t)]
+        for task, name in ((task, name) for task in runnable for name in names):
+            progress(f"{task}: {name}")
+            started = _started()
+            frame = _predicted(bench, task, name)
+            cost[task, name] = {"seconds": time.process_time() - started, "peak_mib": _peak_mib()}
+            if frame is not None:
+                written[name].append(frame)
+        with output.filling() as folder:
+            (folder / "predictions").mkdir()
+            entries = {}
+            for name in [name for name in names if written[name]]:
+                path = folder / "predictions" / f"{name}.csv"
+                path.write_text(_entry_text(name, written[name]), encoding="utf-8")
+                entries[name] = read_entry(path)
+            scores = _score_all(bench, entries, cost)
+            rows = [leaderboard_row(bench, e, _of(scores, n), __version__) for n, e in entries.items()]
+            (folder / "leaderboard.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+            (folder / "scores.csv").write_text(_scores_csv(scores), encoding="utf-8")
+            (folder / "benchmark.html").write_text(_page(bench, scores), encoding="utf-8")
+    return BenchmarkResult(scores, skipped, out)
+
+
+def _predicted(bench: Bench, task: str, name: str) -> Any:
+    try:
+        return entrants.predict(bench, task, name)
+    except ImportError as error:
+        raise UsageError(
+            f"{name} needs {error.name}", expected="pip install scikit-learn", cause="it is an optional extra"
+        ) from None
+
+
+def _entry_text(name: str, frames: Sequence[Any]) -> str:
+    import pandas as pd
+
+    text = guarded(pd.concat(frames)).to_csv(index=False, float_format="%.4f", lineterminator="\n")
+    return f"# entrant: {name}\n# who: aerpaw-cmp {__version__}\n{text}"
+
+
+def _started() -> float:
+    """Processor time now [s]; the peak of the memory counts from here where the system can do that (Linux)."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    return time.process_time()
+
+
+def _peak_mib() -> float:
+    """Largest resident memory of this process since :func:`_started` [MiB], the package itself included."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return float(status.split("VmHWM:")[1].split()[0]) / 1024.0
+    except (OSError, IndexError):
+        return float("nan")
+
+
+def _score_all(bench: Bench, entries: dict[str, Entry], cost: dict[tuple[str, str], dict[str, float]]) -> Scores:
+    scores: Scores = {}
+    for task in bench.manifest.tasks:
+        mine = {n: e for n, e in entries.items() if (e.frame["task"] == task).any()}
+        baselines = {n: mine[n] for n in BASELINES if n in mine}
+        for name, entry in mine.items():
+            row = score_task(bench, task, entry, baselines, accept_levels=True)
+            scores.setdefault(task, {})[name] = row | cost.get((task, name), {})
+    return scores
+
+
+def _of(scores: Scores, entrant: str) -> dict[str, dict[str, Any]]:
+    return {task: rows[entrant] for task, rows in scores.items() if entrant in rows}
+
+
+def _scores_csv(scores: Scores) -> str:
+    keys = list(dict.fromkeys(k for rows in scores.values() for row in rows.values() for k in row))
+    table = StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["task", "entrant", *keys])
+    for task, rows in scores.items():
+        for entrant, row in rows.items():
+            writer.writerow([task, entrant, *(_cell(row.get(key)) for key in keys)])
+    return table.getvalue()
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, (tuple, list)):
+        return " ".join(_cell(v) for v in value)
+    return "" if value is None else repr(float(value)) if isinstance(value, float) else str(value)
+
+
+def _page(bench: Bench, scores: Scores) -> str:
+    from ...report.benchmark_html import benchmark_page, task_table
+
+    tables = []
+    for task, rows in scores.items():
+        one = bench.manifest.tasks[task]
+        rule = f"{one.rule} {repeat_of(bench, task).words}"
+        about = {"title": one.title, "rule": rule, "kind": one.kind, "flights": bench.tests(task)}
+        tables.append(task_table(task, {**about, "skipped": bench.skipped(task, training=False)}, rows))
+    lacking = dict.fromkeys(text for task in bench.manifest.tasks for text in bench.skipped(task, training=True))
+    made = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return benchmark_page(tables, list(lacking), made, __version__)
+
+
+def score_predictions(
+    predictions: Path,
+    data: Path,
+    *,
+    tasks: Sequence[str] = (),
+    manifest: Path | None = None,
+    leaderboard: Path | None = None,
+    accept_levels: bool = False,
+) -> BenchmarkResult:
+    """Score a stranger's predictions.csv on every task it answers.
+
+    Parameters
+    ----------
+    predictions, data : Path
+    tasks : sequence of str
+        Empty: those in the file whose test files are at hand.
+    manifest : Path, optional
+    leaderboard : Path, optional
+        leaderboard.json to which a row is added.
+    accept_levels : bool
+        Skip the test of sign and unit.
+
+    Returns
+    -------
+    BenchmarkResult
+        One entrant.
+    """
+    bench = open_bench(data, manifest)
+    entry = read_entry(predictions)
+    given = list(dict.fromkeys(entry.frame["task"]))
+    chosen_tasks(bench.manifest, given)
+    wanted = [task for task in chosen_tasks(bench.manifest, tasks) if task in given]
+    skipped = {task: bench.skipped(task, training=False) for task in wanted}
+    check_training(bench, entry, wanted)
+    scores: Scores = {}
+    name = entry.head.get("entrant", predictions.stem)
+    for task in wanted:
+        if not bench.tests(task):
+            continue
+        baselines = {}
+        if bench.manifest.tasks[task].kind == "level" and not bench.skipped(task, training=True):
+            made = {b: entrants.predict(bench, task, b) for b in BASELINES}
+            baselines = {b: Entry(frame, {}, "") for b, frame in made.items() if frame is not None}
+        scores[task] = {name: score_task(bench, task, entry, baselines, accept_levels=accept_levels)}
+    if not scores:
+        lacking = "; ".join(text for texts in skipped.values() for text in texts)
+        raise InputError(
+            "nothing could be scored",
+            expected=f"rows of {', '.join(bench.manifest.tasks)}" + (f"; missing: {lacking}" if lacking else ""),
+            path=predictions,
+        )
+    if leaderboard is not None:
+        rows = [*read_leaderboard(leaderboard), leaderboard_row(bench, entry, _of(scores, name), __version__)]
+        with OutputFile(leaderboard, own=_is_leaderboard, inputs=[predictions]) as output:
+            output.write((json.dumps(rows, indent=1) + "\n").encode())
+    return BenchmarkResult(scores, {task: texts for task, texts in skipped.items() if texts})
+
+
+def _is_leaderboard(path: Path) -> bool:
+    try:
+        return bool(read_leaderboard(path)) or is_sealed(path)
+    except InputError:
+        return False
+
+
+def write_template(
+    data: Path, out: Path, *, tasks: Sequence[str] = (), manifest: Path | None = None, force: bool = False
+) -> list[Path]:
+    """Write the table to fill and, beside it, what is known.
+
+    Parameters
+    ----------
+    data : Path
+        Folder of the published logs.
+    out : Path
+        The table to fill: time, position, attitude, directions, an empty ``level_db`` (or rank probabilities) of each
+        test sample, and no measured level of a test flight. Beside it ``NAME_train.csv`` holds the training flights.
+    tasks : sequence of str
+    manifest : Path, optional
+    force : bool
+
+    Returns
+    -------
+    list of Path
+        Both files.
+    """
+    import pandas as pd
+
+    bench = open_bench(data, manifest)
+    wanted = chosen_tasks(bench.manifest, tasks)
+    asked = [truth(bench, task) for task in wanted]
+    known = [truth(bench, task, training=True) for task in wanted]
+    test = pd.concat(asked, ignore_index=True).drop(columns="measured")
+    test["level_db"], test["sd_db"] = "", ""
+    if any(bench.manifest.tasks[task].kind == "rank" for task in wanted):
+        test = test.assign(p_rank1="", p_rank2="", p_rank3="", p_rank4="")
+    train = pd.concat(known, ignore_index=True)
+    beside = out.with_name(f"{out.stem}_train{out.suffix}")
+    for path, frame in ((out, test), (beside, train)):
+        with OutputFile(path, own=is_sealed, inputs=list(bench.places.values()), force=force) as output:
+            output.write(frame.to_csv(index=False, lineterminator="\n").encode())
+    return [out, beside]
+
+
+def fetch(out: Path, *, manifest: Path | None = None, progress: Progress = silent) -> list[Path]:
+    """Download the published files that a folder lacks; a file is kept once its SHA-256 is right.
+
+    Proxies are taken from the environment; a download that was cut is taken up where it ended.
+
+    Raises
+    ------
+    OutputError
+        No network, or the server refuses; what was fetched before stays.
+    InputError
+        A file whose content is not the published one.
+    """
+    listing = load_manifest(manifest)
+    out.mkdir(parents=True, exist_ok=True)
+    made = []
+    for name, one in listing.files.items():
+        path = out / f"{name}{Path(one.path).suffix}"
+        if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == one.sha256:
+            continue
+        progress(f"{name}: {one.bytes / 1e6:.1f} MB from {one.repository}")
+        part = path.with_name(path.name + ".part")
+        _download(one.url, part, one.bytes)
+        digest = hashlib.sha256(part.read_bytes()).hexdigest()
+        if digest != one.sha256:
+            part.unlink()
+            raise InputError(
+                f"SHA-256 {digest}", expected=one.sha256, cause=f"{one.repository} changed the file", path=path
+            )
+        part.replace(path)
+        made.append(path)
+    return made
+
+
+def _download(url: str, part: Path, size: int) -> None:
+    """Append what a partial file lacks, never more than the published size."""
+    have = part.stat().st_size if part.exists() else 0
+    request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
+    try:
+        with urllib.request.urlopen(request, timeout=60) as answer, part.open("ab" if have else "wb") as stream:
+            if have and answer.status != 206:
+                stream.truncate(0)
+                have = 0
+            while have < size and (piece := answer.read(min(1 << 20, size - have))):
+                have += len(piece)
+                stream.write(piece)
+            if have < size:
+                raise OSError(f"the answer ended after {have} of {size} bytes")
+    except (urllib.error.URLError, TimeoutError, OSError) as error:
+        raise OutputError(
+            f"{url} could not be fetched: {error}",
+            expected="a network, or the files copied by hand into the folder (docs/benchmark.md names them)",
+            path=part,
+        ) from None

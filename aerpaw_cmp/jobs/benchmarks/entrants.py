@@ -1,0 +1,309 @@
+"""Our own entrants of the benchmark: baselines, standards, ray tracing, learned antennas, a black box."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ...common.units import BoolArray, FloatArray
+from ...compare import calibration
+from ...compare.calibration import Observed, Recipe
+from ...compare.correction import BIN_S, Base, Predictor, choose, fixed_base
+from ...compare.direction_gain import GainModel, LinkSamples
+from ...compare.forecast import constant_forecast
+from ...compare.spread import fading_of
+from ...flight.data import FlightData
+from ...flight.replay import attitude_rotation
+from ...propagation.arrays import Poses
+from ...propagation.field.baselines import p1411_loss_db, tr36777_loss_db, two_ray_dbm
+from ...propagation.trace import trace
+from ..learning.calibrate import rotation
+from ..learning.calibrate_rank import RankFitSettings, Tried
+from .benchmark import KEY, RANKS, Bench, Question, questions, utc_texts
+
+GainOf = Callable[[Observed], FloatArray]
+"""Level above free space (n,) of samples [dB], up to a constant."""
+
+Answer = tuple[FloatArray, FloatArray]
+"""Level and standard deviation (n,) [dB]."""
+
+Entrant = Callable[[Question, Bench], list[Answer]]
+
+
+def anchored(question: Question, gain: GainOf) -> list[Answer]:
+    """A model of the gain with offsets of its training: of the series' own flight where known, else of its antenna.
+
+    The standard deviation is that of the training residuals about these offsets.
+    """
+    left = [o.samples.residual_db - gain(o) for o in question.train]
+    out = []
+    for one in question.asked:
+        mine = [r for o, r in zip(question.train, left, strict=True) if _same(o, one)]
+        if not mine:
+            mine = [r for o, r in zip(question.train, left, strict=True) if o.samples.antenna == one.samples.antenna]
+        mine = mine or left
+        offset = float(np.concatenate(mine).mean()) if mine else 0.0
+        spread = float(np.sqrt(np.mean(np.concatenate([r - r.mean() for r in mine]) ** 2))) if mine else 10.0
+        out.append((one.free_space_db + gain(one) + offset, np.full(len(one.samples), max(spread, 0.1))))
+    return out
+
+
+def _same(first: Observed, second: Observed) -> bool:
+    return (first.samples.flight, first.samples.antenna) == (second.samples.flight, second.samples.antenna)
+
+
+def _free_space(question: Question, _: Bench) -> list[Answer]:
+    return anchored(question, lambda o: np.zeros(len(o.samples)))
+
+
+def _constant(question: Question, _: Bench) -> list[Answer]:
+    return anchored(question, lambda o: -o.free_space_db)
+
+
+def _log_distance(question: Question, _: Bench) -> list[Answer]:
+    """A slope per antenna, fitted on what is known; offsets of each series are free."""
+    slopes: dict[str, float] = {}
+    for antenna in {o.samples.antenna for o in (*question.train, *question.asked)}:
+        known = [o for o in question.train if o.samples.antenna == antenna] or question.train
+        x = np.concatenate([o.free_space_db - o.free_space_db.mean() for o in known])
+        y = np.concatenate([o.samples.residual_db - o.samples.residual_db.mean() for o in known])
+        slopes[antenna] = float(x @ y / (x @ x))
+    return anchored(question, lambda o: slopes[o.samples.antenna] * o.free_space_db)
+
+
+def _two_ray(question: Question, bench: Bench) -> list[Answer]:
+    def gain(o: Observed) -> FloatArray:
+        data = bench.data(o.samples.flight)
+        tower = data.site.towers[o.samples.tower]
+        carrier, place = _carrier(data, o), tower.position_m[None, :]
+        level = two_ray_dbm(
+            place, o.samples.position_m, carrier, ground_material=data.site.ground_material, ground_m=tower.ground_m
+        )[:, 0]
+        return np.asarray(level - _free(o, tower.position_m, carrier))
+
+    return anchored(question, gain)
+
+
+Loss = Callable[[FloatArray, FloatArray, float], FloatArray]
+"""Loss (n,) [dB] at distances and heights (n,) [m] and a carrier [Hz]."""
+
+
+def _standard(loss_db: Loss) -> Entrant:
+    def answer(question: Question, bench: Bench) -> list[Answer]:
+        def gain(o: Observed) -> FloatArray:
+            data = bench.data(o.samples.flight)
+            tower, carrier = data.site.towers[o.samples.tower].position_m, _carrier(data, o)
+            distance = np.linalg.norm(o.samples.position_m - tower, axis=1)
+            return np.asarray(-loss_db(distance, o.samples.position_m[:, 2], carrier) - _free(o, tower, carrier))
+
+        return anchored(question, gain)
+
+    return answer
+
+
+def _carrier(data: FlightData, o: Observed) -> float:
+    return next(s.link.carrier_hz for s in data.rss if (s.tower, s.channel) == (o.samples.tower, o.samples.channel))
+
+
+def _free(o: Observed, tower_m: FloatArray, carrier_hz: float) -> FloatArray:
+    """Free space of 0 dBm (n,): the samples' own level differs by the transmit power, a constant."""
+    distance = np.linalg.norm(o.samples.position_m - tower_m, axis=1)
+    return np.asarray(20.0 * np.log10(299_792_458.0 / carrier_hz / (4.0 * np.pi * distance)))
+
+
+def _replay(level: str, engine: str = "image", **options: Any) -> Entrant:
+    """Ray tracing with the flight's own arrays; ``level`` is the field of the replay that counts."""
+
+    def answer(question: Question, bench: Bench) -> list[Answer]:
+        def gain(o: Observed) -> FloatArray:
+            data = bench.data(o.samples.flight)
+            series = next(s for s in data.rss if (s.tower, s.channel) == (o.samples.tower, o.samples.channel))
+            time = np.array([t.removesuffix("Z") for t in utc_texts(o.start, o.samples.time_s)], "datetime64[ns]")
+            pose = data.poses_at(time)
+            poses = Poses(pose.position_m, attitude_rotation(pose, data.settings.rt.attitude))
+            link = series.link.build([series.tower], data.folder)
+            replayed = trace(data.site, link, poses, engine, **options)  # type: ignore[arg-type]
+            found = getattr(replayed, level)[:, 0]
+            gain_db = found - o.free_space_db
+            return np.asarray(np.where(np.isfinite(gain_db), gain_db, np.nanmean(gain_db)))
+
+        return anchored(question, gain)
+
+    return answer
+
+
+_FITS: dict[tuple[int, ...], calibration.Learned] = {}
+
+
+def learned_base(train: Sequence[LinkSamples]) -> Predictor:
+    """Antennas learned on these samples, as a base of a correction; each fit is made once."""
+    key = tuple(hash(s.residual_db.tobytes()) for s in train)
+    if key not in _FITS:
+        recipe = Recipe(model=GainModel(bin_s=BIN_S), rotation=rotation)
+        _FITS[key] = calibration.learn(train, recipe)
+    return _FITS[key].predict
+
+
+def _fit(train: Sequence[Observed]) -> calibration.Learned:
+    samples = [o.samples for o in train]
+    learned_base(samples)
+    return _FITS[tuple(hash(s.residual_db.tobytes()) for s in samples)]
+
+
+def _learned(question: Question, _: Bench) -> list[Answer]:
+    fit = _fit(question.train)
+    answers = anchored(question, lambda o: fit.mean(o.samples))
+    return [
+        (level, fit.spread(one.samples.antenna).total_db(fit.predict(one.samples)[1]))
+        for one, (level, _) in zip(question.asked, answers, strict=True)
+    ]
+
+
+def _learned_residual(question: Question, _: Bench) -> list[Answer]:
+    """Learned antennas, and the residual field on what they leave where it helps inside the training flights."""
+    return _corrected(
+        question, [o.samples for o in question.train], learned_base, [o.free_space_db for o in question.asked]
+    )
+
+
+def _kriging(question: Question, _: Bench) -> list[Answer]:
+    """The level itself over place, without any model of propagation."""
+    levels = [
+        dataclasses.replace(o.samples, residual_db=o.samples.residual_db + o.free_space_db) for o in question.train
+    ]
+    constant = fixed_base(lambda s: np.zeros(len(s)))
+    return _corrected(question, levels, constant, [np.zeros(len(o.samples)) for o in question.asked])
+
+
+def _corrected(
+    question: Question, train: Sequence[LinkSamples], base: Base, above: Sequence[FloatArray]
+) -> list[Answer]:
+    """A base and its residual field; ``above`` (n,) is what both count from, of each asked series [dB]."""
+    correction = choose(train, {"base": base})
+    out = []
+    for one, level in zip(question.asked, above, strict=True):
+        known = any(_same(o, one) for o in question.train)
+        fading, _ = fading_of([s for s in train if s.antenna == one.samples.antenna], BIN_S)
+        mean, sd = correction.predict(one.samples, one.samples.flight if known else None, own_mean=not known)
+        out.append((level + mean, np.hypot(sd, fading)))
+    return out
+
+
+def _trees(question: Question, _: Bench) -> list[Answer]:
+    """Gradient-boosted trees on the geometry: the strong black box."""
+    from sklearn.ensemble import HistGradientBoostingRegressor
+
+    names = sorted({o.samples.antenna for o in question.train})
+
+    def features(o: Observed) -> FloatArray:
+        s = o.samples
+        code = np.full(len(s), names.index(s.antenna) if s.antenna in names else -1.0)
+        return np.column_stack([o.free_space_db, s.position_m, s.at_tower, s.at_uav, code])
+
+    x = np.concatenate([features(o) for o in question.train])
+    y = np.concatenate([o.samples.residual_db - o.samples.residual_db.mean() for o in question.train])
+    half = np.concatenate([o.samples.time_s > np.median(o.samples.time_s) for o in question.train])
+
+    def fitted(rows: BoolArray) -> Any:
+        model = HistGradientBoostingRegressor(max_iter=100, learning_rate=0.1, max_depth=5, random_state=0)
+        return model.fit(x[rows], y[rows])
+
+    model = fitted(np.ones(len(y), dtype=np.bool_))
+    # the spread is that of one half of each flight predicted from the other: trees know their own samples by heart
+    left = np.where(half, fitted(~half).predict(x), fitted(half).predict(x)) - y
+    answers = anchored(question, lambda o: np.asarray(model.predict(features(o))) if len(o.samples) else np.zeros(0))
+    return [(level, np.full(len(level), left.std())) for level, _ in answers]
+
+
+LEVEL: dict[str, Entrant] = {
+    "free_space": _free_space,
+    "constant": _constant,
+    "log_distance": _log_distance,
+    "two_ray": _two_ray,
+    "tr36777_rma_av": _standard(partial(tr36777_loss_db, "RMa-AV")),
+    "tr36777_uma_av": _standard(partial(tr36777_loss_db, "UMa-AV")),
+    "p1411": _standard(lambda distance_m, _, carrier_hz: p1411_loss_db(distance_m, carrier_hz)),
+    "kriging": _kriging,
+    "replay_paper": _replay("rss_dbm", max_depth=2),
+    "replay_drafted": _replay("rss_power_dbm", max_depth=1),
+    "replay_sionna": _replay("rss_power_dbm", "sionna", max_depth=1, samples=10_000),
+    "learned": _learned,
+    "learned_residual": _learned_residual,
+    "boosted_trees": _trees,
+}
+
+ONLY_ON_DEMAND = ("replay_sionna",)
+"""Minutes per flight, and the paths of ``replay_drafted``."""
+
+
+def _rank_constant(bench: Bench, train: Sequence[str], flight: str) -> list[FloatArray]:
+    share = constant_forecast(np.concatenate([one.rank for name in train for one in bench.ranks(name)]))
+    return [np.tile(share, (len(one.rank), 1)) for one in bench.ranks(flight)]
+
+
+def _rank_receiver(bench: Bench, train: Sequence[str], flight: str) -> list[FloatArray]:
+    """The receiver that ``calibrate`` learns."""
+    out = []
+    for one in bench.ranks(flight):
+        samples = [s for name in train for s in bench.ranks(name) if s.tower == one.tower]
+        fitted = Tried.of(samples, RankFitSettings()).fit(range(len(samples)))
+        out.append(fitted.forecast(one)[0])
+    return out
+
+
+RANK: dict[str, Callable[[Bench, Sequence[str], str], list[FloatArray]]] = {
+    "constant": _rank_constant,
+    "learned": _rank_receiver,
+}
+
+
+def predict(bench: Bench, task: str, entrant: str) -> pd.DataFrame | None:
+    """Predictions of one of ours for a task, as a predictions.csv has them; None where it has no answer.
+
+    Parameters
+    ----------
+    bench : Bench
+    task : str
+    entrant : str
+        A key of :data:`LEVEL` or :data:`RANK`.
+    """
+    one = bench.manifest.tasks[task]
+    parts: list[pd.DataFrame] = []
+    if one.kind == "rank":
+        if entrant not in RANK:
+            return None
+        for flight in bench.tests(task):
+            for samples, p in zip(bench.ranks(flight), RANK[entrant](bench, one.train, flight), strict=True):
+                frame = _keys(task, flight, samples.tower, "rank", np.datetime64(0, "ns"), samples.time_s)
+                parts.append(frame.assign(**dict(zip(RANKS, p.T, strict=True))))
+        return _whole(parts)
+    if entrant not in LEVEL:
+        return None
+    for flight in bench.tests(task):
+        series = bench.observed(flight)
+        levels = [np.full((2, len(o.samples)), np.nan) for o in series]
+        for question in questions(bench, task, flight):
+            for level, rows, (mean, sd) in zip(levels, question.rows, LEVEL[entrant](question, bench), strict=True):
+                level[:, rows] = mean, sd
+        for o, (mean, sd) in zip(series, levels, strict=True):
+            frame = _keys(task, flight, o.samples.tower, o.samples.channel, o.start, o.samples.time_s)
+            parts.append(frame.assign(level_db=mean, sd_db=sd))
+    return _whole(parts)
+
+
+def _whole(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    table: pd.DataFrame = pd.concat(parts).drop_duplicates(KEY)
+    return table
+
+
+def _keys(
+    task: str, flight: str, tower: str, channel: str, start: np.datetime64 | None, time_s: FloatArray
+) -> pd.DataFrame:
+    names = dict(zip(KEY, (task, flight, tower, channel, utc_texts(start, time_s)), strict=True))
+    table: pd.DataFrame = pd.DataFrame(names)
+    return table

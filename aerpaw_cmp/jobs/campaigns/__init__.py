@@ -1,0 +1,1 @@
+"""Many flights: plan, tasks, fits over flights, seasons."""

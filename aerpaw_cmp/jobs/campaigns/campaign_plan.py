@@ -1,0 +1,272 @@
+"""What of a campaign is kept and what is to do; tasks handed to workers, outcomes gathered."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ...common.errors import AerpawCmpError
+from ...common.stages import Progress, duration
+from ...report.campaign_data import Failure, FlownTrack
+from ..tasks.outcomes import OutcomeStore
+from ..tasks.workers import Lost, Workers
+from .campaign_tasks import Done, Order, Outcome, Task, carry_out, fitted_to, task_facts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskState:
+    """One task of a campaign before it runs.
+
+    ``seconds`` is what it cost, where it is kept; ``failure`` the message of the last run, where that failed, and
+    ``trouble`` which input cannot be read.
+    """
+
+    task: Task
+    kept: bool = False
+    seconds: float | None = None
+    failure: str = ""
+    trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignStatus:
+    """What ``campaign status`` tells.
+
+    ``estimate_s`` is the time of what is to do with ``workers`` tasks side by side: for every task the mean cost of
+    the kept tasks of its setting, else of all; None where nothing was measured yet.
+    """
+
+    name: str
+    keep: str
+    states: tuple[TaskState, ...]
+    failures: tuple[Failure, ...]
+    estimate_s: float | None
+    workers: int
+
+    @property
+    def kept(self) -> int:
+        """Tasks whose outcome is kept."""
+        return sum(state.kept for state in self.states)
+
+    @property
+    def failed(self) -> int:
+        """Tasks that failed the last time; they are to do."""
+        return sum(bool(state.failure) and not state.kept for state in self.states)
+
+    @property
+    def to_do(self) -> int:
+        """Tasks that a run would compute."""
+        return len(self.states) - self.kept
+
+    def metrics(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "campaign": self.name,
+            "keep": self.keep,
+            "tasks": len(self.states),
+            "kept": self.kept,
+            "failed": self.failed,
+            "to_do": self.to_do,
+            "estimate_s": self.estimate_s,
+            "workers": self.workers,
+            "to_do_tasks": [
+                {"flight": s.task.flight, "setting": s.task.setting, "last_failure": s.failure or s.trouble or None}
+                for s in self.states
+                if not s.kept
+            ],
+            "failures": [{"flight": f.flight, "setting": f.setting, "message": f.message} for f in self.failures],
+        }
+
+
+def campaign_status(
+    name: str, tasks: Sequence[Task], failures: Sequence[Failure], store: OutcomeStore | None, *, workers: int = 1
+) -> CampaignStatus:
+    """What of a campaign is kept, what is to do and how long that may take; nothing is computed.
+
+    Parameters
+    ----------
+    name : str
+        Of the campaign.
+    tasks : sequence of Task
+    failures : sequence of Failure
+        Flights whose files cannot be read.
+    store : OutcomeStore, optional
+        None where nothing is kept.
+    workers : int
+        Tasks side by side, for the time.
+
+    Returns
+    -------
+    CampaignStatus
+        A state per task, and the time that what is left may take [s].
+    """
+    states = [TaskState(task=task) if store is None else _state(task, store) for task in tasks]
+    by_setting: dict[str, list[float]] = {}
+    for state in states:
+        if state.seconds is not None:
+            by_setting.setdefault(state.task.setting, []).append(state.seconds)
+    everything = [seconds for some in by_setting.values() for seconds in some]
+    estimate = None
+    if everything:
+        costs = [float(np.mean(by_setting.get(s.task.setting, everything))) for s in states if not s.kept]
+        estimate = max(sum(costs) / max(workers, 1), max(costs, default=0.0))
+    return CampaignStatus(
+        name=name,
+        keep="no place (--fresh)" if store is None else str(store.folder),
+        states=tuple(states),
+        failures=tuple(failures),
+        estimate_s=estimate,
+        workers=workers,
+    )
+
+
+def _state(task: Task, store: OutcomeStore) -> TaskState:
+    """Outcome and cost of a task, by what the store says of itself."""
+    try:
+        key = task_facts(task).key
+    except (AerpawCmpError, OSError) as error:
+        return TaskState(task=task, trouble=str(error))
+    seconds = store.manifest(key).get("seconds")
+    return TaskState(
+        task=task,
+        kept=store.has(key),
+        seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
+        failure=str(store.manifest(key, failed=True).get("message", "")),
+    )
+
+
+class Watch:
+    """Progress of tasks: done, failed, running, links per second, time left.
+
+    Parameters
+    ----------
+    total, kept : int
+        Tasks of the campaign, and those that are not computed.
+    workers : int
+        Tasks at a time.
+    progress : Progress
+    """
+
+    def __init__(self, total: int, kept: int, workers: int, progress: Progress) -> None:
+        self.total, self.kept, self.workers, self.progress = total, kept, max(workers, 1), progress
+        self.done = self.failed = self.links = 0
+        self._start = time.monotonic()
+
+    def __call__(self, outcome: Outcome, links: int) -> None:
+        """One more is through."""
+        self.done += 1
+        self.failed += outcome.failure is not None
+        self.links += links
+        self.progress(f"flights\t{self.words()}", (self.kept + self.done) / max(self.total, 1))
+
+    def words(self) -> str:
+        """One line."""
+        spent = max(time.monotonic() - self._start, 1e-9)
+        left = self.total - self.kept - self.done
+        parts = [f"{self.kept + self.done} of {self.total} done"]
+        parts += [f"{self.failed} failed"] if self.failed else []
+        parts += [f"{min(left, self.workers)} running", f"{self.links / spent:.0f} links/s"]
+        parts += [f"{duration(spent / self.done * left)} left"] if left and self.done else []
+        return ", ".join(parts)
+
+
+class Outcomes:
+    """Outcomes of a campaign's tasks by number, each held without what its setting is not asked for.
+
+    Series of samples stay for the first setting; of the others a row holds numbers, and the flown line of a flight is
+    held once: the memory of 4000 tasks is that of the flights.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+    """
+
+    def __init__(self, tasks: Sequence[Task]) -> None:
+        self._tasks = tasks
+        self._found: dict[int, Outcome] = {}
+        self._tracks: dict[str, FlownTrack] = {}
+
+    def put(self, number: int, outcome: Outcome) -> None:
+        """Take one more, under the names of this campaign."""
+        task = self._tasks[number]
+        fitted = fitted_to(task, outcome)
+        if fitted.track is not None:
+            known = self._tracks.setdefault(task.flight, fitted.track)
+            same = all(
+                np.array_equal(getattr(known, name), getattr(fitted.track, name), equal_nan=True)
+                for name in ("time_s", "position_m")
+            )
+            fitted = replace(fitted, track=known if same else fitted.track)
+        self._found[number] = fitted
+
+    def __getitem__(self, number: int) -> Outcome:
+        return self._found[number]
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+
+def kept_outcomes(
+    tasks: Sequence[Task], store: OutcomeStore | None, progress: Progress
+) -> tuple[Outcomes, dict[int, Order]]:
+    """Outcomes that are there, and what is to be computed, by number."""
+    outcomes, orders = Outcomes(tasks), {number: Order(task=task) for number, task in enumerate(tasks)}
+    if store is None:
+        return outcomes, orders
+    for number, task in enumerate(tasks):
+        with suppress(AerpawCmpError, OSError):  # such a task will say itself what is wrong
+            key = task_facts(task).key
+            orders[number] = Order(task=task, key=key)
+            if isinstance(outcome := store.load(key), Outcome):
+                outcomes.put(number, outcome)
+                del orders[number]
+    for text in store.warnings:
+        progress(text)
+    if len(outcomes):
+        progress(f"{len(outcomes)} of {len(tasks)} outcomes are kept from before in {store.folder}")
+    return outcomes, orders
+
+
+def compute(
+    orders: Mapping[int, Order], workers: Workers, outcomes: Outcomes, store: OutcomeStore | None, progress: Progress
+) -> None:
+    """Let the workers do what is to do; each outcome is put into ``outcomes`` and kept as soon as it comes.
+
+    Parameters
+    ----------
+    orders : mapping of int to Order
+        What is to do, by the number of its task.
+    workers : Workers
+    outcomes : Outcomes
+        Gets the new ones.
+    store : OutcomeStore, optional
+        Keeps the new ones, and failures.
+    progress : Progress
+        Tasks done, and the time left.
+    """
+    watch = Watch(len(outcomes) + len(orders), len(outcomes), workers.count, progress)
+    numbers = list(orders)
+
+    def through(place: int, result: Done | Lost) -> None:
+        order = orders[numbers[place]]
+        if isinstance(result, Lost):
+            task = order.task
+            lost = Failure(flight=task.flight, setting=task.setting, message=result.message)
+            result = Done(outcome=Outcome(failure=lost))
+        failure = result.outcome.failure
+        if store is not None and order.key is not None:
+            if failure is None:
+                store.save(order.key, result.outcome, result.about)
+            else:
+                told = {"message": failure.message, "traceback": failure.traceback}
+                store.save_failure(order.key, {**result.about, **told})
+        outcomes.put(numbers[place], result.outcome)
+        watch(result.outcome, result.links)
+
+    if orders:
+        workers.run(carry_out, [orders[number] for number in numbers], through)

@@ -1,0 +1,377 @@
+"""One flight under one setting: what a worker of any kind is given, does, keeps and gives back."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import platform
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.errors import AerpawCmpError
+from ...common.units import AnyArray, FloatArray
+from ...common.versions import versions
+from ...compare import offset
+from ...compare.result import FlightResult, RankResult, RssResult
+from ...flight.data import FlightData, gather, read_logs
+from ...flight.overrides import Overrides, overridden
+from ...flight.settings import FlightFile, RssSettings, load_flight
+from ...flight.training import logs_of
+from ...report.campaign_data import Failure, FlownRank, FlownTrack, RankRow, RssRow
+from ..reporting.flight_run import run_flight
+from ..tasks.outcomes import OutcomeStore, code_digest, task_inputs, task_key
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One flight file under one setting."""
+
+    path: Path
+    flight: str
+    setting: str
+    overrides: Overrides
+    logs_root: Path | None
+    reference: bool = True
+    """Overlays are drawn for this setting: places and times are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Rows of one task, or why there are none."""
+
+    rss: tuple[RssRow, ...] = ()
+    rank: tuple[RankRow, ...] = ()
+    failure: Failure | None = None
+    track: FlownTrack | None = None
+    flown: tuple[FlownRank, ...] = ()
+
+
+def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Outcomes in the order of their tasks; a flight that holds the log of an earlier one is a failure that says so.
+
+    A log that comes twice, renamed, copied or packed, would be pooled twice and predicted from itself.
+    """
+    home: dict[str, str] = {}
+    kept = []
+    for task, outcome in zip(tasks, outcomes, strict=True):
+        logs = {digest for rows in (outcome.rss, outcome.rank) for row in rows for digest in row.logs}  # type: ignore[attr-defined]
+        again = sorted(digest for digest in logs if home.setdefault(digest, task.flight) != task.flight)
+        if again:
+            message = f"it holds the same log as {home[again[0]]} (SHA-256 {again[0][:12]}...): it is counted once"
+            outcome = Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message))
+        kept.append(outcome)
+    return kept
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """Size and time of a file: a worker that lives for days must see that it was changed; zeros where there is none."""
+    try:
+        status = os.stat(path)  # noqa: PTH116
+    except OSError:
+        return 0, 0
+    return status.st_size, status.st_mtime_ns
+
+
+@lru_cache(maxsize=512)
+def _flight_file(path: Path, _size: int, _mtime_ns: int) -> FlightFile:
+    return load_flight(path)
+
+
+@lru_cache(maxsize=2)
+def _logs(key: _Logs) -> Any:
+    """The logs of a flight: settings after settings reads them once."""
+    return read_logs(key.settings, key.folder, key.logs_root)
+
+
+@dataclass(frozen=True, slots=True)
+class _Logs:
+    """What the reading of logs depends on; settings that do not matter to it do not count in comparisons."""
+
+    folder: Path
+    logs_root: Path | None
+    text: str
+    stamps: tuple[tuple[int, int], ...]
+    settings: FlightFile = field(compare=False)
+
+
+def flight_data(task: Task) -> FlightData:
+    """Read and gather the flight of a task; errors as in :mod:`aerpaw_cmp.flight.data`."""
+    settings = overridden(_flight_file(task.path, *_stamp(task.path)), task.overrides)
+    folder, root = task.path.parent, task.logs_root
+    text = "\n".join([str(settings.timezone), *(log.model_dump_json() for log in settings.logs)])
+    stamps = tuple(_stamp((root or folder) / log.path) for log in settings.logs)
+    return gather(settings, folder, _logs(_Logs(folder, root, text, stamps, settings)), root)
+
+
+def run_task(task: Task) -> Outcome:
+    """Replay and compare one flight under one setting; whatever goes wrong becomes a message."""
+    try:
+        flight_run = run_flight(flight_data(task), audit=False)
+    except AerpawCmpError as error:
+        return _failed(task, str(error), error)
+    except Exception as error:  # one flight's fault must not cost the others their numbers
+        return _failed(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
+    data, found = flight_run.data, flight_run.result
+    return Outcome(
+        rss=tuple(
+            _rss_row(task, data.settings.rss, one, logs_of(data, series))
+            for one, series in zip(found.rss, data.rss, strict=True)
+        ),
+        rank=tuple(
+            row
+            for one, series in zip(found.rank, data.rank, strict=True)
+            for row in _rank_rows(task, one, logs_of(data, series))
+        ),
+        track=_flown(task, flight_run.result),
+        flown=tuple(
+            FlownRank(
+                flight=task.flight,
+                tower=one.tower,
+                position_m=one.position_m,
+                rank=one.measured,
+                simulated=one.rank,
+                time_s=_elapsed_s(one.time),
+                start_ns=_start_ns(one.time),
+            )
+            for one in flight_run.result.rank
+        ),
+    )
+
+
+def _failed(task: Task, message: str, error: BaseException) -> Outcome:
+    text = "".join(traceback.format_exception(error))
+    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message, traceback=text))
+
+
+# --- as a worker does it --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """What a worker is given: paths and the digest of what the outcome depends on, as the first process sees it.
+
+    ``key`` is None where an input cannot be read, or nothing is kept.
+    """
+
+    task: Task
+    key: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Done:
+    """What a worker gives back.
+
+    ``about`` is the manifest of the outcome: what was read, where and when it was computed, what it cost.
+    """
+
+    outcome: Outcome
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def links(self) -> int:
+        """Poses times towers and channels."""
+        ranks = {row.tower: row.n for row in self.outcome.rank}
+        return sum(len(row.measured_db) for row in self.outcome.rss) + sum(ranks.values())
+
+
+TRIES = 2
+"""A task that fails is tried once more."""
+
+
+def carry_out(order: Order) -> Done:
+    """Run a task; what runs in worker processes of every kind.
+
+    The key is computed anew here: a worker that sees another file or runs other code fails the task instead of
+    giving a wrong number under a right name.
+    """
+    task, facts = order.task, None
+    try:
+        facts = None if order.key is None else task_facts(task)
+    except (AerpawCmpError, OSError) as error:
+        return Done(outcome=_failed(task, f"an input can no longer be read: {error}", error))
+    if facts is not None and facts.key != order.key:
+        return Done(outcome=_not_the_same(task))
+    start, cpu = time.perf_counter(), _cpu_s()
+    tried, outcome = 1, run_task(task)
+    while outcome.failure is not None and tried < TRIES:
+        tried, outcome = tried + 1, run_task(task)
+    if facts is None:
+        return Done(outcome=outcome)
+    about = {
+        "flight": task.flight, "setting": task.setting, "flight_file": str(task.path),
+        "logs_root": None if task.logs_root is None else str(task.logs_root), "overrides": dict(task.overrides),
+        "seconds": time.perf_counter() - start, "cpu_s": _cpu_s() - cpu, "tries": tried, "host": platform.node(),
+        "process": os.getpid(), "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "versions": _versions(), "code": code_digest(), "inputs": facts.inputs,
+        "settings": facts.settings.model_dump(mode="json"),
+    }  # fmt: skip
+    return Done(outcome=outcome, about=about)
+
+
+def _cpu_s() -> float:
+    """Processor time of this process and of those that it waited for."""
+    spent = os.times()
+    return time.process_time() + spent.children_user + spent.children_system
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Asked once: looking nine packages up costs more than keeping an outcome."""
+    return versions()
+
+
+def _not_the_same(task: Task) -> Outcome:
+    message = (
+        f"the worker on {platform.node()} sees other inputs, or runs another version of the program, than the process "
+        f"that planned the campaign (aerpaw-cmp {versions()['aerpaw-cmp']} there); expected the same everywhere"
+    )
+    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """What an outcome depends on."""
+
+    settings: FlightFile
+    inputs: list[dict[str, str]]
+    key: str
+
+
+def task_facts(task: Task) -> Facts:
+    """Settings, inputs and key of a task.
+
+    Raises
+    ------
+    AerpawCmpError, OSError
+        If an input cannot be read.
+    """
+    settings = overridden(_flight_file(task.path, *_stamp(task.path)), task.overrides)
+    inputs = task_inputs(settings, task.path, task.logs_root)
+    return Facts(settings=settings, inputs=inputs, key=task_key(settings, inputs))
+
+
+def outcome_store(keep: Path) -> OutcomeStore:
+    """The outcomes of campaigns in a folder."""
+    return OutcomeStore(keep, Outcome)
+
+
+def fitted_to(task: Task, outcome: Outcome) -> Outcome:
+    """A kept outcome under the names of this campaign, without what only the first setting's figures need."""
+
+    def row(one: RssRow) -> RssRow:
+        named = dataclasses.replace(one, flight=task.flight, setting=task.setting)
+        if task.reference:
+            return named
+        none = np.zeros(0)
+        return dataclasses.replace(
+            named,
+            difference=one.moments,
+            time_s=none,
+            measured_db=none,
+            simulated_dbm=none,
+            distance_m=none,
+            position_m=np.zeros((0, 3)),
+            heading_deg=None,
+        )
+
+    failure = outcome.failure and dataclasses.replace(outcome.failure, flight=task.flight, setting=task.setting)
+    return Outcome(
+        rss=tuple(map(row, outcome.rss)),
+        rank=tuple(dataclasses.replace(one, flight=task.flight, setting=task.setting) for one in outcome.rank),
+        failure=failure,
+        track=outcome.track and dataclasses.replace(outcome.track, flight=task.flight),
+        flown=tuple(dataclasses.replace(one, flight=task.flight) for one in outcome.flown) if task.reference else (),
+    )
+
+
+# --- rows -----------------------------------------------------------------------------------------------------------
+
+
+def _flown(task: Task, result: FlightResult) -> FlownTrack:
+    first = result.rss[0] if result.rss else result.rank[0]
+    return FlownTrack(flight=task.flight, time_s=_elapsed_s(first.time), position_m=first.position_m)
+
+
+def _start_ns(time: AnyArray) -> int:
+    return int(time[0].astype("datetime64[ns]").astype(np.int64)) if len(time) else 0
+
+
+def _elapsed_s(time: AnyArray) -> FloatArray:
+    return np.asarray((time - time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
+
+
+def _rss_row(task: Task, rules: RssSettings, result: RssResult, logs: tuple[str, ...]) -> RssRow:
+    score, clock = result.score, result.further.clock
+    # nothing is pooled or ranked from the flight that its antennas were learned from
+    measured_db = np.full_like(result.measured_db, np.nan) if result.further.trained_on else result.measured_db
+    return RssRow(
+        flight=task.flight,
+        setting=task.setting,
+        tower=result.tower,
+        channel=result.channel,
+        unit=result.unit,
+        offset_db=score.offset_db,
+        rmse_db=score.rmse_db,
+        correlation=score.correlation,
+        n=score.n,
+        n_out_of_coverage=score.n_out_of_coverage,
+        at_search_edge=score.at_edge,
+        rmse_ci95_db=score.rmse_ci95_db,
+        offset_ci95_db=score.intervals.offset_db,
+        correlation_ci95=score.intervals.correlation,
+        n_effective=score.intervals.autocorrelation.n_effective,
+        lag_s=score.lag_s,
+        lag_verdict="" if clock is None else clock.verdict,
+        fitted=score.fitted_on_scored,
+        baselines={name: model.rmse_db for name, model in result.baselines.items()},
+        verdicts={
+            name: result.further.compared_with[name].verdict
+            for name in result.baselines
+            if name in result.further.compared_with
+        },
+        step_db=rules.advanced.step_db,
+        span_db=rules.span_db,
+        measured_db=measured_db,
+        simulated_dbm=result.simulated_dbm,
+        time_s=_elapsed_s(result.time),
+        start_ns=_start_ns(result.time),
+        position_m=result.position_m,
+        distance_m=result.geometry["distance_m"],
+        heading_deg=result.geometry.get("heading_deg"),
+        within=result.further.repeatability,
+        difference=offset.difference_moments(measured_db, result.simulated_dbm),
+        logs=logs,
+    )
+
+
+def _rank_rows(task: Task, result: RankResult, logs: tuple[str, ...]) -> list[RankRow]:
+    score = result.score
+    return [
+        RankRow(
+            flight=task.flight,
+            setting=task.setting,
+            tower=result.tower,
+            n=score.n,
+            best_k=score.best_k,
+            best_k_ci95=score.curve.best_k_interval,
+            k=k,
+            n_out_of_coverage=fit.out_of_coverage,
+            agreement=fit.agreement,
+            agreement_ci95=fit.agreement_ci95,
+            kappa=fit.kappa,
+            total_variation=fit.total_variation,
+            total_variation_ci95=fit.total_variation_ci95,
+            wasserstein=fit.wasserstein,
+            commonest_agreement=result.further.commonest.agreement,
+            logs=logs,
+        )
+        for k, fit in score.simulated.items()
+    ]

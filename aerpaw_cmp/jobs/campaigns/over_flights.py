@@ -1,0 +1,195 @@
+"""What can be said only of several flights: shared offsets, repeatability, K chosen on the others."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from ...common.units import FloatArray
+from ...compare.offset import Pooling, pooled_moments
+from ...compare.passes import Pass, PassPair, PassTable, Visit
+from ...compare.rank import repeat_rank
+from ...flight.settings import Positive, Settings
+from ...report.campaign_data import FlownRank, PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
+
+
+class RepeatSettings(Settings):
+    """When two samples count as taken at the same place, and how residuals are gathered by place."""
+
+    radius_m: Positive = 3.0
+    heading_within_deg: Positive | None = 20.0
+    """Headings of a pair agree within this; null: any heading."""
+    cell_m: Positive = 20.0
+
+
+def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], list[PooledOffset]]:
+    """Shared offsets of each setting, entered into the rows and listed by group."""
+    done: list[RssRow] = []
+    groups: list[PooledOffset] = []
+    for setting in dict.fromkeys(row.setting for row in rows):
+        members = [row for row in rows if row.setting == setting]
+        span = (min(r.span_db[0] for r in members), max(r.span_db[1] for r in members))
+        fits = pooled_moments(
+            {row.key: row.moments for row in members},
+            per,
+            step_db=min(r.step_db for r in members),
+            span_db=span,
+        )
+        pooled = [
+            dataclasses.replace(
+                row, pooled_offset_db=fits[row.key].offset_db, pooled_rmse_db=fits[row.key].rmse_db
+            )
+            for row in members
+        ]  # fmt: skip
+        done += pooled
+        by_group: dict[str, list[RssRow]] = {}
+        for row in pooled:
+            by_group.setdefault(_group(row, per), []).append(row)
+        groups += [_pooled(setting, name, some, fits) for name, some in by_group.items()]
+    return done, groups
+
+
+def _group(row: RssRow, per: Pooling) -> str:
+    names = {
+        "link": f"{row.flight} {row.link}",
+        "tower": row.tower,
+        "channel": row.channel,
+        "flight": row.flight,
+        "all": "all",
+    }
+    return names[per]
+
+
+def _pooled(setting: str, name: str, rows: list[RssRow], fits: Mapping[Any, Any]) -> PooledOffset:
+    own = np.array([row.offset_db for row in rows])
+    own = own[np.isfinite(own)]
+    nan = float("nan")
+    return PooledOffset(
+        setting=setting,
+        group=name,
+        members=tuple(f"{row.flight} {row.link}" for row in rows),
+        offset_db=rows[0].pooled_offset_db,
+        spread_db=float(own.std(ddof=1)) if len(own) > 1 else nan,
+        range_db=(float(own.min()), float(own.max())) if len(own) else (nan, nan),
+        own_rmse_db=_mean(row.rmse_db for row in rows),
+        pooled_rmse_db=_mean(row.pooled_rmse_db for row in rows),
+        at_search_edge=any(fits[row.key].at_edge for row in rows),
+        units=tuple(dict.fromkeys(row.unit for row in rows)),
+    )
+
+
+def _mean(values: Any) -> float:
+    known = [v for v in values if np.isfinite(v)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def repeats(rows: Sequence[RssRow], settings: RepeatSettings) -> list[Repeat]:
+    """Every pair of flights that share a tower and channel, of the rows of one setting, in their order."""
+    passes = [
+        Pass(
+            flight=row.flight,
+            link=f"{row.tower}\n{row.channel}",
+            position_m=row.position_m,
+            level_db=row.measured_db,
+            residual_db=row.residual_db,
+            heading_deg=row.heading_deg,
+        )
+        for row in rows
+    ]
+    pairs = PassTable(passes, settings.cell_m).pairs(
+        radius_m=settings.radius_m, heading_within_deg=settings.heading_within_deg
+    )
+    known = [int(np.isfinite(row.measured_db).sum()) for row in rows]
+    ordered = sorted(pairs, key=lambda pair: (pair.first, pair.second))
+    return [_repeat(pair, rows[pair.first], rows[pair.second], known[pair.first]) for pair in ordered]
+
+
+def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat:
+    return Repeat(
+        tower=first.tower,
+        channel=first.channel,
+        first=first.flight,
+        second=second.flight,
+        n=pair.n,
+        share=pair.n / max(known, 1),
+        rmse_db=pair.rmse_db,
+        rmse_ci95_db=pair.rmse_ci95_db,
+        offset_db=pair.offset_db,
+        single_db=pair.rmse_db / 2.0**0.5,
+        residual_rmse_db=pair.residual_rmse_db,
+        place_rmse_db=pair.place_rmse_db,
+        place_correlation=pair.place_correlation,
+        cells=pair.cells,
+        height_difference_m=pair.height_difference_m,
+    )
+
+
+def rank_repeats(flown: Sequence[FlownRank], radius_m: float) -> list[RankPairing]:
+    """Every pair of flights that reported ranks to one tower at the same places."""
+    out = []
+    boxes = [_box(one.position_m) for one in flown]
+    for (i, first), (j, second) in combinations(enumerate(flown), 2):
+        if first.tower != second.tower or first.flight == second.flight:
+            continue
+        if not _near(boxes[i], boxes[j], radius_m):
+            continue
+        passes = Visit(first.position_m, first.rank), Visit(second.position_m, second.rank)
+        repeated = repeat_rank(*passes, radius_m, replicates=0)
+        if repeated.n:
+            out.append(
+                RankPairing(
+                    tower=first.tower,
+                    first=first.flight,
+                    second=second.flight,
+                    n=repeated.n,
+                    agreement=repeated.agreement,
+                    kappa=repeated.kappa,
+                    kappa_ci95=repeated.kappa_ci95,
+                )
+            )
+    return out
+
+
+def _box(position_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest coordinates of the places that are known."""
+    placed = position_m[np.isfinite(position_m).all(axis=1)]
+    return placed.min(axis=0, initial=np.inf), placed.max(axis=0, initial=-np.inf)
+
+
+def _near(first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray], radius_m: float) -> bool:
+    return bool((first[0] <= second[1] + radius_m).all() and (second[0] <= first[1] + radius_m).all())
+
+
+def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
+    """K chosen on the other flights, for every flight that has others with the same tower and K."""
+    out = []
+    for setting, tower in dict.fromkeys((row.setting, row.tower) for row in rows):
+        by: dict[str, dict[float, RankRow]] = {}
+        for row in rows:
+            if (row.setting, row.tower) == (setting, tower) and np.isfinite(row.total_variation):
+                by.setdefault(row.flight, {})[row.k] = row
+        for flight, own in by.items():
+            others = [at for name, at in by.items() if name != flight]
+            common = [k for k in own if others and all(k in at for at in others)]
+            if not common:
+                continue
+            chosen = min(common, key=lambda k: _mean(at[k].total_variation for at in others))
+            best = min(own, key=lambda k: own[k].total_variation)
+            out.append(
+                RankTransfer(
+                    setting=setting,
+                    flight=flight,
+                    tower=tower,
+                    chosen_on=tuple(name for name in by if name != flight),
+                    k=chosen,
+                    total_variation=own[chosen].total_variation,
+                    kappa=own[chosen].kappa,
+                    own_k=best,
+                    own_total_variation=own[best].total_variation,
+                )
+            )
+    return out

@@ -1,0 +1,262 @@
+"""A season's numbers from the rows of a campaign: held-out errors, ranking of settings, drift, residuals by place."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from ...common.errors import InputError
+from ...common.files import LARGEST_TABLE, read_bounded
+from ...common.units import FloatArray
+from ...compare.season import (
+    error_at_offset,
+    left_out_offsets,
+    mean_of_flights,
+    trend,
+    verdict_of,
+)
+from ...logs.records import has_wall_clock
+from ...report.campaign_data import CampaignData, Drift, PlaceMap, RssRow, Season, SettingRank, place_means
+
+DAY_NS = 86_400e9
+QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
+
+
+def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) -> CampaignData:
+    """The campaign with held-out errors in its rows and what they say over the season.
+
+    Parameters
+    ----------
+    data : CampaignData
+    reports : mapping of str to str, optional
+        Address of the report of a flight, against the campaign's folder.
+    """
+    rows = held_out_rows(data.rss)
+    data = dataclasses.replace(data, rss=tuple(rows))
+    if not rows:
+        return dataclasses.replace(data, season=Season(reports=dict(reports or {})))
+    started = started_of(rows)
+    order = sorted(data.flights, key=lambda name: (name not in started, started.get(name, 0)))
+    links = list(dict.fromkeys(row.link for row in rows))
+    ranking = rank_settings(rows, list(data.settings), order, "")
+    if len(links) > 1:
+        for link in links:
+            ranking += rank_settings([r for r in rows if r.link == link], list(data.settings), order, link)
+    return dataclasses.replace(
+        data,
+        season=Season(
+            held_out=any(np.isfinite(row.held_out_rmse_db) for row in rows),
+            started={name: _iso(ns) for name, ns in started.items()},
+            ranking=tuple(ranking),
+            drift=tuple(drifts(rows, started)),
+            places=tuple(place_maps(data.reference_rows, data.cell_m)),
+            reports=dict(reports or {}),
+        ),
+    )
+
+
+def started_of(rows: Iterable[RssRow]) -> dict[str, int]:
+    """First instant of each flight [ns after 1970-01-01]; none where its logs have relative times only."""
+    starts: dict[str, int] = {}
+    for row in rows:
+        if row.start_ns and has_wall_clock(np.datetime64(row.start_ns, "ns")):
+            starts[row.flight] = min(row.start_ns, starts.get(row.flight, row.start_ns))
+    return starts
+
+
+def _iso(ns: int) -> str:
+    return str(np.datetime64(ns, "ns").astype("datetime64[s]")) + "Z"
+
+
+# --- held-out errors --------------------------------------------------------------------------------------------------
+
+
+def held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
+    """Rows with the offset from the other flights of their setting, tower and channel, and what it leaves."""
+    groups: dict[tuple[str, str, str, str], list[int]] = {}
+    for i, row in enumerate(rows):
+        groups.setdefault((row.setting, row.tower, row.channel, row.unit), []).append(i)
+    done = list(rows)
+    for members in groups.values():
+        mine = [rows[i] for i in members]
+        mean = np.array([mean_difference_db(row) for row in mine])
+        offset = left_out_offsets(
+            [row.n if np.isfinite(m) else 0 for row, m in zip(mine, mean, strict=True)],
+            mean,
+            step_db=min(row.step_db for row in mine),
+            span_db=(min(row.span_db[0] for row in mine), max(row.span_db[1] for row in mine)),
+        )
+        error = error_at_offset(offset, [row.rmse_db for row in mine], [row.offset_db for row in mine], mean)
+        for i, o, e in zip(members, offset, error, strict=True):
+            done[i] = dataclasses.replace(rows[i], held_out_offset_db=float(o), held_out_rmse_db=float(e))
+    return done
+
+
+def mean_difference_db(row: RssRow) -> float:
+    """Mean of simulated minus measured over the scored samples [dB]; NaN without one."""
+    return row.moments.mean_db
+
+
+def error_of(row: RssRow) -> float:
+    """The error that settings are ranked by [dB]: held out, or own where there is no other flight."""
+    return row.held_out_rmse_db if np.isfinite(row.held_out_rmse_db) else row.rmse_db
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+def rank_settings(
+    rows: Iterable[RssRow], settings: Sequence[str], flights: Sequence[str], link: str
+) -> list[SettingRank]:
+    """Settings by their mean error over flights, and their difference to the first on the same flights and links.
+
+    Parameters
+    ----------
+    rows : iterable of RssRow
+    settings : sequence of str
+        Labels; ties keep their order.
+    flights : sequence of str
+        Those that are compared.
+    link : str
+        What the rows are of, for the record.
+
+    Returns
+    -------
+    list of SettingRank
+        Least mean error first; settings without a finite error are left out.
+    """
+    table: dict[str, dict[str, dict[str, float]]] = {name: {} for name in settings}
+    for row in rows:
+        if np.isfinite(error_of(row)):
+            table[row.setting].setdefault(row.flight, {})[row.link] = error_of(row)
+    means = {name: np.array([np.mean(list(by.values())) for by in table[name].values()]) for name in settings}
+    known = sorted((name for name in settings if len(means[name])), key=lambda name: float(means[name].mean()))
+    choices = []
+    for name in known:
+        difference = mean_of_flights(_paired(table[name], table[known[0]], flights))
+        low, *middle, high = (float(v) for v in np.quantile(means[name], (0.0, *QUANTILES, 1.0)))
+        choices.append(
+            SettingRank(
+                setting=name,
+                link=link,
+                n_flights=len(means[name]),
+                mean_db=float(means[name].mean()),
+                quantiles_db=(low, *middle, high),
+                difference_db=difference.mean,
+                difference_ci95_db=None if name == known[0] else (difference.low, difference.high),
+                n_paired=difference.n,
+                verdict="first" if name == known[0] else verdict_of(difference),
+            )
+        )
+    return choices
+
+
+def _paired(one: Mapping[str, Any], other: Mapping[str, Any], flights: Sequence[str]) -> FloatArray:
+    """Mean difference on the links that both settings scored, per flight, in the order of the dates."""
+    differences = []
+    for flight in flights:
+        both = sorted(set(one.get(flight, ())) & set(other.get(flight, ())))
+        if both:
+            differences.append(float(np.mean([one[flight][link] - other[flight][link] for link in both])))
+    return np.array(differences)
+
+
+def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
+    """Own offset, before rounding, of every setting, tower and channel over the dates of the flights."""
+    groups: dict[tuple[str, str, str], list[RssRow]] = {}
+    for row in rows:
+        if np.isfinite(row.offset_db):
+            groups.setdefault((row.setting, row.tower, row.channel), []).append(row)
+    made = []
+    for (setting, tower, channel), members in groups.items():
+        days = [started.get(row.flight, np.nan) / DAY_NS for row in members]
+        # not the offsets themselves: three flights whose rounded offsets lie on a line would have no uncertainty
+        exact = np.array([mean_difference_db(row) for row in members])
+        offsets = np.array([row.offset_db for row in members])
+        line = trend(days, exact)
+        made.append(
+            Drift(
+                setting=setting,
+                tower=tower,
+                channel=channel,
+                n=line.n,
+                slope_db_per_30_days=line.slope,
+                slope_ci95_db=(line.low, line.high),
+                scatter_db=line.scatter,
+                spread_db=float(offsets.std(ddof=1)) if len(offsets) > 1 else float("nan"),
+            )
+        )
+    return made
+
+
+# --- places -----------------------------------------------------------------------------------------------------------
+
+
+def place_maps(rows: Sequence[RssRow], cell_m: float) -> list[PlaceMap]:
+    """Mean residual of each cell of the plan over flights: of every tower and channel, and of all together."""
+    residuals: dict[tuple[str, str], dict[tuple[int, int], list[float]]] = {}
+    for row in rows:
+        for cell, (residual, _) in place_means(row, cell_m).items():
+            for key in ((row.tower, row.channel), ("", "")):
+                residuals.setdefault(key, {}).setdefault(cell, []).append(residual)
+    if len(residuals) == 2:  # one link: all together is the same
+        residuals.pop(("", ""))
+    return [_place_map(tower, channel, cells, cell_m) for (tower, channel), cells in residuals.items()]
+
+
+def _place_map(tower: str, channel: str, cells: Mapping[tuple[int, int], list[float]], cell_m: float) -> PlaceMap:
+    at = (np.array(list(cells), dtype=np.float64).reshape(-1, 2) + 0.5) * cell_m
+    return PlaceMap(
+        tower=tower,
+        channel=channel,
+        east_m=at[:, 0],
+        north_m=at[:, 1],
+        mean_db=np.array([np.mean(values) for values in cells.values()]),
+        spread_db=np.array([np.std(values, ddof=1) if len(values) > 1 else np.nan for values in cells.values()]),
+        n=np.array([len(values) for values in cells.values()]),
+    )
+
+
+# --- reports of the flights -------------------------------------------------------------------------------------------
+
+
+def find_reports(flights: Iterable[str], folder: Path, beside: Sequence[Path]) -> dict[str, str]:
+    """Relative addresses of the reports of flights that stand in one of the folders ``beside``.
+
+    Parameters
+    ----------
+    flights : iterable of str
+    folder : Path
+        Of the campaign's page.
+    beside : sequence of Path
+        Each may hold ``NAME/report.html``, as ``aerpaw-cmp report`` writes it.
+
+    Returns
+    -------
+    dict
+        A folder whose metrics.json is of another flight is no report of this one.
+    """
+    reports: dict[str, str] = {}
+    for name in flights:
+        for place in beside:
+            page = place / name / "report.html"
+            if page.is_file() and _flight_of(page.with_name("metrics.json")) == name:
+                relative = Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix()
+                reports[name] = quote(relative)
+                break
+    return reports
+
+
+def _flight_of(path: Path) -> str | None:
+    try:
+        name = json.loads(read_bounded(path, LARGEST_TABLE)).get("flight")
+    except (InputError, OSError, ValueError, AttributeError):
+        return None
+    return name if isinstance(name, str) else None

@@ -1,0 +1,1 @@
+"""Calibration: antennas, ground, lock and rank receivers learned from flights."""

@@ -1,0 +1,507 @@
+"""The ``calibrate`` job: antennas as they hang, learned from several flights, scored on what was left out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ...common.errors import InputError, UsageError
+from ...common.provenance import union
+from ...common.stages import Stages
+from ...common.units import FloatArray
+from ...common.yamlfile import load_yaml
+from ...compare import calibration
+from ...compare.calibration import Learned, Observed, Recipe, Score
+from ...compare.direction_gain import (
+    ANTENNA_TERMS,
+    PLACE_TERM,
+    TOWER_TERMS,
+    UAV_TERMS,
+    GainModel,
+    LinkSamples,
+    Term,
+    column_forms,
+)
+from ...compare.learning_curve import CurvePoint, learning_curve
+from ...compare.mount import GainOf
+from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
+from ...flight.lock import LOCK_FLOOR_DB
+from ...flight.settings import AntennaSettings, Settings, load_flight, load_pattern
+from ...flight.training import counted_once, flight_logs
+from ...propagation.arrays import rotation_from_yaw_pitch_roll
+from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
+from ...report.calibration_words import sentences
+from ...site.learned import LearnedLock, Source
+from .calibrate_lock import learned_locks, lock_words
+from .calibrate_rank import RankFitSettings
+
+ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
+"""Heights of roughness that are tried [m]; infinite is no ground ray."""
+
+
+class PatternsSettings(Settings):
+    """Measured patterns that the learned gain stands on; none: isotropic."""
+
+    uav: AntennaSettings | None = None
+    tower: AntennaSettings | None = None
+    towers: dict[str, AntennaSettings] = Field(default_factory=dict)
+    """By ``tower.channel``, where they differ."""
+
+
+class FitSettings(Settings):
+    """What is learned."""
+
+    gain: Literal["both", "uav", "tower", "none"] = "both"
+    mount: Literal["azimuth", "tilt", "none"] = "azimuth"
+    """Of antennas with a pattern."""
+    place: bool = False
+    """Also a field over places, drawn and scored apart; never part of an antenna."""
+    ground: bool = True
+    """How rough the ground is, by the likelihood of a two-ray model beside the gains."""
+    bin_s: Annotated[float, Field(gt=0, le=60)] = 4.0
+
+
+class CalibrationFile(Settings):
+    """The whole calibration.yaml."""
+
+    calibration: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\\-]*$")]
+    flights: Annotated[list[str], Field(min_length=1)]
+    patterns: PatternsSettings = PatternsSettings()
+    fit: FitSettings = FitSettings()
+    source: Source = Source()
+    """Title, DOI and licence of the flights' data, and their airframe: kept beside what a site remembers."""
+    rank: RankFitSettings | None = None
+    """Also learn how the receiver decides its rank."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundFit:
+    """Roughness of the ground: log likelihood against no ground ray, per height of roughness tried [m]."""
+
+    roughness_m: tuple[float, ...]
+    log_likelihood: tuple[float, ...]
+
+    @property
+    def best_m(self) -> float:
+        """Most probable height; infinite: no coherent ground ray."""
+        return self.roughness_m[int(np.argmax(self.log_likelihood))]
+
+    @property
+    def likely_m(self) -> tuple[float, float]:
+        """Heights within 2 of the best log likelihood (some 95 %)."""
+        least = max(self.log_likelihood) - 2.0
+        near = [r for r, v in zip(self.roughness_m, self.log_likelihood, strict=True) if v > least]
+        return min(near), max(near)
+
+    @property
+    def used_m(self) -> float | None:
+        """What a replay is to take: the most probable height, or None where no ground ray is as likely."""
+        return None if math.isinf(self.likely_m[1]) else self.best_m
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """All that a calibration found."""
+
+    settings: CalibrationFile
+    flights: tuple[FlightData, ...]
+    observed: tuple[Observed, ...]
+    learned: Learned
+    place: Learned | None
+    scores: Mapping[str, tuple[Score, ...]]
+    controls: Mapping[str, tuple[Score, ...]]
+    ground: GroundFit | None
+    curve: tuple[CurvePoint, ...]
+    locks: Mapping[str, LearnedLock]
+    """By antenna, of receivers that lose their lock."""
+    warnings: tuple[str, ...]
+    words: tuple[str, ...]
+
+    @property
+    def trained_on(self) -> tuple[str, ...]:
+        """SHA-256 of every log that was learned from."""
+        return union(*map(flight_logs, self.flights))
+
+
+def load_calibration(path: Path) -> CalibrationFile:
+    """Read and check a calibration.yaml; UsageError as of any settings file."""
+    settings = load_yaml(path, CalibrationFile)
+    if len(set(settings.flights)) != len(settings.flights):
+        raise UsageError(
+            "a flight is named twice", expected="each flight once: its copy would be scored on itself", path=path
+        )
+    return settings
+
+
+def calibrate(
+    settings: CalibrationFile,
+    flights: Sequence[FlightData],
+    folder: Path,
+    logs_root: Path | None = None,
+    *,
+    stages: Stages | None = None,
+    score: Sequence[Path] = (),
+) -> Calibration:
+    """Learn from flights, score.
+
+    Parameters
+    ----------
+    settings : CalibrationFile
+    flights : sequence of FlightData
+        As :func:`read_flights` gives them.
+    folder, logs_root : Path
+        Against which patterns resolve, and logs of ``score`` in place of their flight file's folder.
+    stages : Stages, optional
+    score : sequence of Path
+        Further flight files, scored with all that was learned.
+
+    Returns
+    -------
+    Calibration
+        What was learned, its scores on flights left out, and the controls.
+
+    Raises
+    ------
+    UsageError
+        Settings that are wrong; flights that share no tower and channel.
+    InputError
+        Logs that cannot be read; flights without RSS.
+    """
+    stages = stages or Stages()
+    observed, warnings = observe(flights)
+    recipe = recipe_of(settings, observed, logs_root or folder)
+    series = [o.samples for o in observed]
+    with stages("fit"):
+        learned = calibration.learn(series, recipe)
+        place = None
+        if settings.fit.place:
+            with_place = calibration.only_terms(recipe, (*recipe.model.terms, PLACE_TERM))
+            place = calibration.learn(series, with_place)
+    with stages("ground"):
+        ground = fit_ground(flights, observed, learned) if settings.fit.ground else None
+    kept: dict[str, Learned] = {}
+    with stages("scores"):
+        scores = score_all(observed, recipe, stages, kept)
+        stages.progress("scores: controls")
+        controls = controls_of(observed, recipe)
+        locks = learned_locks(observed, recipe, kept)
+    with stages("curve"):
+        curve = learning_curve(observed, recipe)
+    warnings += mount_warnings(learned)
+    if score:
+        with stages("score"):
+            others, said = _score_others(score, flights, logs_root, learned, observed)
+        scores, warnings = {**scores, "other_flights": others}, [*warnings, *said]
+    return Calibration(
+        settings=settings,
+        flights=tuple(flights),
+        observed=tuple(observed),
+        learned=learned,
+        place=place,
+        scores=scores,
+        controls=controls,
+        ground=ground,
+        curve=curve,
+        locks=locks,
+        warnings=tuple(warnings),
+        words=(
+            *sentences(scores, controls, None if ground is None else ground.likely_m, curve),
+            *map(lock_words, locks.values()),
+        ),
+    )
+
+
+def _score_others(
+    paths: Sequence[Path],
+    flights: Sequence[FlightData],
+    logs_root: Path | None,
+    learned: Learned,
+    observed: Sequence[Observed],
+) -> tuple[tuple[Score, ...], list[str]]:
+    """Scores of further flights with what was learned, and which of them were learned from."""
+    others = [load_data(load_flight(path), path.parent, logs_root) for path in paths]
+    kept, said = counted_once([*flights, *others])
+    fresh = [data for data in kept if not any(data is one for one in flights)]
+    if not fresh:
+        return (), said
+    seen = [one for data in fresh for one in observe([data])[0]]
+    known = {o.samples.antenna for o in observed}
+    said += [
+        f"{o.samples.flight}: nothing was learned about {o.samples.antenna}"
+        for o in seen
+        if o.samples.antenna not in known
+    ]
+    return calibration.score_with(learned, [o for o in seen if o.samples.antenna in known], observed), said
+
+
+# --- flights -------------------------------------------------------------------------------------------------------
+
+
+def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None) -> tuple[list[FlightData], list[str]]:
+    """Every flight of the calibration, gathered, each log once, and what is to be said of copies."""
+    out = []
+    for name in settings.flights:
+        path = folder / name
+        flight = load_flight(path)
+        out.append(load_data(flight, path.parent, logs_root))
+    names = [data.settings.flight.name for data in out]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"two flights are named {name!r}", expected="an own 'flight: {name: ...}' in each file")
+    return counted_once(out)
+
+
+def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
+    """Samples of every series against free space, and what is to be said of them."""
+    observed: list[Observed] = []
+    warnings: list[str] = []
+    carriers: dict[str, dict[str, float]] = {}
+    for data, series in [(flight, one) for flight in flights for one in flight.rss]:
+        seen, said = _observed_level(data, series)
+        warnings += said
+        if seen is not None:
+            carriers.setdefault(seen.samples.antenna, {})[data.settings.flight.name] = series.link.carrier_hz
+            observed.append(seen)
+    if not observed:
+        raise InputError("none of the flights has RSS at known poses", expected="RSS logs with telemetry")
+    for antenna, per_flight in carriers.items():
+        low, high = min(per_flight.values()), max(per_flight.values())
+        if high > 1.02 * low:
+            raise UsageError(
+                f"{antenna} was received at {low / 1e9:g} and {high / 1e9:g} GHz",
+                expected="one frequency per tower and channel: an antenna's gain is of its frequency",
+                cause="flights of different experiments, or a wrong link.rss.carrier_hz",
+            )
+    lonely = [a for a, per_flight in carriers.items() if len(per_flight) == 1]
+    if len(calibration.flights_of(observed)) > 1 and len(lonely) == len(carriers):
+        raise UsageError(
+            "the flights share no tower and channel: " + "; ".join(f"{a} in {next(iter(carriers[a]))}" for a in lonely),
+            expected="at least one tower and channel that two flights have",
+            cause="different 'node' or 'channel' beside the logs in the flight files",
+        )
+    if len(calibration.flights_of(observed)) < 2:
+        warnings.append("one flight alone: nothing can be left out, nothing here is scored, and mounts are unstable")
+    elif lonely:
+        warnings.append(f"only one flight has {', '.join(lonely)}: learned, but not scored")
+    return observed, warnings
+
+
+def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | None, list[str]]:
+    """One series of levels at known poses; None for ratios and without any, and what is to be said of it."""
+    name, said = f"{data.settings.flight.name}: {series.tower} {series.channel}", []
+    if series.channel.lower() in RATIOS:
+        if series.channel.lower() != SNR or any(s.channel.lower() not in RATIOS for s in data.rss):
+            return None, [f"{data.settings.flight.name}: {series.channel} is a ratio, no level: left out"]
+        said.append(
+            f"{data.settings.flight.name}: {series.tower} {SNR} stands for a level: the noise is taken as constant"
+        )
+    one, guessed = _observe(data, series)
+    if not np.isfinite(one.samples.residual_db).any():
+        return None, [*said, f"{name} has no level at a known pose and is left out"]
+    if guessed > 0.01:
+        share = f"{100 * guessed:.0f} % of the attitudes at {series.tower} {series.channel} are unknown"
+        said.append(f"{data.settings.flight.name}: {share}: heading from the track, level flight")
+    return one, said
+
+
+def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:
+    """One series, and which share of its attitudes stands for an unknown one."""
+    if data.track is None:
+        raise InputError(f"flight {data.settings.flight.name} has no telemetry", expected="positions and attitude")
+    place, known = data.tower_at(series.tower, series.time)
+    pose = data.track.pose_at(series.time).where(known)
+    low = data.settings.rss.minimum_height_m
+    with np.errstate(invalid="ignore"):
+        keep = pose.valid if low is None else pose.valid & (pose.position_m[:, 2] >= low)
+    position = pose.position_m[keep]
+    if series.tower in data.nodes:
+        place = place[keep]
+    ray = position - place
+    at_tower = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    ends = place[:, None, :] if series.tower in data.nodes else place
+    free = free_space_dbm(ends, position, series.link.carrier_hz, series.link.transmit_power_dbm)[:, 0]
+    time = series.time[keep]
+    seconds = (time - time.min()) / np.timedelta64(1, "s") if len(time) else np.zeros(0)
+    order = np.argsort(seconds, kind="stable")
+    samples = LinkSamples(
+        flight=data.settings.flight.name,
+        tower=series.tower,
+        channel=series.channel,
+        time_s=np.asarray(seconds, dtype=np.float64),
+        position_m=position,
+        at_uav=np.einsum("nji,nj->ni", pose.rotation[keep], -at_tower),
+        at_tower=at_tower,
+        residual_db=series.measured_db[keep] - free,
+        floor_db=None if series.locked is None else LOCK_FLOOR_DB - free,
+    )
+    guessed = float(np.mean(~pose.attitude_known[keep])) if keep.any() else 0.0
+    moving = place if series.tower in data.nodes else None
+    observed = Observed(
+        samples,
+        free,
+        pose.heading_deg[keep],
+        moving,
+        time.min() if len(time) else None,
+        locked=None if series.locked is None else series.locked[keep],
+        sent_dbm=series.link.transmit_power_dbm,
+    )
+    return observed.part(order), guessed
+
+
+# --- what is learned -----------------------------------------------------------------------------------------------
+
+
+def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
+    """Mount (3, 3) from the angles of flight.yaml."""
+    return rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, pitch_deg, roll_deg]))
+
+
+def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
+    """Terms and patterns as calibration.yaml asks."""
+    terms: dict[str, tuple[Term, ...]] = {
+        "both": ANTENNA_TERMS, "uav": UAV_TERMS, "tower": TOWER_TERMS, "none": ()
+    }  # fmt: skip
+    patterns: dict[str, GainOf] = {}
+    if settings.patterns.uav is not None:
+        patterns["uav"] = gain_of(settings.patterns.uav, folder)
+    for antenna in dict.fromkeys(o.samples.antenna for o in observed):
+        chosen = settings.patterns.towers.get(antenna, settings.patterns.tower)
+        if chosen is not None:
+            patterns[antenna] = gain_of(chosen, folder)
+    return Recipe(
+        model=GainModel(terms=terms[settings.fit.gain], bin_s=settings.fit.bin_s),
+        rotation=rotation,
+        patterns=patterns,
+        mount=settings.fit.mount != "none",
+        tilt=settings.fit.mount == "tilt",
+    ).sharing([o.samples for o in observed])
+
+
+def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
+    """Gain [dBi] of a pattern towards unit vectors (n, 3) of its device frame."""
+    pattern = load_pattern(settings, folder)
+
+    def gain(direction: FloatArray) -> FloatArray:
+        theta = np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
+        e_theta, e_phi = pattern.field(theta, np.arctan2(direction[:, 1], direction[:, 0]))
+        power = np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2
+        return np.asarray(10.0 * np.log10(np.maximum(power, 1e-6)))
+
+    return gain
+
+
+def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:
+    """Likelihood of a coherent ground ray of each roughness, the gains integrated out."""
+    by_name = {data.settings.flight.name: data for data in flights}
+    kept = {(o.samples.flight, o.samples.antenna): o for o in observed}
+
+    def columns(samples: LinkSamples) -> FloatArray:
+        data = by_name[samples.flight]
+        o = kept[samples.flight, samples.antenna]
+        link = next(s.link for s in data.rss if f"{s.tower}.{s.channel}" == samples.antenna)
+        tower = data.site.towers[samples.tower]
+        place = tower.position_m[None, :] if o.tower_m is None else o.tower_m[:, None, :]
+        out = [samples.binned(model.bin_s).residual_db]
+        for sigma in ROUGHNESS_M:
+            level = two_ray_dbm(
+                place,
+                samples.position_m,
+                link.carrier_hz,
+                link.transmit_power_dbm,
+                ground_material=data.site.ground_material,
+                ground_m=tower.ground_m,
+                roughness_m=sigma,
+            )[:, 0]
+            ripple = np.where(np.isfinite(samples.residual_db), level - o.free_space_db, np.nan)
+            out.append(dataclasses.replace(samples, residual_db=ripple).binned(model.bin_s).residual_db)
+        whole = np.stack(out, axis=1)
+        return np.asarray(whole - whole.mean(axis=0))
+
+    model = learned.choice.model
+    left = [
+        dataclasses.replace(
+            o.samples,
+            residual_db=o.samples.residual_db
+            - learned.pattern_db("uav", o.samples.at_uav)
+            - learned.pattern_db(o.samples.antenna, o.samples.at_tower),
+        )
+        for o in observed
+    ]
+    form = column_forms(left, model, columns, 1 + len(ROUGHNESS_M))
+    value = np.diag(form)[1:] - 2.0 * form[0, 1:]
+    likelihood = -0.5 * (value - value[-1])
+    return GroundFit(roughness_m=ROUGHNESS_M, log_likelihood=tuple(map(float, likelihood)))
+
+
+# --- scores --------------------------------------------------------------------------------------------------------
+
+
+def score_all(
+    observed: Sequence[Observed], recipe: Recipe, stages: Stages, kept: dict[str, Learned]
+) -> dict[str, tuple[Score, ...]]:
+    """Every split, on flights that had no part in the fit; fits of one are used by the next.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+    recipe : Recipe
+    stages : Stages
+    kept : dict of str to Learned
+        Receives what was learned without each flight.
+
+    Returns
+    -------
+    dict of str to tuple of Score
+    """
+    scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
+    if len(calibration.flights_of(observed)) < 2:
+        return scores
+    scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, kept)
+    for split, parts, own in (
+        ("altitude_left_out", calibration.altitude_parts, False),
+        ("heading_left_out", calibration.heading_parts, False),
+        ("sector_left_out", calibration.sector_parts, False),
+        ("route_left_out", calibration.route_parts, True),
+    ):
+        stages.progress(f"scores: {split.replace('_', ' ')}")
+        scores[split] = calibration.parts_left_out(observed, recipe, kept, parts, own=own)
+    return scores
+
+
+def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple[Score, ...]]:
+    """Simpler and wrong models, each flight left out in turn."""
+    if len(calibration.flights_of(observed)) < 2:
+        return {}
+    left_out, only = calibration.flight_left_out, calibration.only_terms
+    bare = dataclasses.replace(recipe, patterns={})
+    turned = dataclasses.replace(bare, pairs=None)  # their directions are others
+    scores = {
+        "world frame at the UAV": left_out(calibration.world_frame(observed), turned),
+        "heading turned the wrong way": left_out(calibration.wrong_way(observed), turned),
+        "body frame, no patterns": left_out(observed, bare),
+        "UAV end only": left_out(observed, only(bare, UAV_TERMS)),
+        "tower end only": left_out(observed, only(bare, TOWER_TERMS)),
+        "field over places only": left_out(observed, only(bare, (PLACE_TERM,))),
+    }
+    return scores | (
+        {"patterns with fitted mounts only": left_out(observed, only(recipe, ()))} if recipe.patterns else {}
+    )
+
+
+def mount_warnings(learned: Learned) -> list[str]:
+    """Mounts that the data do not fix."""
+    out = []
+    for name, mount in learned.mounts.items():
+        if not mount.identified:
+            out.append(
+                f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is likeliest, with a standard "
+                f"deviation of {mount.azimuth_sd_deg:.0f} deg"
+            )
+    return out

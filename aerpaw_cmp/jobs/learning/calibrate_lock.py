@@ -1,0 +1,98 @@
+"""The lock's part of ``calibrate``: when a receiver is in lock, from the level that other flights predict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ...compare.calibration import Learned, Observed, Recipe, flight_left_out
+from ...compare.detection import DetectionScore, learn_detection, score_detection
+from ...flight.lock import LOCK_FLOOR_DB
+from ...site.learned import LearnedLock
+
+
+def learned_locks(observed: Sequence[Observed], recipe: Recipe, kept: Mapping[str, Learned]) -> dict[str, LearnedLock]:
+    """P(lock) by antenna, of levels that were predicted without the flight at hand, and its scores on flights left out.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+        Of all flights.
+    recipe : Recipe
+    kept : mapping of str to Learned
+        What was learned without each flight; learned here where it is empty.
+
+    Returns
+    -------
+    dict of str to LearnedLock
+        Nothing for receivers that keep their lock, or whose lock a single flight has lost.
+    """
+    able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
+    if len({o.samples.flight for o in able}) < 2:
+        return {}
+    if not kept:
+        kept = {}
+        flight_left_out(observed, recipe, kept)
+    out = {}
+    for antenna in dict.fromkeys(o.samples.antenna for o in able):
+        lock = _learned([_Levels(o, kept[o.samples.flight]) for o in able if o.samples.antenna == antenna])
+        if lock is not None:
+            out[antenna] = lock
+    return out
+
+
+class _Levels:
+    """Predicted path gain of one series and what was received [dB], where the lock is known."""
+
+    def __init__(self, o: Observed, learned: Learned) -> None:
+        assert o.locked is not None
+        level = o.free_space_db - o.sent_dbm + learned.mean(o.samples)
+        at = np.isfinite(level) & np.isfinite(o.locked)
+        self.time_s, self.level_db = o.samples.time_s[at], level[at]
+        self.free_db = o.free_space_db[at]
+        self.measured_db = o.samples.residual_db[at] + self.free_db
+        self.detected = o.locked[at] == 1.0
+
+
+def _learned(flights: Sequence[_Levels]) -> LearnedLock | None:
+    """From all flights, scored flight by flight by what the others teach."""
+    every = learn_detection([(f.level_db, f.detected) for f in flights])
+    scores: list[DetectionScore] = []
+    for one in flights:
+        others = learn_detection([(f.level_db, f.detected) for f in flights if f is not one])
+        score = None if others is None else score_detection(
+            one.time_s, one.measured_db, one.level_db, one.detected, floor_db=LOCK_FLOOR_DB,
+            free_space_db=one.free_db, forecast=others,
+        )  # fmt: skip
+        if score is not None:
+            scores.append(score)
+    if every is None or not scores:
+        return None
+
+    def mean(name: str) -> float:
+        return round(float(np.mean([getattr(score, name) for score in scores])), 4)
+
+    return LearnedLock(
+        gain_db=round(every.level_db, 2),
+        per_db=round(every.per_db, 4),
+        share=round(every.share, 3),
+        flights=len(scores),
+        brier=mean("brier"),
+        constant_brier=mean("constant_brier"),
+        log_score=mean("log_score"),
+        constant_log_score=mean("constant_log_score"),
+        floor_db=LOCK_FLOOR_DB,
+        floor_rmse_db=mean("rmse_db"),
+        free_space_floor_rmse_db=mean("free_space_rmse_db"),
+    )
+
+
+def lock_words(lock: LearnedLock) -> str:
+    """What flights left out say of P(lock), and of the level with a floor."""
+    return (
+        f"The predicted level gives the probability of lock with a Brier score of {lock.brier:.3f} on flights left out "
+        f"(constant: {lock.constant_brier:.3f}), log score {lock.log_score:.3f} ({lock.constant_log_score:.3f}). Where "
+        f"levels below {lock.floor_db:g} dB re full scale count as {lock.floor_db:g}, the RMSE is "
+        f"{lock.floor_rmse_db:.1f} dB; free space: {lock.free_space_floor_rmse_db:.1f} dB."
+    )

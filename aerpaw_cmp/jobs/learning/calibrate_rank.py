@@ -1,0 +1,413 @@
+"""The receiver's part of ``calibrate``: how the modem decides its rank, learned on flights, scored on those left out.
+
+The ground is flat at height 0 and everything else is left out (line of sight and one ground ray): which way the ports
+look and how strong the ground is decide more about the rank than any wall at a rural site.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ...common.errors import InputError, UsageError
+from ...common.provenance import KEY, union
+from ...common.units import FloatArray, IntArray
+from ...compare.forecast import ForecastScore, constant_forecast, score_forecast
+from ...compare.receiver import (
+    FeatureChoice,
+    Receiver,
+    ReceiverMixture,
+    choose_features,
+    fit_mixture,
+    mixture_loss,
+    out_of_group,
+    sector_groups,
+    stream_features,
+    time_means,
+)
+from ...compare.rss import seconds
+from ...flight.data import FlightData, RankSeries, rank_positions
+from ...flight.replay import attitude_rotation
+from ...flight.settings import Settings
+from ...flight.training import logs_of
+from ...propagation.arrays import Link, Poses
+from ...propagation.drivers.geometries import Geometry, every_geometry, singular_values_of
+from ...site.learned import read_table
+
+FORMAT = "aerpaw-cmp receiver 1"
+"""First key of a receiver file."""
+
+SLANTS_DEG: tuple[tuple[float, ...], ...] = (
+    (45.0, -45.0, 45.0, -45.0), (45.0, -45.0, -45.0, 45.0), (45.0, 45.0, -45.0, -45.0),
+    (-45.0, 45.0, -45.0, 45.0), (-45.0, 45.0, 45.0, -45.0), (-45.0, -45.0, 45.0, 45.0),
+    (0.0, 90.0, 0.0, 90.0), (0.0, 90.0, 90.0, 0.0), (0.0, 0.0, 90.0, 90.0),
+    (90.0, 0.0, 90.0, 0.0), (90.0, 0.0, 0.0, 90.0), (90.0, 90.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 0.0), (90.0, 90.0, 90.0, 90.0),
+)  # fmt: skip
+"""Ways to slant the four ports of a modem: two diagonals, two upright and two lying, all alike."""
+
+
+class RankFitSettings(Settings):
+    """``rank`` of calibration.yaml: which geometries are tried."""
+
+    yaw_step_deg: Annotated[float, Field(ge=5, le=90)] = 30.0
+    uav_slant_deg: list[list[float]] | None = None
+    """Slants of the modem's ports to try; by default :data:`SLANTS_DEG`."""
+    ground: list[Annotated[float, Field(ge=0, le=2)]] = Field(default_factory=lambda: [0.0, 0.2, 0.5, 1.0])
+    """Amplitude factors on the ground reflection to try."""
+    sum: Literal["power_sum", "coherent"] = "power_sum"
+    members: Annotated[int, Field(ge=1, le=60)] = 20
+    """Of the geometries that cannot be told apart, how many the forecast averages."""
+    thin: Annotated[int, Field(ge=1)] = 4
+    """Every n-th sample chooses the geometry; all fit."""
+    shift_s: list[Annotated[float, Field(ge=-30, le=30)]] = Field(
+        default_factory=lambda: [0.0, 2.0, 4.0, 6.0], min_length=1
+    )
+    """Seconds to try by which a report belongs to a later position than the log says."""
+    average_s: list[Annotated[float, Field(ge=0, le=120)]] = Field(
+        default_factory=lambda: [0.0, 8.0, 16.0, 24.0], min_length=1
+    )
+    """Seconds to try over which the modelled channel is averaged."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankSamples:
+    """Reports of one flight at one tower, at known positions: ``rank`` (n,), NaN without CSI; ``time_s`` (n,)."""
+
+    flight: str
+    tower: str
+    tower_m: FloatArray
+    poses: Poses
+    rank: FloatArray
+    link: Link
+    time_s: FloatArray
+    logs: tuple[str, ...] = ()
+    """SHA-256 of the logs that hold the reports."""
+
+    def part(self, rows: Any) -> RankSamples:
+        """Some of the samples."""
+        poses = Poses(self.poses.position_m[rows], self.poses.rotation[rows])
+        return dataclasses.replace(self, poses=poses, rank=self.rank[rows], time_s=self.time_s[rows])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timing:
+    """How reports follow the positions of a log: see :func:`~aerpaw_cmp.compare.receiver.time_means`.
+
+    ``log_score`` is that of the choice on sectors of the training flights left out [nat]; NaN where nothing was chosen.
+    """
+
+    shift_s: float = 0.0
+    average_s: float = 0.0
+    log_score: float = math.nan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FittedReceiver:
+    """A receiver at one tower: the geometries that cannot be told apart, best first, and their mean forecast."""
+
+    tower: str
+    geometries: tuple[Geometry, ...]
+    tied: int
+    flights: tuple[str, ...]
+    """Names of those that it was fitted on."""
+    trained_on: tuple[str, ...] = ()
+    """SHA-256 of their logs: no score there is worth anything; receivers of 0.3 have none."""
+    mixture: ReceiverMixture
+    timing: Timing = Timing()
+
+    def knows(self, samples: RankSamples) -> bool:
+        """Whether it was fitted on these reports: by the content of their logs, or, in 0.3, the name of the flight."""
+        if not self.trained_on:
+            return samples.flight in self.flights
+        return not set(self.trained_on).isdisjoint(samples.logs)
+
+    def forecast(self, samples: RankSamples) -> tuple[FloatArray, IntArray]:
+        """Probability (n, 4) of each rank, and the one that is said."""
+        p = self.mixture.probabilities(features_of(self.geometries, samples, self.timing))
+        return p, self.mixture.decide(p)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the receiver file."""
+        return {
+            "geometries": [dataclasses.asdict(g) for g in self.geometries],
+            "tied": self.tied,
+            "flights": list(self.flights),
+            KEY: list(self.trained_on),
+            "members": [one.as_dict() for one in self.mixture.members],
+            "decision_weight": self.mixture.decision_weight.tolist(),
+            "shift_s": self.timing.shift_s,
+            "average_s": self.timing.average_s,
+        }
+
+    @classmethod
+    def from_dict(cls, tower: str, one: Mapping[str, Any]) -> FittedReceiver:
+        """From :meth:`as_dict`; files of 0.3 have no timing and no logs."""
+        return cls(
+            tower=tower,
+            geometries=tuple(_geometry(g) for g in one["geometries"]),
+            tied=int(one["tied"]),
+            flights=tuple(str(name) for name in one["flights"]),
+            trained_on=tuple(str(digest) for digest in one.get(KEY, ())),
+            mixture=ReceiverMixture(
+                members=tuple(Receiver.from_dict(m) for m in one["members"]),
+                decision_weight=np.asarray(one["decision_weight"], dtype=np.float64),
+            ),
+            timing=Timing(shift_s=float(one.get("shift_s", 0.0)), average_s=float(one.get("average_s", 0.0))),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankCalibration:
+    """Receivers by tower, fitted on all flights, and scores by split: (flight, tower, score)."""
+
+    receivers: Mapping[str, FittedReceiver]
+    scores: Mapping[str, tuple[tuple[str, str, ForecastScore], ...]]
+    warnings: tuple[str, ...]
+
+    def metrics(self) -> dict[str, list[dict[str, Any]]]:
+        """``rank`` of ``calibrate --json``."""
+        return {
+            split: [{"flight": flight, "tower": tower, **score.as_dict()} for flight, tower, score in rows]
+            for split, rows in self.scores.items()
+        }
+
+    def text(self) -> str:
+        """The receiver file."""
+        towers = {name: one.as_dict() for name, one in self.receivers.items()}
+        return json.dumps({"format": FORMAT, "towers": towers}, indent=1) + "\n"
+
+
+def read_receiver(path: Path) -> dict[str, FittedReceiver]:
+    """Receivers of a file that ``calibrate`` wrote, by tower.
+
+    Raises
+    ------
+    InputError
+        If it is no such file.
+    """
+    try:
+        content = json.loads(read_table(path, "a receiver file"))
+        if content["format"] != FORMAT:
+            raise ValueError(f"format {content['format']!r}")
+        return {tower: FittedReceiver.from_dict(tower, one) for tower, one in content["towers"].items()}
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", expected="a receiver file", path=path) from None
+    except (ValueError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"no receiver: {error}", expected=f"a file of format {FORMAT!r}", cause="a file of another kind", path=path
+        ) from None
+
+
+def _geometry(values: Mapping[str, Any]) -> Geometry:
+    slants = {name: tuple(values[name]) for name in ("tower_slant_deg", "uav_slant_deg")}
+    return Geometry(**{**values, **slants})
+
+
+def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
+    """Reports above ``rank.minimum_height_m`` at known positions."""
+    position, valid = rank_positions(series, data.track)
+    rotation = np.tile(np.eye(3), (len(position), 1, 1))
+    if data.track is not None:
+        track = data.track.pose_at(series.time)
+        rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
+    low = data.settings.rank.minimum_height_m
+    with np.errstate(invalid="ignore"):
+        keep = valid if low is None else valid & (position[:, 2] >= low)
+    link = data.settings.link.rank.build([series.tower], data.folder)
+    ports = {len(link.uav_array), len(link.tower_arrays[series.tower])}
+    if series.tower in data.nodes:
+        raise UsageError(
+            f"rank of {series.tower} in {data.settings.flight.name}, which moves",
+            expected="a tower that stands still: geometries of the modem are fitted as seen from one place",
+        )
+    if ports != {4}:
+        raise UsageError(
+            f"link.rank of {data.settings.flight.name} has arrays of {sorted(ports)} ports",
+            expected="four at both ends: the slants and ranks of a four-port modem are fitted",
+        )
+    return RankSamples(
+        flight=data.settings.flight.name,
+        tower=series.tower,
+        tower_m=np.asarray(data.site.towers[series.tower].position_m),
+        poses=Poses(position[keep], np.ascontiguousarray(rotation[keep])),
+        rank=series.rank[keep],
+        link=link,
+        time_s=seconds(series.time[keep]),
+        logs=logs_of(data, series),
+    )
+
+
+def powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArray:
+    """Squares (geometries, n, 4) of the singular values of the modelled channels."""
+    singular = singular_values_of(
+        geometries, samples.link.tower_arrays[samples.tower], samples.tower_m, samples.link.uav_array, samples.poses,
+        samples.link.carrier_hz,
+    )  # fmt: skip
+    return np.stack([sigma**2 for sigma in singular])
+
+
+def features_of(geometries: Sequence[Geometry], samples: RankSamples, timing: Timing | None = None) -> FloatArray:
+    """Features (geometries, n, 4) of the modelled channels."""
+    return _features(powers_of(geometries, samples), samples, timing or Timing())
+
+
+def _features(power: FloatArray, samples: RankSamples, timing: Timing) -> FloatArray:
+    return stream_features(np.sqrt(time_means(power, samples.time_s, timing.shift_s, timing.average_s)))
+
+
+def candidates(settings: RankFitSettings, samples: RankSamples) -> tuple[Geometry, ...]:
+    """Geometries to try: upright and rolled by 90 deg (half a turn is the same), lying flat."""
+    half, full = (np.arange(0.0, end, settings.yaw_step_deg) for end in (180.0, 360.0))
+    mounts = [(float(y), 0.0, r) for r in (0.0, 90.0) for y in half] + [(float(y), 90.0, 0.0) for y in full]
+    tower = tuple(np.degrees(samples.link.tower_arrays[samples.tower].slant_rad).round(9).tolist())
+    slants = [tuple(s) for s in settings.uav_slant_deg] if settings.uav_slant_deg else list(SLANTS_DEG)
+    if any(len(s) != 4 for s in slants):
+        raise UsageError(f"rank.uav_slant_deg {slants}", expected="four slants per way, one per port")
+    return every_geometry(mounts, [tower], slants, settings.ground, (settings.sum,))
+
+
+def fit_rank(flights: Sequence[FlightData], settings: RankFitSettings) -> RankCalibration:
+    """Fit a receiver per tower on all flights, and score it on each flight left out.
+
+    Raises
+    ------
+    InputError
+        No flight has rank, or too few reports.
+    UsageError
+        Arrays or slants of other than four ports.
+    """
+    towers: dict[str, list[RankSamples]] = {}
+    for data in flights:
+        for series in data.rank:
+            towers.setdefault(series.tower, []).append(rank_samples(data, series))
+    if not towers:
+        raise InputError("none of the flights has rank", expected="rank logs", cause="'rank:' in calibration.yaml")
+    receivers, warnings = {}, []
+    scores: dict[str, list[tuple[str, str, ForecastScore]]] = {"flight_left_out": [], "sector_left_out": []}
+    for tower, samples in towers.items():
+        tried = Tried.of(samples, settings)
+        receivers[tower] = tried.fit(range(len(samples)))
+        if len(samples) < 2:
+            warnings.append(f"rank at {tower}: one flight alone, no flight can be left out and nothing is scored")
+            continue
+        for left, one in enumerate(samples):
+            others = [i for i in range(len(samples)) if i != left]
+            fitted, constant = tried.fit(others), constant_forecast(np.concatenate([samples[i].rank for i in others]))
+            p, said = fitted.forecast(one)
+            scores["flight_left_out"].append((one.flight, tower, score_forecast(one.rank, p, said, constant)))
+            scores["sector_left_out"].append((one.flight, tower, _sectors(one, fitted, constant)))
+        timing = receivers[tower].timing
+        if timing.shift_s or timing.average_s:
+            warnings.append(
+                f"rank at {tower}: reports go best with positions {timing.shift_s:g} s later than logged and a channel "
+                f"averaged over {timing.average_s:g} s, as sectors left out within the flights say"
+            )
+        if receivers[tower].tied > 1:
+            warnings.append(
+                f"rank at {tower}: {receivers[tower].tied} geometries give the same score, among them "
+                + "; ".join(g.in_words() for g in receivers[tower].geometries[:3])
+            )
+    return RankCalibration(
+        receivers=receivers, scores={k: tuple(v) for k, v in scores.items()}, warnings=tuple(warnings)
+    )
+
+
+def _sectors(one: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> ForecastScore:
+    """Each sector forecast from the others of the same flight, with the geometries of the other flights."""
+    good = one.part(one.rank >= 1)
+    groups = sector_groups(good.poses.position_m, good.tower_m)
+    penalty = fitted.mixture.members[0].penalty
+    forecast = out_of_group(
+        features_of(fitted.geometries[:1], good, fitted.timing)[0], good.rank.astype(np.int64), groups, penalty
+    )
+    return score_forecast(good.rank, forecast, forecast.argmax(axis=1) + 1, constant)
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """All candidates at thinned samples of each flight, evaluated once: ``power`` (geometries, n, 4) per flight."""
+
+    settings: RankFitSettings
+    samples: Sequence[RankSamples]
+    geometries: tuple[Geometry, ...]
+    thin: Sequence[RankSamples]
+    power: Sequence[FloatArray]
+
+    @classmethod
+    def of(cls, samples: Sequence[RankSamples], settings: RankFitSettings) -> Tried:
+        """All candidates of the settings, for flights at one tower."""
+        geometries = candidates(settings, samples[0])
+        thin = [one.part(slice(None, None, settings.thin)) for one in samples]
+        return cls(settings, samples, geometries, thin, [powers_of(geometries, one) for one in thin])
+
+    def fit(self, flights: Sequence[int] | range) -> FittedReceiver:
+        """Choose geometries and timing, and fit, on some of the flights.
+
+        The geometries are chosen without timing first; the best of them choose the timing, with which all geometries
+        are then compared again.
+        """
+        first = self.choose(flights, Timing())
+        timing = self.choose_timing(flights, first.order[: self.settings.members])
+        choice = first if timing.shift_s == timing.average_s == 0.0 else self.choose(flights, timing)
+        kept = tuple(self.geometries[i] for i in choice.tied[: self.settings.members])
+        whole = [self.samples[i] for i in flights]
+        mixture = fit_mixture(
+            np.concatenate([features_of(kept, one, timing) for one in whole], axis=1),
+            np.concatenate([one.rank for one in whole]),
+            _groups(whole),
+            penalties=(3.0, 10.0, 30.0),
+        )
+        return FittedReceiver(
+            tower=whole[0].tower,
+            geometries=kept,
+            tied=len(choice.tied),
+            flights=tuple(one.flight for one in whole),
+            trained_on=union(*(one.logs for one in whole)),
+            mixture=mixture,
+            timing=timing,
+        )
+
+    def choose(self, flights: Sequence[int] | range, timing: Timing) -> FeatureChoice:
+        """Compare all geometries on sectors left out within the flights."""
+        thin = [self.thin[i] for i in flights]
+        return choose_features(
+            self.features(flights, timing), np.concatenate([one.rank for one in thin]), _groups(thin)
+        )
+
+    def choose_timing(self, flights: Sequence[int] | range, which: IntArray) -> Timing:
+        """Least log score of the mean forecast of some geometries, on sectors left out within the flights."""
+        thin = [self.thin[i] for i in flights]
+        rank, groups = np.concatenate([one.rank for one in thin]), _groups(thin)
+        candidates = [
+            Timing(
+                shift_s=shift_s,
+                average_s=average_s,
+                log_score=mixture_loss(
+                    self.features(flights, Timing(shift_s=shift_s, average_s=average_s), which), rank, groups
+                ),
+            )
+            for shift_s in self.settings.shift_s
+            for average_s in self.settings.average_s
+        ]
+        return min(candidates, key=lambda one: one.log_score)
+
+    def features(
+        self, flights: Sequence[int] | range, timing: Timing, which: IntArray | slice = slice(None)
+    ) -> FloatArray:
+        """Features (geometries, n, 4) at the thinned samples of some flights."""
+        return np.concatenate([_features(self.power[i][which], self.thin[i], timing) for i in flights], axis=1)
+
+
+def _groups(samples: Sequence[RankSamples]) -> IntArray:
+    """Sectors of directions; a sector is left out of all flights at once."""
+    whole = np.concatenate([one.poses.position_m for one in samples])
+    return sector_groups(whole, samples[0].tower_m)

@@ -1,0 +1,442 @@
+"""Antenna files, the settings that name them, and the page of a calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.errors import UsageError
+from ...common.provenance import KEY, union
+from ...common.units import FloatArray, IntArray
+from ...common.versions import versions
+from ...compare.calibration import Learned, mean_rmse
+from ...compare.direction_gain import LinkSamples, pair_knots
+from ...compare.learning_curve import with_one_more
+from ...flight.data import FlightData, RankSeries, RssSeries
+from ...flight.training import flight_logs
+from ...logs.records import has_wall_clock
+from ...report.calibration_data import AntennaMap, CalibrationData
+from ...report.calibration_html import calibration_metrics, write_calibration
+from ...report.export import write_file
+from ...report.names import safe_name
+from ...site.learned import Entry, Errors, LearnedLock, LearnedReceiver, LearnedSeries
+from ...site.pair_gain import PairGain
+from ...site.sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid, sphere_netcdf, unit_mean_gain
+from .calibrate import Calibration, CalibrationFile
+from .calibrate_rank import RankCalibration
+
+MARK = "# aerpaw-cmp calibrate"
+"""First words of calibrated.yaml, by which an own earlier output is known."""
+
+PAIR_SHARE = 0.01
+"""Share of the variance over both directions that the stored directions leave."""
+
+
+def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
+    """Every antenna over the sphere, by ``(tower.channel, "uav" or "tower")``."""
+    theta, azimuth, vectors = sphere_grid()
+    flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
+    fit = calibration.learned.fit
+    if fit is None:
+        raise UsageError(
+            "fit.gain is 'none': there is no gain over direction to write", expected="gain: both, uav or tower"
+        )
+    out = {}
+    for antenna in fit.antennas:
+        for end, frame in (("uav", "body"), ("tower", "mast")):
+            name = "uav" if end == "uav" else antenna
+            gain, sd = fit.gain("body" if frame == "body" else "mast", antenna, flat)
+            raw = (gain + calibration.learned.pattern_db(name, flat)).reshape(shape)
+            whole = unit_mean_gain(raw)
+            out[antenna, end] = AntennaMap(
+                name=f"{antenna} {end}",
+                theta_deg=theta,
+                azimuth_deg=azimuth,
+                gain_dbi=whole,
+                sd_db=sd.reshape(shape),
+                level_db=float((raw - whole).flat[0]),
+                seen=fit.seen("body" if frame == "body" else "mast", antenna),
+            )
+    return out
+
+
+def antenna_files(
+    calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float
+) -> dict[str, str | bytes]:
+    """Content of each file by its name: the full sphere with standard deviation, and cuts for planning tools.
+
+    The sphere is CSV and, where netCDF4 is installed, NetCDF too.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    maps : mapping of (antenna, end) to AntennaMap
+    carrier_hz : float
+
+    Returns
+    -------
+    dict of str to str or bytes
+    """
+    names = ", ".join(data.settings.flight.name for data in calibration.flights)
+    notes = (
+        f"aerpaw-cmp calibrate: {calibration.settings.calibration}, from {names}",
+        "gain of the antenna as mounted: UAV in the body frame (x forward, y left, z up), tower in east-north-up",
+        "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
+        f"{KEY}: {' '.join(calibration.trained_on)}",
+    )
+    made = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    out: dict[str, str | bytes] = {}
+    for (antenna, end), one in maps.items():
+        stem = safe_name(f"{antenna}.{end}")
+        more = (calibration.learned.spread(antenna).text(), *pair_notes(calibration, antenna, end))
+        out[f"{stem}.csv"] = sphere_csv(one.gain_dbi, one.sd_db, (*notes, *more))
+        pattern = SpherePattern(stem, one.gain_dbi, one.sd_db)
+        out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz)
+        said = {
+            "title": f"{antenna}, antenna at the {end}",
+            "source": f"learned from the flights {names}",
+            "history": f"{made} written by aerpaw-cmp calibrate, calibration {calibration.settings.calibration}",
+            "institution": "not stated",
+            "references": "https://arxiv.org/abs/2502.10324",
+            "comment": "; ".join(notes[1:-1]),
+            KEY: " ".join(calibration.trained_on),
+        }
+        sphere = sphere_netcdf(one.gain_dbi, one.sd_db, said, carrier_hz)
+        if sphere is not None:
+            out[f"{stem}.nc"] = sphere
+    return out
+
+
+def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
+    """What the tower's file says about the gain towards both ends at once; nothing where none was learned."""
+    fit = calibration.learned.fit
+    term = next((t for t in fit.model.terms if t.frame == "pair"), None) if fit else None
+    if fit is None or term is None or end == "uav":
+        return ()
+    at = pair_knots(fit.seen("pair", antenna), term.length, PAIR_SHARE)
+    samples = LinkSamples(
+        flight="",
+        tower=antenna.partition(".")[0],
+        channel=antenna.partition(".")[2],
+        time_s=np.arange(float(len(at))),
+        position_m=np.zeros((len(at), 3)),
+        at_uav=at[:, :3],
+        at_tower=at[:, 3:],
+        residual_db=np.full(len(at), np.nan),
+    )
+    return PairGain(
+        directions=at,
+        gain_db=fit.gain("pair", antenna, at)[0],
+        sd_db=fit.predict(samples, ("body", "mast", "pair"))[1],
+        length=term.length,
+        prior_sd_db=term.sd_db,
+    ).notes()
+
+
+def settings_text(calibration: Calibration, folder_name: str) -> str:
+    """calibrated.yaml: the part of a flight.yaml that names the learned antennas."""
+    names = [data.settings.flight.name for data in calibration.flights]
+    lines = [
+        f"{MARK}: {calibration.settings.calibration}. Learned from {', '.join(names)}.",
+        *(f"# {text}" for text in calibration.words),
+        "# Put this into a flight.yaml; files resolve against its folder, or --logs-root.",
+        "# SHA-256 of the logs: nothing is scored on them",
+        f"{KEY}:",
+        *(f"  - {digest}" for digest in calibration.trained_on),
+        "link:",
+        "  channels:",
+    ]
+    for antenna in calibration.learned.fit.antennas if calibration.learned.fit else ():
+        tower, _, channel = antenna.partition(".")
+        link = next(
+            s.link for data in calibration.flights for s in data.rss if (s.tower, s.channel) == (tower, channel)
+        )
+        ends = {end: f"{folder_name}/{safe_name(f'{antenna}.{end}')}.csv" for end in ("tower", "uav")}
+        lines += [
+            f"    {channel}:" if channel.isidentifier() else f"    {channel!r}:",
+            f"      carrier_hz: {link.carrier_hz:.6g}",
+            f"      transmit_power_dbm: {link.transmit_power_dbm:g}",
+            f"      tower: {{antenna: {{model: sphere, file: {ends['tower']}}}}}",
+            f"      uav: {{antenna: {{model: sphere, file: {ends['uav']}}}}}",
+        ]
+    rough = None if calibration.ground is None else calibration.ground.used_m
+    lines += [
+        "# the gains were learned beside line of sight alone",
+        "rt: {engine: image, max_depth: 0, attitude: logged}",
+    ] if rough is None else [
+        "# a ground ray of this roughness is likelier than none beside the learned gains",
+        f"rt: {{engine: image, max_depth: 1, attitude: logged, ground_roughness_m: {rough:g}}}",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def record_of(
+    calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], text: str, stages_s: Mapping[str, float]
+) -> CalibrationData:
+    """All that the page shows.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    maps : mapping of (antenna, end) to AntennaMap
+    text : str
+        The settings to copy into a flight file.
+    stages_s : mapping of str to float
+        Time of each stage [s].
+
+    Returns
+    -------
+    CalibrationData
+        As :func:`aerpaw_cmp.report.calibration_html.write_calibration` takes it.
+    """
+    model = calibration.learned.choice.model
+    mounts = {
+        name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}
+        | {"probability": dict(zip([f"{g:g}" for g in m.grid_deg], map(float, m.probability), strict=True))}
+        for name, m in calibration.learned.mounts.items()
+    }
+    ground = None
+    if calibration.ground is not None:
+        named = [f"{100 * r:g} cm" if math.isfinite(r) else "no ray" for r in calibration.ground.roughness_m]
+        ground = {
+            "rows": list(zip(named, calibration.ground.log_likelihood, strict=True)),
+            "likely_m": calibration.ground.likely_m,
+        }
+    return CalibrationData(
+        name=calibration.settings.calibration,
+        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        flights=[data.settings.flight.name for data in calibration.flights],
+        trained_on=calibration.trained_on,
+        words=calibration.words,
+        warnings=calibration.warnings,
+        scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
+        controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
+        mounts=mounts,
+        strengths={
+            "spread": calibration.learned.choice.spread,
+            "scale": calibration.learned.choice.scale,
+            "left_out_rmse_db": {f"{k:g}": v for k, v in calibration.learned.choice.left_out_rmse_db.items()},
+            "model": dataclasses.asdict(model),
+        },
+        ground=ground,
+        curve=[dataclasses.asdict(point) for point in calibration.curve],
+        one_more_rmse_db=with_one_more(calibration.curve),
+        antennas=tuple(maps.values()),
+        place=None if calibration.place is None else _place(calibration, calibration.place),
+        settings_text=text,
+        versions=versions(),
+        stages_s=stages_s,
+    )
+
+
+def _place(calibration: Calibration, place: Learned) -> dict[str, FloatArray]:
+    """The place field of the first antenna along all flights, thinned."""
+    assert place.fit is not None
+    first = place.fit.antennas[0]
+    own = [o.samples for o in calibration.observed if o.samples.antenna == first]
+    thin = [s.part(np.arange(0, len(s), max(1, len(s) // 1500))) for s in own]
+    gain = [place.fit.mean(s, ("place",)) for s in thin]
+    position = np.concatenate([s.position_m for s in thin])
+    return {"east_m": position[:, 0], "north_m": position[:, 1], "gain_db": np.concatenate(gain)}
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """What was learned from the flights of a calibration, and what is to be said of their logs."""
+
+    settings: CalibrationFile
+    flights: tuple[FlightData, ...]
+    said: tuple[str, ...]
+    calibration: Calibration | None
+    ranked: RankCalibration | None
+
+
+def write_files(
+    found: Calibrated, folder: Path, name: str, stages_s: Mapping[str, float]
+) -> tuple[dict[str, Any], str]:
+    """Fill the folder of a calibration; gives its metrics and the text of calibrated.yaml.
+
+    Parameters
+    ----------
+    found : Calibrated
+    folder : Path
+        Exists, and is swapped for the old one by the caller.
+    name : str
+        Of the folder, as the settings name its files.
+    stages_s : mapping of str to float
+        Time of each stage [s].
+
+    Returns
+    -------
+    metrics : dict
+    text : str
+        calibrated.yaml.
+    """
+    calibration, ranked = found.calibration, found.ranked
+    rank, said = (None, ()) if ranked is None else (ranked.metrics(), ranked.warnings)
+    if calibration is not None:
+        maps = antenna_maps(calibration)
+        carrier = next(s.link.carrier_hz for data in found.flights for s in data.rss)
+        for file, content in antenna_files(calibration, maps, carrier).items():
+            write_file(folder / file, content)
+        text = settings_text(calibration, name)
+        record = dataclasses.replace(
+            record_of(calibration, maps, text, stages_s),
+            rank=rank,
+            warnings=(*found.said, *calibration.warnings, *said),
+        )
+        write_calibration(record, folder)
+        metrics = calibration_metrics(record)
+    else:
+        text = MARK + "\n"
+        metrics = {
+            "scores": {}, "controls": {}, "words": [], "antennas": [], "calibration": found.settings.calibration,
+            "rank": rank, "warnings": [*found.said, *said], "flights": found.settings.flights,
+            KEY: list(union(*map(flight_logs, found.flights))),
+        }  # fmt: skip
+        (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+    if ranked is not None:
+        (folder / "receiver.json").write_text(ranked.text(), encoding="utf-8")
+        text += f"rank:\n  receiver: {name}/receiver.json\n"
+    return metrics, text
+
+
+def site_entries(found: Calibrated, command: str) -> list[tuple[str, Entry, dict[str, bytes]]]:
+    """What a site remembers of a calibration: names of entries, the entries, and their tables by name."""
+    name, out = found.settings.calibration, []
+    if found.calibration is not None:
+        out.append((name, *site_entry(found.calibration, command)))
+    if found.ranked is not None:
+        own = f"{name}_rank" if out else name
+        out.append((own, *receiver_entry(found.settings, found.flights, found.ranked, command)))
+    return out
+
+
+def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str, bytes]]:
+    """What a site remembers of a calibration: the entry, and its tables by name."""
+    name, maps = calibration.settings.calibration, antenna_maps(calibration)
+    tables: dict[str, bytes] = {}
+    series = []
+    for antenna in calibration.learned.fit.antennas if calibration.learned.fit else ():
+        files = {}
+        for end in ("tower", "uav"):
+            one = maps[antenna, end]
+            files[end] = f"{safe_name(f'{name}.{antenna}.{end}')}.csv.gz"
+            notes = (
+                f"aerpaw-cmp calibrate: {name}, {antenna} {end}",
+                f"{KEY}: {' '.join(calibration.trained_on)}",
+                calibration.learned.spread(antenna).text(),
+                *pair_notes(calibration, antenna, end),
+            )
+            tables[files[end]] = sphere_csv(one.gain_dbi, one.sd_db, notes, decimals=2).encode()
+        own = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
+        first = next((data, s) for data in calibration.flights for s in data.rss if f"{s.tower}.{s.channel}" == antenna)
+        seen = np.concatenate([calibration.learned.predict(o.part(_spread_rows(len(o))))[1] for o in own])
+        series.append(
+            LearnedSeries(
+                tower=own[0].tower,
+                channel=own[0].channel,
+                reader=reader_of(*first),
+                carrier_hz=first[1].link.carrier_hz,
+                tower_file=files["tower"],
+                uav_file=files["uav"],
+                sd_db=round(float(np.nanmean(seen)), 2),
+                lock=_at_unit_gain(calibration.locks.get(antenna), maps[antenna, "uav"], maps[antenna, "tower"]),
+            )
+        )
+    return (
+        Entry(
+            **_provenance(calibration.settings, calibration.flights, command),
+            errors=_errors(calibration),
+            series=series,
+            ground_roughness_m=None if calibration.ground is None else calibration.ground.used_m,
+        ),
+        tables,
+    )
+
+
+def _at_unit_gain(lock: LearnedLock | None, *ends: AntennaMap) -> LearnedLock | None:
+    """P(lock) of levels that are predicted with the antennas as written."""
+    if lock is None:
+        return None
+    return lock.model_copy(update={"gain_db": round(lock.gain_db - sum(end.level_db for end in ends), 2)})
+
+
+def receiver_entry(
+    settings: CalibrationFile, flights: Sequence[FlightData], ranked: RankCalibration, command: str
+) -> tuple[Entry, dict[str, bytes]]:
+    """What a site remembers of rank receivers.
+
+    Parameters
+    ----------
+    settings : CalibrationFile
+    flights : sequence of FlightData
+        That the receivers were fitted on.
+    ranked : RankCalibration
+    command : str
+        That makes the entry.
+
+    Returns
+    -------
+    entry : Entry
+    files : dict of str to bytes
+        By name.
+    """
+    file = f"{safe_name(settings.calibration)}.receiver.json.gz"
+    receivers = []
+    for tower in ranked.receivers:
+        scores = [score for _, at, score in ranked.scores["flight_left_out"] if at == tower]
+        first = next((data, s) for data in flights for s in data.rank if s.tower == tower)
+        means = {
+            key: round(float(np.mean([one.as_dict()[key] for one in scores])), 3)
+            for key in ("kappa", "log_score", "constant_log_score")
+            if scores
+        }
+        link = first[0].settings.link.rank
+        receivers.append(
+            LearnedReceiver(tower=tower, reader=reader_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
+        )
+    return Entry(**_provenance(settings, flights, command), receivers=receivers), {file: ranked.text().encode()}
+
+
+def reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:
+    """Reader of the log that holds a series."""
+    return data.files[int(series.log[0]) if len(series.log) else 0].result.reader
+
+
+def _spread_rows(count: int) -> IntArray:
+    return np.unique(np.linspace(0, count - 1, min(count, 200)).round().astype(np.int64))
+
+
+def _provenance(settings: CalibrationFile, flights: Sequence[FlightData], command: str) -> dict[str, Any]:
+    begins = [s.time.min() for data in flights for s in data.rss] + [
+        s.time.min() for data in flights for s in data.rank
+    ]
+    days = {str(begin.astype("datetime64[D]")) for begin in begins if has_wall_clock(begin)}
+    return {
+        "command": command,
+        "made": datetime.now(timezone.utc).date().isoformat(),
+        "flights": [data.settings.flight.name for data in flights],
+        "flown": sorted(days),
+        "trained_on": list(union(*map(flight_logs, flights))),
+        "source": settings.source,
+    }
+
+
+def _errors(calibration: Calibration) -> Errors | None:
+    scores, sectors = (calibration.scores[f"{name}_left_out"] for name in ("flight", "sector"))
+    if not scores:
+        return None
+    values = {
+        name: round(mean_rmse(scores, name), 3) for name in ("rmse_db", "rmse_4s_db", "free_space_rmse_db", "inside_90")
+    }
+    sector = round(mean_rmse(sectors), 3) if sectors else None
+    return Errors(series=len(scores), sector_rmse_db=sector, **values)

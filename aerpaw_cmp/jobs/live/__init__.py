@@ -1,0 +1,1 @@
+"""The tap beside a replay."""

@@ -1,0 +1,1 @@
+"""Coverage and rank maps of a site, and scenes of other programs."""

@@ -1,0 +1,801 @@
+"""The map job: the replay engine plugged into :mod:`aerpaw_cmp.maps.job`, foliage modes, study, record of the page.
+
+Paths depend neither on arrays nor, but for bounces off opaque crowns, on foliage. Each chunk of positions is searched
+once; one element and the arrays, and every foliage mode, are evaluated on the same paths, and a mode re-evaluates only
+the links that foliage touches.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.cf import file_attributes
+from ...common.errors import InputError, UsageError
+from ...common.stages import Progress, Stages, share_of, silent
+from ...common.units import AnyArray, ComplexArray, FloatArray, wavelength_m
+from ...compare.rank import singular_values
+from ...maps import export
+from ...maps import grid as cells
+from ...maps.evaluate import (
+    IntervalCoverage,
+    Predictor,
+    Score,
+    along_trajectory,
+    altitude_held_out,
+    blocked,
+    learning_curve,
+)
+from ...maps.grid import Grid
+from ...maps.interpolate import InverseDistance, Nearest, ServingTowerMean
+from ...maps.job import (
+    CHUNK,
+    PAPER_KS,
+    PAPER_RANK_ALTITUDES_M,
+    PAPER_RSS_ALTITUDES_M,
+    RATIO_LIMIT_DB,
+    Antennas,
+    Evaluate,
+    Evaluation,
+    MapResult,
+    foliage_difference,
+    layers_of,
+    map_job,
+)
+from ...maps.netcdf import write_netcdf
+from ...maps.study import HeldOutStudy, Study, held_out_study, interpolation_study, rank_fields
+from ...maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
+from ...propagation.arrays import Link, Poses, linear_array, single_element
+from ...propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
+from ...propagation.field.stands import stand_loss_db
+from ...propagation.field.sum import channel_matrices, rss_dbm
+from ...propagation.options import Engine, Search
+from ...propagation.paths import PathSet
+from ...propagation.replay import Replay, replay
+from ...propagation.scene import Scene
+from ...propagation.search.crowns import Crowns
+from ...report import maps_data as page
+from ...site.site import Site
+from ...site.siteyaml import load_site
+from ..prediction.corrected_map import CorrectedMaps
+from ..reporting.foliage_notes import p833_note
+from ..tasks.workers import Lost, Workers
+
+FOLIAGE = ("none", "attenuating", "opaque")
+"""Modes of the trees, from no loss to total loss; the paper's is the last."""
+
+RATIOS = ("spread", "condition")
+
+
+@dataclass(frozen=True, slots=True)
+class MapSettings:
+    """What a map is made of; the defaults are the paper's (arXiv 2502.10324, table II and section VII).
+
+    Parameters
+    ----------
+    foliage : tuple of str
+        Modes to map, of :data:`FOLIAGE`.
+    crown_reflections : bool
+        Opaque crowns reflect besides blocking.
+    spacing_m : float
+        Between neighbouring positions.
+    rss_altitudes_m, rank_altitudes_m : tuple of float
+        Heights above ground.
+    ks : tuple of float
+        Singular-value ratios.
+    carrier_hz, transmit_power_dbm : float
+        40 dBm are the paper's 10 W.
+    elements, element_spacing : int, float
+        Of the linear arrays at both ends, along north; spacing in wavelengths.
+    engine, samples, max_depth
+        Of the replay.
+    neighbours, radius_m : int, float
+        M and r0 of the interpolators; the radius grows with a spacing above the paper's, so that M are in reach.
+    block_m : float
+        Side of the blocks that are left out whole.
+    study : bool
+        Correlation, interpolation and their errors, too.
+    threshold_dbm : float
+        A level below it is out of coverage in the RSS maps.
+    seed : int
+        Of random samples.
+    """
+
+    foliage: tuple[str, ...] = FOLIAGE
+    crown_reflections: bool = True
+    spacing_m: float = cells.PAPER_SPACING_M
+    rss_altitudes_m: tuple[float, ...] = PAPER_RSS_ALTITUDES_M
+    rank_altitudes_m: tuple[float, ...] = PAPER_RANK_ALTITUDES_M
+    ks: tuple[float, ...] = PAPER_KS
+    carrier_hz: float = 3.4e9
+    transmit_power_dbm: float = 40.0
+    elements: int = 4
+    element_spacing: float = 0.5
+    engine: Engine = "image"
+    samples: int = 1_000_000
+    max_depth: int = 2
+    neighbours: int = 20
+    radius_m: float = 150.0
+    block_m: float = 300.0
+    study: bool = True
+    threshold_dbm: float = -np.inf
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.foliage if name not in FOLIAGE]
+        if unknown or not self.foliage:
+            raise UsageError(f"foliage {', '.join(unknown) or '(none given)'!r}", expected=", ".join(FOLIAGE))
+        heights = (*self.rss_altitudes_m, *self.rank_altitudes_m)
+        if not heights or any(not h > 0 for h in heights):
+            raise UsageError(f"heights {heights}", expected="heights above ground [m], above 0")
+        if not self.ks or any(not k > 1 for k in self.ks):
+            raise UsageError(f"K {self.ks}", expected="ratios of singular values, above 1")
+        if not self.carrier_hz > 0:
+            raise UsageError(f"a carrier of {self.carrier_hz} Hz", expected="a positive frequency [Hz]")
+
+    @property
+    def shown(self) -> str:
+        """The mode that the study and the paper's rows are about: the paper's, when mapped."""
+        return max(self.foliage, key=FOLIAGE.index)
+
+    @property
+    def reach_m(self) -> float:
+        """Radius of the interpolators."""
+        return self.radius_m * max(1.0, self.spacing_m / cells.PAPER_SPACING_M)
+
+
+QUICK: dict[str, Any] = {"spacing_m": 120.0, "rss_altitudes_m": (30.0, 110.0), "rank_altitudes_m": (3.0, 30.0, 110.0)}
+"""A coarse map in seconds: what ``--quick`` puts in place of the paper's settings."""
+
+
+def map_settings(given: Mapping[str, Any], *, quick: bool = False) -> MapSettings:
+    """Settings of a map from fields that were given; None leaves the default."""
+    stated = {name: value for name, value in given.items() if value is not None}
+    return MapSettings(**({**QUICK, **stated} if quick else stated))
+
+
+# --- the engine ----------------------------------------------------------------------------------------------------
+
+
+class SiteChannels:
+    """The replay engine as :data:`~aerpaw_cmp.maps.job.Evaluate`, one per foliage mode, on shared paths.
+
+    The first mode that asks for a chunk has all modes evaluated; the others are kept until asked for.
+    """
+
+    def __init__(self, site: Site, settings: MapSettings) -> None:
+        self.site, self.settings = site, settings
+        line = linear_array(settings.elements, settings.element_spacing * wavelength_m(settings.carrier_hz), 0.0)
+        self.siso = self._link(single_element())
+        self.mimo = self._link(line)
+        self.sources_m = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
+        reflect = settings.crown_reflections and "opaque" in settings.foliage and len(site.trees) > 0
+        self.mirrors = Crowns(site.trees) if reflect else None
+        self.crowns = self.mirrors.index if self.mirrors else CrownIndex(site.trees)
+        self.paths = self.paths_off_crowns = 0
+        self._kept: dict[tuple[str, bytes], Evaluation] = {}
+
+    def _link(self, array: Any) -> Link:
+        towers = dict.fromkeys(self.site.towers, array)
+        return Link(self.settings.carrier_hz, towers, array, self.settings.transmit_power_dbm, uav_transmits=False)
+
+    def of(self, mode: str) -> Evaluate:
+        """The evaluation of one foliage mode."""
+
+        def evaluate(position_m: FloatArray, towers: tuple[str, ...]) -> Evaluation:
+            if towers != tuple(self.site.towers):
+                raise ValueError(f"towers {towers} are not those of the site")
+            chunk = position_m.tobytes()
+            if (mode, chunk) not in self._kept:
+                self._kept |= {(name, chunk): evaluated for name, evaluated in self._all_modes(position_m).items()}
+            return self._kept.pop((mode, chunk))
+
+        return evaluate
+
+    def spread(self, workers: Workers, site: str, grid: Grid, progress: Progress = silent) -> None:
+        """Let workers evaluate every piece of the grid at every height; they get its number, not its points.
+
+        Parameters
+        ----------
+        workers : Workers
+        site : str
+            As :func:`~aerpaw_cmp.site.siteyaml.load_site` takes it.
+        grid : Grid
+        progress : Progress
+        """
+        s = self.settings
+        heights = sorted({*map(float, s.rss_altitudes_m), *map(float, s.rank_altitudes_m)})
+        orders = [
+            PieceOrder(site=site, settings=s, height_m=height, start=start)
+            for height in heights
+            for start in range(0, len(grid), CHUNK)
+        ]
+
+        def done(number: int, result: PieceDone | Lost) -> None:
+            if isinstance(result, Lost):
+                raise InputError(f"a piece of the map: {result.message}")
+            order = orders[number]
+            chunk = grid.positions_m(order.height_m)[order.start : order.start + CHUNK].tobytes()
+            self._kept |= {(mode, chunk): evaluated for mode, evaluated in result.modes.items()}
+            self.paths += result.paths
+            self.paths_off_crowns += result.paths_off_crowns
+            progress("maps on workers", len(self._kept) / (len(orders) * len(s.foliage)))
+
+        workers.run(map_piece, orders, done)
+
+    def _all_modes(self, position_m: FloatArray) -> dict[str, Evaluation]:
+        poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (len(position_m), 3, 3)))
+        s = self.settings
+        replayed = replay(self.site, self.siso, poses, Search(s.engine, max_depth=s.max_depth, samples=s.samples))
+        self.paths += len(replayed.paths)
+        siso, mimo = replayed.h, self._matrices(replayed, replayed.paths, poses, self.mimo, None)
+        result = {}
+        for mode in s.foliage:
+            loss = self._loss_db(mode, replayed.paths, poses)
+            one = self._shaded(siso, replayed, poses, self.siso, loss)
+            many = self._shaded(mimo, replayed, poses, self.mimo, loss)
+            if mode == "opaque" and self.mirrors:
+                one, many = self._with_bounces(self.mirrors, poses, one, many)
+            result[mode] = Evaluation(self._rss_dbm(one), self._rss_dbm(many), singular_values(many))
+        return result
+
+    def _with_bounces(
+        self, mirrors: Crowns, poses: Poses, siso: ComplexArray, mimo: ComplexArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Channel matrices with what bounces off opaque crowns, which nothing stops on its way."""
+        scene = Scene.of(self.site, self.siso, poses)
+        scene, paths = scene.with_bounces(self.site, poses, mirrors, self.settings.max_depth)
+        self.paths_off_crowns += len(paths)
+        more = (channel_matrices(paths, scene.faces, self.sources_m, poses, x).h for x in (self.siso, self.mimo))
+        return siso + next(more), mimo + next(more)
+
+    def _rss_dbm(self, h: ComplexArray) -> FloatArray:
+        level = rss_dbm(beam_power(h), self.settings.transmit_power_dbm)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.where(level >= self.settings.threshold_dbm, level, np.nan))
+
+    def _above_ground(self, position_m: FloatArray) -> FloatArray:
+        if self.site.dem is None:
+            return position_m
+        ground = self.site.dem.ground_m(position_m[:, 0], position_m[:, 1])
+        return np.column_stack([position_m[:, :2], position_m[:, 2] + ground])
+
+    def _loss_db(self, mode: str, paths: PathSet, poses: Poses) -> FloatArray | None:
+        if mode == "none" or not self.site.wooded:
+            return None
+        model = foliage_model(mode, self.settings.carrier_hz)
+        source, target = self.sources_m[paths.tower], poses.position_m[paths.pose]
+        trees_db = foliage_loss_db(source, paths.vertices_m, target, self.crowns, model)
+        wavelength = wavelength_m(self.settings.carrier_hz)
+        return trees_db + stand_loss_db(self.site, source, paths.vertices_m, target, model, wavelength)
+
+    def _matrices(
+        self, replayed: Replay, paths: PathSet, poses: Poses, link: Link, loss_db: FloatArray | None
+    ) -> ComplexArray:
+        h: ComplexArray = channel_matrices(paths, replayed.faces, self.sources_m, poses, link, loss_db).h
+        return h
+
+    def _shaded(
+        self, clear: ComplexArray, replayed: Replay, poses: Poses, link: Link, loss_db: FloatArray | None
+    ) -> ComplexArray:
+        """Channel matrices with foliage: those of links without any loss stay as they are."""
+        if loss_db is None:
+            return clear
+        paths, h = replayed.paths, clear.copy()
+        touched = np.zeros(h.shape[:2], dtype=np.bool_)
+        touched[paths.pose[loss_db > 0], paths.tower[loss_db > 0]] = True
+        # a path of infinite loss is an obstacle, not a weak path
+        again = touched[paths.pose, paths.tower] & np.isfinite(loss_db)
+        h[touched] = self._matrices(replayed, paths.select(again), poses, link, loss_db[again])[touched]
+        return np.asarray(h)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PieceOrder:
+    """Some positions of a map, for a worker: from ``start`` on, :data:`~aerpaw_cmp.maps.job.CHUNK` of them."""
+
+    site: str
+    settings: MapSettings
+    height_m: float
+    start: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PieceDone:
+    """What a worker gives back: an evaluation per foliage mode, and how many paths there were."""
+
+    modes: Mapping[str, Evaluation]
+    paths: int
+    paths_off_crowns: int
+
+
+def map_piece(order: PieceOrder) -> PieceDone:
+    """Evaluate some positions of a map."""
+    site = load_site(order.site)
+    channels = SiteChannels(site, order.settings)
+    positions = Grid.over_area(site.area_m, order.settings.spacing_m).positions_m(order.height_m)
+    modes = channels._all_modes(positions[order.start : order.start + CHUNK])
+    return PieceDone(modes=modes, paths=channels.paths, paths_off_crowns=channels.paths_off_crowns)
+
+
+def beam_power(h: ComplexArray) -> FloatArray:
+    """Received share of the transmit power of channels (..., n_rx, n_tx): equal feed in phase, mean over receivers."""
+    amplitude = h.sum(axis=-1) / np.sqrt(h.shape[-1])
+    return np.asarray((amplitude.real**2 + amplitude.imag**2).mean(axis=-1), dtype=np.float64)
+
+
+# --- the job -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class MapOutcome:
+    """Everything that one run found.
+
+    ``maps`` by foliage mode. ``studies``: positions out of coverage as no sample ("missing"), as rank 0 ("zero"), and
+    as rank 0 with M random samples within the radius in place of the M nearest ("random").
+    """
+
+    site: Site
+    settings: MapSettings
+    maps: dict[str, MapResult] = field(default_factory=dict)
+    studies: dict[str, Study] = field(default_factory=dict)
+    held_out: HeldOutStudy | None = None
+    peers: dict[str, dict[str, Score]] = field(default_factory=dict)
+    learning: dict[str, FloatArray] = field(default_factory=dict)
+    correlations: dict[str, BinnedCorrelation] = field(default_factory=dict)
+    paths: int = 0
+    paths_off_crowns: int = 0
+    trajectory_m: FloatArray | None = None
+    trajectory_name: str = ""
+    corrected: CorrectedMaps | None = None
+
+    @property
+    def shown(self) -> MapResult:
+        """The maps of the paper's mode."""
+        return self.maps[self.settings.shown]
+
+    def ordered(self) -> list[tuple[str, MapResult]]:
+        """Modes and maps, the paper's mode first."""
+        return sorted(self.maps.items(), key=lambda item: -FOLIAGE.index(item[0]))
+
+
+def make_maps(
+    site: Site, settings: MapSettings, stages: Stages, *, workers: Workers | None = None, name: str = ""
+) -> MapOutcome:
+    """Evaluate the grid of a site in every foliage mode.
+
+    Parameters
+    ----------
+    site : Site
+    settings : MapSettings
+    stages : Stages
+    workers : Workers, optional
+        Share the pieces of the grid.
+    name : str
+        The site as workers load it.
+
+    Returns
+    -------
+    MapOutcome
+        Maps by foliage mode; no study yet.
+    """
+    outcome = MapOutcome(site, settings)
+    grid = Grid.over_area(site.area_m, settings.spacing_m)
+    channels = SiteChannels(site, settings)
+    towers = {name: tower.position_m for name, tower in site.towers.items()}
+    with stages("maps"):
+        if workers is not None and workers.count > 1:
+            channels.spread(workers, name, grid, stages.progress)
+        for mode in settings.foliage:
+            outcome.maps[mode] = map_job(
+                grid, towers, channels.of(mode), rss_altitudes_m=settings.rss_altitudes_m,
+                rank_altitudes_m=settings.rank_altitudes_m, ks=settings.ks,
+                progress=share_of(stages.progress, "maps") if mode == settings.foliage[0] else None,
+            )  # fmt: skip
+    outcome.paths, outcome.paths_off_crowns = channels.paths, channels.paths_off_crowns
+    return outcome
+
+
+def study_maps(outcome: MapOutcome, stages: Stages) -> None:
+    """Correlation, interpolation and its errors, on the maps of the paper's foliage mode."""
+    s, result = outcome.settings, outcome.shown
+    heights, rank = rank_fields(result)
+    if len(heights) < 2:
+        raise UsageError(
+            f"{len(heights)} rank height at or above 30 m", expected="two or more for the study, or --no-study"
+        )
+    local: dict[str, Any] = {"neighbours": s.neighbours, "radius_m": s.reach_m, "seed": s.seed}
+    with stages("leave one out"):
+        zeros, towers = rank_fields(result, "zero")[1], result.towers_m
+        outcome.studies["missing"] = interpolation_study(result.grid, rank, towers, **local)
+        outcome.studies["zero"] = interpolation_study(result.grid, zeros, towers, **local)
+        outcome.studies["random"] = interpolation_study(result.grid, zeros, towers, selection="random", **local)
+    with stages("correlation"):
+        points, width = result.grid.points_m, s.spacing_m
+        outcome.correlations = {
+            "horizontal": field_correlation(points, rank, width_m=width),
+            "vertical": vertical_correlation(heights, np.moveaxis(rank, 0, -1)),
+            "RSS": field_correlation(points, result.rss().T, width_m=width),
+        }
+    if outcome.trajectory_m is None:
+        outcome.trajectory_m, outcome.trajectory_name = tower_round(outcome.site)
+    with stages("held-out tests"):
+        fit, line = outcome.studies["missing"].fit, outcome.trajectory_m
+        outcome.held_out = held_out_study(
+            result.grid, heights, rank, fit, trajectory_m=line, block_m=s.block_m, neighbours=s.neighbours, seed=s.seed
+        )
+        sizes = outcome.held_out.learning_sizes
+        for name, peer in wide_peers(result, s.neighbours).items():
+            outcome.peers.setdefault("blocks", {})[name] = blocked(peer, result.grid.points_m, rank, s.block_m)
+            outcome.peers.setdefault("flight", {})[name] = along_trajectory(peer, result.grid, rank, line)
+            if not isinstance(peer, ServingTowerMean):  # knows no height
+                held = altitude_held_out(peer, result.grid.points_m, heights, rank)
+                outcome.peers.setdefault("altitude", {})[f"{name}, 3-D"] = held
+            outcome.learning[name] = learning_curve(peer, result.grid.points_m, rank, sizes, seed=s.seed)
+
+
+def wide_peers(result: MapResult, neighbours: int) -> dict[str, Predictor]:
+    """Interpolators that reach as far as they must, to stand beside Kriging where samples are far."""
+    return {
+        "nearest": Nearest(np.inf),
+        "inverse distance": InverseDistance(neighbours, np.inf),
+        "serving-tower mean": ServingTowerMean(result.towers_m),
+    }
+
+
+def tower_round(site: Site) -> tuple[FloatArray, str]:
+    """A round over the first three towers and back, every 5 m: the shape of the paper's RSS flight."""
+    corners = np.array([tower.position_m[:2] for tower in list(site.towers.values())[:3]])
+    corners = np.vstack([corners, corners[:1]])
+    legs = [np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / 5.0))) for a, b in itertools.pairwise(corners)]
+    return np.concatenate(legs), "a round " + "-".join([*list(site.towers)[:3], next(iter(site.towers))])
+
+
+# --- the page ------------------------------------------------------------------------------------------------------
+
+
+def maps_record(
+    outcome: MapOutcome,
+    *,
+    name: str,
+    generated: str,
+    versions: Mapping[str, str],
+    stages_s: Mapping[str, float],
+    paper: Iterable[page.PaperRow] = (),
+) -> page.MapsData:
+    """The record that :func:`aerpaw_cmp.report.maps_html.write_maps` turns into files.
+
+    Parameters
+    ----------
+    outcome : MapOutcome
+    name, generated : str
+        Of the maps; UTC, ISO 8601.
+    versions : mapping of str to str
+    stages_s : mapping of str to float
+        Seconds per stage.
+    paper : iterable of PaperRow
+        The table of what the paper states.
+
+    Returns
+    -------
+    MapsData
+    """
+    s, result, flown = outcome.settings, outcome.shown, outcome.corrected
+    rss = tuple(one for mode, maps in outcome.ordered() for one in _rss_maps(maps, mode))
+    rank = tuple(one for mode, maps in outcome.ordered() for one in _rank_maps(maps, mode))
+    towers = result.tower_names if len(result.tower_names) > 1 else ()
+    by_tower = (one for mode, maps in outcome.ordered() for tower in towers for one in _rank_maps(maps, mode, tower))
+    return page.MapsData(
+        title=f"Coverage and rank maps, {outcome.site.name}",
+        name=name,
+        site=outcome.site,
+        generated=generated,
+        east_m=result.grid.east_m,
+        north_m=result.grid.north_m,
+        borders_m=tuple(border.line_m for border in result.borders),
+        rss=rss,
+        corrected=() if flown is None else tuple(flown.rss_maps(result.grid)),
+        flown_m=() if flown is None else flown.flown_m,
+        outside_flown=0.0 if flown is None else flown.outside,
+        corrected_words="" if flown is None else flown.sentence,
+        rank=rank,
+        rank_by_tower=tuple(by_tower),
+        layers=tuple(_further_layers(outcome)),
+        further=(*(() if flown is None else flown.page_layers(result.grid)), *_linked_layers(outcome)),
+        correlation=tuple(_correlation_panels(outcome)),
+        errors=tuple(_errors(outcome)),
+        learning=tuple(_learning(outcome)),
+        paper=tuple(paper),
+        warnings=() if flown is None else flown.warnings,
+        notes=_notes(outcome),
+        versions=versions,
+        settings=asdict(s),
+        stages_s=dict(stages_s),
+        metrics=_metrics(outcome),
+    )
+
+
+def _rss_maps(result: MapResult, mode: str) -> Iterator[page.RssMap]:
+    kinds: tuple[Antennas, ...] = ("mimo", "siso")
+    for antennas in kinds:
+        for row, height in enumerate(result.rss_altitudes_m):
+            for tower in (*result.tower_names, None):
+                values = result.rss(antennas, tower)[row]
+                yield page.RssMap(
+                    tower=tower or page.JOINT,
+                    antennas=antennas.upper(),
+                    altitude_m=height,
+                    rss_dbm=result.grid.raster(values),
+                    coverage=float(np.isfinite(values).mean()),
+                    foliage=mode,
+                )
+
+
+def _rank_maps(result: MapResult, mode: str, tower: str | None = None) -> Iterator[page.RankMap]:
+    """Rank to the serving tower, or to one."""
+    ranks, shares = result.ranks(tower), result.rank_shares(tower)
+    for (column, k), (row, height) in itertools.product(enumerate(result.ks), enumerate(result.rank_altitudes_m)):
+        yield page.RankMap(
+            k=k,
+            altitude_m=height,
+            rank=result.grid.raster(ranks[row, column]).astype(np.int64),
+            share=shares[row, column],
+            foliage=mode,
+            **({} if tower is None else {"tower": tower}),
+        )
+
+
+def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
+    """Layers of the linked map alone: how many towers cover a position, at what share of heights, which one serves."""
+    kinds: tuple[Antennas, ...] = ("mimo", "siso")
+    for mode, result in outcome.ordered():
+        raster = result.grid.raster
+        for antennas in kinds:
+            axes = {"Antennas": antennas.upper(), "Foliage": mode}
+            each = np.isfinite(result.rss_mimo_dbm if antennas == "mimo" else result.rss_siso_dbm)
+            for row, height in enumerate(result.rss_altitudes_m):
+                yield page.MapLayer(
+                    quantity="Towers in coverage", unit="towers", axes={**axes, "Height": f"{height:g} m"},
+                    values=raster(each[row].sum(axis=0).astype(np.float64)),
+                )  # fmt: skip
+            for tower in (None, *result.tower_names) if len(result.rss_altitudes_m) > 1 else ():
+                covered = np.isfinite(result.rss(antennas, tower)).mean(axis=0)
+                yield page.MapLayer(
+                    quantity="Probability of coverage over heights", unit="%",
+                    axes={"Tower": tower or page.JOINT, **axes}, values=raster(100.0 * covered),
+                )  # fmt: skip
+    shown = outcome.shown
+    if len(shown.tower_names) > 1:
+        yield page.MapLayer(
+            quantity="Serving tower", unit="", axes={}, values=shown.grid.raster(shown.serving.astype(np.float64)),
+            classes=shown.tower_names,
+        )  # fmt: skip
+
+
+def _further_layers(outcome: MapOutcome) -> Iterator[page.Layer]:
+    """Singular-value spread and condition number, then what foliage changes."""
+    result, s = outcome.shown, outcome.settings
+    raster = result.grid.raster
+    for name, label, values in (
+        ("Singular-value spread", "σ1/σ2 [dB]", result.spread_db),
+        ("Condition number", f"σ1/σ{s.elements} [dB], at most {RATIO_LIMIT_DB:g}", result.condition_db),
+    ):
+        joint = values[..., result.serving, np.arange(len(result.grid))]
+        for row, height in enumerate(result.rank_altitudes_m):
+            shown = raster(np.minimum(joint[row], RATIO_LIMIT_DB))
+            yield page.Layer(name=f"{name}, foliage {s.shown}", label=label, altitude_m=height, values=shown)
+    clear = outcome.maps.get("none")
+    for mode, maps in outcome.ordered():
+        if clear is None or mode == "none":
+            continue
+        change = foliage_difference(clear, maps)
+        for row, height in enumerate(maps.rss_altitudes_m):
+            yield page.Layer(
+                name=f"RSS lost by foliage, {mode}", label="RSS without minus with foliage [dB], arrays",
+                altitude_m=height, values=raster(change.rss_loss_db[row]), difference=True,
+            )  # fmt: skip
+        for column, k in enumerate(maps.ks if mode == s.shown else ()):
+            for row, height in enumerate(maps.rank_altitudes_m):
+                seen = maps.ranks()[row, column] > 0
+                yield page.Layer(
+                    name=f"Rank change by foliage, {mode}, K = {k:g}", label="rank with minus without foliage",
+                    altitude_m=height, values=raster(np.where(seen, change.rank_change[row, column], np.nan)),
+                    difference=True,
+                )  # fmt: skip
+
+
+def _correlation_panels(outcome: MapOutcome) -> Iterator[page.Correlation]:
+    if not outcome.studies:
+        return
+    distance = np.linspace(0.0, 500.0, 251)
+    for key, title in (("zero", "Rank vectors, Z as rank 0"), ("missing", "Rank vectors, Z left out")):
+        study = outcome.studies[key]
+        fit = study.fit
+        yield page.Correlation(
+            title=title,
+            distance_m=study.correlation.distance_m,
+            correlation=study.correlation.correlation,
+            fit_distance_m=distance,
+            fit=fit(distance),
+            fit_label=f"bi-exponential, RMSE {fit.rmse:.4f}",
+            excluded=study.correlation.excluded_constant,
+        )
+    for key, binned in outcome.correlations.items():
+        title = {"horizontal": "Rank, one height", "vertical": "Rank, across heights", "RSS": "RSS, one height"}[key]
+        yield page.Correlation(
+            title=title,
+            distance_m=binned.distance_m,
+            correlation=binned.correlation,
+            excluded=binned.excluded_constant,
+        )
+
+
+def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
+    if not outcome.studies or outcome.held_out is None:
+        return
+    heights, _ = rank_fields(outcome.shown)
+    held_out = outcome.held_out
+    tables: dict[str, dict[str, Score]] = {
+        "leave one out": dict(outcome.studies["missing"].scores),
+        "leave one out, Z as rank 0": dict(outcome.studies["zero"].scores),
+        "leave one out, Z as rank 0, random samples": _local(outcome.studies["random"].scores),
+        f"blocks of {outcome.settings.block_m:g} m left out": {"Kriging": held_out.blocked, **outcome.peers["blocks"]},
+        "altitude left out": {"Kriging, 3-D": held_out.altitude_held_out, **outcome.peers["altitude"]},
+    }
+    if held_out.trajectory is not None:
+        name = f"trained along {outcome.trajectory_name}"
+        tables[name] = {"Kriging": held_out.trajectory, **outcome.peers["flight"]}
+    fields = list(itertools.product(enumerate(heights), enumerate(outcome.shown.ks)))
+    for evaluation, scores in tables.items():
+        for method, score in scores.items():
+            for (row, height), (column, k) in fields:
+                yield page.MapError(
+                    evaluation=evaluation, method=method, k=k, altitude_m=height,
+                    mae=float(score.mae[row, column]), n=int(score.n[row, column]),
+                )  # fmt: skip
+
+
+def _local(scores: Mapping[str, Score]) -> dict[str, Score]:
+    """The interpolators that draw M samples at random when asked to."""
+    return {name: score for name, score in scores.items() if name in ("Kriging", "makima", "spline")}
+
+
+def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
+    if outcome.held_out is None or not outcome.held_out.learning_sizes:
+        return
+    sizes = np.array(outcome.held_out.learning_sizes)
+    for name, mae in {"Kriging": outcome.held_out.learning_mae, **outcome.learning}.items():
+        mean = np.array([_mean(row) for row in mae.reshape(len(sizes), -1)])
+        yield page.LearningCurve(method=f"{name}, mean over heights and K", samples=sizes, mae=mean)
+
+
+def _notes(outcome: MapOutcome) -> tuple[str, ...]:
+    """Where the loss in crowns is continued beyond its table."""
+    note = p833_note(outcome.settings.carrier_hz) if "attenuating" in outcome.settings.foliage else None
+    return () if note is None else (note,)
+
+
+def _metrics(outcome: MapOutcome) -> dict[str, Any]:
+    """What metrics.json holds beyond the tables of the page."""
+    result: dict[str, Any] = {
+        "paths": outcome.paths,
+        "paths_off_crowns": outcome.paths_off_crowns,
+        "settings": asdict(outcome.settings),
+    }
+    for key in ("zero", "missing"):
+        if key not in outcome.studies:
+            continue
+        study = outcome.studies[key]
+        result.setdefault("correlation", {})[f"z_{key}"] = {
+            **{c: getattr(study.fit, c) for c in ("c1", "c2", "c3", "c4", "rmse", "degenerate", "message")},
+            "positions": study.correlation.positions,
+            "excluded_constant": study.correlation.excluded_constant,
+            "intervals": _interval_metrics(study.intervals),
+            "intervals_paper_v2": _interval_metrics(study.intervals_paper),
+        }
+    if outcome.held_out is not None:
+        result["vertical_scale"] = outcome.held_out.vertical_scale
+        result["trajectory"] = outcome.trajectory_name
+    clear = outcome.maps.get("none")
+    for mode, maps in outcome.ordered():
+        if clear is None or mode == "none":
+            continue
+        change = foliage_difference(clear, maps)
+        result.setdefault("foliage", {})[mode] = [
+            {"altitude_m": h, "mean_rss_loss_db": _mean(change.rss_loss_db[i]), "lost": float(change.lost[i].mean())}
+            for i, h in enumerate(maps.rss_altitudes_m)
+        ]
+    return result
+
+
+def _interval_metrics(intervals: IntervalCoverage) -> dict[str, Any]:
+    return {
+        "level": intervals.level.tolist(),
+        "observed": intervals.observed.tolist(),
+        "standardised_variance": intervals.standardised_variance,
+        "n": intervals.n,
+    }
+
+
+def _mean(values: AnyArray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else float("nan")
+
+
+# --- files beside the page -----------------------------------------------------------------------------------------
+
+
+def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], progress: Progress) -> list[Path]:
+    """layers.csv, layers.geojson, maps.json and maps.kmz; maps.nc and maps.tif where the libraries are installed.
+
+    Parameters
+    ----------
+    outcome : MapOutcome
+    folder : Path
+        Made when missing.
+    summary : mapping
+        Free entries of maps.json.
+    progress : Progress
+        Told of files that are left out, and why.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+    """
+    site, grid = outcome.site, outcome.shown.grid
+    flown = [] if outcome.corrected is None else outcome.corrected.layers()
+    joint, every = (_all_layers(outcome, towers_too=too) + flown for too in (False, True))
+    names = {layer.name for layer in joint}
+    every = [layer for layer in every if layer.name in names or not layer.name.startswith(RATIOS)]
+    shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
+    named = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
+    every_layer = export.MapLayers(
+        grid=grid, frame=site.frame, layers=every, towers_m=named, borders=outcome.shown.borders
+    )
+    all_joint, levels_and_ranks = replace(every_layer, layers=joint), replace(every_layer, layers=shown)
+    written = [
+        export.write_csv(folder / "layers.csv", every_layer),
+        export.write_geojson(folder / "layers.geojson", levels_and_ranks),
+        export.write_json(folder / "maps.json", all_joint, summary),
+        export.write_kmz(folder / "maps.kmz", levels_and_ranks, title=site.name),
+    ]
+    about = file_attributes(
+        title=site.name,
+        source="ray tracing",
+        generated=str(summary.get("generated", "")),
+        version=str(summary.get("version", "")),
+        comment="A missing level has no path or lies below the threshold. A rank of 0 is a code: no path.",
+    )
+    maps = dict(outcome.ordered())
+    writers: tuple[Callable[[], Path], ...] = (
+        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, about, flown),
+        lambda: export.write_geotiff(folder / "maps.tif", all_joint),
+    )
+    for write in writers:
+        try:
+            written.append(write())
+        except UsageError as missing:
+            progress(str(missing))
+    return written
+
+
+def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:
+    """Layers of all modes, with the mode in their names; the serving tower once."""
+    result: list[cells.Layer] = []
+    for mode, maps in outcome.ordered():
+        serving, *others = layers_of(maps, towers_too=towers_too)
+        result += [] if result else [serving]
+        for one in others:
+            # a hundredth of a dB is more than the site's data hold, and a third of the bytes
+            values = one.values if one.classes else np.round(one.values, 2)
+            if one.name.startswith(RATIOS):
+                values = np.minimum(values, RATIO_LIMIT_DB)
+            title = f"{one.title}, foliage {mode}"
+            result.append(replace(one, name=f"{one.name}_{mode}", title=title, values=values))
+    return result

@@ -1,0 +1,212 @@
+"""A Mitsuba scene to a site.yaml, and any site back to a Mitsuba scene."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...common.errors import UsageError
+from ...common.geodesy import SiteFrame
+from ...common.outputs import OutputFile, OutputFolder, is_sealed, sealed
+from ...site.export import export_scene
+from ...site.footprints import site_yaml
+from ...site.mitsuba import TriangleScene
+from ...site.scenes import GROUND_SHARE, bounds, ground_share, placed_scene
+from ...site.siteyaml import SceneModel, SiteModel, build_site, load_site, site_model
+
+LOCAL_NOTE = "this site has no georeference: latitude and longitude count from (0, 0), and no log of a flight fits it"
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a file is XML of a Mitsuba scene: its first element is 'scene'."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(65536)
+    except OSError:
+        return False
+    return path.suffix.lower() == ".xml" and b"<scene" in head and b"<osm" not in head
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneOptions:
+    """What a Mitsuba scene does not say of itself.
+
+    Parameters
+    ----------
+    origin : str, optional
+        ``latitude,longitude[,ground height]`` of the scene's (0, 0, 0), or ``local``. Default: the origin of ``base``.
+    base : str, optional
+        Site whose towers and settings are kept.
+    towers : sequence of str
+        ``name=east,north,height`` [m]: antenna above up = 0 of the scene.
+    materials : sequence of str
+        ``id=material`` for materials of the scene that say nothing about radio.
+    turn_deg : float
+        How far the scene is turned counter-clockwise from above: 0 where x is east and y north.
+    merge_m : float
+        How far from one plane the corners of a face may lie [m].
+    """
+
+    origin: str | None = None
+    base: str | None = None
+    towers: Sequence[str] = ()
+    materials: Sequence[str] = ()
+    turn_deg: float = 0.0
+    merge_m: float = 1e-3
+
+
+def run_scene_import(path: Path, out: Path, asked: SceneOptions, *, force: bool = False) -> list[str]:
+    """Write a site.yaml that names a Mitsuba scene; gives what was done.
+
+    Parameters
+    ----------
+    path : Path
+        The XML file; it stays where it is.
+    out : Path
+        The site.yaml to write.
+    asked : SceneOptions
+    force : bool
+        Replace a file that this tool did not write.
+
+    Returns
+    -------
+    list of str
+        A line per thing that was done.
+
+    Raises
+    ------
+    UsageError
+        Where the scene lies, or where its towers stand, is not said.
+    """
+    named = dict(_pair(text, "--material", "wall=concrete") for text in asked.materials)
+    given = None if asked.base is None else site_model(asked.base)
+    start = _origin(asked.origin, given)
+    with OutputFile(out, own=is_sealed, inputs=[path], force=force) as output:
+        scene = placed_scene(path, materials=named, turn_deg=asked.turn_deg)
+        actions = [_summary(scene), *scene.notes]
+        share = ground_share(scene)
+        ground_plane = share < GROUND_SHARE
+        if ground_plane:
+            actions.append(
+                f"the scene has no ground (level surfaces under {share:.0%} of its plan): a plane of medium_dry_ground "
+                f"is added at its lowest point, up = {bounds(scene)[0][2]:g} m; scene.ground_plane: false leaves it out"
+            )
+        low, high = bounds(scene)
+        content: dict[str, Any] = {} if given is None else given.model_dump(mode="json", exclude_defaults=True)
+        for key in ("buildings", "dem", "tower_ground"):
+            content.pop(key, None)
+        content["name"] = path.stem if given is None else f"{given.name}, {path.stem}"
+        content["origin"] = start
+        content["scene"] = SceneModel(
+            path=Path(os.path.relpath(path.resolve(), out.resolve().parent)).as_posix(),
+            sha256=scene.sha256,
+            turn_deg=asked.turn_deg,
+            materials=named,
+            merge_m=asked.merge_m,
+            ground_plane=ground_plane,
+        ).model_dump(mode="json", exclude_defaults=True)
+        if given is None or asked.towers:
+            content["towers"] = _towers(
+                asked.towers, SiteFrame(start["latitude_deg"], start["longitude_deg"]), low, high
+            )
+        content.setdefault("area_m", [round(float(v), 2) for v in (low[0], high[0], low[1], high[1])])
+        if asked.origin == "local":
+            content["notes"] = [*content.get("notes", []), LOCAL_NOTE]
+            actions.append(LOCAL_NOTE)
+        model = SiteModel.model_validate(content)
+        build_site(model, out.resolve().parent)  # what does not fit is said now
+        output.write(sealed(site_yaml(model, header=["made by 'aerpaw-cmp site import' from a scene", *actions])))
+    return actions
+
+
+def _summary(scene: TriangleScene) -> str:
+    low, high = bounds(scene)
+    size = " x ".join(f"{v:.0f}" for v in high - low)
+    used = sorted({scene.materials[s] for s in set(scene.shape.tolist())})
+    return f"{len(scene.shapes)} shapes, {len(scene)} triangles, {size} m, of {', '.join(used)}"
+
+
+def _pair(text: str, option: str, example: str) -> tuple[str, str]:
+    name, mark, value = text.partition("=")
+    if not (mark and name and value):
+        raise UsageError(f"{option} '{text}'", expected=f"{option} {example}")
+    return name, value
+
+
+def _numbers(text: str, counts: tuple[int, ...], what: str, expected: str) -> list[float]:
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in counts:
+        raise UsageError(f"{what} '{text}'", expected=expected)
+    return values
+
+
+def _origin(text: str | None, base: SiteModel | None) -> dict[str, Any]:
+    if text == "local":
+        return {"latitude_deg": 0.0, "longitude_deg": 0.0}
+    if text is not None:
+        values = _numbers(text, (2, 3), "--origin", "--origin latitude,longitude[,ground height above sea level]")
+        origin: dict[str, Any] = {"latitude_deg": values[0], "longitude_deg": values[1]}
+        if not (abs(values[0]) <= 90 and abs(values[1]) <= 180):
+            raise UsageError(
+                f"--origin '{text}'", expected="latitude,longitude in degrees", cause="the two are swapped"
+            )
+        if len(values) == 3:
+            origin["ground"] = {"height_m": values[2], "reference": "orthometric"}
+        return origin
+    if base is not None:
+        return base.origin.model_dump(mode="json", exclude_defaults=True)
+    raise UsageError(
+        "a Mitsuba scene does not say where on Earth it lies",
+        expected="--origin latitude,longitude[,height] of its point (0, 0, 0), or --base SITE that has its origin",
+        cause="for a scene that lies nowhere: --origin local",
+    )
+
+
+def _towers(towers: Sequence[str], frame: SiteFrame, low: Any, high: Any) -> dict[str, Any]:
+    if not towers:
+        raise UsageError(
+            "a Mitsuba scene has no towers",
+            expected="--tower name=east,north,height (metres in the scene; may be repeated), or --base SITE",
+            cause=f"the scene reaches from {low[0]:.0f} to {high[0]:.0f} m east, {low[1]:.0f} to {high[1]:.0f} m north",
+        )
+    by_name: dict[str, Any] = {}
+    for text in towers:
+        name, place = _pair(text, "--tower", "BS=10,20,25")
+        east, north, up = _numbers(place, (3,), f"--tower {name}", "--tower name=east,north,height")
+        latitude, longitude = frame.to_geographic(east, north)
+        by_name[name] = {
+            "latitude_deg": round(float(latitude), 10),
+            "longitude_deg": round(float(longitude), 10),
+            "antenna_height_m": up,
+        }
+    return by_name
+
+
+def run_site_export(site: str, out: Path, *, trees: bool = True, force: bool = False) -> list[Path]:
+    """Write any site as ``scene.xml`` with PLY meshes, which ``sionna.rt.load_scene`` opens; the files written.
+
+    Parameters
+    ----------
+    site : str
+        site.yaml, or the name of a packaged site.
+    out : Path
+        Folder.
+    trees : bool
+        Crowns and trunks too.
+    force : bool
+        Replace files that this tool did not write.
+
+    Returns
+    -------
+    list of Path
+        Files written.
+    """
+    with OutputFolder(out, job="site export", inputs=[Path(site)], force=force) as output, output.filling() as folder:
+        written = export_scene(load_site(site), folder, trees=trees)
+        return [out / path.relative_to(folder) for path in written]

@@ -1,0 +1,1 @@
+"""Levels before a flight, scored after it; which flight next."""

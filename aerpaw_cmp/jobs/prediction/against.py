@@ -1,0 +1,162 @@
+"""A flight held against what was predicted before it: ``report flight.yaml --against prediction/``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ...common.errors import InputError, UsageError
+from ...common.provenance import KEY
+from ...common.units import FloatArray, IntArray
+from ...compare.calibration import Observed
+from ...compare.entries import LevelSeries, level_scores
+from ...compare.forecast import ForecastScore, score_forecast
+from ...flight.data import FlightData
+from ...flight.training import common, flight_logs
+from ...report.against import Against, AgainstSeries
+from ..learning.calibrate import observe
+from ..learning.calibrate_rank import RankSamples, rank_samples
+from .predict import RANKS
+
+NEAR_M = 30.0
+NEAR_UP_M = 15.0
+TURNED_DEG = 45.0
+"""A sample is scored by the nearest predicted point within these distances [m] whose nose differs by less [deg]."""
+
+FEWEST = 20
+
+
+def score_against(data: FlightData, folder: Path) -> Against:
+    """Score a flight with the prediction of an earlier run of ``predict``.
+
+    Raises
+    ------
+    UsageError
+        The flight's own log was learned from; no sample was predicted.
+    InputError
+        The folder holds no prediction.
+    """
+    try:
+        about = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        table = pd.read_csv(folder / "prediction.csv", low_memory=False)
+        learned, sentence = list(about[KEY]), str(about["sentence"])
+        groups = dict(iter(table[table["level_db"].notna()].groupby(["tower", "channel"])))
+        forecasts = dict(iter(table[table["channel"] == "rank"].groupby("tower")))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"no prediction ({getattr(error, 'strerror', None) or error})",
+            expected="the output folder of 'aerpaw-cmp predict'",
+            path=folder,
+        ) from None
+    if own := common(flight_logs(data), [learned]):
+        raise UsageError(
+            f"the prediction learned from this flight's own log (SHA-256 {own[0][:12]}...)",
+            expected="a prediction made before the flight, or from other flights",
+            path=folder,
+        )
+    series = [
+        one
+        for o in (observe([data])[0] if data.rss else ())
+        if (part := groups.get((o.samples.tower, o.samples.channel))) is not None
+        and (one := _matched(o, part)) is not None
+    ]
+    ranks = {
+        s.tower: score
+        for s in data.rank
+        if s.tower in forecasts and (score := _rank_score(rank_samples(data, s), forecasts[s.tower])) is not None
+    }
+    if not series and not ranks:
+        raise UsageError(
+            f"no tower and channel of the flight has {FEWEST} samples within {NEAR_M:g} m of predicted points",
+            expected="a prediction of this route: " + ", ".join(" ".join(map(str, key)) for key in groups),
+            path=folder,
+        )
+    return Against(
+        folder=folder.name,
+        sentence=sentence,
+        generated=str(about.get("generated", "")),
+        flights=tuple(map(str, about.get("flights", ()))),
+        series=tuple(series),
+        scores={f"{s.tower} {s.channel}": _scores(s) for s in series},
+        ranks=ranks,
+    )
+
+
+def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
+    """Samples near predicted points, each with the level that was predicted there."""
+    good = np.isfinite(o.samples.residual_db)
+    one = o.part(good)
+    index, near = _nearest(one.samples.position_m, one.heading_deg, part)
+    if near.sum() < FEWEST:
+        return None
+    said, s = part.iloc[index[near]], one.samples.part(near)
+    return AgainstSeries(
+        tower=s.tower,
+        channel=s.channel,
+        time_s=s.time_s,
+        measured_db=s.residual_db + one.free_space_db[near],
+        level_db=said["level_db"].to_numpy(np.float64),
+        sd_db=said["sd_db"].to_numpy(np.float64),
+        low_db=said["q05_db"].to_numpy(np.float64),
+        high_db=said["q95_db"].to_numpy(np.float64),
+        share_near=float(near.mean()),
+        common_db=said["slow_sd_db"].to_numpy(np.float64) if "slow_sd_db" in said else 0.0,
+        start=one.start,
+    )
+
+
+def _rank_score(samples: RankSamples, part: pd.DataFrame) -> ForecastScore | None:
+    """Score of predicted probabilities; the constant forecast beside it is their mean over the predicted points."""
+    nose = samples.poses.rotation[:, :, 0]
+    heading_deg = np.degrees(np.arctan2(nose[:, 0], nose[:, 1]))
+    index, near = _nearest(samples.poses.position_m, heading_deg, part)
+    if near.sum() < FEWEST:
+        return None
+    every = part[list(RANKS)].to_numpy(np.float64)
+    said = every[index[near]]
+    return score_forecast(samples.rank[near], said, said.argmax(axis=1) + 1, every.mean(axis=0))
+
+
+def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame) -> tuple[IntArray, Any]:
+    """Predicted point (n,) of each sample, and which of them are near."""
+    from scipy.spatial import cKDTree
+
+    scale = np.array([NEAR_M, NEAR_M, NEAR_UP_M, 1.0, 1.0])
+    turn = 2.0 * np.sin(np.radians(TURNED_DEG) / 2.0)
+
+    def coordinates(place: FloatArray, yaw_deg: FloatArray) -> FloatArray:
+        yaw = np.radians(yaw_deg)
+        nose = np.column_stack([np.sin(yaw), np.cos(yaw)]) / turn
+        return np.asarray(np.column_stack([place, np.nan_to_num(nose)]) / scale)
+
+    points = coordinates(part[["east_m", "north_m", "height_m"]].to_numpy(), part["yaw_deg"].to_numpy())
+    heading = heading_deg if part["yaw_deg"].notna().all() else np.full(len(heading_deg), np.nan)
+    away, index = cKDTree(points).query(coordinates(position_m, heading))
+    return np.asarray(index), away <= np.sqrt(2.0)
+
+
+def _scores(s: AgainstSeries) -> dict[str, float]:
+    """Scores as predicted, offset and all; ``own_offset_rmse_db`` about the mean of the flight."""
+    one = LevelSeries(
+        name=s.channel,
+        time_s=s.time_s,
+        measured_db=s.measured_db,
+        level_db=s.level_db,
+        sd_db=s.sd_db,
+        own_offset=False,
+    )
+    error = s.measured_db - s.level_db
+    return {
+        **level_scores([one]),
+        "bias_db": one.bias_db,
+        "own_offset_rmse_db": float(error.std()),
+        "coverage_50": s.coverage(0.5),
+        "coverage_90": float(np.mean((s.measured_db >= s.low_db) & (s.measured_db <= s.high_db))),
+        "coverage_95": s.coverage(0.95),
+        "mean_sd_db": float(s.sd_db.mean()),
+        "share_near": s.share_near,
+    }

@@ -1,0 +1,439 @@
+"""The ``plan`` command: which flight to fly next, by the standard deviation that each candidate would leave."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from ...common.errors import InputError, UsageError
+from ...common.stages import Stages
+from ...common.units import FloatArray
+from ...compare import calibration
+from ...compare.calibration import Recipe
+from ...compare.correction import choose
+from ...compare.direction_gain import GainModel, LinkSamples, shared_knots
+from ...compare.next_flight import Known, rms_db
+from ...compare.sphere import even_directions
+from ...flight.data import FlightData, load_data
+from ...flight.patterns import NOSES, Pattern, Route, Waypoint, allowed_area, cut, flown, route_of
+from ...flight.settings import load_flight
+from ...flight.training import counted_once
+from ...logs.route import read_areas
+from ...site.site import Site
+from ...site.siteyaml import load_site
+from ..benchmarks.entrants import learned_base
+from ..learning.calibrate import observe, rotation
+from .predict import site_of, sources_of
+from .where import Asked, Targets, find_targets, is_settings, level_samples
+
+SPHERE = "sphere"
+"""Target: all directions of the tower seen from the UAV, at all headings."""
+
+SPHERE_AWAY_M = 150.0
+MOST_TARGETS = 600
+"""Per antenna, while candidates are ranked."""
+
+HEADINGS = 4
+"""At points of a target whose heading is open."""
+
+FARTHEST_M = 1000.0
+"""A target that lies farther outside the geofence throughout is refused."""
+
+SHARES = (0.25, 0.5, 0.75, 1.0, 1.5)
+"""Of the battery, for what a longer flight buys."""
+
+ALLOWED_OUTSIDE_M = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanAsked:
+    """Options of ``plan``.
+
+    Parameters
+    ----------
+    minutes, speed_mps : float
+        Battery and speed.
+    heights_m : tuple of float
+        Of the tool's own patterns, above take-off.
+    tower_distance_m : float
+        Least horizontal distance to towers.
+    fence : Path, optional
+        KML; the area of the site without.
+    avoid : tuple of Path
+        KMLs of no-fly areas.
+    routes : tuple of Path
+        Further candidates.
+    site : str, optional
+        Where no flight names it.
+    towers : tuple of str
+        Whose antennas count, where no flight names them.
+    target : Asked
+        Heights, spacing and heading of a target that is a grid.
+    """
+
+    minutes: float = 15.0
+    speed_mps: float = 8.0
+    heights_m: tuple[float, ...] = (40.0,)
+    tower_distance_m: float = 30.0
+    fence: Path | None = None
+    avoid: tuple[Path, ...] = ()
+    routes: tuple[Path, ...] = ()
+    site: str | None = None
+    towers: tuple[str, ...] = ()
+    target: Asked = field(default_factory=lambda: Asked(spacing_m=60.0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ranked:
+    """A candidate: route, pattern (None of a file), standard deviation that it leaves [dB], why it may not be flown."""
+
+    route: Route
+    pattern: Pattern | None
+    sd_db: float
+    refused: str = ""
+
+
+Candidate = tuple[Route, Pattern | None, str]
+"""Route, pattern (None of a file), and why it may not be flown."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CurvePoint:
+    """What a flight of some minutes leaves [dB]."""
+
+    minutes: float
+    length_m: float
+    sd_db: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightPlan:
+    """The outcome: candidates, best first, and the standard deviation over the target before and after the best.
+
+    ``place_m`` (n, 3), ``before_db``, ``after_db`` (n,): root mean square over antennas and headings.
+    """
+
+    target: str
+    site: Site
+    area: Any
+    antennas: tuple[str, ...]
+    flights: tuple[str, ...]
+    asked: PlanAsked
+    candidates: tuple[Ranked, ...]
+    now_db: float
+    curve: tuple[CurvePoint, ...]
+    place_m: FloatArray
+    before_db: FloatArray
+    after_db: FloatArray
+    warnings: tuple[str, ...]
+
+    @property
+    def best(self) -> Ranked:
+        """The candidate that is written."""
+        return self.candidates[0]
+
+
+def plan_flight(
+    target: str,
+    flights: Sequence[Path],
+    asked: PlanAsked,
+    *,
+    logs_root: Path | None = None,
+    stages: Stages | None = None,
+) -> FlightPlan:
+    """Rank candidate flights by the standard deviation that they would leave over a target.
+
+    Parameters
+    ----------
+    target : str
+        ``sphere``, or what :func:`.where.find_targets` takes.
+    flights : sequence of Path
+        Flight files that were flown; none: antennas are unknown.
+    asked : PlanAsked
+    logs_root : Path, optional
+    stages : Stages, optional
+
+    Returns
+    -------
+    FlightPlan
+
+    Raises
+    ------
+    UsageError, InputError
+        No candidate fits, a target far outside, a route that cannot be read.
+    """
+    stages = stages or Stages()
+    if Path(target).suffix and not Path(target).exists():
+        raise InputError("there is no such file", expected="sphere, a site, a route or points", path=Path(target))
+    with stages("read"):
+        datas, said = counted_once([load_data(load_flight(p), p.parent, logs_root) for p in flights])
+        observed = observe(datas)[0] if datas else []
+        site = _site(target, asked.site, datas)
+        sources = sources_of(datas, observed) if datas else {}
+        ends = {a: (s.series.tower, s.series.channel) for a, s in sources.items()} or _open_ends(site, asked)
+        series = [o.samples for o in observed if o.samples.antenna in ends]
+        area = _area(site, asked)
+    with stages("candidates"):
+        candidates = [*_own(asked, area, site), *_given(asked, area, site)]
+        if not candidates:
+            raise UsageError(
+                "no route fits: no pattern lies within the geofence",
+                expected="a larger area, or --route FILE",
+            )
+        wanted = _targets(target, site, asked, ends, area)
+    with stages("learn"):
+        known = _known(series, [s for route, _, _ in candidates for s in _samples(route, ends, site)])
+    thin = {a: _thinned(s, MOST_TARGETS) for a, s in wanted.items()}
+
+    def leaves_db(route: Route) -> float:
+        return rms_db(known.sd_db(_samples(route, ends, site), thin))
+
+    with stages("rank"):
+        ranked = _ranked(candidates, leaves_db, stages)
+    with stages("curve"):
+        curve = _curve(ranked, leaves_db, site, area, asked)
+    with stages("map"):
+        shown = {a: _thinned(s, 6 * MOST_TARGETS) for a, s in wanted.items()}
+        before, after = known.sd_db([], shown), known.sd_db(_samples(ranked[0].route, ends, site), shown)
+        place = next(iter(shown.values())).position_m
+    return FlightPlan(
+        target=target,
+        site=site,
+        area=area,
+        antennas=tuple(ends),
+        flights=tuple(d.settings.flight.name for d in datas),
+        asked=asked,
+        candidates=tuple(ranked),
+        now_db=rms_db(known.sd_db([], thin)),
+        curve=tuple(curve),
+        place_m=place,
+        before_db=_over(before),
+        after_db=_over(after),
+        warnings=tuple(said),
+    )
+
+
+def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float], stages: Stages) -> list[Ranked]:
+    """Candidates by what they leave, those that may not be flown last."""
+    ranked = []
+    for number, (route, pattern, refused) in enumerate(candidates):
+        stages.progress(f"rank {route.name}", number / len(candidates))
+        ranked.append(Ranked(route=route, pattern=pattern, sd_db=leaves_db(route), refused=refused))
+    ranked.sort(key=lambda one: (bool(one.refused), one.sd_db))
+    if ranked[0].refused:
+        raise UsageError(
+            f"no route fits: {ranked[0].route.name} {ranked[0].refused}",
+            expected="a candidate within the geofence, the battery and the distance to towers",
+        )
+    return ranked
+
+
+def _site(target: str, site_name: str | None, datas: Sequence[FlightData]) -> Site:
+    """By name, else of the target where it is a site, else of the flights."""
+    if site_name is None and target == SPHERE:
+        if not datas:
+            raise UsageError("the site is not named", expected="--site SITE, or --with a flight")
+        return datas[0].site
+    where = Path(site_name or target)
+    if datas:
+        return site_of(where, datas)
+    if site_name is None and where.is_file() and not is_settings(where):
+        raise UsageError("the site is not named", expected="--site SITE, or --with a flight")
+    return load_site(where if where.is_file() else str(where))
+
+
+def _open_ends(site: Site, asked: PlanAsked) -> dict[str, tuple[str, str]]:
+    """Antennas that nobody has measured: one per tower."""
+    towers = asked.towers or tuple(site.towers)
+    for name in towers:
+        if name not in site.towers:
+            raise UsageError(f"no tower {name!r}", expected="one of " + ", ".join(site.towers))
+    return {f"{name}.level": (name, "level") for name in towers}
+
+
+def _area(site: Site, asked: PlanAsked) -> Any:
+    """Where a route may run."""
+    if asked.fence is None:
+        west, south, east, north = site.area_m
+        fence = shapely.box(west, south, east, north)
+    else:
+        fence = shapely.union_all(_polygons(asked.fence, site))
+    avoid = [one for path in asked.avoid for one in _polygons(path, site)]
+    towers = np.array([t.position_m for t in site.towers.values()]).reshape(-1, 3)
+    return allowed_area(fence, avoid, towers, asked.tower_distance_m)
+
+
+def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
+    out = []
+    for corners in read_areas(path):
+        latitude, longitude = np.array(corners).T
+        east, north = site.frame.to_local(latitude, longitude)
+        out.append(shapely.Polygon(np.column_stack([east, north])).buffer(0))
+    if not any(one.area > 0 for one in out):
+        raise InputError("areas without an extent", expected="outlines of three corners or more", path=path)
+    return out
+
+
+def _own(asked: PlanAsked, area: Any, site: Site) -> list[Candidate]:
+    """The tool's own patterns; those that leave the area on the way between legs are dropped."""
+    out: list[Candidate] = []
+    shapes = [("lawnmower", 0.0, False), ("lawnmower", 90.0, False), ("lawnmower", 0.0, True), ("cross", 0.0, False)]
+    for height, (shape, azimuth, turns), nose in product(asked.heights_m, shapes, NOSES):
+        if turns and nose != "along":
+            continue
+        pattern = Pattern(shape=shape, azimuth_deg=azimuth, height_m=height, nose=nose, turns=turns)  # type: ignore[arg-type]
+        try:
+            route = _raised(route_of(pattern, area, asked.speed_mps, 60.0 * asked.minutes), site)
+        except UsageError:
+            continue
+        if not _leaves(route, area):
+            out.append((route, pattern, ""))
+    return out
+
+
+def _given(asked: PlanAsked, area: Any, site: Site) -> list[Candidate]:
+    """Routes of files, flown at the speed of the plan; why one may not be flown."""
+    out: list[Candidate] = []
+    for path in asked.routes:
+        targets = find_targets(path, site, Asked(heights_m=asked.heights_m))
+        if targets.kind == "grid" or len(targets) < 2:
+            raise InputError("no route", expected="a .plan, KML, CSV or log with two points or more", path=path)
+        good = targets.known
+        ground = site.datum.takeoff_ground_m
+        points = [
+            Waypoint(east_m=float(p[0]), north_m=float(p[1]), height_m=float(p[2]) - ground, yaw_deg=float(y))
+            for p, y in zip(targets.position_m[good], targets.yaw_deg[good], strict=True)
+        ]
+        route = _raised(flown(path.name, _corners(points), asked.speed_mps), site)
+        refused = "leaves the allowed area" if _leaves(route, area) else ""
+        if route.duration_s > 60.0 * asked.minutes + 1.0:
+            refused = f"takes {route.duration_s / 60.0:.1f} min of {asked.minutes:g} min"
+        out.append((route, None, refused))
+    return out
+
+
+def _corners(points: Sequence[Waypoint]) -> list[Waypoint]:
+    """Waypoints without those that lie straight between their neighbours and keep the yaw."""
+    place = np.array([(w.east_m, w.north_m, w.height_m) for w in points])
+    kept = [points[0]]
+    for i in range(1, len(points) - 1):
+        one, two = place[i] - place[i - 1], place[i + 1] - place[i]
+        straight = float(one @ two) > 0.9998 * float(np.linalg.norm(one) * np.linalg.norm(two))
+        if not straight or abs(points[i].yaw_deg - kept[-1].yaw_deg) > 2.0:
+            kept.append(points[i])
+    return [*kept, points[-1]]
+
+
+def _raised(route: Route, site: Site) -> Route:
+    """Heights above take-off to heights of the site."""
+    return replace(route, position_m=route.position_m + np.array([0.0, 0.0, site.datum.takeoff_ground_m]))
+
+
+def _leaves(route: Route, area: Any) -> bool:
+    line = shapely.LineString(route.position_m[:, :2])
+    return not bool(shapely.covers(shapely.buffer(area, ALLOWED_OUTSIDE_M + 3.0), line))
+
+
+def _targets(
+    target: str, site: Site, asked: PlanAsked, ends: Mapping[str, tuple[str, str]], area: Any
+) -> dict[str, LinkSamples]:
+    """Target points at every antenna, at all headings where the heading is open."""
+    out = {}
+    points = None if target == SPHERE else find_targets(Path(target), site, asked.target)
+    if points is not None:
+        _check_near(points, area)
+    for antenna, end in ends.items():
+        tower = np.asarray(site.towers[end[0]].position_m)
+        if points is None:
+            direction = even_directions(800)
+            direction = direction[(direction[:, 2] > 0.03) & (direction[:, 2] < 0.98)]
+            place, yaw = tower + SPHERE_AWAY_M * direction, 137.508 * np.arange(len(direction)) % 360.0
+        else:
+            place, yaw = points.position_m[points.known], points.yaw_deg[points.known]
+            step = max(1, len(place) // (2 * MOST_TARGETS))
+            place, yaw = place[::step], yaw[::step]
+            if np.isnan(yaw).any():
+                turns = np.arange(HEADINGS) * (360.0 / HEADINGS)
+                place, yaw = (
+                    np.repeat(place, HEADINGS, axis=0),
+                    np.where(np.isnan(np.repeat(yaw, HEADINGS)), np.tile(turns, len(yaw)), np.repeat(yaw, HEADINGS)),
+                )
+        out[antenna] = level_samples(end, tower, place, np.asarray(yaw, dtype=np.float64), np.zeros(len(yaw)))
+    return out
+
+
+def _check_near(points: Targets, area: Any) -> None:
+    some = points.position_m[points.known][:: max(1, len(points) // 500), :2]
+    away = float(min(shapely.distance(area, shapely.points(some))))
+    if away > FARTHEST_M:
+        raise UsageError(
+            f"the target lies {away:.0f} m outside the area that may be flown",
+            expected=f"a target within {FARTHEST_M:g} m of it",
+            cause="another site, or exchanged coordinates",
+        )
+
+
+def _samples(route: Route, ends: Mapping[str, tuple[str, str]], site: Site) -> list[LinkSamples]:
+    return [
+        level_samples(end, np.asarray(site.towers[end[0]].position_m), route.position_m, route.yaw_deg, route.time_s)
+        for end in ends.values()
+    ]
+
+
+def _known(series: Sequence[LinkSamples], ahead: Sequence[LinkSamples]) -> Known:
+    """Strengths and residual field by the flights that were flown; the model's own without any."""
+    model, left = GainModel(), None
+    if series:
+        learned = calibration.learn(series, Recipe(model=model, rotation=rotation))
+        model = learned.choice.model
+        correction = choose(series, {"learned": learned_base})
+        left = correction.model if correction.on else None
+    return Known(series=series, model=model, field=left, pairs=shared_knots([*series, *ahead], model))
+
+
+def _thinned(samples: LinkSamples, most: int) -> LinkSamples:
+    """Points spread over a target; the step shares no factor with the number of headings."""
+    step = max(1, math.ceil(len(samples) / most))
+    step += int(step > 1 and step % 2 == 0)
+    return samples.part(np.arange(0, len(samples), step))
+
+
+def _over(sd_db: Mapping[str, FloatArray]) -> FloatArray:
+    return np.asarray(np.sqrt(np.mean([sd**2 for sd in sd_db.values()], axis=0)))
+
+
+CURVE_OF = 3
+"""Candidates of which the best one counts at each length: a pattern of fewer legs may lie better."""
+
+
+def _curve(
+    ranked: Sequence[Ranked], leaves_db: Callable[[Route], float], site: Site, area: Any, asked: PlanAsked
+) -> list[CurvePoint]:
+    """What shorter and longer flights of the best candidates leave; of files, shorter ones."""
+    out: list[CurvePoint] = []
+    best = [r for r in ranked if not r.refused][:CURVE_OF]
+    for share in SHARES:
+        tried = []
+        for route in filter(None, (_of_length(one, share, area, asked) for one in best)):
+            raised = _raised(route, site)
+            sd = leaves_db(raised)
+            tried.append(CurvePoint(minutes=raised.duration_s / 60.0, length_m=raised.length_m, sd_db=sd))
+        for point in sorted(tried, key=lambda point: point.sd_db)[:1]:
+            least = min([point.sd_db, *(p.sd_db for p in out)])  # a longer flight may hold the shorter one
+            out.append(replace(point, sd_db=least))
+    return out
+
+
+def _of_length(one: Ranked, share: float, area: Any, asked: PlanAsked) -> Route | None:
+    """A candidate that takes this share of the battery; None of a file for more than it has."""
+    if one.pattern is not None:
+        return route_of(one.pattern, area, asked.speed_mps, 60.0 * share * asked.minutes)
+    whole = flown(one.route.name, one.route.waypoints, asked.speed_mps)
+    return cut(whole, share * whole.duration_s, asked.speed_mps) if share <= 1.0 else None

@@ -1,0 +1,258 @@
+"""Where a prediction is asked for: a grid over a site, a planned route, the plan or track of a flight, points."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from ...common.errors import InputError, UsageError
+from ...common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
+from ...compare.direction_gain import LinkSamples
+from ...flight.data import FlightData, load_data
+from ...flight.settings import FlightFile, load_flight
+from ...flight.simulate import plan_attitude, plan_trajectory
+from ...flight.track import body_rotation
+from ...logs.route import read_route
+from ...maps.grid import Grid
+from ...site.site import Site
+
+STEP_M = 10.0
+"""Between points of a route that is given by its corners [m]."""
+
+SPEED_MPS = 8.0
+"""Of a route without times."""
+
+MOST_POINTS = 2_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Targets:
+    """Points of a prediction.
+
+    Parameters
+    ----------
+    kind : {"grid", "route", "points"}
+    name : str
+    position_m : (n, 3)
+        East, north, up [m]; NaN where a position is not known.
+    yaw_deg : (n,)
+        Clockwise from north; NaN: unknown, all headings count alike.
+    time_s : (n,)
+        Since the first point.
+    grid : Grid, optional
+        Of a grid: the points are its positions, height after height.
+    heights_m : tuple of float
+    remarks : tuple of str
+    """
+
+    kind: str
+    name: str
+    position_m: FloatArray
+    yaw_deg: FloatArray
+    time_s: FloatArray
+    grid: Grid | None = None
+    heights_m: tuple[float, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def known(self) -> BoolArray:
+        """Points (n,) that have a position."""
+        return np.asarray(np.isfinite(self.position_m).all(axis=1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """Options of ``predict`` that say where.
+
+    Parameters
+    ----------
+    heights_m : tuple of float
+        Of a grid; the first also of route points without a height.
+    spacing_m : float
+        Of a grid.
+    heading_deg : float, optional
+        Of a grid and of points without yaw; without it all headings count alike.
+    """
+
+    heights_m: tuple[float, ...] = (40.0,)
+    spacing_m: float = 30.0
+    heading_deg: float | None = None
+
+
+def level_samples(
+    end: tuple[str, str], tower_m: FloatArray, position_m: FloatArray, yaw_deg: FloatArray, time_s: FloatArray
+) -> LinkSamples:
+    """Points of a level aircraft as samples without a level.
+
+    Parameters
+    ----------
+    end : (str, str)
+        Tower and channel.
+    tower_m : (3,)
+        Place of the array [m].
+    position_m : (n, 3)
+    yaw_deg : (n,)
+        Clockwise from north.
+    time_s : (n,)
+
+    Returns
+    -------
+    LinkSamples
+    """
+    ray = position_m - tower_m
+    at_tower = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
+    rotation = body_rotation(np.zeros(len(yaw_deg)), np.zeros(len(yaw_deg)), yaw_deg)
+    return LinkSamples(
+        flight="",
+        tower=end[0],
+        channel=end[1],
+        time_s=time_s,
+        position_m=position_m,
+        at_uav=np.einsum("nji,nj->ni", rotation, -at_tower),
+        at_tower=at_tower,
+        residual_db=np.zeros(len(ray)),
+    )
+
+
+def is_settings(path: Path) -> bool:
+    """Whether a path names a YAML file."""
+    return path.suffix.lower() in (".yaml", ".yml")
+
+
+def flight_of(where: Path) -> FlightFile | None:
+    """The flight file that WHERE is; None where it is a site or a route."""
+    if not is_settings(where) or not where.is_file():
+        return None
+    text = where.read_text(encoding="utf-8", errors="replace")
+    return load_flight(where) if re.search(r"^flight\s*:", text, re.MULTILINE) else None
+
+
+def find_targets(where: Path, site: Site, asked: Asked, logs_root: Path | None = None) -> Targets:
+    """Points that WHERE names.
+
+    Parameters
+    ----------
+    where : Path
+        site.yaml or a packaged site (a grid), flight.yaml (its plan, else its track), a route, or a CSV of points.
+    site : Site
+    asked : Asked
+    logs_root : Path, optional
+        Where the logs of a flight file resolve.
+
+    Returns
+    -------
+    Targets
+
+    Raises
+    ------
+    UsageError, InputError
+        What is no place to predict, with the likely cause.
+    """
+    flight = flight_of(where)
+    if flight is not None:
+        targets = _planned(flight, site) if flight.flight.plan is not None else _flown(flight, where, logs_root)
+    elif is_settings(where) or not where.exists():
+        targets = _grid(site, asked)
+    elif (local := _local_points(where)) is not None:
+        targets = local
+    else:
+        targets = _route(where, site, asked)
+    if len(targets) > MOST_POINTS:
+        raise UsageError(f"{len(targets)} points", expected=f"at most {MOST_POINTS}", cause="too fine a spacing")
+    if not targets.known.any():
+        raise InputError("no point has a position", expected="east, north and height, or latitude and longitude",
+                         path=where)  # fmt: skip
+    return targets
+
+
+def _grid(site: Site, asked: Asked) -> Targets:
+    grid = Grid.over_area(site.area_m, asked.spacing_m)
+    position = np.concatenate([grid.positions_m(h) for h in asked.heights_m])
+    if site.dem is not None:
+        position[:, 2] += site.dem.ground_m(position[:, 0], position[:, 1])
+    heading = np.nan if asked.heading_deg is None else asked.heading_deg
+    return Targets(
+        kind="grid",
+        name=site.name,
+        position_m=position,
+        yaw_deg=np.full(len(position), heading),
+        time_s=np.zeros(len(position)),
+        grid=grid,
+        heights_m=asked.heights_m,
+    )
+
+
+def _planned(flight: FlightFile, site: Site) -> Targets:
+    assert flight.flight.plan is not None
+    trajectory = plan_trajectory(flight.flight.plan)
+    time = np.arange(0.0, trajectory.duration_s + 1e-9, 1.0)
+    position = trajectory.position_at(time)
+    position[:, 2] = np.maximum(position[:, 2] + site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
+    _, _, yaw = plan_attitude(trajectory, time)
+    return Targets(kind="route", name=flight.flight.name, position_m=position, yaw_deg=yaw % 360.0, time_s=time)
+
+
+def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
+    """Track of a flight without a plan: its levels are not looked at."""
+    data: FlightData = load_data(flight, where.parent, logs_root)
+    if data.track is None:
+        raise UsageError("a flight file without a plan and without telemetry", expected="flight.plan", path=where)
+    start, end = data.track.start_ns, data.track.end_ns
+    time = np.arange(start, end, 1_000_000_000).astype("datetime64[ns]")
+    pose = data.poses_at(time)
+    return Targets(
+        kind="route",
+        name=flight.flight.name,
+        position_m=pose.position_m[pose.valid],
+        yaw_deg=pose.heading_deg[pose.valid],
+        time_s=((time - time[0]) / np.timedelta64(1, "s"))[pose.valid],
+        remarks=("The flight file has no plan: its track is the route. Its levels are not used.",),
+    )
+
+
+def _local_points(path: Path) -> Targets | None:
+    """Points of a CSV with east_m, north_m and height_m (and yaw_deg); None for another file."""
+    if path.suffix.lower() != ".csv":
+        return None
+    try:
+        names = [n.strip() for n in path.read_text(encoding="utf-8", errors="replace").partition("\n")[0].split(",")]
+        if not {"east_m", "north_m", "height_m"} <= set(names):
+            return None
+        table = pd.read_csv(path, skipinitialspace=True)
+    except (OSError, pd.errors.ParserError) as error:
+        raise InputError(f"no table: {error}", expected="columns east_m, north_m, height_m", path=path) from None
+    numbers = table.reindex(columns=["east_m", "north_m", "height_m", "yaw_deg"]).apply(pd.to_numeric, errors="coerce")
+    position = numbers[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
+    return Targets(
+        kind="points",
+        name=path.stem,
+        position_m=position,
+        yaw_deg=numbers["yaw_deg"].to_numpy(np.float64),
+        time_s=np.zeros(len(position)),
+    )
+
+
+def _route(where: Path, site: Site, asked: Asked) -> Targets:
+    table = read_route(where, height_m=asked.heights_m[0])
+    east, north = site.frame.to_local(table["latitude_deg"].to_numpy(), table["longitude_deg"].to_numpy())
+    up = np.maximum(table["altitude_m"].to_numpy(np.float64) + site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
+    position, yaw = np.column_stack([east, north, up]), table["yaw_deg"].to_numpy(np.float64)
+    remarks = tuple(table.attrs.get("remarks", ()))
+    time = table["time_s"].to_numpy(np.float64)
+    if not np.isfinite(time).all():
+        gaps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+        along = np.concatenate([[0.0], np.cumsum(gaps)])
+        count = max(int(along[-1] / STEP_M) + 1, 2) if along[-1] > 0 else 1
+        at = np.linspace(0.0, along[-1], count)
+        leg = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(position) - 1)
+        position = np.stack([np.interp(at, along, position[:, i]) for i in range(3)], axis=-1)
+        yaw, time = yaw[leg], at / SPEED_MPS
+        remarks += (f"Points every {STEP_M:g} m; times by a speed of {SPEED_MPS:g} m/s.",)
+    return Targets(kind="route", name=where.stem, position_m=position, yaw_deg=yaw, time_s=time, remarks=remarks)

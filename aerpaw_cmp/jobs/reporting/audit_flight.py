@@ -1,0 +1,336 @@
+"""Audit of a flight's replays: paths by the other engine, fields by Sionna and by a second implementation.
+
+What the second implementation is given comes from the settings, not from the arrays and losses that the replay made
+of them, so that a fault in between is seen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ...common.stages import Progress, silent
+from ...common.units import AnyArray, FloatArray
+from ...compare.field_difference import FieldAudit
+from ...compare.result import AuditResult, EngineResult, RssResult
+from ...flight.data import FlightData
+from ...flight.losses import path_loss, reflecting_crowns
+from ...flight.replay import Replayed, attitude_rotation, part_of
+from ...flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
+from ...logs.ingest import IngestedFile
+from ...propagation.arrays import Poses
+from ...propagation.check.audit import Audit, Second, audit
+from ...propagation.check.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
+from ...propagation.check.raw import gain_table
+from ...propagation.check.reference import (
+    C_MPS,
+    PATTERNS,
+    ExpectedArray,
+    ExpectedLink,
+    ExpectedLoss,
+    Pattern,
+    aircraft,
+    layout_positions,
+    turned,
+)
+from ...propagation.drivers.moving import site_with_tower_at
+from ...propagation.options import Field, Run, Search
+from ...propagation.search.sionna import free_memory
+from ...site.site import Site
+from .audit_raw import raw_checked
+
+ATTITUDE_ROWS = 200
+"""Logged attitudes that are turned into rotations a second time."""
+
+ATTITUDE_TOLERANCE_RAD = 1e-6
+"""Both are float64; telemetry instants are exact to a nanosecond."""
+
+REFERENCE_LINKS_AT_MOST = 64
+"""Of all series together, at least three each: some 0.1 s apiece."""
+
+TIMES = "The time of the engine is its share for the audited links; that of the reference includes its start-up."
+
+NOT_COVERED = (
+    "whether reflection off smooth half-spaces and flat walls is what the place does",
+    "positions of footprints and trees; intervals",
+    "geometry of paths off crowns; terrain that blocks",
+)
+"""What no audit of the replay can see."""
+
+
+def audit_replays(
+    data: FlightData, replays: Sequence[Replayed], progress: Progress = silent, results: Sequence[RssResult] = ()
+) -> EngineResult:
+    """The engine record, with the audit where ``rt.audit_links`` asks for one and ``report.audit`` is not ``later``.
+
+    Parameters
+    ----------
+    data : FlightData
+    replays : sequence of Replayed
+        Of its RSS series, then of its ranks.
+    progress : Progress
+    results : sequence of RssResult
+        What was made of the RSS series; their scores are checked too.
+
+    Returns
+    -------
+    EngineResult
+    """
+    rt, now = data.settings.rt, data.settings.report.audit == "now"
+    return EngineResult(
+        engine=rt.engine,
+        links=sum(len(r.poses) for r in replays),
+        seconds=sum(r.replay.seconds for r in replays),
+        paths=sum(len(r.replay.paths) for r in replays),
+        settings={
+            "max_depth": rt.max_depth,
+            "samples": max(r.replay.samples for r in replays) or rt.advanced.samples
+            if replays
+            else rt.advanced.samples,
+            "attitude": rt.attitude,
+            "foliage": rt.foliage,
+            **_crown_settings(rt, replays),
+        },
+        left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
+        audit=_audit(data, replays, results, progress) if rt.audit_links and now else None,
+    )
+
+
+def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, object]:
+    """Whether opaque crowns reflect, and how many paths bounce off one."""
+    if rt.foliage != "opaque":
+        return {}
+    bounced = sum(int(r.replay.paths.off_crown.sum()) for r in replays)
+    return {"crown_reflections": rt.advanced.crown_reflections, "paths_off_crowns": bounced}
+
+
+def _audit(
+    data: FlightData, replays: Sequence[Replayed], results: Sequence[RssResult], progress: Progress
+) -> AuditResult | None:
+    """One audit over all series: links are shared out in proportion to their poses."""
+    ks = data.settings.rank.k
+    total = sum(len(r.poses) for r in replays)
+    few = int(np.clip(REFERENCE_LINKS_AT_MOST // max(len(replays), 1), 3, REFERENCE_LINKS))
+    named: list[str] = []
+    calls: list[Callable[[], Audit]] = []
+    for site, replayed, expected in standing(data, replays):
+        count = len(replayed.poses)
+        links = min(count, max(math.ceil(data.settings.rt.audit_links * count / max(total, 1)), 1))
+        if links:
+            named.append(f"audit {replayed.replay.towers[0]}: {links} links")
+            calls.append(
+                partial(_of_series, data.settings.rt, ks, site, replayed, expected, links=links, reference_links=few)
+            )
+    if not calls:
+        return None
+    parts: list[Audit] = []
+    for text, call in zip(named, calls, strict=True):
+        progress(text)
+        parts.append(call())
+    free_memory()
+    errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
+    links = sum(p.links for p in parts)
+    fields = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))
+    progress("audit from raw bytes")
+    fields += raw_checked(data, replays, expectations(data, replays), results)
+    return AuditResult(
+        reference=parts[0].reference,
+        links=links,
+        missing_paths=sum(p.missing_paths for p in parts),
+        extra_paths=sum(p.extra_paths for p in parts),
+        rss_max_error_db=max(errors, default=float("nan")),
+        rank_disagreement={k: sum(p.rank_disagreement[k] * p.links for p in parts) / links for k in ks},
+        seconds=sum(r.replay.seconds for r in replays) * links / max(total, 1),
+        reference_seconds=sum(p.reference_seconds for p in parts),
+        note=" ".join([TIMES, *_rays(parts)]),
+        fields=dataclasses.replace(fields, not_covered=(*fields.not_covered, *NOT_COVERED)),
+    )
+
+
+def _of_series(
+    rt: RtSettings,
+    ks: Sequence[float],
+    site: Site,
+    replayed: Replayed,
+    expected: Expected,
+    *,
+    links: int,
+    reference_links: int,
+) -> Audit:
+    """The audit of one series, as the settings ask for it."""
+    return audit(
+        site,
+        replayed.link,
+        replayed.poses,
+        replayed.replay,
+        Search(
+            max_depth=rt.max_depth,
+            samples=rt.advanced.samples,
+            crowns=reflecting_crowns(site.trees, rt),
+            power_cut_db=rt.advanced.power_cut_db,
+        ),
+        Field(loss=path_loss(site, rt, replayed.link.carrier_hz)),
+        Run(cache_dir=None if rt.advanced.cache else ""),
+        Second(links=links, expected=expected, ks=ks, reference_links=reference_links),
+    )
+
+
+MOMENTS = 6
+"""At so many moments a tower that moves is audited as one that stands where it was then; each is a scene of its own."""
+
+
+def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected]]:
+    """Replays with towers that stand, with what the settings say of them: of a tower that moves some moments."""
+    for replayed, expected in zip(replays, expectations(data, replays), strict=True):
+        if replayed.tower_m is None:
+            yield data.site, replayed, expected
+            continue
+        (tower,) = replayed.link.tower_arrays
+        count = len(replayed.poses)
+        for at in np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(np.int64)).tolist():
+            pose = Poses(replayed.poses.position_m[at : at + 1], replayed.poses.rotation[at : at + 1])
+            moment = dataclasses.replace(
+                replayed,
+                poses=pose,
+                valid=np.ones(1, dtype=np.bool_),
+                replay=part_of(replayed.replay, at, at + 1),
+                track=None,
+                tower_m=None,
+            )
+            yield site_with_tower_at(data.site, tower, replayed.tower_m[at]), moment, expected
+
+
+def _rays(parts: Sequence[Audit]) -> list[str]:
+    """How many rays PathSolver shot, and why, in the words of the series that needed most."""
+    most = max(parts, key=lambda p: p.samples)
+    return [f"Rays were raised until two pilots agreed: {most.samples_reason}."] if most.samples_reason else []
+
+
+# --- what the settings say -------------------------------------------------------------------------------------------
+
+
+def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected]:
+    """For each replay what the settings say of its link and losses."""
+    settings = [*(s.link for s in data.rss), *[data.settings.link.rank] * len(data.rank)]
+    loss = expected_loss(data.settings.rt)
+    if len(settings) != len(replays):  # part of the flight: from the links themselves
+        return [Expected.of(r.link, loss) for r in replays]
+    return [
+        Expected(expected_link(link, list(r.link.tower_arrays), data.folder), loss)
+        for link, r in zip(settings, replays, strict=True)
+    ]
+
+
+def expected_loss(rt: RtSettings) -> ExpectedLoss:
+    """Foliage and reflection loss as ``rt`` has them."""
+    return ExpectedLoss(
+        model=rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
+        gamma_db_per_m=rt.advanced.gamma_db_per_m,
+        maximum_db=rt.advanced.maximum_loss_db,
+        in_leaf=rt.leaves == "in",
+        reflection_db=rt.reflection_loss_db,
+        ground_roughness_m=rt.ground_roughness_m,
+    )
+
+
+def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -> ExpectedLink:
+    """A link of flight.yaml."""
+    wavelength = C_MPS / settings.carrier_hz
+    return ExpectedLink(
+        carrier_hz=settings.carrier_hz,
+        transmit_power_dbm=settings.transmit_power_dbm,
+        uav_transmits=settings.uav_transmits,
+        towers={name: expected_array(settings.towers.get(name, settings.tower), wavelength, folder) for name in towers},
+        uav=expected_array(settings.uav, wavelength, folder),
+        noise_floor_dbm=_floor_dbm(settings),
+    )
+
+
+def _floor_dbm(settings: LinkSettings) -> float:
+    """Given, or kTB at 290 K with the noise figure."""
+    if settings.noise_floor_dbm is not None:
+        return settings.noise_floor_dbm
+    return 10 * math.log10(1.380649e-23 * 290 * (settings.bandwidth_hz or 1.0) * 1e3) + (settings.noise_figure_db or 0)
+
+
+def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> ExpectedArray:
+    """An array of flight.yaml, laid out a second time."""
+    positions = layout_positions(settings.layout, wavelength, settings.elements, settings.positions_m)
+    slants = settings.slant_deg if isinstance(settings.slant_deg, list) else [settings.slant_deg]
+    antennas = settings.antennas or [settings.antenna]
+
+    def per_element(values: Sequence[object]) -> list[object]:
+        return list(values) * len(positions) if len(values) == 1 else list(values)
+
+    return ExpectedArray(
+        positions_m=positions,
+        slants_deg=tuple(float(x) for x in per_element(slants)),  # type: ignore[arg-type]
+        patterns=tuple(_pattern(a, folder, C_MPS / wavelength) for a in per_element(antennas)),  # type: ignore[arg-type]
+        mount=turned(settings.yaw_deg, settings.pitch_deg, settings.roll_deg),
+    )
+
+
+def _pattern(settings: AntennaSettings, folder: Path, carrier_hz: float) -> Pattern:
+    """A formula or a table of gain a second time; other antenna files are taken as the replay reads them."""
+    if settings.model in PATTERNS and not settings.installed_db:
+        return PATTERNS[settings.model]
+    if settings.model == "sphere" and not settings.installed_db:
+        content = (folder / str(settings.file)).read_bytes()
+        return gain_table(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
+    pattern: Pattern = scalar_pattern(load_pattern(settings, folder, carrier_hz))
+    return pattern
+
+
+# --- attitude --------------------------------------------------------------------------------------------------------
+
+
+def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudit:
+    """Rotations of the track at telemetry instants against the logged angles, turned a second time."""
+    mode = data.settings.rt.attitude
+    if mode == "ignored" or data.track is None:
+        turned_anyway = any(np.abs(r.poses.rotation - np.eye(3)).max(initial=0.0) > 0 for r in replays)
+        moved = mode == "ignored" and turned_anyway
+        return FieldAudit(failures=("rt.attitude is 'ignored' and the UAV's array turns",) if moved else ())
+    times, angles = _logged_attitudes(data.files)
+    if not len(times):
+        return FieldAudit(not_covered=("the attitude: the telemetry has none",))
+    rows = np.unique(np.linspace(0, len(times) - 1, min(len(times), ATTITUDE_ROWS)).round().astype(int))
+    at = data.track.pose_at(times[rows])
+    used = np.flatnonzero(at.valid & at.attitude_known)
+    rotation = attitude_rotation(at, mode)
+    worst = 0.0
+    for index in used:
+        roll, pitch, yaw = (float(x) for x in angles[rows[index]])
+        expected = np.array(aircraft(*((roll, pitch) if mode == "logged" else (0.0, 0.0)), yaw))
+        worst = max(worst, _angle(expected, rotation[index]))
+    failures = (f"rotations differ from the logged attitude by {worst:.2g} rad",) if worst > _tolerance() else ()
+    return FieldAudit(attitude_rows=len(used), attitude_max_rad=worst, failures=failures)
+
+
+def _tolerance() -> float:
+    return ATTITUDE_TOLERANCE_RAD
+
+
+def _angle(first: FloatArray, second: FloatArray) -> float:
+    """Largest difference of two rotations' entries [rad]."""
+    return float(np.abs(first - second).max())
+
+
+def _logged_attitudes(files: Sequence[IngestedFile]) -> tuple[AnyArray, FloatArray]:
+    """Instants (n,) and roll, pitch, yaw (n, 3) [deg] of telemetry rows whose instant occurs once."""
+    import pandas as pd
+
+    frames = [s.frame for f in files for s in f.result.streams if s.kind == "telemetry"]
+    if not frames:
+        return np.zeros(0, dtype="datetime64[ns]"), np.zeros((0, 3))
+    frame = frames[0]
+    frame = frame[pd.notna(frame["time"]) & ~frame["time"].duplicated(keep=False)]
+    angles = frame[["roll_deg", "pitch_deg", "yaw_deg"]].to_numpy(dtype=np.float64)
+    good = np.isfinite(angles).all(axis=1)
+    return np.asarray(frame["time"].to_numpy())[good], angles[good]

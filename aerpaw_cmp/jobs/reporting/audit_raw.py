@@ -1,0 +1,519 @@
+"""The way from the bytes of the logs to positions, attitude and levels, walked a second time at some samples.
+
+What is compared with is made by :mod:`aerpaw_cmp.propagation.check.raw` and
+:mod:`aerpaw_cmp.propagation.check.reference`, which share no code with readers, track, geodesy, antennas and replay.
+Taken from this package are the settings and, per sample, which paths there are: those have an audit of their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.units import FloatArray, IntArray
+from ...compare.field_difference import FieldAudit
+from ...compare.result import APPLIED, GIVEN, RssResult
+from ...flight.data import FlightData, RankSeries, RssSeries
+from ...flight.replay import Replayed, attitude_rotation
+from ...flight.settings import LogSettings
+from ...logs.ingest import IngestedFile
+from ...propagation.check.field_audit import Expected
+from ...propagation.check.raw import LOWEST_M, Log, Matrix, Pose, RawPath, Reading, east_north_m, level, read_log
+from ...propagation.check.reference import Mirror, Reference
+from ...site.site import Tower
+
+SAMPLES = 48
+"""Of all RSS series together, at least three of each; and moments of the track between its rows."""
+
+LARGEST_LOG = 1 << 25
+"""Larger logs are not read twice: a report of some gigabytes stays quick."""
+
+FURTHEST_M = 5_000.0
+"""From the site's origin; beyond it the plane of the second way parts from the geodesic."""
+
+TOLERANCES = {
+    "time": (1e-3, "s"), "position": (0.005, "m"), "rotation": (1e-5, "rad"), "measured level": (1e-3, "dB"),
+    "simulated level": (0.01, "dB"), "compared level": (1e-6, "dB"), "offset": (1e-6, "dB"), "RMSE": (1e-6, "dB"),
+    "tower": (0.005, "m"), "rank": (0.5, ""), "clock": (1e-6, "s"),
+}  # fmt: skip
+"""Largest differences by kind, with the unit. Coherent levels have more in fades, as much as 0.01 rad does there."""
+
+
+@dataclass(slots=True)
+class _Account:
+    """Worst difference by kind with its place, how many were compared and failed, and what could not be."""
+
+    count: dict[str, int] = field(default_factory=dict)
+    worst: dict[str, tuple[float, str]] = field(default_factory=dict)
+    failed: dict[str, int] = field(default_factory=dict)
+    beside: list[str] = field(default_factory=list)
+    not_covered: list[str] = field(default_factory=list)
+
+    def add(self, kind: str, difference: float, where: str, spare: float = 0.0) -> None:
+        """One comparison; NaN is a failure, ``spare`` more than the tolerance is allowed."""
+        off = difference if math.isfinite(difference) else math.inf
+        self.count[kind] = self.count.get(kind, 0) + 1
+        self.failed[kind] = self.failed.get(kind, 0) + (off > TOLERANCES[kind][0] + spare)
+        if off > self.worst.get(kind, (-1.0, ""))[0]:
+            self.worst[kind] = (off, where)
+
+    def leave(self, text: str) -> None:
+        """Name what is not checked."""
+        if text not in self.not_covered:
+            self.not_covered.append(text)
+
+    def result(self) -> FieldAudit:
+        """As a part of the audit of fields."""
+        failures = []
+        for kind, count in self.failed.items():
+            if count:
+                off, where = self.worst[kind]
+                shown = f"by {off:.3g} {TOLERANCES[kind][1]}" if math.isfinite(off) else "altogether"
+                share = f"{count} of {self.count[kind]}"
+                failures.append(f"from raw bytes: {kind} differs {shown} at {where} ({share} differ)")
+        most = {kind: self.worst.get(kind, (0.0, ""))[0] for kind in TOLERANCES}
+        return FieldAudit(
+            raw_samples=self.count.get("measured level", 0),
+            raw_poses=self.count.get("rotation", 0),
+            raw_levels=self.count.get("simulated level", 0),
+            raw_position_max_m=most["position"],
+            raw_attitude_max_rad=most["rotation"],
+            raw_measured_max_db=most["measured level"],
+            raw_level_max_db=most["simulated level"],
+            failures=(*failures, *self.beside),
+            not_covered=tuple(f"from raw bytes: {text}" for text in self.not_covered),
+        )
+
+
+def raw_checked(
+    data: FlightData, replays: Sequence[Replayed], expected: Sequence[Expected], results: Sequence[RssResult] = ()
+) -> FieldAudit:
+    """Positions, datum, attitude, readings, levels and scores of some samples, from the bytes of the logs.
+
+    Parameters
+    ----------
+    data : FlightData
+    replays : sequence of Replayed
+        Of its RSS series, then of its ranks.
+    expected : sequence of Expected
+        The settings of each replay, read a second time.
+    results : sequence of RssResult
+        What was made of the RSS series, where it was compared.
+
+    Returns
+    -------
+    FieldAudit
+        The ``raw_`` numbers, what is out of tolerance, and what could not be checked.
+    """
+    account = _Account()
+    logs = _logs(data, account)
+    towers = _towers_checked(data, account)
+    path = _path(data, logs, account)
+    if path is not None:
+        _track_checked(data, path, account)
+    each = max(3, SAMPLES // max(len(data.rss), 1))
+    for series, replayed, one in zip(data.rss, replays, expected, strict=False):
+        rows = _spread(replayed, path, series, each)
+        reference = _reference(data, replayed, one, towers, series.tower, account)
+        check = _Series(data=data, series=series, replayed=replayed, path=path, reference=reference, account=account)
+        check.readings(logs, rows)
+        check.poses_and_levels(rows)
+        check.clock_sign()
+    for series, result in zip(data.rss, results, strict=False):
+        _scores_checked(data, series, result, account)
+    for rank in data.rank:
+        _rank_checked(data, rank, logs, path, account)
+    return account.result()
+
+
+# ---------------------------------------------------------------- bytes
+
+
+def _logs(data: FlightData, account: _Account) -> list[Log | None]:
+    """Each log of the flight, read a second time; None with a word where it cannot be."""
+    return [_log(data, *pair, account) for pair in zip(data.settings.logs, data.files, strict=True)]
+
+
+def _log(data: FlightData, settings: LogSettings, file: IngestedFile, account: _Account) -> Log | None:
+    zone = "UTC" if settings.clock == "utc" else settings.timezone or data.settings.timezone
+    content = _content(data.folder / settings.path, file.sha256)
+    if content is None:
+        account.leave(f"{settings.path} (packed, larger than 32 MiB, or read in pieces)")
+        return None
+    if zone is None or settings.clock == "local_as_utc" or settings.time_origin or settings.columns:
+        account.leave(f"{settings.path} (the flight file states its times or columns)")
+        return None
+    with contextlib.suppress(ValueError, KeyError, IndexError, NotImplementedError):
+        if (log := read_log(content, zone)) is not None:
+            return log
+    account.leave(f"{settings.path} (a format that the second way does not know)")
+    return None
+
+
+def _content(path: Path, sha256: str) -> bytes | None:
+    """The bytes that the report names by their hash."""
+    try:
+        if path.stat().st_size > LARGEST_LOG:
+            return None
+        content = path.read_bytes()
+        if content[:2] == b"\x1f\x8b":
+            with gzip.open(path) as book:
+                content = book.read(LARGEST_LOG)
+    except (OSError, EOFError):
+        return None
+    return content if hashlib.sha256(content).hexdigest() == sha256 else None
+
+
+def _path(data: FlightData, logs: Sequence[Log | None], account: _Account) -> RawPath | None:
+    """The flight between the rows of the first telemetry log."""
+    for settings, file, log in zip(data.settings.logs, data.files, logs, strict=True):
+        if not any(s.kind == "telemetry" and s.name not in settings.skip for s in file.result.streams):
+            continue
+        if log is None or not log.rows or settings.height_m is not None:
+            account.leave(f"the track, since {settings.path} has no rows for it")
+            return None
+        origin = data.site.frame.latitude_deg, data.site.frame.longitude_deg
+        content = _site_file(data)
+        if "origin" not in content:
+            account.leave("the track, since the site's file is not beside the logs")
+            return None
+        path = RawPath(log.rows, origin, float(content["origin"].get("takeoff_ground_m", 0.0)))
+        if path.out_of_order or not path.rows:
+            account.leave("the track, whose rows are out of time order")
+            return None
+        return path
+    return None
+
+
+# ---------------------------------------------------------------- site
+
+
+def _site_file(data: FlightData) -> Mapping[str, Any]:
+    """The site's file, as YAML and no more."""
+    import yaml
+
+    name = data.settings.site.file
+    path = data.folder / name
+    if not path.is_file():
+        path = Path(str(resources.files("aerpaw_cmp.site"))) / "data" / f"{name.lower().replace('-', '_')}.yaml"
+    try:
+        return dict(yaml.load(path.read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)))
+    except (OSError, ValueError, yaml.YAMLError):
+        return {}
+
+
+def _towers_checked(data: FlightData, account: _Account) -> dict[str, Tower]:
+    """Towers of the site a second time, by name."""
+    content, choice = _site_file(data), data.settings.site
+    offsets = content.get("tower_ground") == "offsets"
+    if "dem" in content or "scene" in content:
+        account.leave("towers on an elevation model or in a scene")
+        return {}
+    origin = content.get("origin", {})
+    center = (float(origin.get("latitude_deg", math.nan)), float(origin.get("longitude_deg", math.nan)))
+    out = {}
+    for name, tower in content.get("towers", {}).items():
+        if {"antenna", "ground"} & set(tower) or name not in data.site.towers:
+            account.leave(f"tower {name} (heights of another reference)")
+            continue
+        known = tower.get("positions")
+        wanted = choice.coordinates or content.get("coordinates") or next(iter(known or {}), "")
+        place = known[wanted] if known else tower
+        east, north = east_north_m(place["latitude_deg"], place["longitude_deg"], center)
+        height = tower.get("antenna_height_m") or place.get("antenna_height_m") or 10.0
+        ground = float(tower.get("ground_offset_m") or 0.0) if offsets else 0.0
+        height = float(choice.antenna_height_m or height)
+        found = data.site.towers[name]
+        away = float(np.linalg.norm(found.position_m - np.array([east, north, ground + height])))
+        spare = 1e-6 * math.hypot(east, north)
+        account.add("tower", away, f"tower {name}", spare=spare if math.hypot(east, north) < FURTHEST_M else math.inf)
+        out[name] = replace(found, east_m=east, north_m=north, ground_m=ground, antenna_height_m=height)
+    return out
+
+
+def _reference(
+    data: FlightData, replayed: Replayed, expected: Expected, towers: Mapping[str, Tower], tower: str, account: _Account
+) -> Reference | None:
+    """The second implementation of a link, with the tower where the second way has it; None where it cannot be."""
+    if replayed.tower_m is not None or tower not in towers:
+        account.leave(f"levels of {tower} (a node of the flight, or one that moves)")
+        return None
+    rt = data.settings.rt
+    if data.site.scene is not None or data.site.dem is not None or rt.diffraction != "none" or rt.refraction:
+        account.leave("levels over terrain, in scenes of triangles, with diffraction or refraction")
+        return None
+    return Reference(replace(data.site, towers={tower: towers[tower]}), tower, expected.link, expected.loss)
+
+
+# ---------------------------------------------------------------- track
+
+
+def _track_checked(data: FlightData, path: RawPath, account: _Account) -> None:
+    """Poses of the track between its rows, where a turn that is held or late shows."""
+    assert data.track is not None
+    rows = np.unique(np.linspace(0, len(path.times_us) - 2, SAMPLES).round().astype(np.int64)).clip(0)
+    steps = [(path.times_us[i], path.times_us[min(i + 1, len(path.times_us) - 1)]) for i in rows.tolist()]
+    moments = [int(start + share * (end - start)) for start, end in steps for share in (0.25, 0.75)]
+    times = np.array(moments, dtype="datetime64[us]").astype("datetime64[ns]")
+    track = data.track.pose_at(times)
+    turns = attitude_rotation(track, "logged")
+    for at, moment in enumerate(moments):
+        pose = path.pose(moment)
+        if pose is not None and track.valid[at]:
+            known = turns[at] if track.attitude_known[at] else None
+            _pose_checked(pose, track.position_m[at], known, f"{times[at]} UTC", account)
+
+
+def _pose_checked(pose: Pose, place: FloatArray, turn: FloatArray | None, where: str, account: _Account) -> None:
+    away = math.hypot(*pose.place_m[:2])
+    if away < FURTHEST_M:
+        account.add("position", math.dist(pose.place_m, place.tolist()), where, spare=1e-6 * away)
+    if turn is not None and pose.turn is not None:
+        account.add("rotation", float(np.abs(np.array(pose.turn) - turn).max()), where)
+
+
+def _spread(replayed: Replayed, path: RawPath | None, series: RssSeries, count: int) -> IntArray:
+    """Samples with a pose, evenly spread, of each two neighbours the one that lies further from telemetry rows."""
+    rows = np.flatnonzero(replayed.valid)
+    picked = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(np.int64))]
+    if path is None or not len(picked):
+        return np.asarray(picked)
+    times = np.asarray(path.times_us, dtype=np.float64)
+    stamp = series.time.astype("datetime64[us]").astype(np.int64)
+
+    def away(row: int) -> float:
+        return float(np.abs(times - stamp[row]).min())
+
+    last = rows[-1]
+    return np.array([max((r for r in (row, row + 1) if r <= last and replayed.valid[r]), key=away) for row in picked])
+
+
+# ---------------------------------------------------------------- RSS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Series:
+    """One RSS series and its replay, against the second way."""
+
+    data: FlightData
+    series: RssSeries
+    replayed: Replayed
+    path: RawPath | None
+    reference: Reference | None
+    account: _Account
+
+    @property
+    def name(self) -> str:
+        return f"{self.series.tower} {self.series.channel}"
+
+    def readings(self, logs: Sequence[Log | None], rows: IntArray) -> None:
+        """Times and levels of samples against the lines that they name."""
+        series, account = self.series, self.account
+        for row in rows.tolist() if len(series.log) else ():
+            number, line = int(series.log[row]), int(series.line[row])
+            log, settings = logs[number], self.data.settings.logs[number]
+            reading = None if log is None else log.readings.get(line)
+            if log is None or not log.readings:
+                continue
+            where = f"{settings.path}:{line}"
+            if reading is not None and not reading.values:
+                continue  # a line that stands for repeated samples
+            value = None if reading is None else _value(reading, series, settings)
+            if reading is None or value is None:
+                account.leave(f"readings of {self.name} (no column of {settings.path} is known to be its level)")
+                return
+            if settings.node is not None and settings.node != series.tower and not settings.cells:
+                account.beside.append(f"from raw bytes: {settings.path} is of {settings.node}, not of {series.tower}")
+            stamp = int(series.time[row].astype("datetime64[us]").astype(np.int64))
+            account.add("time", abs(stamp - reading.time_us) * 1e-6, where)
+            measured = float(series.measured_db[row])
+            if value <= settings.floor_db:
+                account.add("measured level", 0.0 if math.isnan(measured) else math.inf, where)
+            else:
+                account.add("measured level", abs(measured - value), where, spare=1e-6 * abs(value))
+
+    def poses_and_levels(self, rows: IntArray) -> None:
+        """Poses on the telemetry's clock, and the levels that arrays and paths give there."""
+        if self.path is None:
+            return
+        mode, place = self.data.settings.rt.attitude, np.cumsum(self.replayed.valid) - 1
+        for row in rows.tolist():
+            pose = self.path.pose(self._telemetry_us(row))
+            if pose is None:
+                continue
+            at, where = int(place[row]), f"{self.name}, sample {row}"
+            turn = _as_asked(pose, mode)
+            ours = self.replayed.poses.rotation[at] if turn is not None else None
+            _pose_checked(replace(pose, turn=turn), self.replayed.poses.position_m[at], ours, where, self.account)
+            if turn is not None and self.reference is not None:
+                self._level(self.reference, at, replace(pose, turn=turn), where)
+
+    def _telemetry_us(self, row: int) -> float:
+        """Instant of a sample on the telemetry's clock: the radio's clock shows later times where it is ahead."""
+        stamp = float(self.series.time[row].astype("datetime64[us]").astype(np.int64))
+        clock = self.replayed.clock
+        if clock is None or clock.result.applied not in (APPLIED, GIVEN):
+            return stamp
+        return stamp - clock.result.radio_minus_telemetry_s * 1e6
+
+    def _level(self, reference: Reference, at: int, pose: Pose, where: str) -> None:
+        """Level of direct and ground path, where the replay has no others."""
+        replay = self.replayed.replay
+        mine = np.flatnonzero(replay.paths.pose == at)
+        faces = replay.paths.faces[mine]
+        grounds = np.zeros(len(mine), dtype=np.bool_)
+        for n, row in enumerate(faces):
+            grounds[n] = all(face < 0 or replay.faces.solid[face] < 0 for face in row.tolist())
+        if not len(mine) or not grounds.all() or (replay.paths.depth[mine] > 1).any():
+            self.account.leave("levels of samples with paths off walls (the second implementation has those)")
+            return
+        ground = next(m for m in reference.mirrors if m.solid < 0)
+        paths = []
+        for depth in replay.paths.depth[mine].tolist():
+            sequence: tuple[Mirror, ...] = (ground,) * depth
+            loss = reference.loss_db(sequence, pose.place_m)
+            if loss is None:
+                return
+            paths.append((sequence, loss))
+        assert pose.turn is not None
+        try:
+            h, power = reference.matrix(paths, pose.place_m, pose.turn)
+        except LookupError:
+            self.account.leave(f"levels over {reference.site.ground_material}")
+            return
+        link = reference.link
+        coherent = float((np.abs(h) ** 2).mean())
+        for ours, value in ((replay.rss_dbm, coherent), (replay.rss_power_dbm, power)):
+            found = float(ours[at, 0])
+            expected = 10 * math.log10(value) + link.transmit_power_dbm if value > 0 else -math.inf
+            if abs(expected - link.noise_floor_dbm) < 0.1:
+                continue
+            if expected < link.noise_floor_dbm:
+                self.account.add("simulated level", math.inf if math.isfinite(found) else 0.0, where)
+                continue
+            spare = 20 * math.log10(1 + 0.01 * math.sqrt(power / value)) if value < power else 0.0
+            self.account.add("simulated level", abs(found - expected), where, spare=spare)
+
+    def clock_sign(self) -> None:
+        """The measurement follows direct and ground path better at the clock taken off than at its opposite."""
+        clock, reference = self.replayed.clock, self.reference
+        if clock is None or self.path is None or reference is None or clock.result.applied != APPLIED:
+            return
+        ahead = clock.result.radio_minus_telemetry_s
+        if abs(ahead) < LEAST_AHEAD_S:
+            return
+        known = np.flatnonzero(self.replayed.valid & np.isfinite(self.series.measured_db))
+        rows = known[np.unique(np.linspace(0, len(known) - 1, min(CLOCK_SAMPLES, len(known))).round().astype(np.int64))]
+        spreads = []
+        for sign in (-1.0, 1.0):
+            error = [self._residual_db(reference, row, sign * ahead) for row in rows.tolist()]
+            spreads.append(float(np.nanstd(error)) if np.isfinite(error).sum() > CLOCK_SAMPLES // 2 else math.nan)
+        if spreads[1] < WRONG_SIGN * spreads[0]:
+            self.account.beside.append(
+                f"from raw bytes: the radio clock of {self.name}, {ahead:+.2f} s, has the wrong sign: the level varies "
+                f"by {spreads[0]:.1f} dB about the prediction with it, by {spreads[1]:.1f} dB with its opposite"
+            )
+
+    def _residual_db(self, reference: Reference, row: int, added_s: float) -> float:
+        """Measured minus coherent sum of direct and ground path, at a pose so much later."""
+        assert self.path is not None
+        pose = self.path.pose(float(self.series.time[row].astype("datetime64[us]").astype(np.int64)) + added_s * 1e6)
+        turn = None if pose is None else _as_asked(pose, self.data.settings.rt.attitude)
+        if pose is None or turn is None:
+            return math.nan
+        ground = next(m for m in reference.mirrors if m.solid < 0)
+        h, _ = reference.matrix([((), 0.0), ((ground,), 0.0)], pose.place_m, turn)
+        value = float((np.abs(h) ** 2).mean())
+        return float(self.series.measured_db[row]) - 10 * math.log10(value) if value > 0 else math.nan
+
+
+LEAST_AHEAD_S, CLOCK_SAMPLES, WRONG_SIGN = 0.2, 60, 0.9
+"""Clocks nearer to the telemetry's have no sign to see; samples; the opposite must be better by a tenth to fail."""
+
+
+def _value(reading: Reading, series: RssSeries, log: LogSettings) -> float | None:
+    """The value of a reading that is a series' level."""
+    values = {name.lower(): value for name, value in reading.values.items()}
+    if set(values) == {""}:
+        return values[""]
+    if log.channel is not None or log.columns:
+        return None
+    channel = series.channel.lower()
+    merged = {"usrp1": "mpower1", "usrp2": "mpower2", "power": "mpower", "quality": "mquality"}
+    for name in (merged.get(channel, channel), f"{channel}_{series.tower.lower()}"):
+        if name in values:
+            return values[name]
+    return None
+
+
+def _as_asked(pose: Pose, mode: str) -> Matrix | None:
+    """The turn as ``rt.attitude`` has it; None where the log says none."""
+    if mode == "ignored":
+        return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    return level(pose.turn) if mode == "level" and pose.turn is not None else pose.turn
+
+
+def _scores_checked(data: FlightData, series: RssSeries, result: RssResult, account: _Account) -> None:
+    """Offset and RMSE in closed form from the levels that rss.csv lists."""
+    settings, where = data.settings.rss, f"{series.tower} {series.channel}"
+    error = np.asarray(result.measured_db - result.simulated_dbm)
+    error = error[np.isfinite(error)]
+    if result.further.trained_on or not len(error):
+        return
+    account.add("RMSE", abs(len(error) - result.score.n), f"the number of samples of {where}")
+    low, high = (round(end / settings.advanced.step_db) for end in settings.span_db)
+    mean = -float(error.mean()) / settings.advanced.step_db
+    steps = (math.floor(mean), math.floor(mean) + 1)
+    nearest = min(steps, key=lambda n: (round(abs(n - mean), 9), abs(n)))
+    offset = min(max(nearest, low), high) * settings.advanced.step_db
+    account.add("offset", abs(offset - result.score.offset_db), where, spare=1e-3 * settings.advanced.step_db)
+    rmse = math.sqrt(float(((error + result.score.offset_db) ** 2).mean()))
+    account.add("RMSE", abs(rmse - result.score.rmse_db), where)
+
+
+# ---------------------------------------------------------------- rank
+
+
+def _rank_checked(
+    data: FlightData, series: RankSeries, logs: Sequence[Log | None], path: RawPath | None, account: _Account
+) -> None:
+    """Rank and position of samples against the lines of a table that holds both, found by their times."""
+    for number in np.unique(series.log).tolist():
+        log, settings = logs[number], data.settings.logs[number]
+        readings = {} if log is None else {reading.time_us: reading for reading in log.readings.values()}
+        rows = np.flatnonzero(series.log == number)
+        stamps = series.time[rows].astype("datetime64[us]").astype(np.int64)
+        some = np.unique(np.linspace(0, len(rows) - 1, SAMPLES // 4).round().astype(np.int64))
+        names = [name for name in ("nr ri", "lte ri", "ri", "pdsch_rank") if readings and name in _names(log)]
+        if not names or settings.ri_base == "zero":
+            account.leave(f"ranks of {settings.path}")
+            continue
+        for at in some.tolist():
+            where, row = f"{settings.path}, rank sample {rows[at]}", int(rows[at])
+            reading = readings.get(int(stamps[at]))
+            if reading is None:
+                account.add("time", math.inf, where)
+                continue
+            written, found = reading.values.get(names[0], math.nan), float(series.rank[row])
+            account.add("rank", 0.0 if math.isnan(found) and not written >= 1 else abs(found - written), where)
+            if series.position_m is not None and path is not None and "latitude" in reading.values:
+                place = (reading.values["latitude"], reading.values["longitude"])
+                east, north = east_north_m(*place, path.origin_deg)
+                up = path.ground_m + max(reading.values["altitude"], LOWEST_M)
+                away = math.dist((east, north, up), series.position_m[row].tolist())
+                account.add("position", away, where, spare=1e-6 * math.hypot(east, north))
+
+
+def _names(log: Log | None) -> set[str]:
+    """Columns of a table."""
+    first = next(iter(log.readings.values()), None) if log is not None else None
+    return set() if first is None else set(first.values)

@@ -1,0 +1,710 @@
+"""Compare each replayed series with its measurement: numbers, as :mod:`aerpaw_cmp.compare.result` lists them.
+
+A new number of a tower and channel is a field of ``RssFurther`` there and a function here, called in
+:func:`compare_rss_series`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.errors import InputError
+from ...common.stages import give_memory_back
+from ...common.units import BoolArray, FloatArray, IntArray, wavelength_m
+from ...compare import offset as offsets
+from ...compare import rank as ranks
+from ...compare import rss, statistics
+from ...compare.causes import Cause
+from ...compare.detection import DetectionForecast, DetectionScore, score_detection
+from ...compare.forecast import ForecastScore, score_forecast
+from ...compare.ladder import log_distance_level_db
+from ...compare.passes import Visit, repeatability
+from ...compare.result import (
+    APPLIED,
+    ExpectedOffset,
+    Fit,
+    FlightResult,
+    ModelLevel,
+    PairResult,
+    RankFurther,
+    RankResult,
+    RssFurther,
+    RssResult,
+    SnrScore,
+)
+from ...compare.serving import ServingComparison, at_times, compare_serving
+from ...compare.spread import StatedSpread, inside_shares
+from ...flight.data import FlightData, RankSeries, RssSeries
+from ...flight.lock import LOCK_FLOOR_DB
+from ...flight.losses import direct_foliage_m
+from ...flight.remembered import errors_elsewhere, lock_elsewhere
+from ...flight.replay import FlightReplay, Replayed
+from ...flight.settings import PortSettings, ReferencePowers, RssSettings, RtSettings
+from ...flight.training import learned_here
+from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
+from ...site.site import Site
+from ..learning.calibrate_rank import rank_samples, read_receiver
+from .levels import Levels, at_samples, levels_of, stated_spread
+from .likely_cause import cause_of
+
+AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
+"""Both sides are averaged over these windows to see how much of the error is fading."""
+
+AVERAGING_WAVELENGTHS = 40
+AVERAGING_LENGTH_M = 20.0
+"""And over stretches of path, each of which counts once, however long the UAV hovered there."""
+
+PASSES_WITHIN_M = 3.0
+"""Two passes of one place, first and second half of a flight, come this near."""
+
+
+SHORTEST_S = 5.0
+"""A shorter stretch of large error is a fade."""
+
+
+def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
+    """Every series against its replay, and every two channels of a tower against each other."""
+    results = []
+    for series, replayed in zip(data.rss, replays.rss, strict=True):
+        results.append(compare_rss_series(data, series, replayed))
+        give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
+    return FlightResult(
+        rss=tuple(results),
+        rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
+        pairs=tuple(pairs_of(results)),
+        serving=serving_of(data.rss, results),
+    )
+
+
+SERVING_WITHIN_S = 1.5
+"""A prediction of another cell at most this long before or after stands for the moment: phones report once a second."""
+
+
+def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> ServingComparison | None:
+    """Serving cells of the log against the strongest predicted; None where no log tells which cell serves.
+
+    Compared are the cells that the flight file gives to towers, at the moments when one of them served. Levels are as
+    simulated: cells of one network send alike, and an offset fitted per cell would hide which one is stronger.
+    """
+    cells = [(one, result) for one, result in zip(series, results, strict=True) if one.serving is not None]
+    if len(cells) < 2 or not any(np.nansum(one.serving) for one, _ in cells if one.serving is not None):
+        return None
+    start = min(one.time.min() for one, _ in cells if len(one.time))
+    times, served = [], []
+    for i, (one, _) in enumerate(cells):
+        assert one.serving is not None
+        mine = (one.time - start)[one.serving == 1] / np.timedelta64(1, "s")
+        times.append(mine)
+        served.append(np.full(len(mine), i))
+    at = np.concatenate(times)
+    predicted = np.full((len(at), len(cells)), np.nan)
+    for j, (one, result) in enumerate(cells):
+        order = np.argsort(one.time, kind="stable")
+        seconds = ((one.time - start) / np.timedelta64(1, "s"))[order]
+        predicted[:, j] = at_times(at, seconds, result.simulated_dbm[order], within_s=SERVING_WITHIN_S)
+    return compare_serving(np.concatenate(served), predicted, [f"{one.tower} {one.channel}" for one, _ in cells])
+
+
+# --- RSS -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Case:
+    """One tower and channel with what every number of it is computed from.
+
+    ``simple`` are the baselines at the samples; ``trained`` names logs of this flight that its antennas were learned
+    from: then nothing is scored.
+    """
+
+    data: FlightData
+    series: RssSeries
+    replayed: Replayed
+    levels: Levels
+    position_m: FloatArray
+    geometry: Mapping[str, FloatArray]
+    simple: Mapping[str, FloatArray]
+    trained: tuple[str, ...]
+
+    @property
+    def settings(self) -> RssSettings:
+        return self.data.settings.rss
+
+
+def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> RssResult:
+    """Offset, RMSE, correlation, intervals and baselines of one tower and channel."""
+    settings, case = data.settings.rss, _case(data, series, replayed)
+    levels, clock = case.levels, replayed.clock
+    score = rss.compare_rss(
+        series.time,
+        levels.measured_db,
+        levels.simulated_db,
+        baselines=case.simple,
+        posed=levels.posed,
+        step_db=settings.advanced.step_db,
+        span_db=settings.span_db,
+    )
+    if clock is not None:
+        also = ("lag_s",) if clock.result.applied == APPLIED else ()
+        lag_s = clock.result.radio_minus_telemetry_s
+        score = dataclasses.replace(score, lag_s=lag_s, fitted_on_scored=(*score.fitted_on_scored, *also))
+    direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
+    quantities = {**case.geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
+    residual_by = {name: rss.bin_residual(score.residual_db, values) for name, values in quantities.items()}
+    curve_offset_db, curve_rmse_db = offsets.offset_curve(
+        levels.measured_db, levels.simulated_db, step_db=settings.advanced.step_db, span_db=settings.span_db
+    )
+    spans = _worst(series.time, score.residual_db, case.position_m, case.geometry, direct)
+    if case.trained:
+        score, residual_by, spans = rss.without_errors(score), {}, []
+        curve_offset_db = curve_rmse_db = np.zeros(0)
+    stated = stated_spread(replayed, settings.window_s)
+    return RssResult(
+        tower=series.tower,
+        channel=series.channel,
+        unit=series.unit,
+        time=series.time,
+        measured_db=levels.measured_db,
+        simulated_dbm=np.where(levels.posed, levels.simulated_db, np.nan),
+        posed=levels.posed,
+        position_m=case.position_m,
+        tower_m=tower_places(replayed),
+        line_of_sight=direct,
+        geometry=case.geometry,
+        score=score,
+        baselines=_baselines(case.simple, score),
+        curve_offset_db=curve_offset_db,
+        curve_rmse_db=curve_rmse_db,
+        spans=tuple(spans),
+        residual_by=residual_by,
+        further=_further(case, score, stated, {name: table.explained for name, table in residual_by.items()}),
+        stated=stated,
+    )
+
+
+def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
+    settings, trained = data.settings.rss, learned_here(data, series, replayed.link)
+    levels = levels_of(series, replayed, settings)
+    geometry = link_geometry(data.site, series.tower, replayed, data.settings.rt)
+    simple = {
+        name: at_samples(series, replayed, level, settings)
+        for name, level in baseline_levels(data.site, series.tower, replayed).items()
+    }
+    position = _positions(replayed)
+    simple |= _fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
+    return _Case(
+        data=data,
+        series=series,
+        replayed=replayed,
+        levels=levels,
+        position_m=position,
+        geometry=geometry,
+        simple=simple,
+        trained=trained,
+    )
+
+
+def _further(
+    case: _Case, score: rss.RssComparison, stated: StatedSpread | None, explained_by: Mapping[str, float]
+) -> RssFurther:
+    """Counts, conditions and, where it may be scored, further views of the error.
+
+    Parameters
+    ----------
+    case : _Case
+    score : RssComparison
+    stated : StatedSpread, optional
+        Error bars that learned antennas state.
+    explained_by : mapping of str to float
+        Share of the residual's variance by quantity.
+
+    Returns
+    -------
+    RssFurther
+    """
+    settings, levels, series, replayed = case.settings, case.levels, case.series, case.replayed
+    wild = rss.outliers(levels.measured_db)
+    passes = _halves(series.time, case.position_m, levels.measured_db, case.geometry.get("heading_deg"))
+    further = RssFurther(
+        n_measured_out=score.n_measured_out,
+        n_simulated_out=score.n_simulated_out,
+        block_length=score.intervals.autocorrelation.block_length,
+        identifiable_db=score.identifiable_db,
+        trimmed=Fit(offset_db=score.trimmed.offset_db, rmse_db=score.trimmed.rmse_db, n=score.trimmed.n),
+        n_too_low=int((replayed.valid & ~levels.posed).sum()),
+        n_no_pose=int((~replayed.valid).sum()),
+        n_outliers=int(wild.sum()),
+        rmse_without_outliers_db=_rmse_without(wild, settings, levels, score),
+        n_flagged=dict(series.flagged),
+        clock=None if replayed.clock is None else replayed.clock.result,
+        baseline_rmse_ci95_db=score.baseline_intervals,
+        compared_with={},
+        averaged={},
+        explained_by=explained_by,
+        expected_offset=_expected(settings.reference_powers, case.data.folder, series, score.offset_db),
+        repeatability={name: repeatability(*pair, PASSES_WITHIN_M) for name, pair in passes.items()},
+        simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
+        error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
+        elsewhere=_elsewhere(case.data, series),
+        trained_on=case.trained or None,
+    )
+    if case.trained:
+        return further
+    return dataclasses.replace(
+        further,
+        compared_with=_paired(levels, case.simple),
+        averaged=_averaged(series, replayed, levels, case.position_m, settings),
+        censored=_censored(settings, levels),
+        detection=_detection(case.data, series, levels, case.simple["free_space"]),
+        snr=_snr(series, levels),
+        likely_cause=_cause(case.data.site, series, replayed, levels, case.simple["free_space"]),
+    )
+
+
+def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score: rss.RssComparison) -> float:
+    """RMSE after an own offset where some samples do not count."""
+    if not wild.any():
+        return score.rmse_db
+    kept = np.where(wild, np.nan, levels.measured_db)
+    return offsets.grid_offset(
+        kept, levels.simulated_db, step_db=settings.advanced.step_db, span_db=settings.span_db
+    ).rmse_db
+
+
+def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
+    """Error to expect on another flight, where the antennas of the site say it."""
+    errors = errors_elsewhere(data.settings.antennas, series, data.folder)
+    lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
+    out: dict[str, float] = {}
+    for known, names in (
+        (errors, ("rmse_db", "free_space_rmse_db", "rmse_4s_db")),
+        (lock, ("floor_rmse_db", "free_space_floor_rmse_db")),
+    ):
+        out |= {} if known is None else {name: getattr(known, name) for name in names}
+    return out or None
+
+
+def _cause(site: Site, series: RssSeries, replayed: Replayed, levels: Levels, free_space: FloatArray) -> Cause | None:
+    """The likely cause of the error of a channel; None where no trouble is shown."""
+    cause = cause_of(site, series.tower, rss.seconds(series.time), replayed, levels, free_space)
+    return None if cause.name == "none" else cause
+
+
+def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[str, float]:
+    """Parts of the stated standard deviation [dB], and the shares of samples that its intervals hold, where scored."""
+    parts = {"gain_sd_db": float(np.nanmean(stated.gain_sd_db)), **dataclasses.asdict(stated.spread)}
+    return parts | ({} if residual_db is None else inside_shares(residual_db, stated))
+
+
+def baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
+    """Free space and two-ray (isotropic) at the replayed poses (n,) [dBm]."""
+    place, link = site.towers[tower], replayed.link
+    source, target = replayed.source_m(site), replayed.poses.position_m
+    if replayed.tower_m is not None:  # a place per pose: (poses, towers, 3)
+        source = source[:, None, :]
+    ends = (source, target, link.carrier_hz, link.transmit_power_dbm)
+    two_ray = two_ray_dbm(*ends, ground_material=site.ground_material, ground_m=place.ground_m)
+    return {"free_space": free_space_dbm(*ends)[:, 0], "two_ray": two_ray[:, 0]}
+
+
+def _fitted_levels(
+    free_space_dbm: FloatArray, measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray
+) -> dict[str, FloatArray]:
+    """Baselines that know no physics, about the mean level of free space (n,) [dBm]: a constant, and log-distance."""
+    known = np.isfinite(measured_db) & np.isfinite(free_space_dbm)
+    mean = float(free_space_dbm[known].mean()) if known.any() else np.nan
+    line = log_distance_level_db(measured_db, distance_m, position_m)
+    return {"constant": np.where(np.isfinite(line), mean, np.nan), "log_distance": mean + line}
+
+
+def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> dict[str, ModelLevel]:
+    return {
+        name: ModelLevel(
+            level_dbm=level,
+            offset_db=score.baselines[name].offset_db,
+            rmse_db=score.baselines[name].rmse_db,
+            rmse_ci95_db=score.baseline_intervals[name],
+        )
+        for name, level in levels.items()
+    }
+
+
+def _paired(levels: Levels, others: Mapping[str, FloatArray]) -> dict[str, statistics.PairedDifference]:
+    """The replay against each other model on the samples that both have, each with its own offset."""
+    error_db = levels.measured_db - levels.simulated_db
+    return {name: statistics.paired_difference(error_db, levels.measured_db - level) for name, level in others.items()}
+
+
+def _averaged(
+    series: RssSeries, replayed: Replayed, levels: Levels, position_m: FloatArray, settings: RssSettings
+) -> dict[str, dict[str, Fit]]:
+    """Both sides averaged alike, over windows of time and stretches of path, per simulation."""
+    simulations = {
+        "coherent": replayed.spread(replayed.level_dbm("coherent")),
+        "power_sum": replayed.spread(replayed.level_dbm("power")),
+    }
+    wavelength = wavelength_m(series.link.carrier_hz)
+    lengths = {
+        f"{AVERAGING_WAVELENGTHS} wavelengths of path": AVERAGING_WAVELENGTHS * wavelength,
+        f"{AVERAGING_LENGTH_M:g} m of path": AVERAGING_LENGTH_M,
+    }
+    averages = {f"{w:g} s": partial(rss.local_mean_db, series.time, window_s=w) for w in AVERAGING_WINDOWS_S}
+    averages |= {name: partial(rss.stretch_means_db, rss.stretches(position_m, m)) for name, m in lengths.items()}
+    fits = rss.averaged_fits(
+        levels.measured_db, simulations, averages, step_db=settings.advanced.step_db, span_db=settings.span_db
+    )
+    return {
+        name: {
+            average: Fit(offset_db=fit.offset_db, rmse_db=fit.rmse_db, n=fit.n if average in lengths else None)
+            for average, fit in each.items()
+        }
+        for name, each in fits.items()
+    }
+
+
+def _expected(
+    budget: ReferencePowers | None, folder: Path, series: RssSeries, offset_db: float
+) -> ExpectedOffset | None:
+    """Offset that the USRP reference powers predict; None where ``rss.reference_powers`` has none for the channel.
+
+    Parameters
+    ----------
+    budget : ReferencePowers, optional
+    folder : Path
+        Against which its table resolves.
+    series : RssSeries
+    offset_db : float
+        As fitted.
+
+    Returns
+    -------
+    ExpectedOffset or None
+
+    Raises
+    ------
+    InputError
+        If the table cannot be read.
+    """
+    receiver = None if budget is None else budget.receivers.get(series.channel)
+    if budget is None or receiver is None:
+        return None
+    table = offsets.read_reference_powers(folder / budget.file)
+
+    def reference(port: PortSettings, category: Any) -> float:
+        return offsets.reference_power_dbm(
+            table, node=port.node, category=category, channel=port.channel, gain_db=port.gain_db,
+            frequency_hz=series.link.carrier_hz, amplifier=port.amplifier,
+        )  # fmt: skip
+
+    received = reference(receiver, "rx")
+    if budget.receiver_gain_removed:  # the log holds dB re full scale minus the gain setting
+        received += receiver.gain_db
+    sent = reference(budget.transmitter, "tx") if budget.transmitter else series.link.transmit_power_dbm
+    expected = offsets.expected_offset_db(
+        receiver_reference_dbm=received,
+        transmitter_reference_dbm=sent,
+        simulated_transmit_dbm=series.link.transmit_power_dbm,
+        transmit_amplitude_dbfs=budget.transmit_amplitude_dbfs,
+        transmit_gain_db=budget.transmitter.extra_gain_db if budget.transmitter else 0.0,
+        receive_gain_db=receiver.extra_gain_db,
+    )
+    return ExpectedOffset(
+        expected_db=expected,
+        receiver_reference_dbm=received,
+        transmitter_reference_dbm=sent,
+        fitted_minus_expected_db=offset_db - expected,
+    )
+
+
+def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
+    """The replay's level over the receiver's noise against the logged ratio, without any offset."""
+    if series.noise_dbm is None:
+        return None
+    error_db = levels.measured_db - (levels.simulated_db - series.noise_dbm)
+    error_db = error_db[np.isfinite(error_db)]
+    if not len(error_db):
+        return None
+    return SnrScore(
+        noise_dbm=series.noise_dbm,
+        rmse_db=float(np.sqrt(np.mean(error_db**2))),
+        mean_error_db=float(error_db.mean()),
+        n=len(error_db),
+    )
+
+
+def _detection(data: FlightData, series: RssSeries, levels: Levels, free_space_db: FloatArray) -> DetectionScore | None:
+    """P(lock), or P(above the floor), and all samples with the floor; None for a level without either."""
+    if series.locked is not None:
+        known, detected, floor_db = np.isfinite(series.locked), series.locked == 1.0, LOCK_FLOOR_DB
+    else:
+        detected = np.isfinite(levels.measured_db)
+        known = np.ones(len(detected), dtype=np.bool_)
+        if not (levels.posed & ~detected).any() or not detected.any():
+            return None
+        floor_db = float(np.nanmin(levels.measured_db))
+    at = known & levels.posed
+    lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
+    forecast = None if lock is None else DetectionForecast(
+        level_db=lock.gain_db + series.link.transmit_power_dbm, per_db=lock.per_db, share=lock.share
+    )  # fmt: skip
+    score = score_detection(
+        rss.seconds(series.time[at]),
+        levels.measured_db[at],
+        levels.simulated_db[at],
+        detected[at],
+        floor_db=floor_db,
+        free_space_db=free_space_db[at],
+        forecast=forecast,
+    )
+    return None if score is None else dataclasses.replace(score, locks=series.locked is not None)
+
+
+def _censored(settings: RssSettings, levels: Levels) -> offsets.Censored | None:
+    """Offset when samples without a signal, or without a path, count as "below the weakest level seen"."""
+    measured, simulated = levels.measured_db[levels.posed], levels.simulated_db[levels.posed]
+    if not len(measured) or (np.isfinite(measured) & np.isfinite(simulated)).all():
+        return None
+    floors = [float(np.min(side, where=np.isfinite(side), initial=np.inf)) for side in (measured, simulated)]
+    if not np.isfinite(floors).all():
+        return offsets.Censored(n=0)
+    return offsets.censored_offset(
+        measured,
+        simulated,
+        # the weakest level itself is a measurement: it is no "below"
+        measured_floor_db=floors[0] - 1e-9,
+        simulated_floor_db=floors[1] - 1e-9,
+        step_db=settings.advanced.step_db,
+        span_db=settings.span_db,
+    )
+
+
+def _halves(
+    time: Any, position_m: FloatArray, values: FloatArray, heading_deg: FloatArray | None
+) -> dict[str, tuple[Visit, Visit]]:
+    """Both halves of a flight, whose second passes places of the first: with headings that count, and without."""
+    elapsed = rss.seconds(time)
+    with np.errstate(invalid="ignore"):
+        late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
+    headings = {"same_heading": heading_deg, "any_heading": None}
+    if heading_deg is None:
+        del headings["same_heading"]
+
+    def half(rows: BoolArray, turned: FloatArray | None) -> Visit:
+        return Visit(position_m[rows], values[rows], None if turned is None else turned[rows])
+
+    return {name: (half(~late, turned), half(late, turned)) for name, turned in headings.items()}
+
+
+def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
+    """Every two channels of a tower against each other, where they have instants in common."""
+    out = []
+    for channel, other_channel in combinations(results, 2):
+        if channel.tower != other_channel.tower:
+            continue
+        here, there = _same_instants(channel.time, other_channel.time)
+        if not len(here):
+            continue
+        first, second = channel.calibrated_db[here], other_channel.calibrated_db[there]
+        position = channel.position_m[here]
+        context = {"height_m": position[:, 2], "elevation_deg": channel.geometry["elevation_deg"][here]}
+        if "heading_deg" in channel.geometry:
+            context["heading_deg"] = channel.geometry["heading_deg"][here]
+        out.append(
+            PairResult(
+                tower=channel.tower,
+                first=channel.channel,
+                second=other_channel.channel,
+                time=channel.time[here],
+                difference_db=first - second,
+                simulated_difference_db=channel.simulated_dbm[here] - other_channel.simulated_dbm[there],
+                score=rss.channel_difference(channel.time[here], first, second, position_m=position, context=context),
+            )
+        )
+    return out
+
+
+def _same_instants(first: Any, second: Any) -> tuple[IntArray, IntArray]:
+    """Samples of two series that were taken within half a sampling interval of each other."""
+    if len(first) == len(second) and (first == second).all():
+        return np.arange(len(first)), np.arange(len(second))
+    if len(first) < 2 or not len(second):
+        return np.arange(0), np.arange(0)
+    order = np.argsort(second, kind="stable")
+    ahead = np.clip(np.searchsorted(second[order], first), 0, len(second) - 1)
+    before = np.maximum(ahead - 1, 0)
+    nearer = np.abs(second[order[before]] - first) < np.abs(second[order[ahead]] - first)
+    nearest = order[np.where(nearer, before, ahead)]
+    limit = 0.5 * np.median(np.abs(np.diff(first)))
+    here = np.flatnonzero(np.abs(second[nearest] - first) <= limit)
+    return here, nearest[here]
+
+
+def _has_direct(replayed: Replayed) -> BoolArray:
+    paths = replayed.replay.paths
+    direct = np.zeros(len(replayed.poses), dtype=np.bool_)
+    direct[paths.pose[paths.depth == 0]] = True
+    return direct
+
+
+def _positions(replayed: Replayed) -> FloatArray:
+    """Positions at the samples (n, 3); NaN without a pose."""
+    position = np.full((len(replayed.valid), 3), np.nan)
+    position[replayed.valid] = replayed.poses.position_m
+    return position
+
+
+def tower_places(replayed: Replayed) -> FloatArray | None:
+    """Places (n, 3) [m] of a tower that moves at the samples, NaN where not known; None of one that stands."""
+    if replayed.tower_m is None:
+        return None
+    place = np.full((len(replayed.valid), 3), np.nan)
+    place[replayed.valid] = replayed.tower_m
+    return place
+
+
+def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) -> dict[str, FloatArray]:
+    """Quantities that residuals are drawn against, at the samples of the series (n,), by name with unit.
+
+    Parameters
+    ----------
+    site : Site
+    tower : str
+    replayed : Replayed
+        Its poses, arrays and which samples have a pose.
+    rt : RtSettings
+        ``foliage`` says whether the depth of foliage counts.
+
+    Returns
+    -------
+    dict of str to (n,)
+        ``altitude_m``, ``distance_m``, ``elevation_deg``, ``azimuth_deg``, ``tower_elevation_deg``,
+        ``uav_azimuth_deg``, ``uav_elevation_deg``; ``heading_deg`` with a track, ``foliage_depth_m`` with trees.
+        NaN where no pose is known.
+    """
+    link = replayed.link
+    seen = rss.link_geometry(
+        replayed.source_m(site),
+        replayed.poses.position_m,
+        replayed.poses.rotation,
+        tower_mount=link.tower_arrays[tower].mount,
+        uav_mount=link.uav_array.mount,
+    )
+    seen["azimuth_deg"] = seen["tower_azimuth_deg"]  # residuals are drawn in the frame of the antenna
+    out = {"altitude_m": replayed.spread(replayed.poses.position_m[:, 2])}
+    for name in (
+        "distance_m", "elevation_deg", "azimuth_deg", "tower_elevation_deg", "uav_azimuth_deg", "uav_elevation_deg",
+    ):  # fmt: skip
+        out[name] = replayed.spread(seen[name])
+    if replayed.track is not None:
+        out["heading_deg"] = replayed.spread(replayed.track.heading_deg)
+    if len(site.trees) and rt.foliage != "none":
+        depth = direct_foliage_m(replayed.source_m(site), replayed.poses.position_m, site.trees)
+        out["foliage_depth_m"] = replayed.spread(depth)
+    return out
+
+
+def _worst(
+    time: Any,
+    residual_db: FloatArray,
+    position_m: FloatArray,
+    geometry: Mapping[str, FloatArray],
+    line_of_sight: FloatArray,
+) -> list[rss.ErrorSpan]:
+    """The spans of largest error, with place and likely cause."""
+    context = {
+        "los": line_of_sight,
+        "elevation_deg": geometry["elevation_deg"],
+        "height_m": geometry["altitude_m"],
+    }
+    for ours, theirs in (("heading_deg", "heading_deg"), ("foliage_depth_m", "foliage_m")):
+        if ours in geometry:
+            context[theirs] = geometry[ours]
+    spans = rss.error_spans(time, residual_db, position_m=position_m, context=context, largest=len(residual_db))
+    return [span for span in spans if span.end_s - span.start_s >= SHORTEST_S][:6]
+
+
+# --- rank ----------------------------------------------------------------------------------------------------------
+
+
+def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed) -> RankResult:
+    """Measured against simulated rank for each K."""
+    settings = data.settings.rank
+    position = _positions(replayed)
+    keep = replayed.valid.copy()
+    if settings.minimum_height_m is not None:
+        with np.errstate(invalid="ignore"):
+            keep &= position[:, 2] >= settings.minimum_height_m
+    rows, kept = np.flatnonzero(keep), np.flatnonzero(keep[replayed.valid])
+    h = replayed.replay.h[kept, 0]
+    sinr_db = series.sinr_db[rows] if np.isfinite(series.sinr_db[rows]).any() else None
+    score = ranks.compare_rank(
+        series.rank[rows],
+        h,
+        settings.k,
+        time_s=(series.time[rows] - series.time[:1]) / np.timedelta64(1, "s") if len(rows) else None,
+        sinr_db=sinr_db,
+        replicates=max(settings.advanced.bootstrap, 1),
+    )
+    sigma, towers = ranks.singular_values(h), tower_places(replayed)
+    probability, forecast, trained = _receiver_forecast(data, series)
+    heading = None if replayed.track is None else replayed.spread(replayed.track.heading_deg)[rows]
+    return RankResult(
+        tower=series.tower,
+        n_samples=len(series.rank),
+        time=series.time[rows],
+        position_m=position[rows],
+        tower_m=None if towers is None else towers[rows],
+        measured=series.rank[rows],
+        sinr_db=sinr_db,
+        sigma=sigma,
+        level_dbm=replayed.replay.rss_dbm[kept, 0],
+        rank={k: ranks.rank_from_singular_values(sigma, k) for k in score.simulated},
+        score=score,
+        further=RankFurther(
+            n_flagged=dict(series.flagged),
+            kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
+            commonest=ranks.commonest_rank(series.rank[rows]),
+            repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], heading),
+            receiver=forecast,
+            trained_on=trained or None,
+        ),
+        probability=probability,
+    )
+
+
+def _receiver_forecast(
+    data: FlightData, series: RankSeries
+) -> tuple[FloatArray | None, ForecastScore | None, tuple[str, ...]]:
+    """Probability (n, 4) of each rank by the receiver of the flight file, its score, and logs that it was fitted on."""
+    named = data.settings.rank.receiver
+    if named is None:
+        return None, None, ()
+    receivers = read_receiver(data.folder / named)
+    if series.tower not in receivers:
+        raise InputError(
+            f"no receiver at {series.tower}",
+            expected="a receiver fitted at one of the flight's towers; it has " + ", ".join(receivers),
+            path=data.folder / named,
+        )
+    samples, receiver = rank_samples(data, series), receivers[series.tower]
+    probability, said = receiver.forecast(samples)
+    if receiver.knows(samples):  # nothing is scored where it was fitted
+        return probability, None, samples.logs
+    constant = receiver.mixture.members[0].constant
+    replicates = max(data.settings.rank.advanced.bootstrap, 2)
+    return probability, score_forecast(samples.rank, probability, said, constant, replicates=replicates), ()
+
+
+def _repeated_rank(
+    time: Any, position_m: FloatArray, rank: FloatArray, heading_deg: FloatArray | None
+) -> dict[str, ranks.RankRepeat]:
+    """How well the modem agrees with itself where the second half of the flight passes places of the first."""
+    passes = _halves(time, position_m, rank, heading_deg)
+    return {name: ranks.repeat_rank(*pair, PASSES_WITHIN_M) for name, pair in passes.items()}

@@ -1,0 +1,371 @@
+"""``aerpaw-cmp explain``: every path of one link at one instant, and what the other engine makes of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from ...common.errors import UsageError
+from ...common.stages import Progress, silent
+from ...common.units import FloatArray
+from ...flight.data import FlightData, RankSeries, RssSeries, Times, load_data, rank_positions
+from ...flight.losses import path_loss, roughness_loss
+from ...flight.replay import attitude_rotation, estimate_clocks, replay_poses, telemetry_time, valid_poses
+from ...flight.settings import RtSettings, load_flight
+from ...propagation.arrays import Link, Poses
+from ...propagation.check.explain import (
+    ExplainedPath,
+    edge_path_lines,
+    explain_paths,
+    near_an_edge,
+    power_sum_dbm,
+    simple_paths,
+    wall_path_lines,
+    why_not,
+)
+from ...propagation.drivers.moving import site_with_tower_at
+from ...propagation.paths import joined
+from ...propagation.replay import Replay
+from ...propagation.search.mirror import planes_of
+from ...site.site import Site
+
+MORE_SAMPLES = 10
+"""Times the samples with which Sionna is asked again for paths that it lacks."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OtherEngine:
+    """A path that one engine has and the other has not, in words, with its level where it has one and the reason."""
+
+    found_by: str
+    path: str
+    level_dbm: float | None
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Explanation:
+    """One link at one instant.
+
+    Parameters
+    ----------
+    level_dbm : float
+        Coherent level of the replay, NaN out of coverage: ``simulated_dbm`` of rss.csv with ``rss.field: coherent``.
+    power_sum_dbm : float
+        Of the paths' powers.
+    absent : tuple of (str, str)
+        Line of sight or ground reflections that are not there, and why.
+    differences : tuple of OtherEngine, optional
+        Where both engines were asked.
+    """
+
+    flight: str
+    tower: str
+    channel: str
+    time_utc: str
+    time_s: float
+    position_m: tuple[float, float, float]
+    transmit_power_dbm: float
+    carrier_hz: float
+    engine: str
+    paths: tuple[ExplainedPath, ...]
+    level_dbm: float
+    power_sum_dbm: float
+    measured_db: float | None
+    unit: str
+    absent: tuple[tuple[str, str], ...]
+    differences: tuple[OtherEngine, ...] | None
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        result = {name: getattr(self, name) for name in self.__slots__}
+        result["paths"] = [path.as_dict() for path in self.paths]
+        result["absent"] = [{"path": path, "reason": reason} for path, reason in self.absent]
+        if self.differences is not None:
+            result["differences"] = [dataclasses.asdict(one) for one in self.differences]
+        for name in ("level_dbm", "power_sum_dbm", "measured_db"):
+            if result[name] is not None and not np.isfinite(result[name]):
+                result[name] = None
+        return result
+
+
+def run_explain(
+    flight: Path,
+    *,
+    time: str,
+    tower: str,
+    channel: str | None = None,
+    engine: str | None = None,
+    logs_root: Path | None = None,
+    progress: Progress = silent,
+) -> Explanation:
+    """Explain the link to a tower at the sample nearest to an instant.
+
+    Parameters
+    ----------
+    flight : Path
+    time : str
+        Seconds after the first sample of the tower, or ISO 8601; without an offset in the flight's time zone.
+    tower : str
+    channel : str, optional
+        Of the RSS logs; "rank" for the rank log. Default: the first series of the tower.
+    engine : {"image", "sionna", "both"}, optional
+        Whose paths; default ``rt.engine``. "both" also says what each has that the other has not.
+    logs_root : Path, optional
+    progress : Progress
+
+    Returns
+    -------
+    Explanation
+        The paths of the link with their losses [dB], what is not there and why.
+
+    Raises
+    ------
+    UsageError
+        Unknown tower or channel, a time that is none or lies outside the logs, no pose there.
+    """
+    settings = load_flight(flight)
+    data = load_data(settings, flight.parent, logs_root)
+    series = _series(data, tower, channel)
+    at, seconds = _sample(series, time, settings.timezone)
+    link, pose, notes, instant = _pose(data, series, at, progress)
+    if tower in data.nodes:  # as it stood at that moment
+        place, known = data.tower_at(tower, instant)
+        _known(known, series, at)
+        data = dataclasses.replace(data, site=site_with_tower_at(data.site, tower, place[0]))
+    rt = settings.rt.model_copy(update={"engine": "sionna"}) if engine == "sionna" else settings.rt
+    chosen = rt.engine if engine in (None, "both") else engine
+    replayed = replay_poses(data.site, rt, link, pose, engine=chosen, progress=progress)  # type: ignore[arg-type]
+    source = data.site.towers[tower].position_m
+    if tower in data.nodes:
+        notes.append(f"{tower} moves: it was at {source[0]:.1f} m east, {source[1]:.1f} m north, {source[2]:.1f} m up")
+    paths = _paths(data.site, rt, replayed, link, pose, source)
+    differences = None
+    if engine == "both":
+        differences = tuple(_differences(data.site, rt, replayed, link, pose, source, progress))
+    if isinstance(series, RssSeries) and settings.rss.field != "coherent":
+        notes.append(f"rss.csv holds rss.field: {settings.rss.field}; the level here is the coherent sum")
+    if replayed.pairs_differ is not None and replayed.pairs_differ.any():
+        notes.append(
+            "each element pair has its own paths (rt.advanced.visibility: pairs); these are those of the array centres"
+        )
+    notes += edge_path_lines(replayed, np.asarray(source), pose, link)
+    notes += wall_path_lines(replayed, np.asarray(source), pose, link)
+    measured = float(series.measured_db[at]) if isinstance(series, RssSeries) else None
+    return Explanation(
+        flight=settings.flight.name,
+        tower=tower,
+        channel=series.channel if isinstance(series, RssSeries) else "rank",
+        time_utc=str(np.datetime_as_string(series.time[at].astype("datetime64[ms]"))) + "Z",
+        time_s=seconds,
+        position_m=tuple(float(x) for x in pose.position_m[0]),  # type: ignore[arg-type]
+        transmit_power_dbm=link.transmit_power_dbm,
+        carrier_hz=link.carrier_hz,
+        engine=replayed.engine,
+        paths=paths,
+        level_dbm=float(replayed.rss_dbm[0, 0]),
+        power_sum_dbm=power_sum_dbm(paths) if paths else float("nan"),
+        measured_db=measured,
+        unit=series.unit if isinstance(series, RssSeries) else "",
+        absent=tuple(_absent(replayed, source, pose.position_m[0])),
+        differences=differences,
+        notes=(*notes, *(f"left out: {what}" for what in replayed.left_out)),
+    )
+
+
+def _series(data: FlightData, tower: str, channel: str | None) -> RssSeries | RankSeries:
+    every: list[RssSeries | RankSeries] = [*data.rss, *data.rank]
+    towers = list(dict.fromkeys(series.tower for series in every))
+    mine = {_channel(series): series for series in reversed(every) if series.tower == tower}
+    if not mine:
+        there = tower in data.site.towers
+        raise UsageError(
+            f"no log of tower {tower!r}",
+            expected="one of " + ", ".join(towers),
+            cause="the site has it, the flight has not measured there" if there else "a typing error",
+        )
+    if channel is None:
+        return mine[list(mine)[-1]]
+    if channel not in mine:
+        raise UsageError(f"no channel {channel!r} at {tower}", expected="one of " + ", ".join(reversed(mine)))
+    return mine[channel]
+
+
+def _channel(series: RssSeries | RankSeries) -> str:
+    return series.channel if isinstance(series, RssSeries) else "rank"
+
+
+def _sample(series: RssSeries | RankSeries, time: str, zone: str | None) -> tuple[int, float]:
+    """Number of the sample nearest to an instant, and its seconds after the first."""
+    first, last = series.time.min(), series.time.max()
+    span = float((last - first) / np.timedelta64(1, "s"))
+    wanted = _instant(time, first, zone)
+    step = span / max(len(series.time) - 1, 1)
+    away = float((wanted - first) / np.timedelta64(1, "s"))
+    if not -max(step, 1.0) <= away <= span + max(step, 1.0):
+        raise UsageError(
+            f"--time {time} is {abs(away) if away < 0 else away - span:.1f} s "
+            f"{'before the first' if away < 0 else 'after the last'} sample of {series.tower}",
+            expected=f"0 to {span:.1f} s, or {_iso(first)} to {_iso(last)}",
+        )
+    at = int(np.argmin(np.abs(series.time - wanted)))
+    return at, float((series.time[at] - first) / np.timedelta64(1, "s"))
+
+
+def _iso(time: Any) -> str:
+    return f"{np.datetime_as_string(time.astype('datetime64[ms]'))}Z"
+
+
+def _instant(text: str, first: Any, zone: str | None) -> Any:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = float("nan")
+    if np.isfinite(seconds) and abs(seconds) < 1e9:
+        return first + np.timedelta64(round(1e9 * seconds), "ns")
+    try:
+        parsed = datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
+    except ValueError:
+        raise UsageError(
+            f"--time {text!r}",
+            expected="seconds after the tower's first sample (12.5), or a time such as 2025-06-01T14:00:05.5Z",
+        ) from None
+    if parsed.tzinfo is None:
+        parsed = parsed.replace(tzinfo=ZoneInfo(zone or "UTC"))
+    return np.datetime64(parsed.astimezone(timezone.utc).replace(tzinfo=None), "ns")
+
+
+def _pose(
+    data: FlightData, series: RssSeries | RankSeries, at: int, progress: Progress
+) -> tuple[Link, Poses, list[str], Times]:
+    """Link and pose of a sample, as the report replays it, and its instant (1,) on the telemetry's clock."""
+    rt, notes = data.settings.rt, []
+    if isinstance(series, RssSeries):
+        time = series.time
+        if data.settings.rss.lag == "apply" or isinstance(data.settings.rss.lag, float):
+            clock = estimate_clocks(data, progress)[[s is series for s in data.rss].index(True)]
+            time = telemetry_time(time, clock)
+            if clock is not None and clock.applied_s[at]:
+                notes.append(f"{clock.applied_s[at]:.3f} s are taken off the radio's clock")
+        track = data.poses_at(time[at : at + 1])
+        _known(track.valid, series, at)
+        return series.link.build([series.tower], data.folder), valid_poses(track, rt.attitude), notes, time[at : at + 1]
+    link = data.settings.link.rank.build([series.tower], data.folder)
+    position, valid = rank_positions(series, data.track)
+    _known(valid[at : at + 1], series, at)
+    rotation: FloatArray = np.eye(3)[None]
+    if data.track is not None:
+        track = data.poses_at(series.time[at : at + 1])
+        if track.valid[0]:
+            rotation = np.asarray(attitude_rotation(track, rt.attitude))
+    return link, Poses(position[at : at + 1], np.ascontiguousarray(rotation)), notes, series.time[at : at + 1]
+
+
+def _known(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
+    if not valid[0]:
+        raise UsageError(
+            f"no pose is known at {_iso(series.time[at])}",
+            expected="a time with telemetry",
+            cause="the telemetry starts later, ends earlier or has a gap (rt.advanced.maximum_gap_s)",
+        )
+
+
+SMOOTH = {"reflection_loss_db": 0.0, "ground_roughness_m": 0.0}
+
+
+def _paths(
+    site: Site, rt: RtSettings, replayed: Replay, link: Link, pose: Poses, source: FloatArray
+) -> tuple[ExplainedPath, ...]:
+    """The paths with their terms, foliage and roughness apart."""
+    through = path_loss(site, rt.model_copy(update=SMOOTH), link.carrier_hz)
+    further = {}
+    if through is not None:
+        further["foliage"] = through(replayed.paths, source[None], pose.position_m)
+    if rt.reflection_loss_db:
+        further["rough surfaces"] = rt.reflection_loss_db * replayed.paths.depth.astype(np.float64)
+    rough = roughness_loss(site, rt, link.carrier_hz)
+    if rough is not None:
+        further["rough ground"] = rough(replayed.paths, source[None], pose.position_m)
+    if replayed.paths.terrain_db.any():
+        further["terrain"] = replayed.paths.terrain_db
+    return explain_paths(replayed.paths, replayed.faces, source, pose, link, further)
+
+
+def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterator[tuple[str, str]]:
+    there = {tuple(row[row >= 0].tolist()) for row in replayed.paths.faces}
+    for words, sequence in simple_paths(replayed):
+        if tuple(sequence.tolist()) not in there:
+            yield words, why_not(replayed.faces, source, target, sequence, replayed.surfaces) or _elsewhere(replayed)
+
+
+def _elsewhere(replayed: Replay) -> str:
+    if replayed.engine == "sionna":
+        return f"nothing is in its way: not found with {replayed.samples} samples per tower"
+    stopped = "stopped by the terrain, the ground of another tower, or left out by rt.advanced.power_cut_db"
+    return f"geometry allows it: {stopped}"
+
+
+def _differences(
+    site: Site, rt: RtSettings, replayed: Replay, link: Link, pose: Poses, source: FloatArray, progress: Progress
+) -> Iterator[OtherEngine]:
+    """Paths of one engine that the other has not, both ways, with the reason."""
+    engines = {replayed.engine: replayed}
+    for name in ("image", "sionna"):
+        if name not in engines:
+            engines[name] = replay_poses(site, rt, link, pose, engine=name, progress=progress)  # type: ignore[arg-type]
+    ours, theirs = engines["image"], engines["sionna"]
+    target = pose.position_m[0]
+    mine, others = _by_plane(ours, theirs)
+    explained = {p.planes: p for p in _paths(site, rt, ours, link, pose, source)}
+    missing = [key for key in mine if key not in others]
+    more: set[tuple[int, ...]] = set()
+    if missing:
+        knobs = {"samples": MORE_SAMPLES * max(theirs.samples, 1), "cache": False}
+        wide = rt.model_copy(update={"advanced": rt.advanced.model_copy(update=knobs)})
+        more = set(_by_plane(ours, replay_poses(site, wide, link, pose, engine="sionna", progress=progress))[1])
+    for key in missing:
+        path = explained[mine[key]]
+        if near_an_edge(ours.faces, source, target, path, ours.surfaces):
+            reason = "within 1 mm of an edge: float32 decides otherwise"
+        elif key in more:
+            reason = f"sample budget: found with {MORE_SAMPLES * theirs.samples} samples, not with {theirs.samples}"
+        else:
+            reason = f"not found with {MORE_SAMPLES * theirs.samples} samples either: a small face or a weak reflection"
+        yield OtherEngine(found_by="image", path=path.words, level_dbm=_level(path.level_dbm), reason=reason)
+    levels = {p.planes: p for p in _paths(site, rt, theirs, link, pose, source)}
+    for key, sequence in others.items():
+        if key in mine:
+            continue
+        reason = why_not(theirs.faces, source, target, np.array(sequence, dtype=np.int64), theirs.surfaces)
+        path = levels[sequence]
+        yield OtherEngine(
+            found_by="sionna", path=path.words, level_dbm=_level(path.level_dbm), reason=reason or "no reason found"
+        )
+
+
+def _level(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+_Rows = dict[tuple[int, ...], tuple[int, ...]]
+
+
+def _by_plane(first: Replay, second: Replay) -> tuple[_Rows, _Rows]:
+    """Face sequences of two replays by their planes: coplanar faces are the same mirror."""
+    plane = np.split(planes_of(joined(first.faces, second.faces)), [len(first.faces)])
+    rows: list[_Rows] = []
+    for replay, number in zip((first, second), plane, strict=True):
+        sequences = [tuple(row[row >= 0].tolist()) for row in replay.paths.faces]
+        rows.append({tuple(number[list(s)].tolist()) if s else (): s for s in sequences})
+    return rows[0], rows[1]
+
+
+__all__ = ["Explanation", "OtherEngine", "run_explain"]

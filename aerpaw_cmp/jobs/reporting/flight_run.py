@@ -1,0 +1,86 @@
+"""One flight from its data to its numbers: clocks, replay, comparison, audit. Every job on a flight starts here.
+
+A new stage (a ladder of models, the receiver's chain, a further audit) is a function of what stands before it, one
+field of :class:`FlightRun` or of :class:`~aerpaw_cmp.compare.result.FlightResult`, and two lines in :func:`run_flight`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from ...common.stages import Stages
+from ...compare.ladder import series_rows
+from ...compare.result import FlightResult
+from ...flight.data import FlightData
+from ...flight.replay import FlightReplay, replay_flight
+from .audit_flight import audit_replays
+from .compare_flight import compare_flight
+from .ladder import FlightLadder, flight_ladder
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightRun:
+    """What was computed of one flight.
+
+    Parameters
+    ----------
+    data : FlightData
+        As read: settings, site, logs, track, series.
+    replays : FlightReplay
+        Poses, paths, fields and clock of every series.
+    result : FlightResult
+        Numbers alone.
+    ladder : FlightLadder, optional
+        Which models the measurement asks for.
+    """
+
+    data: FlightData
+    replays: FlightReplay
+    result: FlightResult
+    ladder: FlightLadder | None = None
+
+
+def run_flight(
+    data: FlightData,
+    stages: Stages | None = None,
+    *,
+    replays: FlightReplay | None = None,
+    audit: bool = True,
+    ladder: bool = False,
+) -> FlightRun:
+    """Clocks, replay, comparison, audit and ladder.
+
+    Parameters
+    ----------
+    data : FlightData
+    stages : Stages, optional
+        Times "clocks", "replay", "compare", "audit" and "ladder".
+    replays : FlightReplay, optional
+        Of this flight, where they were made before (:func:`~aerpaw_cmp.flight.replay.replay_flight`).
+    audit : bool
+        Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
+    ladder : bool
+        Also score simpler and richer models of the RSS on stretches left out.
+
+    Returns
+    -------
+    FlightRun
+        Replays, numbers of the comparison, and the ladder where it was asked for.
+    """
+    stages = stages or Stages()
+    replays = replays or replay_flight(data, stages)
+    with stages("compare"):
+        result = compare_flight(data, replays)
+    if audit:
+        with stages("audit"):
+            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress, result.rss))
+    climbed: FlightLadder | None = None
+    if ladder:
+        with stages("ladder"):
+            stages.progress("ladder of models")
+            climbed = flight_ladder(data, replays)
+            if climbed is not None:
+                rows = (series_rows(climbed.ladder, index, name) for index, name in enumerate(climbed.names))
+                result = dataclasses.replace(result, ladder=tuple(row for of_series in rows for row in of_series))
+    return FlightRun(data=data, replays=replays, result=result, ladder=climbed)

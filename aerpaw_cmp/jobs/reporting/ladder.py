@@ -1,0 +1,469 @@
+"""The ladder of models of a flight: which antennas, attitude, ground, buildings and trees its measurement asks for.
+
+Stages come one after the other (antennas, ground, buildings, trees); each adds its variants to the best model so far,
+by the RMSE on held-out segments. Everything but the offset is fixed beforehand.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+
+from ...common.errors import UsageError
+from ...common.units import FloatArray
+from ...common.yamlfile import parse_yaml
+from ...compare.ladder import Ladder, Rung, climb
+from ...compare.result import BASELINE_TITLE
+from ...flight.data import FlightData, RssSeries
+from ...flight.learned_gain import pair_db
+from ...flight.losses import path_loss
+from ...flight.remembered import errors_elsewhere, offered
+from ...flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
+from ...flight.settings import FlightFile, RssSettings
+from ...flight.training import learned_here
+from ...propagation.arrays import Link, Poses
+from ...propagation.drivers.moving import replay_moving
+from ...propagation.field.sum import mean_pair_power, rss_dbm
+from ...propagation.options import Field, Run, Search
+from ...propagation.replay import Replay, replay
+from ...site.antennas import Isotropic
+from ...site.installed import InstalledPattern
+from ...site.site import Site
+from ...site.sphere_pattern import SpherePattern
+from .levels import Levels, levels_of
+
+WEAK_GROUND_DB = 10.0
+"""Loss of the weakened ground reflection: a smooth half-space reflects more than any field."""
+
+MOST_SAMPLES = 4000
+"""Per series; of longer ones every second, third, ... sample is taken."""
+
+AS_SET = "as set in flight.yaml"
+FREE_SPACE = BASELINE_TITLE["free_space"]
+LINES = BASELINE_TITLE["constant"], BASELINE_TITLE["log_distance"]
+"""Lines that replay nothing: what a model must beat to be worth its name."""
+
+LEARNED_HERE = " (its antennas were learned on this flight, too: not scored)"
+"""Behind the name of a rung that would be scored where it was fitted."""
+
+Antennas = Literal["isotropic", "measured", "installed", "learned"]
+Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
+Trees = Literal["none", "p833", "weissberger", "opaque"]
+
+GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "rough": "rough", "power sum": "incoherent"}
+"""What the ladder calls the sums and losses of the ground reflection."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Model:
+    """One combination of what a replay may hold."""
+
+    antennas: Antennas = "isotropic"
+    attitude: Literal["ignored", "level", "logged"] = "ignored"
+    ground: Ground = "none"
+    buildings: bool = False
+    trees: Trees = "none"
+    diffraction: bool = False
+    """Paths over one edge of a building, with the ground on either side."""
+    roughness_m: float = 0.0
+    """Of ``ground: rough``: that of the flight file, where it has one."""
+
+    @property
+    def name(self) -> str:
+        """What it holds, in words."""
+        parts = {
+            "isotropic": [], "measured": ["antennas"], "installed": ["antennas with learned gain"],
+            "learned": ["learned sphere"],
+        }[self.antennas]  # fmt: skip
+        parts += {"ignored": [], "level": ["heading"], "logged": ["attitude"]}[self.attitude]
+        if self.ground != "none":
+            parts.append(f"{GROUND_WORDS[self.ground]} ground reflection")
+        parts += ["buildings"] if self.buildings else []
+        parts += ["diffraction"] if self.diffraction else []
+        if self.trees != "none":
+            parts.append("opaque trees" if self.trees == "opaque" else f"trees ({self.trees})")
+        return FREE_SPACE if not parts else " + ".join(parts)
+
+    def settings(self, max_depth: int) -> dict[str, dict[str, Any]]:
+        """The keys of flight.yaml that make it, ``max_depth`` that of the flight file."""
+        depth = 0 if self.ground == "none" else max(max_depth, 1) if self.buildings else 1
+        rt: dict[str, Any] = {
+            "max_depth": depth,
+            "attitude": self.attitude,
+            "reflection_loss_db": WEAK_GROUND_DB if self.ground == "weakened" else 0.0,
+            **({"ground_roughness_m": self.roughness_m} if self.ground == "rough" else {}),
+            "foliage": "none" if self.trees == "none" else "opaque" if self.trees == "opaque" else "attenuating",
+        }
+        if self.diffraction:
+            rt["diffraction"] = "edges"
+        if self.trees in ("p833", "weissberger"):
+            rt["foliage_model"] = self.trees
+        return {
+            "rt": rt,
+            "rss": {"field": "power" if self.ground == "power sum" else "coherent"},
+            "site": {"without_buildings": not self.buildings},
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightLadder:
+    """The scored ladder; ``models`` are in the order of its rungs (None: the settings of the flight file)."""
+
+    ladder: Ladder
+    models: tuple[Model | None, ...]
+    names: tuple[tuple[str, str], ...]
+    offered: Mapping[str, str] = field(default_factory=dict)
+    """Names of learned antennas that the site offers and the flight file does not use."""
+
+    @property
+    def recommended(self) -> Model | None:
+        """The recommended model; None where it is that of the flight file, or none."""
+        chosen = self.ladder.recommended
+        return None if chosen is None else self.models[chosen]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Series:
+    """One series, thinned: ``rows`` (m,) of its samples, their poses, and which of its replayed poses they are."""
+
+    replayed: Replayed
+    levels: Levels
+    rows: Any
+    picked: Any
+    step: int
+    time_s: FloatArray
+
+
+def flight_ladder(data: FlightData, replays: FlightReplay) -> FlightLadder | None:
+    """Climb the ladder; None for a flight without RSS, or replayed by rays of another engine than the image method."""
+    if not data.rss or data.settings.rt.engine != "image":
+        return None
+    return _Climber(data, [_thin(data.rss, i, r, data.settings.rss) for i, r in enumerate(replays.rss)]).climb()
+
+
+def _thin(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: RssSettings) -> _Series:
+    levels = levels_of(rss[index], replayed, rules)
+    wanted = np.flatnonzero(levels.posed & np.isfinite(levels.measured_db))
+    step = max(1, -(-len(wanted) // MOST_SAMPLES))
+    rows = wanted[::step]
+    pose_of = np.cumsum(replayed.valid) - 1
+    seconds = (rss[index].time - rss[0].time[:1]) / np.timedelta64(1, "s")
+    return _Series(replayed=replayed, levels=levels, rows=rows, picked=pose_of[rows], step=step, time_s=seconds[rows])
+
+
+class _Climber:
+    """Evaluates models on the series of a flight, each search of paths once."""
+
+    def __init__(self, data: FlightData, series: Sequence[_Series]) -> None:
+        self._data, self._series = data, series
+        self._measured = [s.levels.measured_db[s.rows] for s in series]
+        self._traced: dict[tuple[int, bool], tuple[Replay, float]] = {}
+        patterns = [p for s in series for a in _arrays(s.replayed.link) for p in a.patterns]
+        self._offer = offered(data) if all(p.name == "iso" for p in patterns) else None
+        own = [s.replayed.link for s in series]
+        self._links = own if self._offer is None else [_link_of(self._offer, data, s) for s in data.rss]
+
+    def climb(self) -> FlightLadder:
+        """All stages."""
+        rungs = self._lines()
+        models: list[Model | None] = [None] * len(rungs)
+        best = Model()
+        for stage in (self._antennas, self._ground, self._buildings, self._edges, self._trees):
+            for model in stage(best):
+                if model not in models:
+                    models.append(model)
+                    rungs.append(self._rung(model))
+            scored = self._scored(rungs)
+            if scored.best_replay is not None:
+                best = models[scored.best_replay] or best
+        models.append(None)
+        rungs.append(self._as_set())
+        names = tuple((s.tower, s.channel) for s in self._data.rss)
+        found = FlightLadder(
+            ladder=self._scored(rungs),
+            models=tuple(models),
+            names=names,
+            offered={} if self._offer is None else self._offer.antennas,
+        )
+        return self._by_flights_left_out(found)
+
+    def _by_flights_left_out(self, climbed: FlightLadder) -> FlightLadder:
+        """The learned model, as it was calibrated, where flights left out say that it beats free space."""
+        antennas = (self._offer or self._data.settings).antennas
+        errors = [errors_elsewhere(antennas, series, self._data.folder) for series in self._data.rss]
+        known = [one for one in errors if one is not None]
+        if len(known) < len(errors) or not known:
+            return climbed
+        learned, free = (
+            _root_mean_square([getattr(e, key) for e in known]) for key in ("rmse_db", "free_space_rmse_db")
+        )
+        for attitude in ("logged", "level"):
+            model = Model(antennas="learned", attitude=attitude)
+            at = climbed.models.index(model) if model in climbed.models else None
+            if at is not None and np.isfinite(climbed.ladder.rmse_db[at]) and learned < free:
+                ladder = dataclasses.replace(climbed.ladder, recommended=at, elsewhere_db=(learned, free))
+                return dataclasses.replace(climbed, ladder=ladder)
+        return climbed
+
+    def _scored(self, rungs: Sequence[Rung]) -> Ladder:
+        return climb(
+            self._measured,
+            [s.time_s for s in self._series],
+            rungs,
+            position_m=[s.replayed.poses.position_m[s.picked] for s in self._series],
+        )
+
+    # the stages: what may be added to the best model so far
+
+    def _antennas(self, _best: Model) -> list[Model]:
+        patterns = [p for link in self._links for a in _arrays(link) for p in a.patterns]
+        models = [Model()]
+        if all(p.name == "iso" for p in patterns):
+            return models
+        kind: Antennas = "learned" if any(isinstance(p, SpherePattern) for p in patterns) else "measured"
+        models.append(Model(antennas=kind))
+        tracks = [s.replayed.track for s in self._series]
+        if all(t is not None for t in tracks):
+            known = np.concatenate([t.attitude_known for t in tracks if t is not None])
+            models.append(Model(antennas=kind, attitude="level"))
+            if known.any():
+                models.append(Model(antennas=kind, attitude="logged"))
+        if any(isinstance(p, InstalledPattern) for p in patterns):
+            models += [dataclasses.replace(m, antennas="installed") for m in models[1:]]
+        return models
+
+    def _ground(self, best: Model) -> list[Model]:
+        kinds: tuple[Ground, ...] = ("power sum", "weakened", "coherent")
+        models = [dataclasses.replace(best, ground=kind) for kind in kinds]
+        rough = self._data.settings.rt.ground_roughness_m
+        return [*models, *([dataclasses.replace(best, ground="rough", roughness_m=rough)] if rough else [])]
+
+    def _buildings(self, best: Model) -> list[Model]:
+        if not self._data.site.buildings:
+            return []
+        return [dataclasses.replace(best, buildings=True)]
+
+    def _edges(self, best: Model) -> list[Model]:
+        moving = any(s.replayed.tower_m is not None for s in self._series)
+        if not (self._data.site.buildings or self._data.site.dem) or moving:
+            return []
+        return [dataclasses.replace(best, buildings=True, diffraction=True)]
+
+    def _trees(self, best: Model) -> list[Model]:
+        if not self._data.site.wooded:
+            return []
+        kinds: tuple[Trees, ...] = ("p833", "weissberger", "opaque")
+        return [dataclasses.replace(best, trees=kind) for kind in kinds]
+
+    # levels
+
+    def _lines(self) -> list[Rung]:
+        zeros = tuple(np.zeros(len(s.rows)) for s in self._series)
+        away = tuple(s.replayed.poses.position_m[s.picked] - self._sources(s) for s in self._series)
+        range_db = tuple(10.0 * np.log10(np.maximum(np.linalg.norm(a, axis=1), 0.1)) for a in away)
+        return [
+            Rung(model=name, level_db=zeros, seconds=0.0, regressor_db=x)
+            for name, x in zip(LINES, (zeros, range_db), strict=True)
+        ]
+
+    def _as_set(self) -> Rung:
+        levels = tuple(s.levels.simulated_db[s.rows] for s in self._series)
+        seconds = self._of_flight([s.replayed.replay.seconds for s in self._series])
+        if self._learned_here and self._offer is None:
+            nothing = tuple(np.full(len(level), np.nan) for level in levels)
+            return Rung(model=AS_SET + LEARNED_HERE, level_db=nothing, seconds=seconds)
+        return Rung(model=AS_SET, level_db=levels, seconds=seconds)
+
+    def _of_flight(self, seconds: Sequence[float]) -> float:
+        """Seconds of a flight from those of its series: channels that share a replay cost it once."""
+        shared: dict[tuple[str, str], float] = {}
+        for series, one in zip(self._data.rss, seconds, strict=True):
+            key = series.tower, series.settings_key
+            shared[key] = max(one, shared.get(key, 0.0))
+        return sum(shared.values())
+
+    @cached_property
+    def _learned_here(self) -> bool:
+        """Whether antennas or settings of the flight file were learned from a log of this very flight."""
+        pairs = zip(self._data.rss, self._links, strict=True)
+        return any(learned_here(self._data, series, link) for series, link in pairs)
+
+    def _rung(self, model: Model) -> Rung:
+        learned = model.antennas in ("learned", "installed") or model.ground == "rough"
+        if learned and self._learned_here:
+            nothing = tuple(np.full(len(s.rows), np.nan) for s in self._series)
+            return Rung(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
+        levels = [self._level(i, model) for i in range(len(self._series))]
+        return Rung(
+            model=model.name, level_db=tuple(f[0] for f in levels), seconds=self._of_flight([f[1] for f in levels])
+        )
+
+    def _level(self, index: int, model: Model) -> tuple[FloatArray, float]:
+        """Level (m,) [dBm] at the thinned samples of a series, and the seconds that the whole series would take."""
+        series, rt = self._series[index], self._data.settings.rt
+        traced, search_s = self._paths(index, model.buildings)
+        begin = time.perf_counter()
+        poses, link = self._poses(series, model.attitude), _link(self._links[index], model.antennas)
+        paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
+        wanted = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
+        loss = path_loss(self._data.site, wanted, link.carrier_hz)
+        pair = pair_db(link, poses, self._sources(series))
+        if model.diffraction:
+            search = Search(max_depth=traced.paths.faces.shape[1], diffraction="edges")
+            bent = replay(self._data.site, link, poses, search, Field(loss), Run(cache_dir=""))
+            level = bent.rss_power_dbm if model.ground == "power sum" else bent.rss_dbm
+            return level[:, 0] + pair, series.step * bent.seconds
+        fields = fields_from(self._sources(series), traced.faces, paths, link, poses, loss)
+        power = fields.power if model.ground == "power sum" else mean_pair_power(fields.h)
+        level = rss_dbm(power, link.transmit_power_dbm)[:, 0] + pair
+        return level, series.step * (search_s + time.perf_counter() - begin)
+
+    def _paths(self, index: int, buildings: bool) -> tuple[Replay, float]:
+        if (index, buildings) not in self._traced:
+            begin = time.perf_counter()
+            site: Site = self._data.site if buildings else dataclasses.replace(self._data.site, buildings=())
+            depth = max(self._data.settings.rt.max_depth, 1) if buildings else 1
+            series = self._series[index]
+            link, poses, sources = series.replayed.link, self._poses(series, "ignored"), self._sources(series)
+            if series.replayed.tower_m is not None:
+                replayed = replay_moving(site, link, poses, sources, Search(max_depth=depth))
+            else:
+                replayed = replay(site, link, poses, Search(max_depth=depth), run=Run(cache_dir=""))
+            self._traced[index, buildings] = replayed, time.perf_counter() - begin
+        return self._traced[index, buildings]
+
+    def _sources(self, series: _Series) -> FloatArray:
+        """Place of the tower: (1, 3), or (m, 3) at the thinned samples where it moves."""
+        places = series.replayed.source_m(self._data.site)
+        return places if series.replayed.tower_m is None else places[series.picked]
+
+    def _poses(self, series: _Series, attitude: str) -> Poses:
+        whole, track = series.replayed.poses, series.replayed.track
+        turn = whole.rotation if track is None else attitude_rotation(track, attitude)
+        return Poses(whole.position_m[series.picked], np.ascontiguousarray(turn[series.picked]))
+
+
+def _root_mean_square(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _link_of(settings: FlightFile, data: FlightData, series: RssSeries) -> Link:
+    """The link of a series as other settings have it."""
+    link = settings.link.channels.get(series.channel, settings.link.rss)
+    return link.build([series.tower], data.folder)
+
+
+def _arrays(link: Link) -> list[Any]:
+    return [*link.tower_arrays.values(), link.uav_array]
+
+
+def _link(link: Link, antennas: Antennas) -> Link:
+    """The link with isotropic elements, with measured ones without added gain, or as it is."""
+
+    def pattern(p: Any) -> Any:
+        if antennas == "isotropic":
+            return Isotropic()
+        return p.base if antennas == "measured" and isinstance(p, InstalledPattern) else p
+
+    def other(array: Any) -> Any:
+        return dataclasses.replace(array, patterns=tuple(pattern(p) for p in array.patterns))
+
+    towers = {name: other(array) for name, array in link.tower_arrays.items()}
+    return dataclasses.replace(link, tower_arrays=towers, uav_array=other(link.uav_array))
+
+
+def recommended_settings(
+    settings: Mapping[str, Any], model: Model | None, offered: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """flight.yaml as nested mappings with the settings of a model; None leaves it as it is.
+
+    Parameters
+    ----------
+    settings : mapping
+        The keys that the flight file states.
+    model : Model or None
+        See :attr:`FlightLadder.recommended`.
+    offered : mapping of str to str, optional
+        Learned antennas of the site by name, which a learned model takes.
+
+    Returns
+    -------
+    dict
+    """
+    result = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
+    result.pop("antennas", None)  # the names of learned antennas: link holds their files by now
+    if model is None:
+        return result
+    if offered and model.antennas == "learned":
+        result["antennas"] = dict(offered)
+    changes = model.settings(int(result.get("rt", {}).get("max_depth", 2)))
+    for section, change in changes.items():
+        result[section] = {**result.get(section, {}), **change}
+    if model.ground != "rough":
+        result["rt"].pop("ground_roughness_m", None)
+    if not model.diffraction:
+        result["rt"].pop("diffraction", None)
+    if model.trees not in ("p833", "weissberger"):
+        result["rt"].pop("foliage_model", None)
+    if model.antennas not in ("installed", "learned"):
+        link = dict(result.get("link", {}))
+        for name in [key for key in ("rss",) if key in link]:
+            link[name] = _antennas_as(link[name], model.antennas)
+        if "channels" in link:
+            link["channels"] = {name: _antennas_as(one, model.antennas) for name, one in link["channels"].items()}
+        if link:
+            result["link"] = link
+    return result
+
+
+def _antennas_as(value: Any, antennas: Antennas) -> Any:
+    """Nested link settings with isotropic antennas, or with measured ones without added gain."""
+    if isinstance(value, Mapping):
+        out = {}
+        for key, item in value.items():
+            if key in ("antenna", "antennas"):
+                several = [dict(one) for one in item] if isinstance(item, list) else [dict(item)]
+                changed = [
+                    {"model": "iso"}
+                    if antennas == "isotropic"
+                    else {k: v for k, v in one.items() if k != "installed_db"}
+                    for one in several
+                ]
+                out[key] = changed if isinstance(item, list) else changed[0]
+            else:
+                out[key] = _antennas_as(item, antennas)
+        return out
+    return value
+
+
+def recommended_text(settings: FlightFile, ladder: FlightLadder | None, name: str) -> str:
+    """The flight file ``name`` with the settings of the recommended model, as text.
+
+    Raises
+    ------
+    UsageError
+        If no ladder was climbed: no RSS, or rays of another engine than the image method.
+    """
+    if ladder is None or ladder.ladder.recommended is None:
+        raise UsageError(
+            "no model can be recommended for this flight",
+            expected="RSS with known poses, replayed by the image engine (rt.engine: image)",
+        )
+    stated = settings.model_dump(mode="json", exclude_unset=True)
+    changed = recommended_settings(stated, ladder.recommended, ladder.offered)
+    chosen = ladder.ladder.rungs[ladder.ladder.recommended].model
+    rmse = ladder.ladder.rmse_db[ladder.ladder.recommended]
+    head = f"# {name} with the model that its ladder recommends: {chosen} ({rmse:.2f} dB on held-out segments).\n"
+    if ladder.ladder.elsewhere_db is not None:
+        learned, free = ladder.ladder.elsewhere_db
+        head += f"# On flights left out of its antennas: {learned:.2f} dB, free space {free:.2f} dB.\n"
+    text = head + yaml.safe_dump(changed, sort_keys=False, allow_unicode=True, width=120)
+    parse_yaml(text, FlightFile)  # a flight file that its own reader refuses is a fault of ours
+    return text

@@ -1,0 +1,55 @@
+"""Propagation paths of a spread of poses, for the drawing of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ...common.units import FloatArray
+from ...flight.data import FlightData, RankSeries, RssSeries
+from ...flight.replay import FlightReplay, Replayed
+from ...propagation.paths import PathSet
+from ...report.data import DIFFRACTED, PASSING, PosePaths
+
+POSES = 300
+"""Poses per tower whose paths are drawn."""
+
+SHORTEST = 8
+"""Paths over edges, and through walls, that are drawn of a pose."""
+
+
+def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> tuple[PosePaths, ...]:
+    """Paths of each tower's first series at about ``limit`` of its poses, spread over the flight."""
+    by_tower: dict[str, PosePaths] = {}
+    every: list[RssSeries | RankSeries] = [*data.rss, *data.rank]
+    for series, replayed in zip(every, replays.all, strict=True):
+        if series.tower not in by_tower and replayed.valid.any():
+            poses = np.unique(np.linspace(0, len(replayed.poses) - 1, limit).astype(np.int64))
+            time = series.time[replayed.valid][poses]
+            tower_m = np.broadcast_to(replayed.source_m(data.site), replayed.poses.position_m.shape)
+            lines = tuple(tuple(_lines(replayed, pose, tower_m[pose])) for pose in poses)
+            by_tower[series.tower] = PosePaths(tower=series.tower, time=time, lines=lines)
+    return tuple(by_tower.values())
+
+
+def _lines(replayed: Replayed, pose: int, tower_m: FloatArray) -> Iterator[tuple[FloatArray, int]]:
+    """Polylines of a pose with their kind: number of reflections, DIFFRACTED or PASSING."""
+    replay, target_m = replayed.replay, replayed.poses.position_m[pose]
+    kinds: list[tuple[PathSet, int | None]] = [(replay.paths, None)]
+    if replay.edge_paths is not None:
+        kinds.append((replay.edge_paths.as_path_set(), DIFFRACTED))
+    if replay.through is not None:
+        kinds.append((replay.through.paths, PASSING))
+    for paths, kind in kinds:
+        start, stop = np.searchsorted(paths.pose, [pose, pose + 1])
+        found = [
+            np.concatenate([tower_m[None], paths.vertices_m[row, : paths.depth[row]], target_m[None]])
+            for row in range(start, stop)
+        ]
+        if kind is not None:
+            found = sorted(found, key=lambda line: float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))[
+                :SHORTEST
+            ]
+        for line in found:
+            yield line, len(line) - 2 if kind is None else kind

@@ -1,0 +1,1 @@
+"""Work shared over processes: workers, outcomes that are kept, manifests."""

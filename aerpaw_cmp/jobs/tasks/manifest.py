@@ -1,0 +1,111 @@
+"""Every file that a report was made from, besides the logs: settings, site, antennas, elevation, reference powers.
+
+Whatever text of the flight file or of the site file names a file is one (:mod:`aerpaw_cmp.common.inputs`).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from ...common.files import LARGEST_TABLE
+from ...common.inputs import named_files
+from ...common.outputs import file_digest
+from ...common.provenance import trained_on
+from ...flight.settings import FlightFile
+from ...report.data import InputFile
+from ...site.learned import read_table
+
+
+def other_inputs(
+    settings: FlightFile, flight: Path, logs_root: Path | None = None, learned: Path | None = None
+) -> tuple[InputFile, ...]:
+    """The flight file, the site file and every file that either names, but for the logs.
+
+    Parameters
+    ----------
+    settings : FlightFile
+        As checked.
+    flight : Path
+        The flight file.
+    logs_root : Path, optional
+        Where logs and antenna files resolve besides the folder of the flight file.
+    learned : Path, optional
+        calibrated.yaml of ``report --with``.
+
+    Returns
+    -------
+    tuple of InputFile
+        Path as it is named (the packaged site: as the package names it), SHA-256, and as role the key that names it.
+        They have no lines to account for.
+    """
+    content = settings.model_dump(exclude={"logs"})
+    roots = [flight.parent] if logs_root is None else [logs_root, flight.parent]
+    entries = {os.path.realpath(flight): _entry(flight.name, flight, "flight file")}
+    if learned is not None:
+        entries[os.path.realpath(learned)] = _entry(learned.name, learned, "learned settings")
+    for key, text, place in named_files(content, roots):
+        if key != "site.file":
+            entries.setdefault(os.path.realpath(place), _entry(text, place, key))
+    for entry, place in _site_inputs(settings.site.file, flight.parent):
+        entries.setdefault(os.path.realpath(place), entry)
+    return tuple(entries.values())
+
+
+def _site_inputs(name: str, folder: Path) -> Iterator[tuple[InputFile, Path]]:
+    """The site file and what it names."""
+    path = folder / name
+    if path.is_file():
+        yield _entry(name, path, "site file"), path
+        status = path.stat()
+        model = _site_model(path, status.st_size, status.st_mtime_ns)
+    else:
+        model = _site_model(name, 0, 0)
+        packaged = name.lower().replace("-", "_").replace(" ", "_") + ".yaml"
+        with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / packaged) as file:
+            if file.is_file():
+                yield _entry(f"aerpaw_cmp/site/data/{packaged}", file, "site file (packaged)"), file
+        return
+    for key, text, place in named_files(model.model_dump(), [path.parent]):
+        yield _entry(text, place, f"site: {key}"), place
+
+
+@lru_cache(maxsize=16)
+def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> Any:
+    """A site file as checked; a campaign asks for the same one with every task."""
+    from ...site.siteyaml import site_model
+
+    return site_model(site)
+
+
+@lru_cache(maxsize=1024)
+def digest_of(place: Path, _size: int, _mtime_ns: int) -> str:
+    """SHA-256 of a file as it was when its size and time were those: a campaign asks with every task."""
+    return file_digest(place)
+
+
+@lru_cache(maxsize=1024)
+def _learned_on(place: Path, size: int, _mtime_ns: int) -> tuple[str, ...]:
+    """SHA-256 of the logs that a file says it was learned from."""
+    if size > LARGEST_TABLE:
+        return ()
+    return trained_on(read_table(place, "an input").decode("utf-8", errors="replace"))
+
+
+def _entry(name: str, place: Path, role: str) -> InputFile:
+    status = os.stat(place)  # noqa: PTH116
+    return InputFile(
+        path=name,
+        sha256=digest_of(place, status.st_size, status.st_mtime_ns),
+        reader="",
+        lines=0,
+        accepted=0,
+        rejected=0,
+        blank=0,
+        role=role,
+        learned_on=_learned_on(place, status.st_size, status.st_mtime_ns),
+    )

@@ -1,0 +1,227 @@
+"""Outcomes of a campaign's tasks, kept by what they depend on: nothing finished is computed twice."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import io
+import json
+import os
+import zipfile
+from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib import import_module, metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ConfigDict, TypeAdapter
+
+from ...common.errors import UsageError
+from ...common.files import atomic_path, seal, unseal
+from ...common.units import AnyArray
+from ...flight.settings import FlightFile
+from .manifest import digest_of, other_inputs
+
+LAYOUT = 5
+"""Raised whenever the form of an entry changes."""
+
+_SEAL = b"aerpaw-cmp outcome"
+
+_TORN = (OSError, EOFError, RecursionError, zipfile.BadZipFile)
+
+READERS = "aerpaw_cmp.readers"
+"""Entry points of readers: those of other packages count with their version."""
+
+
+class OutcomeStore:
+    """Results of tasks by key: ``<key>.npz``, sealed by the digest of its content, and ``<key>.json``, its manifest.
+
+    Parameters
+    ----------
+    folder : Path
+        Made when the first entry is written.
+    kind : type
+        Dataclass of an outcome; an entry is held against its fields, and nothing else is ever built from a file.
+
+    Attributes
+    ----------
+    warnings : list of str
+        Damaged entries that were not used.
+    """
+
+    def __init__(self, folder: Path, kind: type) -> None:
+        self.folder = folder
+        # a list, since pydantic takes no configuration beside a dataclass
+        self._kind = TypeAdapter(list[kind], config=ConfigDict(arbitrary_types_allowed=True, extra="forbid"))  # type: ignore[valid-type]
+        self.warnings: list[str] = []
+
+    def check(self) -> None:
+        """UsageError where nothing can be kept in the folder, before anything runs."""
+        probe = self.folder / f".probe-{os.getpid()}"
+        try:
+            self._write(probe.name, b"")
+            probe.unlink()
+        except OSError as error:
+            raise UsageError(
+                f"outcomes cannot be kept in {self.folder}: {error.strerror or error}",
+                expected="a folder that may be written",
+                cause="a disk that is full or read-only, or a file in the way",
+            ) from None
+
+    def _write(self, name: str, content: bytes) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with atomic_path(self.folder / name) as part:
+            part.write_bytes(content)
+
+    def load(self, key: str) -> Any | None:
+        """The outcome of a key, or None where there is no sound entry."""
+        file = self.folder / f"{key}.npz"
+        try:
+            content = unseal(file.read_bytes(), _SEAL)
+        except OSError:
+            return None
+        except ValueError:
+            self.warnings.append(f"a damaged outcome was not used, its task is computed anew: {file}")
+            return None
+        try:
+            with np.load(io.BytesIO(content), allow_pickle=False) as parts:
+                arrays = {name: parts[name] for name in parts.files}
+            return self._kind.validate_python([_with_arrays(json.loads(arrays["content"].tobytes()), arrays)])[0]
+        except (ValueError, LookupError, TypeError, ArithmeticError, AttributeError, *_TORN):
+            self.warnings.append(f"an outcome that this tool did not write was not used: {file}")
+            return None
+
+    def save(self, key: str, outcome: Any, manifest: Mapping[str, Any] | None = None) -> None:
+        """Write an entry whole or not at all, then its manifest; nothing where the disk does not take it."""
+        arrays = _Arrays()
+        text = json.dumps(_plain(outcome, arrays), default=lambda number: number.item())
+        content = np.frombuffer(text.encode(), dtype=np.uint8)
+        entry = io.BytesIO()
+        np.savez(entry, content=content, **arrays.by_name)  # type: ignore[arg-type]
+        with contextlib.suppress(OSError):
+            self._write(f"{key}.npz", seal(entry.getvalue(), _SEAL))
+            self._write(f"{key}.json", _text(manifest or {}))
+            (self.folder / f"{key}.failed.json").unlink(missing_ok=True)
+
+    def save_failure(self, key: str, manifest: Mapping[str, Any]) -> None:
+        """Remember that a task failed, and how; it is never taken for an outcome."""
+        with contextlib.suppress(OSError):
+            self._write(f"{key}.failed.json", _text(manifest))
+
+    def manifest(self, key: str, *, failed: bool = False) -> dict[str, Any]:
+        """What stands beside an outcome (or a failure); empty where it cannot be read."""
+        try:
+            return dict(json.loads((self.folder / f"{key}{'.failed' if failed else ''}.json").read_bytes()))
+        except (OSError, ValueError, TypeError):
+            return {}
+
+    def has(self, key: str) -> bool:
+        """Whether there is an entry."""
+        return (self.folder / f"{key}.npz").is_file()
+
+
+_ARRAY = "array of the entry"
+"""Key of the name of an array, in its place in the JSON."""
+
+
+def _plain(value: Any, arrays: _Arrays) -> Any:
+    """A record as JSON takes it."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name), arrays) for field in dataclasses.fields(value)}
+    if isinstance(value, np.ndarray):
+        return {_ARRAY: arrays.put(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item, arrays) for key, item in value.items()}
+    return [_plain(item, arrays) for item in value] if isinstance(value, (tuple, list)) else value
+
+
+def _with_arrays(value: Any, arrays: Mapping[str, AnyArray]) -> Any:
+    """JSON with the arrays in their places."""
+    if isinstance(value, dict):
+        named = value.get(_ARRAY)
+        return arrays[named] if named else {key: _with_arrays(item, arrays) for key, item in value.items()}
+    return [_with_arrays(item, arrays) for item in value] if isinstance(value, list) else value
+
+
+class _Arrays:
+    """Arrays by name, each once: channels of a tower share times and places, half of all that is kept."""
+
+    def __init__(self) -> None:
+        self.by_name: dict[str, AnyArray] = {}
+        self._names: dict[tuple[str, tuple[int, ...], bytes], str] = {}
+
+    def put(self, array: AnyArray) -> str:
+        """The name of an array."""
+        if array.dtype.hasobject:  # these would be pickled
+            raise TypeError("an outcome holds no arrays of objects")
+        name = self._names.setdefault((array.dtype.str, array.shape, array.tobytes()), f"a{len(self._names)}")
+        self.by_name[name] = array
+        return name
+
+
+def _text(manifest: Mapping[str, Any]) -> bytes:
+    """A manifest as JSON, a line per entry: indented, it would cost as much as all else that keeps an outcome."""
+    lines = [f"{json.dumps(str(key))}: {json.dumps(value, default=str)}" for key, value in manifest.items()]
+    return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
+
+
+_WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links": True, "advanced": {"cache"}}}
+"""Settings that a campaign's outcome does not depend on: names, the plan of a simulation, pages, the audit, caches."""
+
+
+def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> list[dict[str, str]]:
+    """Role, path and SHA-256 of every file that an outcome depends on, logs last.
+
+    Raises
+    ------
+    OSError
+        If a log cannot be read.
+    UsageError
+        If the site cannot.
+    """
+    entries = [
+        {"role": one.role, "path": one.path, "sha256": one.sha256}
+        for one in other_inputs(settings, flight, logs_root)
+        if one.role != "flight file"  # what it says stands in the settings, overrides included
+    ]
+    for log in settings.logs:
+        path = (logs_root or flight.parent) / log.path
+        entries.append({"role": "log", "path": log.path, "sha256": _content(path)})
+    return entries
+
+
+def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: object) -> str:
+    """Digest of what an outcome depends on: settings that matter, content of every input, code, and ``more``.
+
+    Labels do not: a flight or a setting that gets another name keeps its outcomes.
+    """
+    digest = hashlib.sha256()
+    digest.update("\n".join([str(LAYOUT), code_digest(), *map(str, more)]).encode())
+    digest.update(settings.model_dump_json(exclude=_WITHOUT_EFFECT).encode())
+    for one in inputs:
+        digest.update(f"{one['role']} {one['sha256']}\n".encode())
+    return digest.hexdigest()
+
+
+def _content(path: Path) -> str:
+    status = os.stat(path)  # noqa: PTH116  the times make the key of the cache
+    return digest_of(path, status.st_size, status.st_mtime_ns)
+
+
+@cache
+def code_digest() -> str:
+    """Digest of the source of this program and of the versions of what it computes with."""
+    digest = hashlib.sha256()
+    for name in ("aerpaw_cmp", "aerpaw_parsers"):
+        with contextlib.suppress(ImportError):
+            root = Path(str(import_module(name).__file__)).parent
+            for path in sorted(root.rglob("*.py")):
+                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    for name in ("numpy", "scipy", "sionna-rt"):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            digest.update(f"{name} {metadata.version(name)}".encode())
+    for plugin in sorted({str(p.dist and (p.dist.name, p.dist.version)) for p in metadata.entry_points(group=READERS)}):
+        digest.update(plugin.encode())
+    return digest.hexdigest()

@@ -1,0 +1,432 @@
+"""Independent tasks on workers: here, in processes of this machine, or on a Dask cluster; one function, one result.
+
+Tasks are functions of small records (paths, settings, hashes) that can be pickled. A lost worker costs what it was
+doing: that task runs again, a last time alone, and only one that loses its worker even then is :class:`Lost`.
+
+Processes of this machine are talked to by pipes that only they and this process hold: nothing listens. A scheduler and
+its workers unpickle what they are sent, and so run code for whoever reaches them: only TLS is spoken with them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import pickle
+import platform
+import signal
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from ...common.errors import InputError, UsageError
+from ...common.stages import Progress, silent
+from .outcomes import code_digest
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+TRIES = 2
+"""A task in work when a worker is lost is tried again; after so many tries once more, alone."""
+
+CONNECT_S = 10.0
+"""How long a scheduler may take to answer."""
+
+NO_WORKER_S = 30.0
+"""A scheduler that has had no worker for so long is spoken of, again and again."""
+
+
+LOOK_S = 2.0
+"""How often workers are counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """In place of a result: the worker ended, again and again, or the task could not be sent or brought back."""
+
+    message: str
+
+
+ENDED = Lost("its worker process ended, time after time: out of memory, or killed")
+
+
+class Workers(Protocol):
+    """Runs tasks side by side."""
+
+    @property
+    def count(self) -> int:
+        """Tasks at a time."""
+
+    def run(
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        done: Callable[[int, Result | Lost], None],
+    ) -> None:
+        """``function`` of every item, in any order; ``done`` gets number and result as they come."""
+
+
+class Here:
+    """One after the other, in this process."""
+
+    count = 1
+
+    def run(  # noqa: D102
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        done: Callable[[int, Result | Lost], None],
+    ) -> None:
+        for number, item in enumerate(items):
+            done(number, function(item))
+
+
+# --- processes of this machine --------------------------------------------------------------------------------------
+
+
+class Processes:
+    """Processes of this machine, each with a pipe of its own; one that ends is known, and another takes its place."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def run(  # noqa: D102
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        done: Callable[[int, Result | Lost], None],
+    ) -> None:
+        with contextlib.ExitStack() as stack:
+            crew = [stack.enter_context(_Worker(function)) for _ in range(min(self.count, len(items)))]
+            tries: Counter[int] = Counter()
+            killed = _through(crew, items, deque(range(len(items))), tries, done)
+            for number in killed:  # a last time, so that none pays for its neighbour
+                if _through(crew[:1], items, deque([number]), tries, done):
+                    done(number, ENDED)
+
+
+def _through(
+    crew: Sequence[_Worker],
+    items: Sequence[Any],
+    waiting: deque[int],
+    tries: Counter[int],
+    done: Callable[[int, Any], None],
+) -> list[int]:
+    """Run some tasks; gives those that lost their worker too often."""
+    killed: list[int] = []
+    active: dict[Connection, tuple[_Worker, int]] = {}
+    while waiting or active:
+        for worker in [one for one in crew if one.pipe not in active][: len(waiting)]:
+            number = waiting.popleft()
+            worker.send(items[number])
+            active[worker.pipe] = worker, number
+        for pipe in wait(list(active)):
+            assert isinstance(pipe, Connection)
+            worker, number = active.pop(pipe)
+            try:
+                succeeded, content = pickle.loads(pipe.recv_bytes())
+            except (EOFError, OSError):
+                worker.start_anew()
+                tries[number] += 1
+                (waiting if tries[number] < TRIES else killed).append(number)
+            else:
+                done(number, content if succeeded else Lost(f"its worker process ended: {content}"))
+    return killed
+
+
+class _Worker:
+    """A process that runs a function of what it is sent, as a context; killed where the block is left by an error."""
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self._function = function
+        self._start()
+
+    def _start(self) -> None:
+        # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
+        context = get_context("spawn")
+        self.pipe, there = context.Pipe()
+        self._process = context.Process(target=_serve, args=(there, self._function), daemon=True)  # type: ignore[attr-defined]
+        self._process.start()
+        there.close()
+
+    def send(self, item: Any) -> None:
+        with contextlib.suppress(OSError):  # one that has ended is seen where its answer is awaited
+            self.pipe.send((item,))
+
+    def start_anew(self) -> None:
+        self._end(kill=True)
+        self._start()
+
+    def __enter__(self) -> _Worker:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._end(kill=kind is not None)
+
+    def _end(self, *, kill: bool) -> None:
+        with contextlib.suppress(OSError):
+            self.pipe.send(None)
+        if not kill:
+            self._process.join(5.0)
+        self._process.kill()
+        self._process.join()
+        self.pipe.close()
+
+
+def _serve(pipe: Connection, function: Callable[[Any], Any]) -> None:
+    """Answer until the pipe says no more, or is closed: the process that holds its other end is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the first process
+    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+        signal.signal(number, signal.SIG_DFL)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    with contextlib.suppress(EOFError, OSError):
+        while (order := pipe.recv()) is not None:
+            try:
+                answer = pickle.dumps((True, function(*order)))
+            except Exception as error:
+                answer = pickle.dumps((False, str(error).strip() or type(error).__name__))
+            pipe.send_bytes(answer)
+
+
+def _follow_parent() -> None:
+    """End with the first process, in the middle of a task too."""
+    if (parent := multiprocessing.parent_process()) is not None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+
+# --- Dask -----------------------------------------------------------------------------------------------------------
+
+
+class Cluster:
+    """Workers of a Dask scheduler.
+
+    Parameters
+    ----------
+    client : distributed.Client
+    progress : Progress
+        Told when no worker is there.
+    """
+
+    def __init__(self, client: Any, progress: Progress = silent) -> None:
+        self._client, self._progress = client, progress
+        self._looked_s = self._seen_s = time.monotonic()
+
+    @property
+    def count(self) -> int:
+        """Threads of all workers that are there now."""
+        return max(1, int(sum(self._client.nthreads().values())))
+
+    def run(  # noqa: D102
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        done: Callable[[int, Result | Lost], None],
+    ) -> None:
+        killed = self._through(function, items, range(len(items)), done)
+        for number in killed:  # a last time, so that none pays for its neighbour
+            if self._through(function, items, [number], done):
+                done(number, ENDED)
+
+    def _through(
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        numbers: Iterable[int],
+        done: Callable[[int, Result | Lost], None],
+    ) -> list[int]:
+        """Run some; gives those that lost their worker too often, as Dask counts."""
+        killed: list[int] = []
+        active = {self._client.submit(function, items[number], pure=False): number for number in numbers}
+        while active:
+            ready = [future for future in active if future.done()]
+            if not ready:
+                self._check_scheduler()
+                time.sleep(0.05)
+            for future in ready:
+                number, result = active.pop(future), self._result(future)
+                if result is None:
+                    killed.append(number)
+                else:
+                    done(number, result[0])
+                future.release()
+        return killed
+
+    def _result(self, future: Any) -> tuple[Any] | None:
+        """What a task that is done gave, or how it was lost; None where its workers were, again and again."""
+        try:
+            return (future.result(),)
+        except CancelledError:  # with its scheduler
+            raise self._gone() from None
+        except Exception as error:
+            if type(error).__name__ == "KilledWorker":
+                return None
+            return (Lost(f"its worker process ended: {str(error).strip() or type(error).__name__}"),)
+
+    def _check_scheduler(self) -> None:
+        """InputError where it is gone; where it has had no worker for a while, that is said."""
+        if self._client.status != "running":
+            raise self._gone()
+        now = time.monotonic()
+        if now - self._looked_s < LOOK_S:
+            return
+        self._looked_s = now
+        if self._client.nthreads():
+            self._seen_s = now
+        elif now - self._seen_s > NO_WORKER_S:
+            self._progress(f"the scheduler has had no worker for {NO_WORKER_S:.0f} s; finished tasks are kept")
+            self._seen_s = now
+
+    def _gone(self) -> InputError:
+        return InputError(
+            "the scheduler of the workers went away",
+            cause="it was stopped; what was finished is kept, run the same command again",
+        )
+
+
+@contextlib.contextmanager
+def open_workers(
+    workers: int,
+    scheduler: str | None = None,
+    *,
+    paths: Sequence[Path] = (),
+    progress: Progress = silent,
+) -> Iterator[Workers]:
+    """Workers for the tasks of a job.
+
+    Parameters
+    ----------
+    workers : int
+        On this machine; 1 runs the tasks in this process.
+    scheduler : str, optional
+        Address of a Dask scheduler (``tls://``), in place of workers here.
+    paths : sequence of Path
+        Files and folders that every worker of a scheduler has to see.
+    progress : Progress
+        How many workers a scheduler has, and the address of its dashboard.
+
+    Yields
+    ------
+    Workers
+        Closed at the end of the block.
+
+    Raises
+    ------
+    UsageError
+        No scheduler answers, ``distributed`` is missing, or workers run other code or do not see the files.
+    """
+    if scheduler is not None:
+        with _scheduler(scheduler, paths, progress) as cluster:
+            yield cluster
+    elif workers <= 1:
+        yield Here()
+    else:
+        yield Processes(workers)
+
+
+def _quiet() -> None:
+    """No log lines of distributed on the terminal: what matters is told once, in our words."""
+    for name in list(logging.root.manager.loggerDict):
+        if name.split(".")[0] in ("distributed", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+
+
+@contextlib.contextmanager
+def _scheduler(address: str, paths: Sequence[Path], progress: Progress) -> Iterator[Cluster]:
+    """Workers of a running scheduler."""
+    try:
+        from distributed import Client
+
+        _quiet()
+    except ImportError:
+        raise UsageError(
+            f"--scheduler {address!r} needs the package 'distributed'", expected="pip install 'aerpaw-cmp[cluster]'"
+        ) from None
+    if not address.startswith("tls://"):
+        raise UsageError(
+            f"--scheduler {address!r} is not protected: whoever reaches it runs programs as you, here and there",
+            expected="tls://HOST:PORT, with certificates in Dask's configuration (docs/howto/cluster.md)",
+        )
+    try:
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError, ImportError) as error:
+        raise UsageError(
+            f"--scheduler {address!r}: no scheduler answers ({error})",
+            cause="no certificates in Dask's configuration (distributed.comm.tls)"
+            if isinstance(error, TypeError)
+            else None,
+        ) from error
+    cluster = Cluster(client, progress)
+    try:
+        check_workers(client, paths)
+        there = client.scheduler_info().get("services", {}).get("dashboard")
+        page = f"; dashboard {client.dashboard_link}" if there else ""
+        progress(f"{len(client.nthreads())} workers, {cluster.count} tasks at a time{page}")
+        yield cluster
+    finally:
+        with contextlib.suppress(Exception):
+            client.close(timeout=5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerFacts:
+    """What a worker says of itself."""
+
+    host: str
+    python: str
+    version: str
+    code: str
+    missing: tuple[str, ...]
+
+
+def worker_facts(paths: Sequence[str]) -> WorkerFacts:
+    """Of the process that this runs in."""
+    from ... import __version__
+
+    return WorkerFacts(
+        host=platform.node(),
+        python=platform.python_version(),
+        version=__version__,
+        code=code_digest(),
+        missing=tuple(path for path in paths if not os.access(path, os.R_OK)),
+    )
+
+
+def check_workers(client: Any, paths: Sequence[Path]) -> None:
+    """One message for all workers that run other code or do not see the files.
+
+    Raises
+    ------
+    UsageError
+        Naming worker, host and what is wrong.
+    """
+    answers = client.run(worker_facts, [str(path.absolute()) for path in paths], on_error="return")
+    here = worker_facts([])
+    wrong = [f"{worker}: {text}" for worker, facts in answers.items() if (text := _trouble(facts, here))]
+    if wrong:
+        more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""
+        raise UsageError(
+            f"{len(wrong)} of {len(answers)} workers cannot do this campaign: " + "; ".join(wrong[:4]) + more,
+            expected="the same aerpaw-cmp on every worker, and the same files under the same paths",
+            cause="another environment, or a disk that is not mounted there",
+        )
+
+
+def _trouble(facts: Any, here: WorkerFacts) -> str:
+    if isinstance(facts, BaseException):
+        return f"aerpaw-cmp cannot be loaded there ({type(facts).__name__}: {facts})"
+    if facts.code != here.code:
+        other = f"aerpaw-cmp {facts.version}, here {here.version}" if facts.version != here.version else "another state"
+        return f"{facts.host} runs other code ({other} of the program or of NumPy, SciPy, Sionna RT)"
+    if facts.missing:
+        more = f" and {len(facts.missing) - 1} more" if len(facts.missing) > 1 else ""
+        return f"{facts.host} does not see {facts.missing[0]}{more}"
+    return ""

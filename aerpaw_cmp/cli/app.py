@@ -131,7 +131,7 @@ def _with_quiet(function: Callable[..., Any]) -> Callable[..., Any]:
         *inspect.signature(function).parameters.values(),
         inspect.Parameter("quiet", kind, default=False),
     ]
-    typed = [one.replace(kind=kind, annotation=hints[one.name]) for one in parameters]
+    typed = [parameter.replace(kind=kind, annotation=hints[parameter.name]) for parameter in parameters]
     run.__signature__ = inspect.Signature(typed)  # type: ignore[attr-defined]  # typer reads the options here
     run.__annotations__ = hints
     return run

@@ -61,12 +61,12 @@ def _print_diff(comparison: Any) -> None:
     for text in comparison.remarks:
         say.warn(f"warning: {one_line(text)}")
     for title, items in (("setting", comparison.settings), ("version", comparison.versions)):
-        for one in items[:_SHOWN]:
-            print(one_line(f"{title} {one.key}: {_value(one.first)} -> {_value(one.second)}"))
+        for item in items[:_SHOWN]:
+            print(one_line(f"{title} {item.key}: {_value(item.first)} -> {_value(item.second)}"))
         if len(items) > _SHOWN:
             print(f"and {len(items) - _SHOWN} more {title}s")
-    for one in comparison.inputs:
-        print(one_line(f"input {one.path} ({one.role}): {one.what}"))
+    for item in comparison.inputs:
+        print(one_line(f"input {item.path} ({item.role}): {item.what}"))
     _print_numbers(comparison)
     for name, texts in (("second", comparison.new_warnings), ("first", comparison.gone_warnings)):
         for text in texts:

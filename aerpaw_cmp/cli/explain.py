@@ -96,9 +96,11 @@ def _print(explanation: Any) -> None:
     if explanation.differences is not None:
         if not explanation.differences:
             print("both engines have the same paths")
-        for one in explanation.differences:
-            other = "sionna" if one.found_by == "image" else "image"
-            level = number(one.level_dbm, "{:.2f}")
-            print(f"{one.found_by} has and {other} has not: {one.path} ({level} dBm): {one.reason}")
+        for difference in explanation.differences:
+            other = "sionna" if difference.found_by == "image" else "image"
+            level = number(difference.level_dbm, "{:.2f}")
+            print(
+                f"{difference.found_by} has and {other} has not: {difference.path} ({level} dBm): {difference.reason}"
+            )
     for note in explanation.notes:
         print(f"note: {note}")

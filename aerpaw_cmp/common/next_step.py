@@ -62,7 +62,7 @@ def _nearest(place: Path) -> str:
     while not _exists(folder) and folder != folder.parent:
         folder = folder.parent
     try:
-        names = [one.name for one in folder.iterdir()]
+        names = [item.name for item in folder.iterdir()]
     except OSError:
         names = []
     near = get_close_matches(place.name, names, n=1, cutoff=0.8) if folder == place.parent else []

@@ -31,4 +31,4 @@ def trained_on(text: str) -> tuple[str, ...]:
 
 def union(*lists: Iterable[str]) -> tuple[str, ...]:
     """All of several lists, each log once, in order."""
-    return tuple(dict.fromkeys(digest for one in lists for digest in one))
+    return tuple(dict.fromkeys(digest for item in lists for digest in item))

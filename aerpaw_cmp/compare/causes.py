@@ -130,7 +130,7 @@ def likely_cause(evidence: LevelEvidence) -> Cause:
         for cost, name, estimate, where, fit in _troubles(binned)
     ]
     gain, name, estimate, where, fit = max(scored, key=lambda one: one[0], default=(0.0, "none", _NOTHING, "", plain))
-    rmse, rmse_with = (float(np.sqrt(np.mean(one.residual_db**2))) for one in (plain, fit))
+    rmse, rmse_with = (float(np.sqrt(np.mean(item.residual_db**2))) for item in (plain, fit))
     if gain < MARGIN or rmse_with > (1.0 - LEAST_SHARE) * rmse:
         return NO_CAUSE
     value, low, high = estimate

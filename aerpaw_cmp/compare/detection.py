@@ -61,7 +61,7 @@ def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> Detectio
     """
     from scipy.optimize import minimize
 
-    flights = [one for one in flights if len(one[0])]
+    flights = [flight for flight in flights if len(flight[0])]
     detected = np.concatenate([np.zeros(0, dtype=np.bool_), *(seen for _, seen in flights)])
     if min(int(detected.sum()), int((~detected).sum())) < _FEWEST:
         return None
@@ -194,8 +194,8 @@ def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> tu
     said = out_of_group(level_db[:, None], outcome, segment, _PENALTY)[:, :2]
     said = said / said.sum(axis=1, keepdims=True)  # two outcomes of the four that a receiver of ranks knows
     constant = np.zeros_like(said)
-    for one in np.unique(segment):
-        constant[segment == one] = constant_forecast(outcome[segment != one], 2)
+    for item in np.unique(segment):
+        constant[segment == item] = constant_forecast(outcome[segment != item], 2)
     return said, constant
 
 

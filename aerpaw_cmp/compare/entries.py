@@ -93,7 +93,7 @@ def level_scores(series: Sequence[LevelSeries]) -> dict[str, float]:
         ``rmse_db, rmse_4s_db, bias_db`` (mean size of the offsets), ``crps_db, log_score, coverage_90`` (NaN without
         ``sd_db``), ``n``.
     """
-    rows = [_series_scores(one) for one in series]
+    rows = [_series_scores(item) for item in series]
     return {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if key != "n"} | {
         "n": float(sum(row["n"] for row in rows))
     }

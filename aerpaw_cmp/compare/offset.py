@@ -419,8 +419,8 @@ def pooled_moments(
         if not known:
             fits |= {key: OffsetFit(float("nan"), float("nan"), 0, False) for key in members}
             continue
-        total = sum(one.n for one in known)
-        mean = known[0].mean_db + sum((one.mean_db - known[0].mean_db) * (one.n / total) for one in known)
+        total = sum(item.n for item in known)
+        mean = known[0].mean_db + sum((item.mean_db - known[0].mean_db) * (item.n / total) for item in known)
         best = nearest_offset(grid, mean, step_db)
         offset, at_edge = float(grid[best]), best in (0, len(grid) - 1)
         for key in members:

@@ -443,10 +443,10 @@ def fit_mixture(
         Fewer than :data:`FEWEST` samples, or one rank only: nothing to learn from.
     """
     x, y, group = _training(features, rank, groups)
-    means = [np.mean([out_of_group(one, y, group, penalty) for one in x], axis=0) for penalty in penalties]
+    means = [np.mean([out_of_group(item, y, group, penalty) for item in x], axis=0) for penalty in penalties]
     best = int(np.argmin([log_losses(p, y).mean() for p in means]))
     return ReceiverMixture(
-        members=tuple(_fitted(one, y, float(penalties[best])) for one in x),
+        members=tuple(_fitted(item, y, float(penalties[best])) for item in x),
         decision_weight=decision_weights(means[best], y, group),
     )
 
@@ -549,11 +549,11 @@ def _own_losses(x: FloatArray, rank: IntArray) -> FloatArray:
     z = (x - mean[..., None, :]) / scale[..., None, :]
     weights = _fit_multinomial(z, rank, np.ones(len(rank)), CHOICE_PENALTY, steps=6)
     p = _softmax(_design(z) @ np.swapaxes(weights, -1, -2))
-    return np.array([log_losses(one, rank).mean() for one in p])
+    return np.array([log_losses(item, rank).mean() for item in p])
 
 
 def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray) -> FloatArray:
-    return np.stack([log_losses(one, rank) for one in out_of_group(x, rank, groups, CHOICE_PENALTY)])
+    return np.stack([log_losses(item, rank) for item in out_of_group(x, rank, groups, CHOICE_PENALTY)])
 
 
 def _not_worse(difference: FloatArray, replicates: int) -> bool:

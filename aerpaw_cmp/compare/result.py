@@ -365,7 +365,7 @@ class FlightResult:
     @property
     def clocks(self) -> dict[str, ClockResult]:
         """One clock per receiver."""
-        return {clock.receiver: clock for one in self.rss if (clock := one.further.clock) is not None}
+        return {clock.receiver: clock for item in self.rss if (clock := item.further.clock) is not None}
 
     @property
     def series(self) -> tuple[RssResult | RankResult, ...]:

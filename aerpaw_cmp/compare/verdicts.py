@@ -85,7 +85,7 @@ def campaign_verdict(
     Each candidate splits the flights in two; its two-sample t test with pooled variance is that of the externally
     Studentised residual for one flight. The smallest chance counts times the number of candidates (Bonferroni).
     """
-    found = [one for one in _shifts(errors_db, offsets_db, order) if math.isfinite(one.chance)]
+    found = [shift for shift in _shifts(errors_db, offsets_db, order) if math.isfinite(shift.chance)]
     best = min(found, key=lambda one: one.chance, default=None)
     if best is None or best.chance * len(found) >= FALSE_ALARMS:
         return Verdict()
@@ -188,11 +188,11 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
         ``antenna`` where each wrong frame is significantly worse, ``place`` where one is significantly better, ``no
         interval`` of too few flights, else ``not separable``; effect and interval of the nearer frame.
     """
-    known = [one for one in against if math.isfinite(one.effect)]
+    known = [item for item in against if math.isfinite(item.effect)]
     if not known:
         return Verdict()
-    said = {one.cause for one in known}
-    nearest = max((one for one in known if one.cause == "worse" or "worse" not in said), key=lambda one: one.effect)
+    said = {item.cause for item in known}
+    nearest = max((item for item in known if item.cause == "worse" or "worse" not in said), key=lambda one: one.effect)
     if "worse" in said:
         cause = "place"
     else:

@@ -124,7 +124,7 @@ def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
     """Origin under which a log with positions lies on the track of a flight."""
     tracks = [track for other in flight.files for track in _tracks(other)]
     origins = [origin_of(stream, track) for stream in file.result.streams for track in tracks[:1]]
-    return min((one for one in origins if one is not None), key=lambda one: one.distance_m, default=None)
+    return min((item for item in origins if item is not None), key=lambda one: one.distance_m, default=None)
 
 
 def _home(file: IngestedFile, groups: list[Flight]) -> Flight:

@@ -121,7 +121,7 @@ class TrackPoses:
         """The poses of some rows (n,) bool; the very same where these are all of them."""
         if rows.all():
             return self
-        return TrackPoses(**{one.name: getattr(self, one.name)[rows] for one in dataclasses.fields(self)})
+        return TrackPoses(**{field.name: getattr(self, field.name)[rows] for field in dataclasses.fields(self)})
 
     def where(self, known: BoolArray) -> TrackPoses:
         """The poses with those as not valid at which the tower, which moves too, is not known (n,)."""
@@ -324,7 +324,7 @@ class Track:
         if len(instant) <= AT_ONCE:
             return self._pose_at(instant)
         parts = [self._pose_at(part) for part in np.array_split(instant, -(-len(instant) // AT_ONCE))]
-        names = [one.name for one in dataclasses.fields(TrackPoses)]
+        names = [field.name for field in dataclasses.fields(TrackPoses)]
         return TrackPoses(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
     def why_not(self, pose: TrackPoses) -> str:

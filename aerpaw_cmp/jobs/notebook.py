@@ -342,20 +342,20 @@ class Comparison:
         ``<baseline>_rmse_db``.
         """
         rows = []
-        for one in self.result.rss:
-            low, high = one.score.rmse_ci95_db
+        for item in self.result.rss:
+            low, high = item.score.rmse_ci95_db
             rows.append(
                 {
-                    "tower": one.tower,
-                    "channel": one.channel,
-                    "n": one.score.n,
-                    "offset_db": one.score.offset_db,
-                    "rmse_db": one.score.rmse_db,
+                    "tower": item.tower,
+                    "channel": item.channel,
+                    "n": item.score.n,
+                    "offset_db": item.score.offset_db,
+                    "rmse_db": item.score.rmse_db,
                     "rmse_low_db": low,
                     "rmse_high_db": high,
-                    "correlation": one.score.correlation,
-                    "at_search_edge": one.score.at_edge,
-                    **{f"{name}_rmse_db": fit.rmse_db for name, fit in one.baselines.items()},
+                    "correlation": item.score.correlation,
+                    "at_search_edge": item.score.at_edge,
+                    **{f"{name}_rmse_db": fit.rmse_db for name, fit in item.baselines.items()},
                 }
             )
         table: pd.DataFrame = pd.DataFrame(rows)
@@ -364,10 +364,10 @@ class Comparison:
     def rank_to_frame(self) -> pd.DataFrame:
         """One row per tower and K: ``tower k n agreement kappa total_variation wasserstein``."""
         rows = []
-        for one in self.result.rank:
-            for k, fit in one.score.simulated.items():
+        for item in self.result.rank:
+            for k, fit in item.score.simulated.items():
                 numbers = {name: getattr(fit, name) for name in RANK_NUMBERS}
-                rows.append({"tower": one.tower, "k": k, "n": one.score.n, **numbers})
+                rows.append({"tower": item.tower, "k": k, "n": item.score.n, **numbers})
         table: pd.DataFrame = pd.DataFrame(rows)
         return table
 
@@ -388,12 +388,12 @@ class Comparison:
         """
         xarray = require_xarray()
         nodes = {}
-        for one in self.result.rss:
-            level = {"measured_db": one.measured_db, "calibrated_db": one.measured_db + one.score.offset_db}
-            level |= {"simulated_dbm": one.simulated_dbm, "residual_db": one.score.residual_db}
-            columns = {**level, **_place(one.position_m)}
-            nodes[_node((one.tower, one.channel))] = xarray.Dataset(
-                {name: ("time", values) for name, values in columns.items()}, {"time": one.time}, {"unit": one.unit}
+        for item in self.result.rss:
+            level = {"measured_db": item.measured_db, "calibrated_db": item.measured_db + item.score.offset_db}
+            level |= {"simulated_dbm": item.simulated_dbm, "residual_db": item.score.residual_db}
+            columns = {**level, **_place(item.position_m)}
+            nodes[_node((item.tower, item.channel))] = xarray.Dataset(
+                {name: ("time", values) for name, values in columns.items()}, {"time": item.time}, {"unit": item.unit}
             ).set_coords(["east_m", "north_m", "up_m"])
         for one_rank in self.result.rank:
             ranks = np.array(list(one_rank.rank.values()))
@@ -416,10 +416,10 @@ class Comparison:
         matplotlib.axes.Axes
         """
         axes = axes if axes is not None else _new_axes()
-        for one in self.result.rss:
-            name, measured_dbm = f"{one.tower} {one.channel}", one.measured_db + one.score.offset_db
-            (line,) = axes.plot(one.time, measured_dbm, ".", markersize=2, label=f"{name} measured")
-            axes.plot(one.time, one.simulated_dbm, color=line.get_color(), label=f"{name} simulated")
+        for item in self.result.rss:
+            name, measured_dbm = f"{item.tower} {item.channel}", item.measured_db + item.score.offset_db
+            (line,) = axes.plot(item.time, measured_dbm, ".", markersize=2, label=f"{name} measured")
+            axes.plot(item.time, item.simulated_dbm, color=line.get_color(), label=f"{name} simulated")
         axes.set(xlabel="Time [UTC]", ylabel="Level [dBm]")
         axes.legend()
         return axes

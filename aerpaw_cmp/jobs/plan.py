@@ -157,7 +157,7 @@ def report_plan(
     reading = time.process_time() - start
     factor = probe() / PROBE_S
     cost = {name: seconds * factor for name, seconds in MEASURED.items()}
-    n_rss, n_rank = (sum(len(one.time) for one in series) for series in (data.rss, data.rank))
+    n_rss, n_rank = (sum(len(item.time) for item in series) for series in (data.rss, data.rank))
     rss, rank = _tried_replays(data)
     rt = settings.rt
     stages = [
@@ -201,11 +201,11 @@ def _tried_replays(data: FlightData) -> tuple[list[PlannedStage], list[PlannedSt
         poses = Poses(track.position_m[track.valid], attitude_rotation(track, rt.attitude)[track.valid])
         name = f"replay RSS {tower} {', '.join(series.channel for series in members)}"
         rss.append(_tried(site, rt, name, members[0].link.build([tower], data.folder), poses))
-    for one in data.rank:
-        position, valid = rank_positions(one, data.track)
+    for item in data.rank:
+        position, valid = rank_positions(item, data.track)
         rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
-        link = data.settings.link.rank.build([one.tower], data.folder)
-        rank.append(_tried(site, rt, f"replay rank {one.tower}", link, Poses(position[valid], rotation)))
+        link = data.settings.link.rank.build([item.tower], data.folder)
+        rank.append(_tried(site, rt, f"replay rank {item.tower}", link, Poses(position[valid], rotation)))
     return rss, rank
 
 

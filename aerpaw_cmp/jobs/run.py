@@ -702,11 +702,13 @@ def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
     """A file per failed task in ``failures/``: its message, and where in the program it came from."""
     from ..report.names import safe_name
 
-    for one in failures:
-        if one.traceback:
-            target = folder / "failures" / f"{safe_name(one.flight)}__{safe_name(one.setting)}.txt"
+    for failure in failures:
+        if failure.traceback:
+            target = folder / "failures" / f"{safe_name(failure.flight)}__{safe_name(failure.setting)}.txt"
             target.parent.mkdir(exist_ok=True)
-            target.write_text(f"{one.flight}, {one.setting}: {one.message}\n\n{one.traceback}", encoding="utf-8")
+            target.write_text(
+                f"{failure.flight}, {failure.setting}: {failure.message}\n\n{failure.traceback}", encoding="utf-8"
+            )
 
 
 def campaign_status(path: Path, options: RunOptions = DEFAULT, *, keep: Path | None = None, fresh: bool = False) -> Any:

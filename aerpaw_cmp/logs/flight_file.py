@@ -197,7 +197,7 @@ def _write_file(group: Any, file: IngestedFile, sink: _Sink) -> None:
         },
     )
     _write_json(group, "rejected", [[line.number, line.reason, line.text] for line in result.rejected])
-    _write_json(group, "reasons", [[one.reason, one.count, one.first, one.last] for one in result.reasons])
+    _write_json(group, "reasons", [[item.reason, item.count, item.first, item.last] for item in result.reasons])
     shelf = group.create_group("streams")
     for i, stream in enumerate(result.streams):
         _write_stream(shelf.create_group(f"{i:05d}"), stream, sink)

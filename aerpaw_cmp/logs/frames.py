@@ -191,5 +191,5 @@ def _opened(file: BinaryIO, options: ReadOptions, reader: str | None) -> Ingeste
         place = Path(folder) / name
         place.write_bytes(file.read())
         read_there = ingest(place, options=options, reader=reader)
-    renamed: list[IngestedFile] = [replace(one, path=one.path.replace(str(place), name, 1)) for one in read_there]
+    renamed: list[IngestedFile] = [replace(item, path=item.path.replace(str(place), name, 1)) for item in read_there]
     return Ingested(renamed, read_there.skipped)

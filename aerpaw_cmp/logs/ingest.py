@@ -138,7 +138,7 @@ def _below(place: Path, options: OptionsFor | None, chosen: Reader | None) -> tu
     if (is_folder := _is_folder(place)) or _is_archive(place):
         inside, left = (_folder if is_folder else _archive)(place, options, chosen)
     elif _head(place).startswith(_HDF5):
-        return [replace(_of_kind(one, chosen, place), holder=str(place)) for one in read_flight(place)], []
+        return [replace(_of_kind(item, chosen, place), holder=str(place)) for item in read_flight(place)], []
     else:
         return [read_file(place, options=options, reader=chosen)], []
     if not inside:
@@ -247,7 +247,7 @@ def read_log(
     else:
         files = ingest([path], options=options, reader=reader)
     if len(files) != 1:
-        names = ", ".join(one_line(Path(one.path).name) for one in files[:4])
+        names = ", ".join(one_line(Path(item.path).name) for item in files[:4])
         raise UsageError(
             f"{len(files)} logs stand under one path: {names}",
             expected=f"one of them, such as {name}/{one_line(Path(files[0].path).name)}",
@@ -413,9 +413,9 @@ def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedF
     """One of the logs that a flight file holds, by its path or the end of it."""
     held = {} if held is None else held
     files = held[flight_file] = held.get(flight_file) or read_flight(flight_file)
-    named = [one for one in files if one.path == name or Path(one.path).as_posix().endswith(f"/{name}")]
+    named = [item for item in files if item.path == name or Path(item.path).as_posix().endswith(f"/{name}")]
     if len(named) != 1:
-        known = ", ".join(one_line(one.path) for one in files)
+        known = ", ".join(one_line(item.path) for item in files)
         raise InputError(f"{len(named)} of its logs are called {name!r}", expected=f"one of {known}", path=flight_file)
     return named[0]
 

@@ -48,9 +48,9 @@ def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
             frame = stream.frame.assign(line=stream.frame["line"] + before)
             parts.setdefault((stream.kind, stream.name), []).append((stream, frame))
         rejected += [RejectedLine(line.number + before, line.reason, line.text) for line in file.result.rejected]
-        for one in file.result.reasons:
-            old = reasons.get(one.reason, replace(one, count=0, first=one.first + before))
-            reasons[one.reason] = replace(old, count=old.count + one.count, last=one.last + before)
+        for item in file.result.reasons:
+            old = reasons.get(item.reason, replace(item, count=0, first=item.first + before))
+            reasons[item.reason] = replace(old, count=old.count + item.count, last=item.last + before)
         before += file.result.lines
     streams = tuple(_stream(part) for part in parts.values())
     warnings = dict.fromkeys(text for file in group for text in file.result.warnings)

@@ -174,7 +174,7 @@ class ReadResult:
     @property
     def rejected_count(self) -> int:
         """Rejected lines, those that are not kept included."""
-        return sum(one.count for one in self.reasons)
+        return sum(item.count for item in self.reasons)
 
 
 def has_wall_clock(start: np.datetime64) -> bool:

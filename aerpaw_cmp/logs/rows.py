@@ -494,10 +494,10 @@ def of_ues(
 def _divided(name: str, where: BoolArray, column: FloatArray, label: str) -> list[tuple[str, BoolArray, float | None]]:
     """Rows by the values of a column where several of these are there at once, with that value; else all as one."""
     known = np.unique(column[where & np.isfinite(column)]).tolist()
-    if not _together([np.flatnonzero(where & (column == one))[[0, -1]] for one in known]):
+    if not _together([np.flatnonzero(where & (column == item))[[0, -1]] for item in known]):
         return [(name, where, known[0] if len(known) == 1 else None)]
     parts: list[tuple[str, BoolArray, float | None]] = [
-        (f"{name}_{label.format(int(one))}", where & (column == one), one) for one in known
+        (f"{name}_{label.format(int(item))}", where & (column == item), item) for item in known
     ]
     return [*parts, (name, where & np.isnan(column), None)]
 

@@ -139,7 +139,7 @@ def _levels(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
     }  # fmt: skip
     found = {}
     for name, (meaning, height, unit, shown, values_of) in kinds.items():
-        by_tower = [np.moveaxis(values_of(one), 1, 0) for one in maps.values()]  # tower, height, n
+        by_tower = [np.moveaxis(values_of(item), 1, 0) for item in maps.values()]  # tower, height, n
         joint = [
             values[one.serving, :, np.arange(len(one.grid))].T
             for one, values in zip(maps.values(), by_tower, strict=True)
@@ -153,8 +153,8 @@ def _levels(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
 def _ranks(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
     said = _codes(("out_of_coverage", *(f"rank_{i}" for i in range(1, HIGHEST_RANK + 1))), "channel rank")
     # (height, K, tower, n) to (tower, K, height, n)
-    by_tower = [np.moveaxis(one.rank, (2, 1, 0), (0, 1, 2)) for one in maps.values()]
-    joint = [np.moveaxis(one.ranks(), 1, 0) for one in maps.values()]
+    by_tower = [np.moveaxis(item.rank, (2, 1, 0), (0, 1, 2)) for item in maps.values()]
+    joint = [np.moveaxis(item.ranks(), 1, 0) for item in maps.values()]
     return {
         "rank": _stacked(maps, by_tower, ("tower", "k", "height_of_rank"), said),
         "rank_joint": _stacked(maps, joint, ("k", "height_of_rank"), said),
@@ -203,6 +203,6 @@ def _codes(meanings: Sequence[str], long_name: str) -> dict[str, Any]:
         "long_name": long_name,
         "flag_values": np.arange(len(meanings), dtype=np.int8),
         # all that CF allows in a meaning
-        "flag_meanings": " ".join(re.sub(r"[^A-Za-z0-9_.+@-]", "_", one) or "_" for one in meanings),
+        "flag_meanings": " ".join(re.sub(r"[^A-Za-z0-9_.+@-]", "_", item) or "_" for item in meanings),
         "grid_mapping": "crs",
     }

@@ -196,7 +196,7 @@ def replay(
     bent, over, unmodelled = _bent(site, scene, link, poses, search, field, run)
     through, added = _passing(site, scene, link, poses, search, field, run)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
-    more = [one for one in (over, added) if one is not None]
+    more = [item for item in (over, added) if item is not None]
     result, idle = _evaluated(scene, link, poses, paths, search, field, run, more)
     result = replace(result, edge_paths=bent, through=through)
     notes += [*stopped, *unmodelled]
@@ -397,9 +397,9 @@ def _evaluated(
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True
-    for one in more:
-        fields = Fields(fields.h + one.h, fields.path_power, fields.power + one.power)
-        has_path |= one.power > 0.0
+    for item in more:
+        fields = Fields(fields.h + item.h, fields.path_power, fields.power + item.power)
+        has_path |= item.power > 0.0
     idle: list[str] = []
     if field.relevance_db is not None:
         power = mean_pair_power(fields.h)

@@ -62,7 +62,7 @@ class Against:
     @property
     def words(self) -> str:
         """What the flight says of the prediction."""
-        said = [after_flight(self.scores, [one.stated for one in self.series])] if self.series else []
+        said = [after_flight(self.scores, [item.stated for item in self.series])] if self.series else []
         return " ".join([*said, *(rank_after_flight(tower, score) for tower, score in self.ranks.items())])
 
     def metrics(self) -> dict[str, Any]:

@@ -140,7 +140,7 @@ def _first_words(tables: Sequence[TaskTable]) -> str:
     """On how many tasks a model without ray tracing and learning is as good as any."""
     simple = {TITLES[n] for n in ("free_space", "log_distance", "two_ray", "tr36777_rma_av", "tr36777_uma_av", "p1411")}
     simple |= {"constant", TITLES["kriging"]}
-    won = [one.title for one in tables if one.bars and one.bars[0].title in simple]
+    won = [item.title for item in tables if item.bars and item.bars[0].title in simple]
     text = f"{len(tables)} tasks were scored. "
     if not won:
         return text + "On none of them is a baseline the best model."

@@ -47,8 +47,8 @@ def report_data(
     warnings = [
         *clock_warnings(result.clocks),
         *data.warnings,
-        *(text for one in result.rss for text in rss_warnings(one)),
-        *(text for one in result.rank for text in rank_warnings(one)),
+        *(text for item in result.rss for text in rss_warnings(item)),
+        *(text for item in result.rank for text in rank_warnings(item)),
     ]
     sources = {
         one.name: record.Source(files=tuple(log.path for log in settings.logs), file=series.log, line=series.line)
@@ -56,7 +56,7 @@ def report_data(
         if len(series.line) == len(series.time)
     }
     return record.ReportData(
-        **{one.name: getattr(result, one.name) for one in dataclasses.fields(result)},
+        **{field.name: getattr(result, field.name) for field in dataclasses.fields(result)},
         title=settings.report.title or settings.flight.title or settings.flight.name,
         flight=settings.flight.name,
         site=data.site,

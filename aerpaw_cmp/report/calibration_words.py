@@ -72,7 +72,7 @@ def frame(controls: Mapping[str, Sequence[Score]]) -> Verdict:
 
 
 def _errors(scores: Sequence[Score], name: str = "rmse_db") -> list[tuple[str, float]]:
-    return [(one.flight, getattr(one, name)) for one in scores]
+    return [(score.flight, getattr(score, name)) for score in scores]
 
 
 def sentences(

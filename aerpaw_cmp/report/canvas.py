@@ -236,7 +236,7 @@ def seconds_since(time: AnyArray, start: np.datetime64) -> FloatArray:
 def start_of(data: ReportData) -> np.datetime64:
     """The instant that is zero on every time axis: the first of the track, or of any panel."""
     times = [] if data.track is None or not len(data.track.time) else [data.track.time[0]]
-    times += [one.time[0] for one in data.series if len(one.time)]
+    times += [item.time[0] for item in data.series if len(item.time)]
     if not times:
         return np.datetime64(0, "ns")
     return times[0] if data.track is not None and len(data.track.time) else min(times)
@@ -672,7 +672,7 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
 
 def used_towers(data: ReportData) -> list[str]:
     """Towers that a panel of the report names, or all."""
-    used = dict.fromkeys(one.tower for one in data.series)
+    used = dict.fromkeys(item.tower for item in data.series)
     return [name for name in used if name in data.site.towers] or list(data.site.towers)
 
 

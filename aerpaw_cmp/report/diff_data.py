@@ -96,8 +96,8 @@ def _differences(diff: ReportDiff) -> Iterator[str]:
     for name, links in (("first", diff.links_first_only), ("second", diff.links_second_only)):
         if links:
             yield f"only the {name} report has {', '.join(links)}"
-    for one in diff.levels:
-        yield from (f"{one.tower} {one.channel}: {text}" for text in _level_clauses(one, diff.tolerance_db))
+    for level in diff.levels:
+        yield from (f"{level.tower} {level.channel}: {text}" for text in _level_clauses(level, diff.tolerance_db))
     for rank in diff.ranks:
         yield from (f"{rank.tower} K = {rank.k}: {text}" for text in _rank_clauses(rank))
     if not diff.levels and not diff.ranks and diff.numbers:

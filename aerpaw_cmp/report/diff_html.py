@@ -33,7 +33,7 @@ class Whisker:
 
 def whiskers(diff: ReportDiff) -> tuple[list[Whisker], float]:
     """Differences of RMSE with their intervals, and the reach of the axis on either side of zero [dB]."""
-    rows = [(f"{one.tower} {one.channel}", one.rmse) for one in diff.levels if one.rmse.n]
+    rows = [(f"{level.tower} {level.channel}", level.rmse) for level in diff.levels if level.rmse.n]
     if diff.pooled is not None and len(rows) > 1:
         rows.append(("all links", diff.pooled))
     sizes = [abs(x) for _, p in rows for x in (p.difference_db, *p.difference_ci95_db) if x == x]  # not NaN

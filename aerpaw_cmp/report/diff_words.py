@@ -52,8 +52,8 @@ CAUSES: dict[str, tuple[str, str]] = {
 
 def verdict(diff: ReportDiff) -> str:
     """The result in one or two sentences."""
-    common = sum(one.samples.common for one in diff.levels)
-    ranked = max((one.samples.common for one in diff.ranks), default=0)
+    common = sum(level.samples.common for level in diff.levels)
+    ranked = max((rank.samples.common for rank in diff.ranks), default=0)
     if not diff.differences:
         seen = [f"{count(common)} RSS samples"] * bool(common) + [f"{count(ranked)} rank samples"] * bool(ranked)
         on = f" on {' and '.join(seen)}" if seen else " in metrics.json (no samples were compared)"
@@ -66,7 +66,7 @@ def _cause(diff: ReportDiff) -> str:
     """What else differs, which may be the reason."""
     kinds = {"setting": diff.settings, "input": diff.inputs, "version": diff.versions}
     changed = {name: len(items) for name, items in kinds.items()}
-    moved = max((one.measured_max_db for one in diff.levels if math.isfinite(one.measured_max_db)), default=0.0)
+    moved = max((level.measured_max_db for level in diff.levels if math.isfinite(level.measured_max_db)), default=0.0)
     found = changed_verdict(diff.pooled, bool(diff.differences), moved > diff.tolerance_db, changed)
     listed = " and ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in changed.items() if n)
     verb = "differs" if sum(changed.values()) == 1 else "differ"
@@ -79,11 +79,11 @@ def _cause(diff: ReportDiff) -> str:
 
 
 def _level_verdict(diff: ReportDiff) -> str:
-    scored = [one for one in diff.levels if one.rmse.n]
+    scored = [level for level in diff.levels if level.rmse.n]
     if not scored or diff.pooled is None:
         return ""
-    if all(abs(one.rmse.difference_db) <= diff.tolerance_db for one in scored):
-        moved = max((one.simulated_max_db for one in scored if math.isfinite(one.simulated_max_db)), default=0.0)
+    if all(abs(item.rmse.difference_db) <= diff.tolerance_db for item in scored):
+        moved = max((item.simulated_max_db for item in scored if math.isfinite(item.simulated_max_db)), default=0.0)
         though = f", though the replay moved by up to {moved:.2g} dB" if moved > diff.tolerance_db else ""
         return f"RSS errors agree on the common samples{though}."
     pooled = diff.pooled
@@ -94,7 +94,7 @@ def _level_verdict(diff: ReportDiff) -> str:
         difference=pooled.difference_db, interval=_bounds(pooled.difference_ci95_db, 2)
     )
     if len(scored) > 1:
-        verdicts = [(word, sum(one.rmse.verdict == word for one in scored)) for word in ("better", "worse")]
+        verdicts = [(word, sum(item.rmse.verdict == word for item in scored)) for word in ("better", "worse")]
         rest = len(scored) - sum(n for _, n in verdicts)
         text += f" Links: {verdicts[0][1]} better, {verdicts[1][1]} worse, {rest} not significant."
     return text
@@ -106,7 +106,7 @@ def _bounds(value: tuple[float, float], decimals: int) -> str:
 
 
 def _rank_verdict(diff: ReportDiff) -> str:
-    moved = [one for one in diff.ranks if one.n_changed or abs(one.kappa.difference) > LEAST_RANK]
+    moved = [rank for rank in diff.ranks if rank.n_changed or abs(rank.kappa.difference) > LEAST_RANK]
     if not diff.ranks:
         return ""
     if not moved:

@@ -30,8 +30,8 @@ def metrics(data: ReportData) -> dict[str, Any]:
     Keys keep one order: that of the report. ``extra_metrics`` of the data is merged in last, key by key.
     """
     rss: dict[str, dict[str, Any]] = {}
-    for one in data.rss:
-        rss.setdefault(one.tower, {})[one.channel] = _rss_metrics(one)
+    for item in data.rss:
+        rss.setdefault(item.tower, {})[item.channel] = _rss_metrics(item)
     pairs: dict[str, dict[str, Any]] = {}
     for pair in data.pairs:
         pairs.setdefault(pair.tower, {})[f"{pair.first} - {pair.second}"] = pair.score.as_dict()
@@ -50,7 +50,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         KEY: list(union(*(f.learned_on for f in data.inputs))),
         "settings": data.settings,
         "rss": rss,
-        "rank": {one.tower: _rank_metrics(one) for one in data.rank},
+        "rank": {item.tower: _rank_metrics(item) for item in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),
         "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
         "warnings": list(data.warnings),
@@ -193,8 +193,8 @@ _ROWS = 50_000
 
 def rss_tables(series: Sequence[RssResult]) -> Iterator[_Table]:
     """Times and further columns of rss.csv by tower and channel, not yet rounded; one that a series lacks is NaN."""
-    models = list(dict.fromkeys(name for one in series for name in one.baselines))
-    more = [_rss_columns(one) for one in series]
+    models = list(dict.fromkeys(name for item in series for name in item.baselines))
+    more = [_rss_columns(item) for item in series]
     for one, own in zip(series, more, strict=True):
         nowhere = np.full(len(one.time), np.nan)
         yield (
@@ -236,8 +236,8 @@ def rank_tables(series: Sequence[RankResult]) -> Iterator[_Table]:
     def integers(values: Any) -> Any:
         return pd.Series(values, dtype="float64").astype("Int64").array  # NaN becomes an empty cell, 2.0 becomes 2
 
-    ks = sorted({k for one in series for k in one.rank})
-    numbers = [_number_columns(one) for one in series]
+    ks = sorted({k for item in series for k in item.rank})
+    numbers = [_number_columns(item) for item in series]
     for one, own in zip(series, numbers, strict=True):
         nowhere = np.full(len(one.time), np.nan)
         yield (

@@ -133,7 +133,7 @@ def judged(panels: Sequence[RssResult]) -> Judged | None:
 
 def most_telling(every: Sequence[Judged]) -> Judged:
     """The comparison to be said first: the best baseline that ray tracing loses to, else the best one."""
-    lost = [one for one in every if one.worse > one.better]
+    lost = [entry for entry in every if entry.worse > entry.better]
     return min(lost or every, key=lambda one: one.other_db)
 
 
@@ -269,7 +269,7 @@ def _difference(panels: Sequence[RssResult]) -> list[Headline]:
     paired = _paired(panels, best[0])
     if not paired:
         return []
-    words = [one.verdict for one in paired]
+    words = [entry.verdict for entry in paired]
     undecided = len(words) - words.count("better") - words.count("worse")
     if len(paired) == 1:
         low, high = paired[0].difference_ci95_db

@@ -298,7 +298,7 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         ladder_verdict=words.ladder_verdict(data.ladder),
         ladder=ladder_table(data.ladder),
         warnings=words.warnings(data),
-        baselines=list(dict.fromkeys(name for one in data.rss for name in one.baselines)),
+        baselines=list(dict.fromkeys(name for item in data.rss for name in item.baselines)),
         rss_columns=RSS_COLUMNS,
         rank_columns=RANK_COLUMNS,
         rejected_shown=REJECTED_SHOWN,

@@ -43,27 +43,27 @@ def page_layers(data: MapsData) -> list[MapLayer]:
         MapLayer(
             quantity="RSS",
             unit="dBm",
-            axes={"Tower": one.tower, "Antennas": one.antennas, **_foliage(one.foliage), **_height(one.altitude_m)},
-            values=one.rss_dbm,
+            axes={"Tower": item.tower, "Antennas": item.antennas, **_foliage(item.foliage), **_height(item.altitude_m)},
+            values=item.rss_dbm,
         )
-        for one in data.rss
+        for item in data.rss
     ]
     layers += [
         MapLayer(
             quantity="Rank",
             unit="",
-            axes={"Tower": one.tower, "K": k_key(one.k), **_foliage(one.foliage), **_height(one.altitude_m)},
-            values=np.where(one.rank > 0, one.rank, np.nan),
+            axes={"Tower": item.tower, "K": k_key(item.k), **_foliage(item.foliage), **_height(item.altitude_m)},
+            values=np.where(item.rank > 0, item.rank, np.nan),
             classes=RANK_CLASSES,
         )
-        for one in (*data.rank, *data.rank_by_tower)
+        for item in (*data.rank, *data.rank_by_tower)
     ]
     layers += [
         MapLayer(
-            quantity=one.name, unit=_unit(one.label), axes=_height(one.altitude_m), values=one.values,
-            difference=one.difference,
+            quantity=item.name, unit=_unit(item.label), axes=_height(item.altitude_m), values=item.values,
+            difference=item.difference,
         )
-        for one in data.layers
+        for item in data.layers
     ]  # fmt: skip
     return [*layers, *data.further]
 
@@ -122,8 +122,8 @@ def payload(data: MapsData, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
     """
     layers = page_layers(data)
     tries: list[tuple[str, Sequence[MapLayer], int]] = [("", layers, 1)]
-    joint = [one for one in layers if _is_joint(one)]
-    levels = [one for one in layers if _is_joint(one) or one.quantity == "RSS"]
+    joint = [item for item in layers if _is_joint(item)]
+    levels = [item for item in layers if _is_joint(item) or item.quantity == "RSS"]
     tries.append(("layers of single towers but RSS", levels, 1))
     tries.append(("layers of single towers", joint, 1))
     stride = 1

@@ -57,22 +57,22 @@ def first_words(data: MapsData) -> str:
 
 def coverage(data: MapsData) -> list[Coverage]:
     """Each height of the map of the nearest tower, with the most trees that were mapped."""
-    shown = [one for one in data.rss if one.tower == JOINT] or list(data.rss)
+    shown = [item for item in data.rss if item.tower == JOINT] or list(data.rss)
     if not shown:
         return []
     first = shown[0]
-    kept = [one for one in shown if (one.tower, one.antennas) == (first.tower, first.antennas)]
-    clear = {one.altitude_m: one.coverage for one in kept if one.foliage == "none" != first.foliage}
+    kept = [item for item in shown if (item.tower, item.antennas) == (first.tower, first.antennas)]
+    clear = {item.altitude_m: item.coverage for item in kept if item.foliage == "none" != first.foliage}
     return [
         Coverage(
-            height_m=one.altitude_m,
-            covered=one.coverage,
-            clear=clear.get(one.altitude_m, np.nan),
-            reached=_reached(data, one),
+            height_m=item.altitude_m,
+            covered=item.coverage,
+            clear=clear.get(item.altitude_m, np.nan),
+            reached=_reached(data, item),
             outside=data.outside_flown,
         )
-        for one in kept
-        if one.foliage == first.foliage
+        for item in kept
+        if item.foliage == first.foliage
     ]
 
 

@@ -155,9 +155,9 @@ def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]
         alone = None if one.tower == JOINT else one.tower
         image = draw_map(ax, data, one.rss_dbm, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
         ax.set_title(f"{one.tower}: {100 * one.coverage:.0f} %", fontsize=9)
-    levels = np.concatenate([one.rss_dbm.ravel() for one in maps])
+    levels = np.concatenate([entry.rss_dbm.ravel() for entry in maps])
     colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits))
-    entries = overlay_legend(data, borders=any(one.tower == JOINT for one in maps))
+    entries = overlay_legend(data, borders=any(entry.tower == JOINT for entry in maps))
     fig.legend(handles=entries, loc="outside lower center", ncols=3)
     return fig
 
@@ -181,7 +181,7 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
 def layer_maps(data: MapsData, layers: Sequence[Any]) -> Figure:
     """One further quantity at every height, on one colour scale."""
     fig, axes = map_axes(data, len(layers))
-    finite = np.concatenate([one.values[np.isfinite(one.values)] for one in layers])
+    finite = np.concatenate([layer.values[np.isfinite(layer.values)] for layer in layers])
     low, high = np.percentile(finite, [1, 99]) if len(finite) else (0.0, 1.0)
     options: dict[str, Any] = {"cmap": "cividis", "vmin": low, "vmax": high}
     if layers[0].difference:
@@ -233,7 +233,7 @@ def rank_shares(maps: Sequence[RankMap]) -> Figure:
     axes = fig.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for ax, (k, members) in zip(axes, panels.items(), strict=True):
         at = np.arange(len(members))
-        share = 100 * np.array([one.share for one in members])
+        share = 100 * np.array([member.share for member in members])
         below = np.zeros(len(members))
         for column, value in enumerate((0, *RANKS)):
             face: Any = "white" if value == 0 else rank_colour(value)
@@ -244,7 +244,7 @@ def rank_shares(maps: Sequence[RankMap]) -> Figure:
                 label="Z: out of coverage" if value == 0 else f"rank {value}",
             )  # fmt: skip
             below = below + share[:, column]
-        ax.set_xticks(at, [f"{one.altitude_m:g}" for one in members], fontsize=7)
+        ax.set_xticks(at, [f"{member.altitude_m:g}" for member in members], fontsize=7)
         ax.set_title(f"K = {k_key(k)}")
         ax.set_xlabel("Height [m]")
         ax.grid(visible=False)
@@ -284,12 +284,12 @@ def error_curves(errors: Sequence[MapError]) -> Figure:
         for number, (method, rows) in enumerate(grouped(members, lambda one: one.method).items()):
             rows = sorted(rows, key=lambda one: one.altitude_m)
             ax.plot(
-                [one.altitude_m for one in rows], [one.mae for one in rows], color=COLOURS[number % 6],
+                [entry.altitude_m for entry in rows], [entry.mae for entry in rows], color=COLOURS[number % 6],
                 linestyle=LINES[number % 6], marker=MARKERS[number % 8], markersize=5, linewidth=1.2, label=method,
             )  # fmt: skip
         ax.set_title(f"K = {k_key(k)}")
         ax.set_xlabel("Height [m]")
-    worst = max((one.mae for one in errors if np.isfinite(one.mae)), default=1.0)
+    worst = max((error.mae for error in errors if np.isfinite(error.mae)), default=1.0)
     axes[0].set_ylim(0.0, 1.08 * worst if worst > 0 else 1.0)  # shared by all panels
     axes[0].set_ylabel("Mean absolute error of the rank")
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
@@ -318,7 +318,7 @@ def learning_curves(curves: Sequence[LearningCurve]) -> Figure:
 
 def level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
     """One colour scale for all maps [dBm]: the 1 to 99.5 % range, to whole 5 dB."""
-    parts = [one.rss_dbm[np.isfinite(one.rss_dbm)] for one in maps]
+    parts = [entry.rss_dbm[np.isfinite(entry.rss_dbm)] for entry in maps]
     finite = np.concatenate(parts) if parts else np.zeros(0)
     if not len(finite):
         return -100.0, -50.0

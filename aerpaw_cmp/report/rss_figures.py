@@ -91,7 +91,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     whole, close = fig.subplots(1, 2, width_ratios=(1.0, 1.35))
     draw_site(whole, data.site)
     draw_site(close, data.site)
-    nodes = {one.tower: one for one in data.series}.values()
+    nodes = {item.tower: item for item in data.series}.values()
     for panel in nodes:
         draw_node(whole, panel)
         draw_node(close, panel)
@@ -107,7 +107,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     near = [data.site.towers[name] for name in used_towers(data)]
     extent = float(np.nanmax([np.ptp(track.east_m), np.ptp(track.north_m), 100.0])) if len(track.east_m) else 100.0
     centre = np.array([np.nanmean(track.east_m), np.nanmean(track.north_m)])
-    ways = [one.tower_m for one in nodes if one.tower_m is not None]
+    ways = [node.tower_m for node in nodes if node.tower_m is not None]
     near = [t for t in near if np.hypot(t.east_m - centre[0], t.north_m - centre[1]) < extent]
     frame_around(
         close,

@@ -148,10 +148,10 @@ def first_sentence(facts: Judged) -> str:
 def expected_sentence(panels: Sequence[RssResult]) -> str:
     """The error to expect on another flight; nothing unless every scored channel has it from flights left out."""
     known = [panel.further.elsewhere for panel in panels]
-    if not known or not all(one and "rmse_db" in one for one in known):
+    if not known or not all(item and "rmse_db" in item for item in known):
         return ""
     learned, free = (
-        math.sqrt(sum(one[name] ** 2 for one in known if one) / len(known))
+        math.sqrt(sum(item[name] ** 2 for item in known if item) / len(known))
         for name in ("rmse_db", "free_space_rmse_db")
     )
     return f"Expect {learned:.1f} dB on another flight (free space {free:.1f} dB)."

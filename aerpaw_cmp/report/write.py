@@ -83,7 +83,7 @@ def write_report(
     beside = (folder, folder / FOLDER)
     files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in beside)]
     with stages("report"):
-        shown = [one for one in pictures if {"png", "svg"} & set(one.formats)]
+        shown = [picture for picture in pictures if {"png", "svg"} & set(picture.formats)]
         page = write_file(folder / "report.html", html.page(data, shown, files))
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
     numbers = write_file(folder / "metrics.json", json_text(metrics(data)))

@@ -120,12 +120,12 @@ class Entry(_Record):
                 f"; expect an RMSE of {self.errors.rmse_db:.1f} dB on another flight, free space "
                 f"{self.errors.free_space_rmse_db:.1f} dB"
             )
-        for lock in [one.lock for one in self.series if one.lock is not None][:1]:
+        for lock in [item.lock for item in self.series if item.lock is not None][:1]:
             text += (
                 f", {lock.floor_rmse_db:.1f} and {lock.free_space_floor_rmse_db:.1f} dB where levels below "
                 f"{lock.floor_db:g} count as {lock.floor_db:g}"
             )
-        kappas = [one.kappa for one in self.receivers if one.kappa is not None]
+        kappas = [receiver.kappa for receiver in self.receivers if receiver.kappa is not None]
         return text + (f"; expect kappa {sum(kappas) / len(kappas):.2f} on another flight" if kappas else "")
 
 

@@ -74,15 +74,15 @@ class Table:
 def table(readings: Iterable[Reading]) -> Table:
     """Readings, one by one, as columns."""
     found = list(readings)
-    pci, arfcn, rsrp = (np.array([getattr(one, name) for one in found], dtype=np.float64) for name in _NUMBERS)
+    pci, arfcn, rsrp = (np.array([getattr(item, name) for item in found], dtype=np.float64) for name in _NUMBERS)
     return Table(
-        row=np.array([one.row for one in found], dtype=np.int64),
-        rat=np.array([RATS.index(one.rat) for one in found], dtype=np.int8),
+        row=np.array([item.row for item in found], dtype=np.int64),
+        rat=np.array([RATS.index(item.rat) for item in found], dtype=np.int8),
         pci=pci,
         arfcn=arfcn,
         rsrp_dbm=rsrp,
-        serving=np.array([bool(one.serving) for one in found], dtype=bool),
-        beside=np.array([one.beside for one in found], dtype=np.float64).reshape(len(found), len(BESIDE)).T,
+        serving=np.array([bool(item.serving) for item in found], dtype=bool),
+        beside=np.array([item.beside for item in found], dtype=np.float64).reshape(len(found), len(BESIDE)).T,
     )
 
 
@@ -93,7 +93,7 @@ def joined(tables: Sequence[Table]) -> Table:
     """Several tables, one behind the other."""
     if not tables:
         return table(())
-    columns = {part.name: [getattr(one, part.name) for one in tables] for part in fields(Table)}
+    columns = {part.name: [getattr(item, part.name) for item in tables] for part in fields(Table)}
     return Table(**{name: np.concatenate(column, axis=-1) for name, column in columns.items()})
 
 
@@ -118,8 +118,8 @@ def streams(rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: st
     pci = np.where(np.isfinite(pci) & (pci >= 0), pci, -1.0)
     made: list[Stream] = []
     for rat in np.unique(rats).tolist():
-        for one in np.unique(pci[rats == rat]).tolist():
-            of_pci = np.flatnonzero((rats == rat) & (pci == one))
+        for item in np.unique(pci[rats == rat]).tolist():
+            of_pci = np.flatnonzero((rats == rat) & (pci == item))
             carriers = np.unique(arfcn[of_pci][np.isfinite(arfcn[of_pci])])
             if len(carriers) < 2:
                 parts = [(of_pci, float(carriers[0]) if len(carriers) else np.nan)]
@@ -127,7 +127,7 @@ def streams(rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: st
                 parts = [(of_pci[arfcn[of_pci] == carrier], carrier) for carrier in carriers.tolist()]
                 parts.append((of_pci[np.isnan(arfcn[of_pci])], np.nan))
             for pick, carrier in parts:
-                cell = Cell(RATS[rat], one, carrier, several=len(carriers) > 1)
+                cell = Cell(RATS[rat], item, carrier, several=len(carriers) > 1)
                 made += [_stream(rows, found, order[pick], served[pick], cell, source)] if len(pick) else []
     return made
 

@@ -142,7 +142,7 @@ def number(value: Any) -> float:
 
 def column(found: list[dict[str, Any]], *names: str) -> FloatArray:
     """A key of every object as numbers: of several names, the first that an object has."""
-    return np.array([number(next((one[name] for name in names if name in one), None)) for one in found])
+    return np.array([number(next((entry[name] for name in names if name in entry), None)) for entry in found])
 
 
 def inside(one: dict[str, Any], name: str) -> dict[str, Any]:

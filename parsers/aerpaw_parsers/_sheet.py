@@ -184,7 +184,7 @@ class Sheet:
 @cache
 def _compiled(patterns: tuple[str, ...]) -> list[re.Pattern[str]]:
     """Patterns for whole names: all of them as one, and then each."""
-    return [re.compile(text) for text in ("|".join(f"(?:{one})" for one in patterns), *patterns)]
+    return [re.compile(text) for text in ("|".join(f"(?:{item})" for item in patterns), *patterns)]
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:

@@ -158,9 +158,9 @@ _MILLISECONDS = "the times are whole numbers beyond a day of seconds: read as mi
 def _of_day(texts: Sequence[str], options: ReadOptions) -> tuple[str, AnyArray, list[str]]:
     """Times of the day: their date is that of ``time_origin``, of the file name, or nobody's."""
     found = [_OF_DAY.fullmatch(text) for text in texts]
-    seconds = np.array([_seconds(one.groups()) if one else np.nan for one in found], dtype=np.float64)
+    seconds = np.array([_seconds(item.groups()) if item else np.nan for item in found], dtype=np.float64)
     seconds += 86_400.0 * np.cumsum(np.nan_to_num(np.diff(seconds, prepend=np.nan)) < -43_200)
-    marked = any(one[5] for one in found if one)
+    marked = any(item[5] for item in found if item)
     hours = _hours_off(seconds, options.file_name)
     seconds -= 3600.0 * hours
     warnings = ["the times are marked as UTC but read as local, as the program's own names say"] if marked else []

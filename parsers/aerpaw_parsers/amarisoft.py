@@ -73,13 +73,13 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb`` with CQI and MCS; UsageError if no time zone is given."""
     lines = _lines.split(data)
     found, rejected = _table(lines)
-    time = np.array([one[1] for one in found] or [b""], dtype=np.bytes_)[: len(found)]
-    row = np.array([one[0] for one in found], dtype=np.int64)
+    time = np.array([item[1] for item in found] or [b""], dtype=np.bytes_)[: len(found)]
+    row = np.array([item[0] for item in found], dtype=np.int64)
     rows = _rows.built(
         lines, row, {"time": time}, options, reader="amarisoft", reason=lambda _line: None, extra=rejected
     )
     kept = [found[i][2] for i in rows.at.tolist()]
-    value = {name: np.array([one.get(name, np.nan) for one in kept]) for name in _WANTED}
+    value = {name: np.array([item.get(name, np.nan) for item in kept]) for name in _WANTED}
     beside = {"cqi": value["cqi"], "mcs": value["mcs"], "rnti": value["RNTI"]}
     return rows.result(_rows.mean_rank(rows, value["ri"], beside, none=value["ri"] == 0))
 
@@ -96,7 +96,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     lines = _lines.split(data)
     answers = _json.objects(lines)
     found = answers.found
-    has_utc = any("utc" in one for one in found)
+    has_utc = any("utc" in item for item in found)
     time = _json.column(found, "utc" if has_utc else "time")
     rows = _rows.built(
         lines, answers.row, {"time": time}, options, reader="amarisoft_json", reason=_json.bracket,

@@ -116,14 +116,14 @@ def _next_mark(data: bytes, at: int) -> int:
 def _of_vehicle(
     found: dict[int, list[tuple[int, int, float, tuple[float, ...]]]],
 ) -> tuple[_autopilot.Series, _autopilot.Series, _autopilot.Series]:
-    systems = [one[1] for one in found[_POSITION]]
+    systems = [item[1] for item in found[_POSITION]]
     vehicle = max(set(systems), key=systems.count) if systems else -1
     made = []
     for kind in (_POSITION, _ATTITUDE, _GPS):
-        rows = [one for one in found[kind] if one[1] == vehicle]
-        table = np.array([one[3] for one in rows], dtype=np.float64).reshape(len(rows), _FIELDS[kind])
+        rows = [item for item in found[kind] if item[1] == vehicle]
+        table = np.array([row[3] for row in rows], dtype=np.float64).reshape(len(rows), _FIELDS[kind])
         series = _autopilot.Series(
-            np.array([one[2] for one in rows]), np.array([one[0] for one in rows], dtype=np.int64), {}
+            np.array([row[2] for row in rows]), np.array([row[0] for row in rows], dtype=np.int64), {}
         )
         series.columns = _columns(kind, table) if len(rows) or kind == _POSITION else {}
         made.append(series)

@@ -52,9 +52,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """
     lines = _lines.split(data)
     found = list(_RECORD.finditer(data))
-    row = np.searchsorted(lines.starts, np.array([one.start() for one in found], dtype=np.int64), side="right") - 1
+    row = np.searchsorted(lines.starts, np.array([item.start() for item in found], dtype=np.int64), side="right") - 1
     row, first = np.unique(row, return_index=True)
-    texts = [cells[first] for cells in _lines.columns([one.groups(b"") for one in found], 7)]
+    texts = [cells[first] for cells in _lines.columns([item.groups(b"") for item in found], 7)]
     names = ("time", "what", "value", "unit", *_POSITION)
     rows = _rows.built(
         lines, row, dict(zip(names, texts, strict=True)), options, reader="nemo_kml", reason=_reason,

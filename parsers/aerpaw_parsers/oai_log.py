@@ -64,12 +64,12 @@ def _rows_of(lines: _lines.Lines) -> tuple[IntArray, list[dict[str, bytes]], str
             found.append({key: value for key, value in match.groupdict().items() if value is not None})
             stamps.append((stamp, seconds, max(frame, 0) * _FRAMES_S))
     number = np.array(row, dtype=np.int64)
-    if stamps and all(one[0] for one in stamps):
-        return number, found, "wall", np.array([one[0] for one in stamps], dtype=np.bytes_)
-    if stamps and all(one[1] for one in stamps):
-        value = np.array([float(one[1]) for one in stamps])
+    if stamps and all(item[0] for item in stamps):
+        return number, found, "wall", np.array([item[0] for item in stamps], dtype=np.bytes_)
+    if stamps and all(item[1] for item in stamps):
+        value = np.array([float(item[1]) for item in stamps])
         return number, found, "epoch_s" if value.min() > 1e9 else "relative_s", value
-    return number, found, "relative_s", np.array([one[2] for one in stamps], dtype=np.float64)
+    return number, found, "relative_s", np.array([item[2] for item in stamps], dtype=np.float64)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -79,9 +79,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows = _rows.built(lines, row, {"time": time}, options, reader="oai_log", reason=lambda _line: None, clock=clock)
     kept = [found[i] for i in rows.at.tolist()]
     value = {
-        name: np.array([float(one.get(name, b"nan")) for one in kept]) for name in ("ri", "cqi", "sinr", "rsrp", "meas")
+        name: np.array([float(item.get(name, b"nan")) for item in kept])
+        for name in ("ri", "cqi", "sinr", "rsrp", "meas")
     }
-    rnti = np.array([float(int(one["rnti"], 16)) if "rnti" in one else np.nan for one in kept])
+    rnti = np.array([float(int(item["rnti"], 16)) if "rnti" in item else np.nan for item in kept])
     reported = np.flatnonzero(~np.isnan(value["ri"]))
     ri = value["ri"][reported]
     good = (ri >= 1) & (ri <= 8)

@@ -91,20 +91,20 @@ def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
     cells = [_text_cells(lines.raw(i)) for i in row.tolist()]
     other = [lines.reject(i, "a block of other fields (quantities switched off in the app?)")
              for i, one in zip(row.tolist(), cells, strict=True) if one is None]  # fmt: skip
-    kept = np.array([one is not None for one in cells], dtype=bool)
+    kept = np.array([item is not None for item in cells], dtype=bool)
     rows = _rows.built(
-        lines, row[kept], {"time": np.array([float(one[0]) for one in groups], dtype=np.float64)[kept]}, options,
+        lines, row[kept], {"time": np.array([float(group[0]) for group in groups], dtype=np.float64)[kept]}, options,
         reader="pawprints", reason=lambda _line: "not a whole 'CELL_LOG_START ... CELL_LOG_STOP' (torn line?)",
         clock="epoch_ms", extra=other,
     )  # fmt: skip
-    whole = [one for one in cells if one is not None]
+    whole = [item for item in cells if item is not None]
     readings = [_reading(i, cell, np.nan) for i, at in enumerate(rows.at.tolist()) for cell in whole[at]]
     return rows.result(_cells.streams(rows, readings, source="PawPrints"))
 
 
 def _nr(rows: _rows.Rows, found: list[dict[str, Any]]) -> Stream | None:
     """Level of the NR leg: the phone tells it apart from the cells, without a PCI."""
-    legs = [_json.inside(one, "nr_signal_strength") for one in found]
+    legs = [_json.inside(item, "nr_signal_strength") for item in found]
     level = _json.column(legs, "ss_rsrp")
     if not np.isfinite(level).any():
         return None
@@ -119,7 +119,7 @@ def _nr(rows: _rows.Rows, found: list[dict[str, Any]]) -> Stream | None:
 
 def _track(rows: _rows.Rows, found: list[dict[str, Any]]) -> Stream | None:
     """Positions, in the object itself or in its ``location``."""
-    places = [{**_json.inside(one, "gps"), **_json.inside(one, "location"), **one} for one in found]
+    places = [{**_json.inside(item, "gps"), **_json.inside(item, "location"), **item} for item in found]
     values = {
         "latitude_deg": _json.column(places, "latitude", "lat"),
         "longitude_deg": _json.column(places, "longitude", "lon", "lng"),
@@ -144,7 +144,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         extra=one.rejected, markup=one.more,
     )  # fmt: skip
     kept = [found[i] for i in rows.at.tolist()]
-    if any("companion_abs_time" not in one for one in kept):
+    if any("companion_abs_time" not in item for item in kept):
         rows.warnings.append("some lines lack companion_abs_time: the phone's own clock was taken there")
     return rows.result(
         [_track(rows, kept), *_cells.streams(rows, _readings(kept), source="PawPrints"), _nr(rows, kept)]

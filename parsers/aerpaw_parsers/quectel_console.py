@@ -65,8 +65,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Cells by PCI, and rank where CSI tables stand; UsageError if no time zone is given."""
     lines = _lines.split(data)
     found, rejected = _tables(lines)
-    row = np.array([one[0] for one in found], dtype=np.int64)
-    time = np.array([one[1] for one in found] or [b""], dtype=np.bytes_)[: len(found)]
+    row = np.array([item[0] for item in found], dtype=np.int64)
+    time = np.array([item[1] for item in found] or [b""], dtype=np.bytes_)[: len(found)]
     rows = _rows.built(
         lines, row, {"time": time}, options, reader="quectel_console", reason=lambda _line: None, extra=rejected
     )
@@ -80,7 +80,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         )
         for i, (_, _, title, value) in enumerate(kept) if "RSRP" in value
     ]  # fmt: skip
-    ranks = [_rank(rows, name, [(one[2], one[3]) for one in kept]) for name in _CSI]
+    ranks = [_rank(rows, name, [(item[2], item[3]) for item in kept]) for name in _CSI]
     return rows.result([*ranks, *_cells.streams(rows, readings, source="Quectel console")])
 
 

@@ -71,7 +71,7 @@ def _times(captures: list[dict[str, Any]], *fields: str) -> list[str]:
     found: list[str] = []
     for capture in captures:
         value = next((capture[field] for field in fields if field in capture), None)
-        found += [str(one) for one in _list(value)]
+        found += [str(item) for item in _list(value)]
     return found
 
 
@@ -204,7 +204,7 @@ def _powers(
     size = max(1, round(BURST_S * rate))
     texts: list[str] = []
     powers: list[FloatArray] = []
-    starts = [min(max(_whole(one.get("core:sample_start"), 0), 0), len(samples)) for one in captures]
+    starts = [min(max(_whole(item.get("core:sample_start"), 0), 0), len(samples)) for item in captures]
     for capture, start, end in zip(captures, starts, [*starts[1:], len(samples)], strict=True):
         stamp = next((capture[key] for key in ("core:datetime", "core:timestamp", "core:time") if key in capture), None)
         if stamp is None:

@@ -46,7 +46,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
         for i in range(len(rows))
     ]
     for cc in np.unique(carrier).tolist():  # two carriers may share a PCI, and the console prints no ARFCN
-        of_carrier = [one for one in readings if carrier[one.row] == cc]
+        of_carrier = [reading for reading in readings if carrier[reading.row] == cc]
         for stream in _cells.streams(rows, of_carrier, source="srsUE"):
             name = f"{stream.name}_cc{cc}" if cc else stream.name
             yield replace(stream, name=name, attributes={**stream.attributes, "channel": rows.options.channel or name})

@@ -132,7 +132,7 @@ def locate(manifest: Manifest, folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
         raise InputError("no such folder", expected="the folder of the published logs (--data)", path=folder)
     wanted = {digest: name for name, one in manifest.files.items() for digest in (one.sha256, *one.also)}
-    sizes = {size for one in manifest.files.values() for size in (one.bytes, *one.also.values())}
+    sizes = {size for item in manifest.files.values() for size in (item.bytes, *item.also.values())}
     places: dict[str, Path] = {}
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         name = wanted.get(_content_digest(path, sizes))
@@ -210,7 +210,7 @@ class Bench:
         """Rank reports of a flight, those with CSI alone."""
         data = self.data(flight)
         samples = (rank_samples(data, series) for series in data.rank)
-        return [one.part(one.rank >= 1) for one in samples]
+        return [sample.part(sample.rank >= 1) for sample in samples]
 
     def skipped(self, task: str, *, training: bool) -> list[str]:
         """What a task lacks, each file with its source; empty where it can be run."""
@@ -350,14 +350,14 @@ def _level_rows(bench: Bench, task: str, flight: str) -> Iterator[pd.DataFrame]:
 
 
 def _rank_rows(bench: Bench, task: str, flight: str) -> Iterator[pd.DataFrame]:
-    for one in bench.ranks(flight):
-        times = utc_texts(np.datetime64(0, "ns"), one.time_s)
-        frame = _geometry(task, flight, one.tower, "rank", times, one.poses.position_m, one.poses.rotation)
+    for item in bench.ranks(flight):
+        times = utc_texts(np.datetime64(0, "ns"), item.time_s)
+        frame = _geometry(task, flight, item.tower, "rank", times, item.poses.position_m, item.poses.rotation)
         frame["fold"] = 0
-        for name, value in zip(("tower_east_m", "tower_north_m", "tower_up_m"), one.tower_m, strict=True):
+        for name, value in zip(("tower_east_m", "tower_north_m", "tower_up_m"), item.tower_m, strict=True):
             frame[name] = value
-        frame["carrier_hz"] = one.link.carrier_hz
-        frame["measured"] = one.rank.astype(np.int64)
+        frame["carrier_hz"] = item.link.carrier_hz
+        frame["measured"] = item.rank.astype(np.int64)
         yield frame
 
 

@@ -42,14 +42,14 @@ def anchored(question: Question, gain: GainOf) -> list[Answer]:
     """
     left = [o.samples.residual_db - gain(o) for o in question.train]
     out = []
-    for one in question.asked:
-        mine = [r for o, r in zip(question.train, left, strict=True) if _same(o, one)]
+    for item in question.asked:
+        mine = [r for o, r in zip(question.train, left, strict=True) if _same(o, item)]
         if not mine:
-            mine = [r for o, r in zip(question.train, left, strict=True) if o.samples.antenna == one.samples.antenna]
+            mine = [r for o, r in zip(question.train, left, strict=True) if o.samples.antenna == item.samples.antenna]
         mine = mine or left
         offset = float(np.concatenate(mine).mean()) if mine else 0.0
         spread = float(np.sqrt(np.mean(np.concatenate([r - r.mean() for r in mine]) ** 2))) if mine else 10.0
-        out.append((one.free_space_db + gain(one) + offset, np.full(len(one.samples), max(spread, 0.1))))
+        out.append((item.free_space_db + gain(item) + offset, np.full(len(item.samples), max(spread, 0.1))))
     return out
 
 
@@ -243,16 +243,16 @@ ONLY_ON_DEMAND = ("replay_sionna",)
 
 def _rank_constant(bench: Bench, train: Sequence[str], flight: str) -> list[FloatArray]:
     share = constant_forecast(np.concatenate([one.rank for name in train for one in bench.ranks(name)]))
-    return [np.tile(share, (len(one.rank), 1)) for one in bench.ranks(flight)]
+    return [np.tile(share, (len(item.rank), 1)) for item in bench.ranks(flight)]
 
 
 def _rank_receiver(bench: Bench, train: Sequence[str], flight: str) -> list[FloatArray]:
     """The receiver that ``calibrate`` learns."""
     out = []
-    for one in bench.ranks(flight):
-        samples = [s for name in train for s in bench.ranks(name) if s.tower == one.tower]
+    for item in bench.ranks(flight):
+        samples = [s for name in train for s in bench.ranks(name) if s.tower == item.tower]
         fitted = Tried.of(samples, RankFitSettings()).fit(range(len(samples)))
-        out.append(fitted.forecast(one)[0])
+        out.append(fitted.forecast(item)[0])
     return out
 
 

@@ -74,12 +74,12 @@ class RankBench:
     def thinned(self, samples: int) -> RankBench:
         """Evenly spread reports of every series."""
         series = []
-        for one in self.data.rank:
-            rows = np.unique(np.linspace(0, len(one.time) - 1, min(samples, len(one.time))).astype(int))
-            position = None if one.position_m is None else one.position_m[rows]
+        for item in self.data.rank:
+            rows = np.unique(np.linspace(0, len(item.time) - 1, min(samples, len(item.time))).astype(int))
+            position = None if item.position_m is None else item.position_m[rows]
             series.append(
                 dataclasses.replace(
-                    one, time=one.time[rows], rank=one.rank[rows], sinr_db=one.sinr_db[rows], position_m=position
+                    item, time=item.time[rows], rank=item.rank[rows], sinr_db=item.sinr_db[rows], position_m=position
                 )
             )
         return RankBench(dataclasses.replace(self.data, rank=tuple(series)))

@@ -134,14 +134,14 @@ def run_task(task: Task) -> Outcome:
         flown=tuple(
             FlownRank(
                 flight=task.flight,
-                tower=one.tower,
-                position_m=one.position_m,
-                rank=one.measured,
-                simulated=one.rank,
-                time_s=_elapsed_s(one.time),
-                start_ns=_start_ns(one.time),
+                tower=item.tower,
+                position_m=item.position_m,
+                rank=item.measured,
+                simulated=item.rank,
+                time_s=_elapsed_s(item.time),
+                start_ns=_start_ns(item.time),
             )
-            for one in flight_run.result.rank
+            for item in flight_run.result.rank
         ),
     )
 
@@ -285,10 +285,10 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
     failure = outcome.failure and dataclasses.replace(outcome.failure, flight=task.flight, setting=task.setting)
     return Outcome(
         rss=tuple(map(row, outcome.rss)),
-        rank=tuple(dataclasses.replace(one, flight=task.flight, setting=task.setting) for one in outcome.rank),
+        rank=tuple(dataclasses.replace(item, flight=task.flight, setting=task.setting) for item in outcome.rank),
         failure=failure,
         track=outcome.track and dataclasses.replace(outcome.track, flight=task.flight),
-        flown=tuple(dataclasses.replace(one, flight=task.flight) for one in outcome.flown) if task.reference else (),
+        flown=tuple(dataclasses.replace(item, flight=task.flight) for item in outcome.flown) if task.reference else (),
     )
 
 

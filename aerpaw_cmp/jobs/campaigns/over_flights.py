@@ -131,7 +131,7 @@ def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat
 def rank_repeats(flown: Sequence[FlownRank], radius_m: float) -> list[RankPairing]:
     """Every pair of flights that reported ranks to one tower at the same places."""
     out = []
-    boxes = [_box(one.position_m) for one in flown]
+    boxes = [_box(item.position_m) for item in flown]
     for (i, first), (j, second) in combinations(enumerate(flown), 2):
         if first.tower != second.tower or first.flight == second.flight:
             continue

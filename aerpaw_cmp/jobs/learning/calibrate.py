@@ -228,7 +228,7 @@ def _score_others(
     """Scores of further flights with what was learned, and which of them were learned from."""
     others = [load_data(load_flight(path), path.parent, logs_root) for path in paths]
     kept, said = counted_once([*flights, *others])
-    fresh = [data for data in kept if not any(data is one for one in flights)]
+    fresh = [data for data in kept if not any(data is item for item in flights)]
     if not fresh:
         return (), said
     seen = [one for data in fresh for one in observe([data])[0]]

@@ -59,11 +59,11 @@ def _learned(flights: Sequence[_Levels]) -> LearnedLock | None:
     """From all flights, scored flight by flight by what the others teach."""
     every = learn_detection([(f.level_db, f.detected) for f in flights])
     scores: list[DetectionScore] = []
-    for one in flights:
-        others = learn_detection([(f.level_db, f.detected) for f in flights if f is not one])
+    for item in flights:
+        others = learn_detection([(f.level_db, f.detected) for f in flights if f is not item])
         score = None if others is None else score_detection(
-            one.time_s, one.measured_db, one.level_db, one.detected, floor_db=LOCK_FLOOR_DB,
-            free_space_db=one.free_db, forecast=others,
+            item.time_s, item.measured_db, item.level_db, item.detected, floor_db=LOCK_FLOOR_DB,
+            free_space_db=item.free_db, forecast=others,
         )  # fmt: skip
         if score is not None:
             scores.append(score)

@@ -142,7 +142,7 @@ class FittedReceiver:
             "tied": self.tied,
             "flights": list(self.flights),
             KEY: list(self.trained_on),
-            "members": [one.as_dict() for one in self.mixture.members],
+            "members": [member.as_dict() for member in self.mixture.members],
             "decision_weight": self.mixture.decision_weight.tolist(),
             "shift_s": self.timing.shift_s,
             "average_s": self.timing.average_s,
@@ -346,8 +346,8 @@ class Tried:
     def of(cls, samples: Sequence[RankSamples], settings: RankFitSettings) -> Tried:
         """All candidates of the settings, for flights at one tower."""
         geometries = candidates(settings, samples[0])
-        thin = [one.part(slice(None, None, settings.thin)) for one in samples]
-        return cls(settings, samples, geometries, thin, [powers_of(geometries, one) for one in thin])
+        thin = [sample.part(slice(None, None, settings.thin)) for sample in samples]
+        return cls(settings, samples, geometries, thin, [powers_of(geometries, item) for item in thin])
 
     def fit(self, flights: Sequence[int] | range) -> FittedReceiver:
         """Choose geometries and timing, and fit, on some of the flights.
@@ -361,8 +361,8 @@ class Tried:
         kept = tuple(self.geometries[i] for i in choice.tied[: self.settings.members])
         whole = [self.samples[i] for i in flights]
         mixture = fit_mixture(
-            np.concatenate([features_of(kept, one, timing) for one in whole], axis=1),
-            np.concatenate([one.rank for one in whole]),
+            np.concatenate([features_of(kept, item, timing) for item in whole], axis=1),
+            np.concatenate([item.rank for item in whole]),
             _groups(whole),
             penalties=(3.0, 10.0, 30.0),
         )
@@ -370,8 +370,8 @@ class Tried:
             tower=whole[0].tower,
             geometries=kept,
             tied=len(choice.tied),
-            flights=tuple(one.flight for one in whole),
-            trained_on=union(*(one.logs for one in whole)),
+            flights=tuple(item.flight for item in whole),
+            trained_on=union(*(item.logs for item in whole)),
             mixture=mixture,
             timing=timing,
         )
@@ -380,13 +380,13 @@ class Tried:
         """Compare all geometries on sectors left out within the flights."""
         thin = [self.thin[i] for i in flights]
         return choose_features(
-            self.features(flights, timing), np.concatenate([one.rank for one in thin]), _groups(thin)
+            self.features(flights, timing), np.concatenate([item.rank for item in thin]), _groups(thin)
         )
 
     def choose_timing(self, flights: Sequence[int] | range, which: IntArray) -> Timing:
         """Least log score of the mean forecast of some geometries, on sectors left out within the flights."""
         thin = [self.thin[i] for i in flights]
-        rank, groups = np.concatenate([one.rank for one in thin]), _groups(thin)
+        rank, groups = np.concatenate([item.rank for item in thin]), _groups(thin)
         candidates = [
             Timing(
                 shift_s=shift_s,
@@ -409,5 +409,5 @@ class Tried:
 
 def _groups(samples: Sequence[RankSamples]) -> IntArray:
     """Sectors of directions; a sector is left out of all flights at once."""
-    whole = np.concatenate([one.poses.position_m for one in samples])
+    whole = np.concatenate([sample.poses.position_m for sample in samples])
     return sector_groups(whole, samples[0].tower_m)

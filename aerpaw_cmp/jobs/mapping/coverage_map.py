@@ -791,11 +791,11 @@ def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:
     for mode, maps in outcome.ordered():
         serving, *others = layers_of(maps, towers_too=towers_too)
         result += [] if result else [serving]
-        for one in others:
+        for other in others:
             # a hundredth of a dB is more than the site's data hold, and a third of the bytes
-            values = one.values if one.classes else np.round(one.values, 2)
-            if one.name.startswith(RATIOS):
+            values = other.values if other.classes else np.round(other.values, 2)
+            if other.name.startswith(RATIOS):
                 values = np.minimum(values, RATIO_LIMIT_DB)
-            title = f"{one.title}, foliage {mode}"
-            result.append(replace(one, name=f"{one.name}_{mode}", title=title, values=values))
+            title = f"{other.title}, foliage {mode}"
+            result.append(replace(other, name=f"{other.name}_{mode}", title=title, values=values))
     return result

@@ -46,14 +46,14 @@ class CorrectedMaps:
     def layers(self) -> list[Layer]:
         """For the files beside the page."""
         out = []
-        for one in self.levels:
-            at = f"h{one.height_m:03.0f}m_{re.sub(r'[^0-9A-Za-z]', '_', one.link)}"
+        for item in self.levels:
+            at = f"h{item.height_m:03.0f}m_{re.sub(r'[^0-9A-Za-z]', '_', item.link)}"
             for name, title, unit, values in (
-                ("rss_raw", "RSS, raw replay", "dBm", one.raw_dbm),
-                ("rss_corrected", "RSS, corrected by flights", "dBm", one.corrected_dbm),
-                ("rss_sd", "Standard deviation of the corrected RSS", "dB", one.sd_db),
+                ("rss_raw", "RSS, raw replay", "dBm", item.raw_dbm),
+                ("rss_corrected", "RSS, corrected by flights", "dBm", item.corrected_dbm),
+                ("rss_sd", "Standard deviation of the corrected RSS", "dB", item.sd_db),
             ):
-                text = f"{title}, {one.link}, {one.height_m:g} m"
+                text = f"{title}, {item.link}, {item.height_m:g} m"
                 out.append(Layer(f"{name}_{at}", np.round(values, 2), unit, text))
         for (tower, height), rank in self.ranks.items():
             name = f"rank_learned_h{height:03.0f}m_{re.sub(r'[^0-9A-Za-z]', '_', tower)}"
@@ -63,12 +63,14 @@ class CorrectedMaps:
 
     def page_layers(self, grid: Grid) -> Iterator[page.MapLayer]:
         """For the linked map: raw and corrected level, standard deviation, rank."""
-        for one in self.levels:
-            axes = {"Link": one.link, "Height": f"{one.height_m:g} m"}
-            for version, values in (("corrected", one.corrected_dbm), ("raw", one.raw_dbm)):
+        for item in self.levels:
+            axes = {"Link": item.link, "Height": f"{item.height_m:g} m"}
+            for version, values in (("corrected", item.corrected_dbm), ("raw", item.raw_dbm)):
                 yield page.MapLayer(quantity="RSS, raw and corrected", unit="dBm", axes={"Version": version, **axes},
                                     values=grid.raster(values))  # fmt: skip
-            yield page.MapLayer(quantity="SD of the corrected RSS", unit="dB", axes=axes, values=grid.raster(one.sd_db))
+            yield page.MapLayer(
+                quantity="SD of the corrected RSS", unit="dB", axes=axes, values=grid.raster(item.sd_db)
+            )
         for (tower, height), rank in self.ranks.items():
             yield page.MapLayer(
                 quantity="Rank, learned receiver",
@@ -81,12 +83,12 @@ class CorrectedMaps:
     def rss_maps(self, grid: Grid) -> Iterator[page.RssMap]:
         """For the figures: maps and distributions of both versions."""
         for version in ("raw", "corrected"):
-            for one in self.levels:
-                values = one.raw_dbm if version == "raw" else one.corrected_dbm
+            for item in self.levels:
+                values = item.raw_dbm if version == "raw" else item.corrected_dbm
                 yield page.RssMap(
-                    tower=one.link,
+                    tower=item.link,
                     antennas=version,
-                    altitude_m=one.height_m,
+                    altitude_m=item.height_m,
                     rss_dbm=grid.raster(values),
                     coverage=float(np.isfinite(values).mean()),
                 )

@@ -276,7 +276,7 @@ def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
         latitude, longitude = np.array(corners).T
         east, north = site.frame.to_local(latitude, longitude)
         out.append(shapely.Polygon(np.column_stack([east, north])).buffer(0))
-    if not any(one.area > 0 for one in out):
+    if not any(item.area > 0 for item in out):
         raise InputError("areas without an extent", expected="outlines of three corners or more", path=path)
     return out
 
@@ -421,7 +421,7 @@ def _curve(
     best = [r for r in ranked if not r.refused][:CURVE_OF]
     for share in SHARES:
         tried = []
-        for route in filter(None, (_of_length(one, share, area, asked) for one in best)):
+        for route in filter(None, (_of_length(item, share, area, asked) for item in best)):
             raised = _raised(route, site)
             sd = leaves_db(raised)
             tried.append(CurvePoint(minutes=raised.duration_s / 60.0, length_m=raised.length_m, sd_db=sd))

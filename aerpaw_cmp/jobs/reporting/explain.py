@@ -90,7 +90,7 @@ class Explanation:
         result["paths"] = [path.as_dict() for path in self.paths]
         result["absent"] = [{"path": path, "reason": reason} for path, reason in self.absent]
         if self.differences is not None:
-            result["differences"] = [dataclasses.asdict(one) for one in self.differences]
+            result["differences"] = [dataclasses.asdict(difference) for difference in self.differences]
         for name in ("level_dbm", "power_sum_dbm", "measured_db"):
             if result[name] is not None and not np.isfinite(result[name]):
                 result[name] = None

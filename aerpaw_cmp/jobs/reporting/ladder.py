@@ -198,7 +198,7 @@ class _Climber:
         """The learned model, as it was calibrated, where flights left out say that it beats free space."""
         antennas = (self._offer or self._data.settings).antennas
         errors = [errors_elsewhere(antennas, series, self._data.folder) for series in self._data.rss]
-        known = [one for one in errors if one is not None]
+        known = [error for error in errors if error is not None]
         if len(known) < len(errors) or not known:
             return climbed
         learned, free = (
@@ -429,12 +429,12 @@ def _antennas_as(value: Any, antennas: Antennas) -> Any:
         out = {}
         for key, item in value.items():
             if key in ("antenna", "antennas"):
-                several = [dict(one) for one in item] if isinstance(item, list) else [dict(item)]
+                several = [dict(entry) for entry in item] if isinstance(item, list) else [dict(item)]
                 changed = [
                     {"model": "iso"}
                     if antennas == "isotropic"
-                    else {k: v for k, v in one.items() if k != "installed_db"}
-                    for one in several
+                    else {k: v for k, v in entry.items() if k != "installed_db"}
+                    for entry in several
                 ]
                 out[key] = changed if isinstance(item, list) else changed[0]
             else:

@@ -73,15 +73,15 @@ def refuse_changed(before: Sequence[Mapping[str, Any]], inputs: Sequence[InputFi
     InputError
         With the first that is.
     """
-    now = {(one.path, one.role): one.sha256 for one in inputs}
-    for one in before:
-        key = (one["path"], one["role"])
-        if now.get(key) != one["sha256"] and "packaged" not in one["role"]:
+    now = {(item.path, item.role): item.sha256 for item in inputs}
+    for item in before:
+        key = (item["path"], item["role"])
+        if now.get(key) != item["sha256"] and "packaged" not in item["role"]:
             raise InputError(
                 "changed since the report was made" if key in now else "no longer an input of this flight",
-                expected=f"the file with SHA-256 {one['sha256'][:12]}...",
+                expected=f"the file with SHA-256 {item['sha256'][:12]}...",
                 cause="a log or the flight file was edited: run 'aerpaw-cmp report' anew",
-                path=one["path"],
+                path=item["path"],
             )
 
 

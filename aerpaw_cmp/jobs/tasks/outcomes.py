@@ -182,9 +182,9 @@ def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> l
         If the site cannot.
     """
     entries = [
-        {"role": one.role, "path": one.path, "sha256": one.sha256}
-        for one in other_inputs(settings, flight, logs_root)
-        if one.role != "flight file"  # what it says stands in the settings, overrides included
+        {"role": other_input.role, "path": other_input.path, "sha256": other_input.sha256}
+        for other_input in other_inputs(settings, flight, logs_root)
+        if other_input.role != "flight file"  # what it says stands in the settings, overrides included
     ]
     for log in settings.logs:
         path = (logs_root or flight.parent) / log.path

@@ -124,7 +124,7 @@ def _through(
     killed: list[int] = []
     active: dict[Connection, tuple[_Worker, int]] = {}
     while waiting or active:
-        for worker in [one for one in crew if one.pipe not in active][: len(waiting)]:
+        for worker in [entry for entry in crew if entry.pipe not in active][: len(waiting)]:
             number = waiting.popleft()
             worker.send(items[number])
             active[worker.pipe] = worker, number

@@ -290,7 +290,7 @@ _last_index: list[CrownIndex] = []
 
 def crown_index(trees: Trees) -> CrownIndex:
     """The index of cones of these trees; the last one is kept: a flight asks many times, the next has its site."""
-    kept = next((one for one in _last_index if one.trees is trees or _same(one.trees, trees)), None)
+    kept = next((item for item in _last_index if item.trees is trees or _same(item.trees, trees)), None)
     if kept is None:
         kept = CrownIndex(trees)
         _last_index[:] = [kept]

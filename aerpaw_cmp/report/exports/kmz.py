@@ -44,14 +44,14 @@ class _Shown:
 def write_kmz(export: Export, folder: Path) -> list[Path]:
     """``samples.kmz``."""
     shown = list(_shown(export))
-    scales = {one.scale.key: one.scale for one in shown}
+    scales = {item.scale.key: item.scale for item in shown}
     budget = POINTS // max(1, len(shown))
     body = [_towers(export), *_flown(export)]
     for number, one in enumerate(shown):
         lines = "".join(_lines(one, budget, clock=export.clock, visible=number == 0))
         body.append(kml.folder(one.name, _legend_name(one.scale), lines, visible=number == 0))
     words = [*export.remarks, "Lines stand at their height above the ground below."]
-    if max((len(one.rows) for one in shown), default=0) > budget:
+    if max((len(item.rows) for item in shown), default=0) > budget:
         words.append(
             f"Thinned to about {budget} points per line, with minimum and maximum of every segment; all samples are in "
             "rss.csv and rank.csv."
@@ -63,7 +63,7 @@ def write_kmz(export: Export, folder: Path) -> list[Path]:
 
 def _shown(export: Export) -> Iterator[_Shown]:
     for kind, scales in scales_of(export).items():
-        points = next(one for one in export.sets if one.kind == kind)
+        points = next(item for item in export.sets if item.kind == kind)
         columns = {c.name: c for c in points.columns}
         for (flight, tower, channel, rows), (name, scale) in itertools.product(points.links(), scales.items()):
             if name.startswith("simulated_rank") and rows[name].isna().all():  # a K of other links
@@ -102,7 +102,7 @@ def _flown(export: Export) -> Iterator[str]:
         at = kml.coordinates(longitude, latitude, line.up_m[pick])
         if export.clock:
             times = "".join(f"<when>{time}</when>" for time in iso_time(line.time[pick]))
-            places = "".join(f"<gx:coord>{one.replace(',', ' ')}</gx:coord>" for one in at)
+            places = "".join(f"<gx:coord>{item.replace(',', ' ')}</gx:coord>" for item in at)
             shape = f"<gx:Track>{_AIR}{times}{places}</gx:Track>"
         else:
             shape = f"<LineString>{_AIR}<coordinates>{' '.join(at)}</coordinates></LineString>"

@@ -317,7 +317,7 @@ def of_campaign(data: CampaignData) -> Export | None:
     if data.site is None:
         return None
     rss = [_rss_link(row) for row in data.reference_rows]
-    rank = [_rank_link(one) for one in data.flown_ranks]
+    rank = [_rank_link(flown_rank) for flown_rank in data.flown_ranks]
     lines = []
     for track in data.tracks:
         start = next((x["time"][0] for x in (*rss, *rank) if x["flight"] == track.flight and len(x["time"])), None)
@@ -331,7 +331,7 @@ def of_campaign(data: CampaignData) -> Export | None:
         site=data.site,
         sets=(*points_table("rss", rss, data.site.frame), *points_table("rank", rank, data.site.frame)),
         lines=tuple(lines),
-        clock=_clock(one["time"] for one in (*rss, *rank)),
+        clock=_clock(item["time"] for item in (*rss, *rank)),
         synthetic=bool(data.synthetic),
         attributes=_made(data.generated, data.versions),
     )

@@ -140,8 +140,8 @@ def points_dataset(export: Export, points: Points) -> Any:
             said["positive"] = "up"
         variables[short] = ("obs", points.table[name].to_numpy(), said)
     variables["crs"] = ((), np.int32(0), WGS84)
-    for one in points.columns:
-        variables[one.name.replace(".", "p")] = ("obs", *_values(one, points.table[one.name].to_numpy()))
+    for item in points.columns:
+        variables[item.name.replace(".", "p")] = ("obs", *_values(item, points.table[item.name].to_numpy()))
     about = file_attributes(
         title=f"{_TITLES.get(points.kind, points.kind)}: {export.title}",
         source="field logs, replayed by ray tracing",

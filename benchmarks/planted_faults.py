@@ -79,7 +79,7 @@ FAULTS = (
     Fault("ground of wet earth", "aerpaw_cmp.site.materials", "material", "return Material(key, _TABLE[key]", "return Material(key, _TABLE['wet_ground' if key == 'medium_dry_ground' else key]"),
     Fault("permittivity with a gain", "aerpaw_cmp.site.materials", "Material.relative_permittivity", "-loss)", "loss)"),
     Fault("conductivity at 1 GHz", "aerpaw_cmp.site.materials", "Material.conductivity_s_per_m", "(frequency_hz / 1e9) ** d", "1.0 ** d"),
-    Fault("walls 10 % thicker", f"{P}.field.fresnel", 'FaceMaterials.of', 'np.inf if t is None else t for t', 'np.inf if t is None else 1.1 * t for t'),
+    Fault("walls 10 % thicker", f"{P}.field.fresnel", 'FaceMaterials.of', 'np.inf if one.thickness_m is None else one.thickness_m', 'np.inf if one.thickness_m is None else 1.1 * one.thickness_m'),
     Fault("foliage 10 % stronger", f"{P}.field.foliage", "P833.loss_db", "-self.gamma_db_per_m * depth", "-1.1 * self.gamma_db_per_m * depth"),
     Fault("foliage without its largest loss", f"{P}.field.foliage", "P833.loss_db", "-self.maximum_db * np.expm1(-self.gamma_db_per_m * depth / self.maximum_db)", "self.gamma_db_per_m * depth"),
     Fault("foliage at the last entry of the table", f"{P}.field.foliage", "P833.at", "_GAMMA_EXPONENT * (mhz - inside)", "0.0 * (mhz - inside)"),

@@ -273,7 +273,7 @@ def test_a_log_that_changes_is_read_again_by_a_worker_that_lives_on(flight: Path
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from aerpaw_cmp.jobs import campaign_tasks
+from aerpaw_cmp.jobs.campaigns import campaign_tasks
 from aerpaw_cmp.jobs.campaigns.campaign_plan import compute, kept_outcomes
 from aerpaw_cmp.jobs.tasks.workers import Here
 from aerpaw_cmp.report.campaign_data import FlownTrack

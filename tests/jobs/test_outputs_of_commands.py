@@ -141,7 +141,12 @@ def test_a_bad_folder_is_told_before_the_computation(
     def never(*_: Any, **__: Any) -> None:
         raise AssertionError("the computation began")
 
-    for name in ("flight.data.gather", "jobs.campaign.run", "jobs.coverage_map.make_maps", "report.site_view.plan"):
+    for name in (
+        "flight.data.gather",
+        "jobs.campaigns.campaign.run",
+        "jobs.mapping.coverage_map.make_maps",
+        "report.site_view.plan",
+    ):
         monkeypatch.setattr(f"aerpaw_cmp.{name}", never)
     command = commands[job]
     taken, mine = logs.parent / "taken", logs.parent / "mine"

@@ -46,7 +46,7 @@ NEW_OBJECTS = 10_000
 
 
 def help_text() -> str:
-    """What ``aerpaw-cmp --help`` prints."""
+    """Text that ``aerpaw-cmp --help`` prints."""
     from .common.commands import COMMANDS
 
     width = max(map(len, COMMANDS))
@@ -104,7 +104,7 @@ def _quick_answer(arguments: list[str]) -> int | None:
 
 
 def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
-    """What the user is told of an exception that reached the top, and the exit code."""
+    """Message to the user about an exception that reached the top, and the exit code."""
     from .common.errors import AerpawCmpError
 
     if isinstance(error, AerpawCmpError):
@@ -144,7 +144,7 @@ def _is_homeless() -> bool:
 
 
 def _notes(error: BaseException | None) -> list[str]:
-    """What is kept, by the exception or those that it came of."""
+    """Notes on what is kept, from the exception and those that it came of."""
     notes: list[str] = []
     while error is not None:
         notes += [note for note in getattr(error, "__notes__", ()) if note not in notes]

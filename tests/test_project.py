@@ -320,3 +320,13 @@ def test_the_files_that_run_first_are_there() -> None:
         node for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "DEAREST"
     ]
     assert all((ROOT / "tests" / name).is_file() for name in ast.literal_eval(named.value))
+
+
+def test_docstrings_begin_with_the_thing_or_a_verb() -> None:
+    """Not with What, Whether and the like, which tell the reader nothing before the verb comes."""
+    asked = {"What", "Whether", "How", "Where", "Why", "Which", "Whose", "Who", "When"}
+    for path in [*(ROOT / "aerpaw_cmp").rglob("*.py"), *(ROOT / "parsers").rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef, ast.Module)):
+                first = (ast.get_docstring(node) or "").split(" ")[0]
+                assert first not in asked, f"{path.name}: {getattr(node, 'name', 'module')} begins with {first!r}"

@@ -77,7 +77,7 @@ def campaign(
 
 
 def _action(words: list[str]) -> tuple[str, Path]:
-    """What is asked for, and the campaign.yaml."""
+    """Action asked for, and the path of the campaign.yaml."""
     if len(words) == 1 and words[0] not in ("status", "resume"):
         return "run", Path(words[0])
     if len(words) == 2 and words[0] in ("status", "resume"):

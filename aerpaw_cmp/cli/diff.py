@@ -36,7 +36,7 @@ def diff(
     force: Force = False,
     as_json: Json = False,
 ) -> int:
-    """What changed between two reports of a flight: settings, inputs, versions, numbers on common samples."""
+    """Differences between two reports of a flight: settings, inputs, versions, numbers on common samples."""
     from ..jobs.diff_reports import run_diff
     from ..report.diff_html import diff_metrics
 

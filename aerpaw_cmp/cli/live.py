@@ -135,7 +135,7 @@ class StatusLine:
 
     @property
     def end(self) -> str:
-        """What leaves the line behind."""
+        """Text that leaves the line behind."""
         return "\n" if self._terminal else ""
 
     def __call__(self, name: str, now: Any) -> None:

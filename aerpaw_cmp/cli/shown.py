@@ -1,4 +1,4 @@
-"""What the commands print: progress, tables, JSON."""
+"""Output of the commands: progress, tables, JSON."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def print_json(value: dict[str, Any]) -> None:
 
 
 def print_plan(plan: Any, as_json: bool = False) -> None:
-    """What a command would do: a table of stages with their seconds, or one object."""
+    """Print what a command would do: a table of stages with their seconds, or one object."""
     if as_json:
         print_json(plan.as_dict())
         return
@@ -105,7 +105,7 @@ def print_plan(plan: Any, as_json: bool = False) -> None:
 
 
 def print_files(paths: Sequence[Path], as_json: bool = False) -> None:
-    """What was written: a line each, or one object."""
+    """Print the files that were written: a line each, or one object."""
     if as_json:
         print_json({"files": [str(path) for path in paths]})
         return

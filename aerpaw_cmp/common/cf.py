@@ -1,4 +1,4 @@
-"""What NetCDF files after the CF conventions share: units, reference systems, the file."""
+"""Common parts of NetCDF files after the CF conventions: units, reference systems, the file."""
 
 from __future__ import annotations
 

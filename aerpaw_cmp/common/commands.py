@@ -9,7 +9,7 @@ COMMANDS: dict[str, str] = {
     "audit": "Fill the audit into a report that was written without it.",
     "campaign": "Many flights and settings: pooled offsets, held-out flights, repeatability.",
     "explain": "Every path of a link at an instant: faces, angles, each loss, the sum.",
-    "diff": "What changed between two reports of a flight: settings, inputs, numbers with intervals.",
+    "diff": "Differences between two reports of a flight: settings, inputs, numbers with intervals.",
     "calibrate": "Learn antennas from several flights; score them on what was left out.",
     "tap": "Log the rank indicator live from the modem's serial port.",
     "modem-sim": "A pseudo-terminal that behaves like the modem, to try the tap without hardware.",

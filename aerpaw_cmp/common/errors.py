@@ -1,4 +1,4 @@
-"""Whose fault is it? One class per answer, each with its exit code.
+"""Exceptions, sorted by whose fault it is: one class per answer, each with its exit code.
 
 ======================  =========  =====================================
 class                   exit code  meaning

@@ -61,7 +61,7 @@ class SiteFrame:
 
 
 def in_shape(transform: Callable[[Any, Any], Any], x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """What pyproj makes of coordinates, in their common shape; up to 3.7.1 it takes an array of one for a number.
+    """Coordinates transformed by pyproj, in their common shape; up to 3.7.1 it takes an array of one for a number.
 
     Parameters
     ----------

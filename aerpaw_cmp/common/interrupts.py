@@ -32,7 +32,7 @@ _last: int = signal.SIGINT
 
 
 def came() -> bool:
-    """Whether an interrupt came since :func:`noted` began; False outside of it."""
+    """Check whether an interrupt came since :func:`noted` began; False outside of it."""
     return _came
 
 

@@ -1,4 +1,4 @@
-"""What to type after a failure: the last part of every message."""
+"""Text on what to type after a failure: the last part of every message."""
 
 from __future__ import annotations
 

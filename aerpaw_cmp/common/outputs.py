@@ -1,4 +1,4 @@
-"""Where results go: they replace nothing that is not this tool's, and appear whole or not at all.
+"""Output files and folders: they replace nothing that is not this tool's, and appear whole or not at all.
 
 Three kinds of result, one rule:
 
@@ -62,7 +62,7 @@ def sealed(text: str) -> bytes:
 
 
 def is_sealed(path: Path) -> bool:
-    """Whether a file is as :func:`sealed` made it, and nobody changed it since."""
+    """Check whether a file is as :func:`sealed` made it, and nobody changed it since."""
     with path.open("rb") as stream:
         head = stream.readline(len(_SEAL) + 80)
         seal = f"{_SEAL}{_digest(stream)}\n" if head.startswith(_SEAL.encode("ascii")) else ""
@@ -248,7 +248,7 @@ def _ask(own: Callable[[Path], bool], path: Path) -> bool:
 
 
 class _SeveralFiles:
-    """How outputs of several files end: what is unfinished goes, and an interrupt says what stands."""
+    """End of outputs of several files: what is unfinished goes, and an interrupt says what stands."""
 
     named: Path
     _place: _Place | None
@@ -734,7 +734,7 @@ class _Place:
 
 
 def _lock(descriptor: int) -> bool:
-    """Whether the lock was had; True as well on systems and disks that have no locks."""
+    """Check whether the lock was had; True as well on systems and disks that have no locks."""
     try:
         import fcntl
 
@@ -843,7 +843,7 @@ _WRONG_NAMES = (errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, e
 
 
 def _taken(path: Path) -> bool:
-    """Whether anything has the name; OSError where nothing can have it, which ``lexists`` takes for a free one."""
+    """Check whether anything has the name; OSError where nothing can, which ``lexists`` takes for a free one."""
     try:
         path.lstat()
     except FileNotFoundError:

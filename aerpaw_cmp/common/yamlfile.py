@@ -350,7 +350,7 @@ class _Builder:
 
 
 def _plain_value(text: str) -> Any:
-    """What an unquoted scalar means by the core schema of YAML 1.2."""
+    """Value of an unquoted scalar by the core schema of YAML 1.2."""
     if text in _WORDS:
         return _WORDS[text]
     if _INT.match(text) and len(text) < 40:

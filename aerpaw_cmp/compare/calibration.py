@@ -1,4 +1,4 @@
-"""What flights teach about antennas, and how well it carries over to flights, heights and directions left out."""
+"""Antenna gain learned from flights, and its generalization to flights, heights and directions left out."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Observed:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """What is learned.
+    """Definition of the quantities to be learned.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class Learned:
     """Of each antenna: :func:`~aerpaw_cmp.compare.spread.fading_of` the flights that were learned from."""
 
     def spread(self, antenna: str) -> Spread:
-        """What remains of a level at an antenna besides the standard deviation of the gain."""
+        """Spread of a level at an antenna besides the standard deviation of the gain."""
         model = self.choice.model
         sd_db, kurtosis = self.fading.get(antenna, (0.0, 0.0))
         return Spread(
@@ -181,7 +181,7 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, choice: Choice | None =
 
 
 def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkSamples:
-    """What is left of the residual beside ``known_db``; below the floor, what the fit expects, no higher than it."""
+    """Residual minus ``known_db``; below the floor, the value that the fit expects, no higher than the floor."""
     left = samples.residual_db - known_db
     if samples.floor_db is None:
         return dataclasses.replace(samples, residual_db=left)

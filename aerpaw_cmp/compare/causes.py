@@ -48,7 +48,7 @@ _LAGS_S = np.arange(-10.0, 10.25, 0.5)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LevelEvidence:
-    """What a cause is told from: one channel of a flight.
+    """Evidence from which a cause is told: one channel of a flight.
 
     Parameters
     ----------

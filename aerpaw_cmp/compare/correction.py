@@ -1,4 +1,4 @@
-"""Which prediction to trust, and what to add to it: chosen on flights (or blocks) left out inside those that are known.
+"""Choice of a prediction and its correction, by flights (or blocks) left out inside those that are known.
 
 A *base* predicts levels above free space: nothing at all (a constant level), free space, a replay, learned antennas. A
 *correction* is the residual field (:mod:`.field_gp`) of a base. Both are chosen by the CRPS of what is left out, and
@@ -61,7 +61,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Correction:
-    """What was chosen, conditioned on all that is known.
+    """Chosen base and residual field, conditioned on all that is known.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Correction:
 
     @property
     def on(self) -> bool:
-        """Whether a residual field is added."""
+        """True if a residual field is added."""
         return self.title != OFF
 
     def rows_of(self, samples: LinkSamples, flight: str | None = None) -> Rows:
@@ -196,7 +196,7 @@ def _model(title: str, channels: Mapping[str, Channel]) -> FieldModel:
 
 @dataclass(frozen=True, slots=True)
 class _Fold:
-    """What is known, and what is asked, of one part that is left out."""
+    """Known samples and asked samples of one part that is left out."""
 
     known: list[LinkSamples]
     asked: list[LinkSamples]

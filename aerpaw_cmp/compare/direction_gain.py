@@ -37,7 +37,7 @@ MOST_COLUMNS = 6000
 
 @dataclass(frozen=True, slots=True)
 class LinkSamples:
-    """What one flight measured on one channel of one tower, against a model without the gain to be learned.
+    """Measurements of one flight on one channel of one tower, against a model without the gain to be learned.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ class _System:
 
 
 def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
-    """What a term of this frame is a function of: (n, 3), or (n, 6) of both directions."""
+    """Argument of a term of this frame: (n, 3), or (n, 6) of both directions."""
     if frame == "pair":
         return np.concatenate([samples.at_uav, samples.at_tower], axis=1)
     if frame == "body":
@@ -451,7 +451,7 @@ def _ratio(model: GainModel) -> float:
 
 
 def _key(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> bytes:
-    """What the equations of a series depend on."""
+    """Digest of everything that the equations of a series depend on."""
     terms = [(block.term.frame, block.term.length, block.knots is None) for block in own]
     knots = [block.knots for block in own if block.knots is not None]
     return _digest((_ratio(model), model.own_length_m, terms), *(getattr(samples, n) for n in _ARRAYS), *knots)

@@ -9,7 +9,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldAudit:
-    """What the two references found.
+    """Differences that the two references found.
 
     Parameters
     ----------

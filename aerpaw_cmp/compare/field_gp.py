@@ -1,4 +1,4 @@
-"""What a prediction leaves, as a Gaussian process over place, height, direction and time of flight.
+"""Residual of a prediction, as a Gaussian process over place, height, direction and time of flight.
 
 One covariance for every use (a map, a route, blocks left out, the rest of a flight)::
 
@@ -95,7 +95,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rows:
-    """Where and when: samples of one channel, or targets.
+    """Places and times: samples of one channel, or targets.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Apart:
-    """How far rows are apart (..., n, m): horizontally, in height, in direction (squared), in time; same flight."""
+    """Distances between rows (..., n, m): horizontal, in height, in direction (squared), in time; same flight."""
 
     across_m: FloatArray
     height_m: FloatArray
@@ -266,7 +266,7 @@ class FieldFit:
         return mean, sd
 
     def fits(self, targets: int) -> bool:
-        """Whether so many targets have the exact solution."""
+        """Check whether so many targets have the exact solution."""
         return len(self.rows) <= EXACT_ROWS and len(self.rows) ** 2 * float(targets) <= EXACT_WORK
 
     @cached_property

@@ -67,7 +67,7 @@ def constant_forecast(rank: ArrayLike, ranks: int = MAX_RANK) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForecastScore:
-    """What a forecast is worth on samples that had no part in its fit.
+    """Score of a forecast on samples that had no part in its fit.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How strong ends, nuisance and noise are against each other: chosen on the training flights alone.
+"""Relative strengths of ends, nuisance and noise: chosen on the training flights alone.
 
 Everything here works on the covariance of averaged bins, some thousand rows at most, in place of the normal equations
 of harmonics: folds and strengths are parts and multiples of one matrix.

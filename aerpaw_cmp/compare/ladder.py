@@ -1,4 +1,4 @@
-"""What a scene needs: a ladder of models, scored on stretches of the flight that had no part in their offset.
+"""Ladder of models, to find what a scene needs: scored on stretches of the flight that had no part in their offset.
 
 Each rung is a prediction of the same samples by a model with one thing more than another. A flight is cut into
 places, or into stretches of time; the offset of a model is fitted without one and scored on it, in turn. Models are

@@ -1,4 +1,4 @@
-"""How the error on flights left out falls with the number of flights that were learned from, and one more."""
+"""Error on flights left out against the number of flights that were learned from, and for one more."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a transmitter of unknown place stands, from the levels of one flight.
+"""Position estimate of a transmitter of unknown place, from the levels of one flight.
 
 The model: a level falls with the logarithm of the distance, by a free slope; both antennas add a gain over the
 elevation, shadowing is remembered for half a minute, and what lies below the receiver's floor says only that.
@@ -247,7 +247,7 @@ class NodeEstimate:
     at_edge: bool
 
     def __contains__(self, place_m: ArrayLike) -> bool:
-        """Whether a place lies within the 90 % region."""
+        """Check whether a place lies within the 90 % region."""
         away = np.asarray(place_m, dtype=np.float64)[:2] - self.place_m[:2]
         return bool(np.hypot(*away) <= self.radius90_m)
 

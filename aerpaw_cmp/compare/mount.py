@@ -1,4 +1,4 @@
-"""How antennas of known pattern hang: azimuth and tilt of all ends of several flights at once."""
+"""Mounts of antennas of known pattern: azimuth and tilt of all ends of several flights at once."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ the broad shape over azimuth that tells a mount: on dataset 12 the azimuth at th
 
 @dataclass(frozen=True, slots=True)
 class MountFit:
-    """How an antenna of known pattern hangs.
+    """Fitted mount of an antenna of known pattern.
 
     Parameters
     ----------

@@ -359,7 +359,7 @@ _GROUP: dict[str, tuple[int, ...]] = {"link": (0, 1, 2), "tower": (1,), "channel
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moments:
-    """What an offset needs of a sequence: pairs, mean and variance of simulated minus measured [dB, dB^2]."""
+    """Moments of a sequence that an offset needs: pairs, mean and variance of simulated minus measured [dB, dB^2]."""
 
     n: int
     mean_db: float

@@ -47,7 +47,7 @@ def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Repeated:
-    """What two passes of the same places differ by [dB], over ``n`` pairs: no model can be expected to do better."""
+    """Difference of two passes of the same places [dB], over ``n`` pairs: no model can be expected to do better."""
 
     rmse_db: float
     rmse_ci95_db: Interval

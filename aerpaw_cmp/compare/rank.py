@@ -546,7 +546,7 @@ def capacity_rank(h: ArrayLike, sinr_db: ArrayLike) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class Staleness:
-    """How long the modem's report was held.
+    """Time that the modem's report was held.
 
     Parameters
     ----------
@@ -879,7 +879,7 @@ def commonest_rank(measured: ArrayLike) -> CommonestRank:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankRepeat:
-    """What two passes of the same places agree to: no model can be expected to do better.
+    """Agreement of two passes of the same places: no model can be expected to do better.
 
     Parameters
     ----------
@@ -941,7 +941,7 @@ def _kappa_interval(a: IntArray, b: IntArray, kappa: float) -> Interval:
 
 
 def _explored(a: IntArray, b: IntArray) -> bool:
-    """Whether both sequences are long enough to have met the ranks that their process has.
+    """Check whether both sequences are long enough to have met the ranks that their process has.
 
     Agreement forgets sooner than the ranks do, but a rank that a short flight never met is in no resample of it.
     """

@@ -1,4 +1,4 @@
-"""How a receiver decides its rank, learned on flights: from singular values and level to a probability of each rank.
+"""Rank decision of a receiver, learned on flights: from singular values and level to a probability of each rank.
 
 A receiver picks the rank that promises most throughput at its noise, from a codebook and an estimate of the channel
 that no log holds. What can be learned is how often it says 1, 2, 3 or 4 where the modelled channel has certain ratios
@@ -41,7 +41,7 @@ _HELD = 1 << 22
 
 
 def stream_features(sigma: ArrayLike) -> FloatArray:
-    """What a receiver may decide by: ratios of singular values and level.
+    """Features that a receiver may decide by: ratios of singular values and level.
 
     Parameters
     ----------
@@ -456,7 +456,7 @@ def fit_mixture(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeatureChoice:
-    """Which of several modelled channels explains the training ranks best, and which do as well.
+    """Choice of the modelled channel that explains the training ranks best, and of those that do as well.
 
     Parameters
     ----------

@@ -209,7 +209,7 @@ class RssResult:
 
     @property
     def training(self) -> bool:
-        """Whether the antennas were learned from the very logs of this series: no error is given then."""
+        """True if the antennas were learned from the very logs of this series: no error is given then."""
         return bool(self.further.trained_on)
 
     @property
@@ -337,7 +337,7 @@ class AuditResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineResult:
-    """Which engine replayed the flight, at what price, what it left out, and its audit."""
+    """Engine that replayed the flight, its price, the things that it left out, and its audit."""
 
     engine: str
     links: int

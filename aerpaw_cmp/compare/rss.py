@@ -45,7 +45,7 @@ def seconds(time: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class RssComparison:
-    """How well a simulation predicts the measured level of one link.
+    """Comparison of a simulation with the measured level of one link.
 
     Parameters
     ----------
@@ -395,7 +395,7 @@ def link_geometry(
     tower_mount: FloatArray | None = None,
     uav_mount: FloatArray | None = None,
 ) -> dict[str, FloatArray]:
-    """What the residual may depend on, for every pose.
+    """Variables that the residual may depend on, for every pose.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a season of flights says: offsets from the other flights, differences between settings, drift over the dates."""
+"""Results of a season of flights: offsets from other flights, differences between settings, drift over the dates."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
 
 
 def verdict_of(difference: MeanOfFlights) -> Verdict:
-    """Whether a setting is shown to be worse than the first."""
+    """Check whether a setting is shown to be worse than the first."""
     if not np.isfinite(difference.low):
         return "no interval"
     return "worse" if difference.low > 0 else "not significant"

@@ -1,4 +1,4 @@
-"""Which cell serves: the one that the prediction says is strongest, against the one that the phone was on."""
+"""Serving cell: the one that the prediction says is strongest, against the one that the phone was on."""
 
 from __future__ import annotations
 

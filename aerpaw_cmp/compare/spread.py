@@ -1,4 +1,4 @@
-"""How far a level may lie from its prediction by learned antennas: gain, the flight's own nuisance, noise, fading."""
+"""Spread of a level about its prediction by learned antennas: gain, the flight's own nuisance, noise, fading."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_KURTOSIS = 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """What remains of a predicted level besides the gain's own standard deviation.
+    """Spread of a predicted level besides the gain's own standard deviation.
 
     Parameters
     ----------

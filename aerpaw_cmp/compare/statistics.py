@@ -63,7 +63,7 @@ def plain(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Autocorrelation:
-    """How long a sequence remembers.
+    """Memory of a sequence.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Autocorrelation:
 
     @property
     def enough(self) -> bool:
-        """Whether an interval can be given at all: at least :data:`FEWEST_INDEPENDENT` independent samples."""
+        """True if an interval can be given at all: at least :data:`FEWEST_INDEPENDENT` independent samples."""
         return bool(self.n_effective >= FEWEST_INDEPENDENT)
 
 

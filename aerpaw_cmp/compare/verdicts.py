@@ -175,7 +175,7 @@ def _means(errors_db: Iterable[tuple[str, float]]) -> dict[str, float]:
 
 
 def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
-    """Whether what was learned turns with the aircraft: the body frame against frames that do not (:func:`by_flight`).
+    """Check whether what was learned turns with the aircraft: body frame versus frames that do not (:func:`by_flight`).
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ LEAST_RATIO = 1.15
 
 
 def stated_errors(error_db: FloatArray, sd_db: FloatArray, common_db: FloatArray | float = 0.0) -> Verdict:
-    """Whether errors are as large as was stated for them.
+    """Check whether errors are as large as was stated for them.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ class Coverage:
 
 
 def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
-    """How much of the worst height is covered, and what takes the rest.
+    """Share of the worst height that is covered, and the cause that takes the rest.
 
     Parameters
     ----------
@@ -312,7 +312,7 @@ def _fraction(value: float) -> float:
 def changed_verdict(
     pooled: PairedDifference | None, differs: bool, measured_moved: bool, changed: Mapping[str, int]
 ) -> Verdict:
-    """What a difference between two reports comes from.
+    """Cause of a difference between two reports.
 
     Parameters
     ----------

@@ -75,7 +75,7 @@ _START = _Parts(5.0, 0.3, 1.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Along:
-    """What the level of a channel depends on, at equally spaced instants of the telemetry; NaN where no pose is known.
+    """Predictors of the level of a channel, at equally spaced instants of the telemetry; NaN where no pose is known.
 
     Parameters
     ----------

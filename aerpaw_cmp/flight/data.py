@@ -198,7 +198,7 @@ class _NodePlace:
 
 
 def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile, site: Site) -> _NodePlace:
-    """Where a node stands, or how it moves."""
+    """Position of a node, or its track where it moves."""
     if node.track is None:
         assert node.latitude_deg is not None
         assert node.longitude_deg is not None
@@ -286,7 +286,7 @@ RATIOS = ("quality", SNR)
 
 
 def is_ratio(stream: Stream, names: Sequence[str] = RATIOS) -> bool:
-    """Whether a stream of kind rss is a ratio to the noise, of one of the names."""
+    """Check whether a stream of kind rss is a ratio to the noise, of one of the names."""
     known = (stream.name, _text(stream, "channel"), _text(stream, "quantity"))
     return stream.kind == "rss" and any(name is not None and name.lower() in names for name in known)
 
@@ -402,7 +402,7 @@ def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 
 
 def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
-    """What is said of streams that are compared with a level over noise, or as if they were one."""
+    """Remarks on streams that are compared with a level over noise, or as if they were one."""
     kept = [s for s in streams if is_ratio(s) and s.name not in log.skip]
     blind = [s.name for s in kept if _noise(s, _link_of(links, log, s))[0] is None]
     if not blind:
@@ -494,7 +494,7 @@ def _nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) 
 
 
 def _idle_attitude(data: FlightData) -> tuple[str, ...]:
-    """What is to be told where ``rt.attitude`` cannot act, or only in part."""
+    """Warnings where ``rt.attitude`` cannot act, or only in part."""
     mode = data.settings.rt.attitude
     if mode == "ignored":
         return ()
@@ -535,7 +535,7 @@ def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
 
 
 def _unnamed_cell(log: LogSettings, stream: Stream) -> bool:
-    """Whether a stream is that of a cell that the flight file, which names others, does not name."""
+    """Check whether a stream is that of a cell that the flight file, which names others, does not name."""
     pci = stream.attributes.get("pci")
     return bool(log.cells) and pci is not None and int(pci) not in log.cells
 
@@ -636,7 +636,7 @@ def _joined(parts: Sequence[RssSeries | RankSeries], name: str) -> AnyArray:
 
 
 def _form(series: RssSeries | RankSeries) -> object:
-    """What two parts of one record must share."""
+    """Property that two parts of one record must share."""
     return series.unit if isinstance(series, RssSeries) else series.position_m is None
 
 

@@ -131,7 +131,7 @@ def draft(
 
 
 def _proof(text: str, folder: Path, files: Mapping[str, IngestedFile], paths: Sequence[str]) -> DryRun:
-    """What a report of the draft would score; logs whose times the draft moves are read again."""
+    """Dry run of the draft's report: the samples it would score; logs whose times the draft moves are read again."""
     settings = parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
     settings = with_learned(settings, folder)
     read = []
@@ -229,7 +229,7 @@ SURE_M = 100.0
 
 
 def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
-    """What the site remembers that fits; of a memory that cannot be read, nothing, and a remark says so."""
+    """Fitting part of the site's memory; nothing, and a remark, where the memory cannot be read."""
     series = [(tower, channel, reader) for tower, channel, reader in entries.series]
     try:
         known = read_learned(site_place(site, folder))
@@ -315,7 +315,7 @@ def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, si
 
 
 def _has_attitude(frame: Any) -> bool:
-    """Whether most telemetry rows know how the aircraft is turned."""
+    """Check whether most telemetry rows know how the aircraft is turned."""
     names = ["roll_deg", "pitch_deg", "yaw_deg"]
     return set(names) <= set(frame.columns) and bool(frame[names].notna().all(axis=1).mean() > 0.5)
 
@@ -384,7 +384,7 @@ class _Entries:
         return None if self.flown is None else self.flown[0]
 
     def leads(self, file: IngestedFile) -> bool:
-        """Whether the track is in this file."""
+        """Check whether the track is in this file."""
         return any(s is self._track for s in file.result.streams)
 
     def sort(self, files: Sequence[IngestedFile]) -> None:
@@ -587,7 +587,7 @@ def _leading(streams: Sequence[Stream]) -> dict[str, str]:
 
 
 def _key(stream: Stream, entry: Mapping[str, Any]) -> tuple[str, ...]:
-    """What a report tells series apart by."""
+    """Key by which a report tells series apart."""
     tower = str(entry.get("node") or stream.attributes.get("node"))
     if stream.kind == "rank":
         return tower, "rank"
@@ -606,7 +606,7 @@ def _has_positions(stream: Stream) -> bool:
 
 
 def _has_level(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None) -> bool:
-    """Whether some stream of the flight is RSS in the proper sense."""
+    """Check whether some stream of the flight is RSS in the proper sense."""
     levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
     spans = [span for s in levels if (span := stream_span(s))]
     return any(flown is None or _meet(span, flown[1]) for span in spans)
@@ -699,7 +699,7 @@ def _flow(entry: dict[str, Any]) -> str:
 
 
 def _is_text(path: str) -> bool:
-    """Whether a path can be written as UTF-8: names that cannot are held as surrogates."""
+    """Check whether a path can be written as UTF-8: names that cannot are held as surrogates."""
     try:
         path.encode("utf-8")
     except UnicodeEncodeError:

@@ -1,4 +1,4 @@
-"""How many samples of a flight a report would score, and why not more, before anything is replayed."""
+"""Number of samples of a flight that a report would score, and why not more, before anything is replayed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class DryRun:
 
     @property
     def reason(self) -> str:
-        """Why nothing would be scored; empty where something is."""
+        """Reason why nothing would be scored; empty where something is."""
         return "" if self.samples else self.refused or "; ".join(self.lost)
 
 
@@ -77,7 +77,7 @@ def _counts(place: FloatArray, known: BoolArray, value: FloatArray, lowest_m: fl
 
 
 def _loss(data: FlightData, time: Times, counts: tuple[int, int, int]) -> str:
-    """Why none, or less than half, of the values of a series is compared; empty for others."""
+    """Give the reason why none, or less than half, of the values of a series is compared; empty for others."""
     valued, placed, high = counts
     if not valued:
         return "no sample holds a value (out of coverage, or no report)"

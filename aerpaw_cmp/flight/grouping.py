@@ -30,12 +30,12 @@ class Flight:
 
     @property
     def measured(self) -> list[Stream]:
-        """What can be compared."""
+        """Streams that can be compared."""
         return [stream for file in self.files for stream in file.result.streams if stream.kind in ("rss", "rank")]
 
     @property
     def complete(self) -> bool:
-        """Whether it holds something to compare, and positions to compare it at."""
+        """True if it holds something to compare, and positions to compare it at."""
         measured = self.measured
         tracked = any(_has_track(file) for file in self.files)
         return bool(measured) and (tracked or any("latitude_deg" in stream.frame for stream in measured))

@@ -15,7 +15,7 @@ _IN_NAME = re.compile(r"(?<![A-Za-z0-9.])(\d{1,3}) ?(?:m|meters|metres)(?![A-Za-
 
 
 def lacks_height(stream: Stream) -> bool:
-    """Whether a stream has positions and no altitude in any row."""
+    """Check whether a stream has positions and no altitude in any row."""
     frame = stream.frame
     if "latitude_deg" not in frame or not frame["latitude_deg"].notna().any():
         return False

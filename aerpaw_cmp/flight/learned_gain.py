@@ -1,4 +1,4 @@
-"""What learned antennas say about a link besides the patterns that the replay takes: both ends at once, error bars."""
+"""Learned antenna data of a link besides the patterns that the replay takes: both ends at once, error bars."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When the receiver of AERPAW's channel sounder was in lock."""
+"""Times when the receiver of AERPAW's channel sounder was in lock."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WITHIN_S = 0.1
 
 
 def may_lose_lock(stream: Stream) -> bool:
-    """Whether a stream is the lock quality of the sounder: where locked, it stays near its peak."""
+    """Check whether a stream is the lock quality of the sounder: where locked, it stays near its peak."""
     if stream.kind != "rss" or stream.name != "quality":
         return False
     quality = stream.frame["rss_db"].to_numpy(np.float64)
@@ -30,12 +30,12 @@ def may_lose_lock(stream: Stream) -> bool:
 
 
 def is_sounder_power(stream: Stream) -> bool:
-    """Whether a stream may be the level beside such a quality."""
+    """Check whether a stream may be the level beside such a quality."""
     return stream.kind == "rss" and stream.name == "power" and stream.attributes.get("unit") == "dB re full scale"
 
 
 def lock_of(power: Stream, others: Iterable[Stream]) -> tuple[FloatArray | None, str]:
-    """When a sounder's level was measured in lock.
+    """Lock state of a sounder's receiver at each row of its level.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a path of a flight loses besides its own field: foliage, reflections, rough ground; and which crowns reflect."""
+"""Losses of a path of a flight besides its own field: foliage, reflections, rough ground; and crowns that reflect."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .settings import RtSettings
 
 
 def crowns_reflect(trees: Trees, rt: RtSettings) -> bool:
-    """Whether crowns reflect: those of ``foliage: opaque``, unless ``rt.advanced.crown_reflections`` is off."""
+    """Check whether crowns reflect: those of ``foliage: opaque``, unless ``rt.advanced.crown_reflections`` is off."""
     return rt.foliage == "opaque" and rt.advanced.crown_reflections and len(trees) > 0
 
 

@@ -1,4 +1,4 @@
-"""Which tower, or which place, the levels of a log fit: proposals for a draft."""
+"""Tower, or place, that the levels of a log fit: proposals for a draft."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class Placer:
 
     @property
     def at_site(self) -> bool:
-        """Whether the flight was flown near a tower of the site."""
+        """True if the flight was flown near a tower of the site."""
         return any(self._near(tower.latitude_deg, tower.longitude_deg) for tower in self.site.towers.values())
 
     def levels(self, stream: Stream, floor_db: float = -np.inf) -> LevelTrack:

@@ -247,7 +247,7 @@ def with_turns(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pattern:
-    """How a route is made: ``shape`` lawnmower or cross, course of its legs, height, nose, slow turns or not."""
+    """Parameters of a route: ``shape`` lawnmower or cross, course of its legs, height, nose, slow turns or not."""
 
     shape: Literal["lawnmower", "cross"]
     azimuth_deg: float

@@ -1,4 +1,4 @@
-"""What a draft takes from the memory of its site: only what fits the tower, the channel, the reader and so the band."""
+"""Part of a site's memory that a draft takes: only what fits the tower, the channel, the reader and so the band."""
 
 from __future__ import annotations
 

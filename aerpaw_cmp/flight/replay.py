@@ -258,7 +258,7 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
 
 
 def _along(data: FlightData, series: RssSeries, instants: Times, step_s: float) -> Along:
-    """What the level of a series depends on along the telemetry; the replay has at most one reflection."""
+    """Predictors of the level of a series along the telemetry; the replay has at most one reflection."""
     link = series.link.build([series.tower], data.folder)
     parts = [_levels_along(data, link, series.tower, part) for part in _in_blocks(instants)]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

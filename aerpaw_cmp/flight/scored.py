@@ -1,4 +1,4 @@
-"""Which rows of a log a comparison scores: those that no flag voids."""
+"""Rows of a log that a comparison scores: those that no flag voids."""
 
 from __future__ import annotations
 

@@ -317,7 +317,7 @@ class Waypoint(Settings):
 
 
 class PlanSettings(Settings):
-    """What ``aerpaw-cmp simulate`` plants into the logs it writes; all of it goes into truth.json."""
+    """Ground truth that ``aerpaw-cmp simulate`` plants into the logs it writes; all of it goes into truth.json."""
 
     start: datetime
     """Local time in the flight's zone."""
@@ -424,7 +424,7 @@ class AdvancedRt(Settings):
 
 
 class RtSettings(GroupedSettings):
-    """How the flight is replayed."""
+    """Settings of the replay of the flight."""
 
     WITHOUT_EFFECT = ("batch", "interactions", "paired_foliage", "scattering_coefficient")
 
@@ -500,7 +500,7 @@ class AdvancedRss(Settings):
 
 
 class RssSettings(GroupedSettings):
-    """How RSS is compared."""
+    """Settings of the comparison of RSS."""
 
     WITHOUT_EFFECT = ("bootstrap",)
 
@@ -544,7 +544,7 @@ class AdvancedRank(Settings):
 
 
 class RankSettings(GroupedSettings):
-    """How rank is compared."""
+    """Settings of the comparison of rank."""
 
     tower: str = "LW1"
     k: Annotated[list[Positive], Field(min_length=1, max_length=64)] = [10.0, 100.0, 1000.0]
@@ -563,7 +563,7 @@ class RankSettings(GroupedSettings):
 
 
 class ReportSettings(GroupedSettings):
-    """What the report shows."""
+    """Contents of the report."""
 
     WITHOUT_EFFECT = ("speed_table",)
 
@@ -595,7 +595,7 @@ class FlightFile(Settings):
     report: ReportSettings = ReportSettings()
 
     def old_keys(self) -> list[str]:
-        """What became of each key that stands at the place of an earlier release."""
+        """Fate of each key that stands at the place of an earlier release."""
         groups = {"rt": self.rt, "rss": self.rss, "rank": self.rank, "report": self.report}
         return [f"{name}.{key} ({fate})" for name, group in groups.items() for key, fate in group._old.items()]
 
@@ -736,7 +736,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
 
 
 def _reason(error: InputError | UsageError) -> str:
-    """What was found instead of what was expected, in which file."""
+    """Reason for an error: what was found, in which file, and what was expected instead."""
     where = f" in {Path(error.path).name}" if error.path else ""
     return f"{error.found}{where}; expected: {error.expected}"
 

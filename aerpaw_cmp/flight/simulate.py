@@ -390,7 +390,7 @@ class FlightSimulator:
         return format_ri_csv(records, str(log.timezone or self.settings.timezone))
 
     def _reported(self, rank: IntArray, layers: int) -> IntArray:
-        """What the modem prints: one layer off now and then, 0 without CSI."""
+        """Rank that the modem prints: one layer off now and then, 0 without CSI."""
         generator, plan = self.generator, self.plan
         off = generator.random(len(rank)) < plan.rank_error_share
         step = np.where(generator.random(len(rank)) < 0.5, -1, 1)

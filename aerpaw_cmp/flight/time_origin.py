@@ -1,4 +1,4 @@
-"""When a log with relative times began, from a companion log that knows the time."""
+"""Start time of a log with relative times, from a companion log that knows the time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the UAV was and how it was turned at any instant.
+"""Position and attitude of the UAV at any instant.
 
 Attitude is interpolated as rotation (slerp), never as angles. Telemetry gaps longer than a stated limit are not
 bridged; poses in them are invalid, with a reason. What a log does not say (attitude) is replaced by level flight
@@ -40,7 +40,7 @@ REASONS = (
 
 @dataclass(frozen=True, slots=True)
 class TrackAccount:
-    """What became of the telemetry rows.
+    """Account of what became of the telemetry rows.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class TrackAccount:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a user should know, one sentence each."""
+        """Warnings for the user, one sentence each."""
         reasons = (
             (self.hour_steps, "step(s) of whole hours between telemetry rows: daylight-saving change or a reset clock"),
             (self.backward_time, "telemetry row(s) out of time order were left out"),
@@ -137,7 +137,7 @@ class TrackPoses:
 
     @property
     def reason(self) -> AnyArray:
-        """Why a pose is not valid (n,), one of :data:`REASONS`; empty where it is."""
+        """Reason why a pose is not valid (n,), one of :data:`REASONS`; empty where it is."""
         return np.asarray(REASONS)[self.reason_code]
 
     @property
@@ -405,7 +405,7 @@ def _interpolate(t: FloatArray, at: FloatArray, values: FloatArray) -> FloatArra
 
 
 def _in_gap(t: FloatArray, at: FloatArray, limit_s: float) -> BoolArray:
-    """Whether an instant lies strictly inside an interval longer than the limit."""
+    """Check whether an instant lies strictly inside an interval longer than the limit."""
     right = np.clip(np.searchsorted(at, t, side="left"), 0, len(at) - 1)
     left = np.maximum(right - 1, 0)
     exact = np.minimum(np.abs(at[right] - t), np.abs(at[left] - t)) <= _SAME_S

@@ -160,7 +160,7 @@ def speed_against_error(
 
 @dataclass(frozen=True)
 class _Case:
-    """What every row replays, and the reference."""
+    """Case that every row replays, and the reference."""
 
     site: Site
     link: Link

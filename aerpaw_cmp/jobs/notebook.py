@@ -116,7 +116,7 @@ class Flight:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What must be known before any number is believed."""
+        """Warnings that must be known before any number is believed."""
         return self.data.warnings
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What every job is told besides its own settings, and what every job gives back."""
+"""Options of every job besides its own settings, and the outcome that every job gives back."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..common.stages import Progress, silent
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOptions:
-    """Where results go and logs lie, what may be replaced, who computes, who is told.
+    """Options of a run: where results go and logs lie, what may be replaced, who computes, who is told.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ DEFAULT = RunOptions()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOutcome:
-    """What a job made.
+    """Outcome of a job.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a command would do and about how long it would take: ``report --dry-run`` and ``map --dry-run``.
+"""Plan of what a command would do and about how long it would take: ``report --dry-run`` and ``map --dry-run``.
 
 The replay is timed: a few poses of the job itself, on this machine, now. Stages that cannot be tried in a second are
 :data:`MEASURED` CPU seconds per unit of work on the sample flight and site, times what this machine needs for a small
@@ -61,7 +61,7 @@ class PlannedStage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What a command would do.
+    """Plan of what a command would do.
 
     Parameters
     ----------

@@ -162,7 +162,7 @@ def run_simulate(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportOptions:
-    """What the command line says of one report.
+    """Options that the command line gives for one report.
 
     Parameters
     ----------
@@ -620,7 +620,7 @@ def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
 
 
 def outcomes_folder() -> Path:
-    """Where outcomes are kept by default: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
+    """Folder where outcomes are kept by default: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
     return Path(os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp") / "outcomes"
 
 
@@ -712,7 +712,7 @@ def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
 
 
 def campaign_status(path: Path, options: RunOptions = DEFAULT, *, keep: Path | None = None, fresh: bool = False) -> Any:
-    """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaigns.campaign_plan.CampaignStatus`).
+    """Status of a campaign: kept and still to do (:class:`~aerpaw_cmp.jobs.campaigns.campaign_plan.CampaignStatus`).
 
     Parameters
     ----------

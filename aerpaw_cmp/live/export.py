@@ -98,7 +98,7 @@ def _rows(source: Path, bad: list[BadLine]) -> Iterator[dict[str, Any]]:
 
 
 def _is_export(path: Path) -> bool:
-    """Whether a file begins as a table of this module."""
+    """Check whether a file begins as a table of this module."""
     head = ",".join(COLUMNS) + "\r\n"
     with path.open("rb") as stream:
         return stream.read(len(head)) == head.encode("ascii")

@@ -127,7 +127,7 @@ class _Modem:
     )  # fmt: skip
 
     def shown(self, now: float) -> dict[str, Any]:
-        """What the page shows of the moment."""
+        """Values of the moment, as the page shows them."""
         while self.times and now - self.times[0] > RATE_WINDOW_S:
             self.times.popleft()
         return {name: getattr(self, name) for name in self._SHOWN} | {
@@ -398,7 +398,7 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
 
 
 def _rest_of_route(rest: Mapping[str, Any]) -> dict[str, Any]:
-    """What the page shows of the rest of a route; ValueError where a level is no number."""
+    """Rest of a route as the page shows it; ValueError where a level is no number."""
     level, (low, high) = float(rest["level_dbm"]), map(float, rest["interval_dbm"])
     points = [[float(v) for v in point[:5]] for point in rest["points"][:POINTS_AHEAD]]
     if not all(map(math.isfinite, [level, low, high, *(v for point in points for v in point)])):

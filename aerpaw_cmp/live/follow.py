@@ -23,7 +23,7 @@ TAIL_BYTES = 65_536
 
 @dataclass(frozen=True, slots=True)
 class TelemetrySample:
-    """Where the UAV was at ``utc_ns``; angles as in the telemetry record."""
+    """Position and attitude of the UAV at ``utc_ns``; angles as in the telemetry record."""
 
     utc_ns: int
     latitude_deg: float

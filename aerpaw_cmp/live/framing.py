@@ -32,7 +32,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What came back for one command.
+    """Response to one command.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def final_result(text: str) -> tuple[Status, str | None] | None:
 
 
 def is_unsolicited(text: str) -> bool:
-    """Whether a line is of a kind that modems send unasked (some are answers too, to their own query)."""
+    """Check whether a line is of a kind that modems send unasked (some are answers too, to their own query)."""
     return _UNSOLICITED.match(text) is not None
 
 
@@ -300,7 +300,7 @@ class Framer:
         return answer
 
     def leave(self) -> tuple[tuple[str, ...], str]:
-        """What is held and belongs to nothing: lines of owed answers, and the unfinished line. Forgotten here."""
+        """Return and forget what is held and belongs to nothing: lines of owed answers, and the unfinished line."""
         lines, self._stray = tuple(self._stray), []
         partial = self._buffer.peek()
         for _ in self._buffer.flush():
@@ -378,7 +378,7 @@ class Framer:
         self._open = None
 
     def _is_owed_final(self, now: _Open, status: Status) -> bool:
-        """Whether a final result ends an owed answer (a modem works off its commands in order)."""
+        """Check whether a final result ends an owed answer (a modem works off its commands in order)."""
         if not self._owed:
             return False
         if self._echo_seen and not now.echoed:

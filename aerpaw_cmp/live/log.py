@@ -81,7 +81,7 @@ def boot_id() -> str:
 
 
 def clock_synchronised() -> bool | None:
-    """Whether the kernel holds the wall clock for synchronised (adjtimex(2)); None if it cannot be asked."""
+    """Check whether the kernel holds the wall clock for synchronised (adjtimex(2)); None if it cannot be asked."""
     try:
         # modes = 0 only reads; the structure is 208 bytes, we need none of it; 5 is TIME_ERROR
         state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.create_string_buffer(512))
@@ -146,7 +146,7 @@ class _Syncer(threading.Thread):
 
 @dataclass(slots=True)
 class LogSettings:
-    """How the log is written.
+    """Settings for writing the log.
 
     Parameters
     ----------

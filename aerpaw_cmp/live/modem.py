@@ -1,4 +1,4 @@
-"""What the tap may say to a Quectel RM5xxQ, and what its answers mean.
+"""Commands that the tap may send to a Quectel RM5xxQ, and the meaning of its answers.
 
 Commands go out only if :data:`QUERIES` lists them; all of them read. The one that writes, ``csi_ctrl``, needs
 ``allow_csi=True``. Nothing here asks for IMEI, IMSI, ICCID or numbers, and :class:`Redactor` removes them from

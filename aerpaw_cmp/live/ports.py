@@ -71,7 +71,7 @@ class Holder:
 
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """Where the system keeps devices; tests give their own tree."""
+    """Folders where the system keeps devices; tests give their own tree."""
 
     dev: Path = Path("/dev")
     sys: Path = Path("/sys")
@@ -324,7 +324,7 @@ class SerialPort:
         return self._fd
 
     def read(self, limit: int = 65_536) -> bytes:
-        """What is there now; ``b""`` if nothing."""
+        """Read what is there now; ``b""`` if nothing."""
         try:
             data = os.read(self._fd, limit)
         except BlockingIOError:

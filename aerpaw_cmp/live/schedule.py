@@ -1,4 +1,4 @@
-"""Which query is due when."""
+"""Schedule of the queries: which one is due when."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ CATCH_UP = 2
 
 
 class Schedule:
-    """When to ask what. The first name goes first whenever it is due; the others by age.
+    """Order and times of the queries. The first name goes first whenever it is due; the others by age.
 
     After a short stall the polls that fell due meanwhile follow each other without a rest (each record has its true
     times), so that a hiccup of the machine costs no answer; after a long one the schedule starts from now.

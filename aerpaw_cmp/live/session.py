@@ -1,4 +1,4 @@
-"""What a session of the tap is told, what it shows and how it ended."""
+"""Settings, status and summary of a session of the tap."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .ports import Roots
 
 @dataclass(frozen=True, slots=True)
 class TapSettings:
-    """What the tap does; the defaults suit a flight.
+    """Settings of the tap; the defaults suit a flight.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ class TapSettings:
 
 @dataclass(frozen=True, slots=True)
 class TapStatus:
-    """What the terminal shows.
+    """Status that the terminal shows.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class TapStatus:
 
 @dataclass(frozen=True, slots=True)
 class TapSummary:
-    """How a session ended.
+    """Summary of a session that ended.
 
     Parameters
     ----------

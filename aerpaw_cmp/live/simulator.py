@@ -37,7 +37,7 @@ Reply = tuple[str, ...] | None
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """What goes wrong; every number counts answers, 0 is never.
+    """Faults that the simulator makes; every number counts answers, 0 is never.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ Kind = Literal["modem", "gps", "diag", "silent", "rubbish"]
 
 @dataclass(frozen=True, slots=True)
 class ModemSimSettings:
-    """Which modem is simulated.
+    """Settings of the simulated modem.
 
     Parameters
     ----------
@@ -408,7 +408,7 @@ class ModemSimulator:
 
     @property
     def port(self) -> Path:
-        """What to open: the link if there is one, else the node."""
+        """Path to open: the link if there is one, else the node."""
         return self.settings.link or self._node
 
     @property
@@ -542,7 +542,7 @@ class ModemSimulator:
         return not data
 
     def _babble(self) -> None:
-        """What other devices say unasked."""
+        """Write the unsolicited output of other devices."""
         kind = self.settings.kind
         if kind == "gps":
             self._write(b"$GPGSV,1,1,00*79\r\n$GPRMC,,V,,,,,,,,,,N*53\r\n")

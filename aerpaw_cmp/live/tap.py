@@ -326,7 +326,7 @@ class Tap:
             self._port = None
 
     def _leave_framer(self) -> None:
-        """What came and was finished by nothing is written down before it is forgotten."""
+        """Record what came and was finished by nothing, before it is forgotten."""
         lines, partial = self._left()
         if lines or partial:
             self._record({"kind": "unsolicited", "lines": lines, "partial": partial, "dropped_bytes": 0, **self._now()})
@@ -489,7 +489,7 @@ class Tap:
         return answer
 
     def _drain(self) -> None:
-        """What came while nothing was in flight is not part of the next answer."""
+        """Read what came while nothing was in flight, which is not part of the next answer."""
         while self._select(0.0) and self._port is not None:
             self._read()
 
@@ -556,7 +556,7 @@ class Tap:
     # waiting ----------------------------------------------------------------------------------------------
 
     def _select(self, timeout_s: float) -> bool:
-        """Whether the port has bytes, waiting at most so long; a stop request ends the waiting."""
+        """Check whether the port has bytes, waiting at most so long; a stop request ends the waiting."""
         poller = select.poll()
         if not self._stop.count:
             poller.register(self._stop.fileno(), select.POLLIN)

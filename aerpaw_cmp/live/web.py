@@ -78,7 +78,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where the page is served."""
+    """Host and port at which the page is served."""
 
     host: str
     port: int
@@ -104,7 +104,7 @@ class Address:
 
     @property
     def loopback(self) -> bool:
-        """Whether only this computer can reach it."""
+        """True if only this computer can reach it."""
         return _is_loopback(self.host)
 
     def __str__(self) -> str:
@@ -204,7 +204,7 @@ class _Server(ThreadingHTTPServer):
         self.server_address = self.socket.getsockname()
 
     def verify_request(self, request: Any, client_address: Any) -> bool:  # noqa: ARG002
-        """Whether the connection is within the limits; one beyond them is closed unanswered."""
+        """Check whether the connection is within the limits; one beyond them is closed unanswered."""
         now, limits = time.monotonic(), self.web.limits
         self._allowance = min(limits.burst, self._allowance + (now - self._counted) * limits.per_second)
         self._counted = now
@@ -289,7 +289,7 @@ class _Handler(BaseHTTPRequestHandler):
                 self._events(self.headers.get("Last-Event-ID") or query.get("from", ""))
 
     def _refusal(self, path: str, query: dict[str, str]) -> tuple[HTTPStatus, str] | None:
-        """Why the request is not answered, None if it is."""
+        """Status and reason with which the request is refused, None if it is answered."""
         web, headers = self.server.web, self.headers
         hosts, origins = headers.get_all("Host", []), headers.get_all("Origin", [])
         if len(hosts) != 1 or not _own_host(hosts[0], web.address.loopback):
@@ -372,7 +372,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def _own_host(text: str, loopback: bool) -> bool:
-    """Whether a Host header names this computer by an address or its own name; the port may be a tunnel's."""
+    """Check whether a Host header names this computer by an address or its own name; the port may be a tunnel's."""
     match = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(:[0-9]{1,5})?", text)
     if match is None:
         return False

@@ -62,12 +62,12 @@ class LogWriter:
 
     @property
     def fault(self) -> str:
-        """Why the disk takes no records now; empty while it does."""
+        """Reason why the disk takes no records now; empty while it does."""
         fault = self._log.fault
         return "" if fault is None else fault.reason
 
     def messages(self) -> list[str]:
-        """What happened to the disk since the last call."""
+        """Messages about the disk since the last call."""
         taken = []
         while self._messages:
             taken.append(self._messages.popleft())

@@ -65,7 +65,7 @@ class Member:
 
 
 def is_archive(head: bytes) -> bool:
-    """Whether the first bytes of a file (gunzipped or not) are those of an archive."""
+    """Check whether the first bytes of a file (gunzipped or not) are those of an archive."""
     return head.startswith(_ZIP) or head[257:262] == _TAR
 
 

@@ -156,7 +156,7 @@ _AT_ONCE = 1 << 20
 
 
 def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Where runs of times within a quarter of an hour begin, the distinct quarters, and that of each run."""
+    """Starts of runs of times within a quarter of an hour, the distinct quarters, and that of each run."""
     if len(wall_ns) == 0:
         none = np.zeros(0, dtype=np.int64)
         return none, none, none
@@ -301,7 +301,7 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
 def parsed_to_utc(
     wall: IntArray, valid: BoolArray, offset_s: IntArray, zoned: BoolArray, options: ReadOptions, *, needed_by: str
 ) -> Instants:
-    """What :func:`parse_texts` gives, to UTC.
+    """Convert the result of :func:`parse_texts` to UTC.
 
     Parameters
     ----------

@@ -148,7 +148,7 @@ class _Sink:
 
 
 def is_flight_file(path: Path) -> bool:
-    """Whether a file is a flight file as it was written: its content has the SHA-256 at its end."""
+    """Check whether a file is a flight file as it was written: its content has the SHA-256 at its end."""
     with path.open("rb") as book:
         content = book.seek(0, os.SEEK_END) - len(_SEAL) - _DIGEST_BYTES
         if content <= 0:

@@ -66,7 +66,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 
 
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
-    """What a packed file holds, other content as it is."""
+    """Content of a packed file, other content as it is."""
     return raw if packed.form(raw) is None else packed.unpacked(raw, path, _most_unpacked(raw))
 
 
@@ -175,7 +175,7 @@ def _present(path: Path) -> bool:
 
 
 def exists(path: Path) -> bool:
-    """Whether a path names a file, a folder, or a member of an archive."""
+    """Check whether a path names a file, a folder, or a member of an archive."""
     return _present(path) or archives.inside(path) is not None
 
 
@@ -336,7 +336,7 @@ def _member(
 
 
 def _samples_of(name: str, names: Collection[str]) -> str | None:
-    """What a file of samples is whose meta file lies beside it."""
+    """Description of a file of samples whose meta file lies beside it; None for any other file."""
     meta = name.removesuffix(".sigmf-data") + ".sigmf-meta"
     if name.endswith(".sigmf-data") and meta in names:
         return f"no log: the samples of {Path(meta).name}, read with it"
@@ -459,7 +459,7 @@ def _read(
 
 
 def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[], ReadResult]) -> ReadResult:
-    """What a reader says, its impossible values flagged; messages name the file, which readers do not know."""
+    """Result of a reader, its impossible values flagged; messages name the file, which readers do not know."""
     from . import limits, origins  # load pandas, as any reader does
 
     with about_file(path):
@@ -504,7 +504,7 @@ def _folder(
 
 
 def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
-    """What ``ingest --json`` prints: files, their account, streams and warnings; ``skipped`` where folders had such."""
+    """Output of ``ingest --json``: files, their account, streams and warnings; ``skipped`` where folders had such."""
     entries = [
         {
             "path": file.path,
@@ -585,7 +585,7 @@ def _start_and_length(streams: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
 
 
 def account_notes(account: Mapping[str, Any]) -> list[str]:
-    """What a table has no room for: warnings, the first rejected lines and the files left out, a line each."""
+    """Notes that a table has no room for: warnings, the first rejected lines and the files left out, a line each."""
     notes = []
     for file in account["files"]:
         path = one_line(file["path"])

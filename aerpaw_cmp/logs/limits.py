@@ -1,4 +1,4 @@
-"""What a quantity of the record model can be at all: rows beyond it are flagged, whatever the reader.
+"""Possible range of each quantity of the record model: rows beyond it are flagged, whatever the reader.
 
 One table for all formats. A value beyond its range becomes NaN (of a position, an attitude or a velocity all three
 components do: they are one quantity), its row gets a flag, and a warning names how many there are and the first of
@@ -192,7 +192,7 @@ def _near_in_time(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> p
 
 
 def _one_run(stamp: IntArray) -> bool:
-    """Whether all stamps [ns] lie within a day, or each within a day of the next; nothing beside them is held."""
+    """Check whether all stamps [ns] lie within a day, or each within a day of the next; nothing beside them is held."""
     low, high = int(stamp.min()), int(stamp.max())
     if low == np.iinfo(np.int64).min:  # a record without a time
         return False

@@ -46,7 +46,7 @@ class Lines:
 
     @property
     def unterminated(self) -> bool:
-        """Whether the last line lacks its line end."""
+        """True if the last line lacks its line end."""
         return bool(self.data) and not self.data.endswith(b"\n")
 
     @cached_property
@@ -95,7 +95,7 @@ SLICE = 1 << 17
 
 
 def places(buffer: AnyArray, one: int, other: int | None = None) -> IntArray:
-    """Where one of two bytes stands, shape (n,)."""
+    """Places where one of two bytes stands, shape (n,)."""
     found = []
     for first in range(0, len(buffer), SLICE):
         piece = buffer[first : first + SLICE]
@@ -273,6 +273,6 @@ def first_lines(head: bytes, count: int = 40) -> list[bytes]:
 
 
 def mostly(head: bytes, pattern: re.Pattern[bytes], *, skip: int = 0) -> bool:
-    """Whether the pattern describes more than half of the first lines."""
+    """Check whether the pattern describes more than half of the first lines."""
     lines = first_lines(head)[skip:]
     return bool(lines) and 2 * sum(pattern.match(line) is not None for line in lines) > len(lines)

@@ -27,7 +27,7 @@ ReadPieces = Callable[[Iterable[bytes], "ReadOptions"], ReadResult]
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """What a file cannot say about itself. All optional; a reader uses what concerns it.
+    """Facts that a file cannot say about itself. All optional; a reader uses what concerns it.
 
     Parameters
     ----------

@@ -104,7 +104,7 @@ class RejectedLine:
 
 @dataclass(frozen=True, slots=True)
 class RejectedReason:
-    """Why lines were rejected: how many, and the first and last of them (1-based)."""
+    """Reason why lines were rejected: their number, and the first and last of them (1-based)."""
 
     reason: str
     count: int
@@ -128,7 +128,7 @@ def reasons_of(rejected: Iterable[RejectedLine]) -> tuple[RejectedReason, ...]:
 
 @dataclass(frozen=True, slots=True)
 class ReadResult:
-    """What a reader made of one file.
+    """Result of reading one file.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class ReadResult:
 
 
 def has_wall_clock(start: np.datetime64) -> bool:
-    """Whether instants are times of day; those of a log with relative times and no origin count from 1970."""
+    """Check whether instants are times of day; those of a log with relative times and no origin count from 1970."""
     import numpy as np
 
     return bool(start >= np.datetime64("1980-01-01"))

@@ -512,6 +512,6 @@ _MOST_RNTI, _MOST_PCI = 0xFFFFFF, 1007
 
 
 def _together(spans: list[IntArray]) -> bool:
-    """Whether any two spans (first, last) overlap."""
+    """Check whether any two spans (first, last) overlap."""
     ordered = sorted(spans, key=lambda span: int(span[0]))
     return any(later[0] < earlier[1] for earlier, later in pairwise(ordered))

@@ -70,12 +70,12 @@ def checks() -> list[Check]:
 
 
 def as_dict(checks: Sequence[Check]) -> dict[str, Any]:
-    """What ``doctor --json`` prints: ``{"ready": bool, "checks": [{name, status, found, remedy}]}``."""
+    """Object that ``doctor --json`` prints: ``{"ready": bool, "checks": [{name, status, found, remedy}]}``."""
     return {"ready": ready(checks), "checks": [asdict(check) for check in checks]}
 
 
 def ready(checks: Sequence[Check]) -> bool:
-    """Whether no check failed (warnings are allowed)."""
+    """Check whether no check failed (warnings are allowed)."""
     return all(check.status != "fail" for check in checks)
 
 
@@ -137,7 +137,7 @@ def llvm_checks() -> Iterator[Check]:
 
 
 def gpu_check() -> Check:
-    """Which Mitsuba variant a replay would use; a GPU is tried the same way as LLVM, in a child process."""
+    """Mitsuba variant that a replay would use; a GPU is tried the same way as LLVM, in a child process."""
     if shutil.which("nvidia-smi") is None and not Path("/proc/driver/nvidia").exists():
         return Check("GPU", "ok", "none found: replays use llvm_ad_mono_polarized")
     trial = llvm.try_variant("cuda_ad_mono_polarized")

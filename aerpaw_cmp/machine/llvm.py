@@ -105,7 +105,7 @@ class Library:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What a child process made of one library, or of one GPU variant (``library`` is None).
+    """Result of trying one library, or one GPU variant (``library`` is None), in a child process.
 
     ``reason`` is empty when ``ok``; ``blames_library`` is False when the trial could not even start, and
     ``missing`` then names the shared library that Dr.Jit itself lacks, if that was the cause.
@@ -197,7 +197,7 @@ def _missing_library(text: str) -> str:
 
 
 def _failure(child: subprocess.CompletedProcess[str]) -> str:
-    """Why a child failed, in one line: the signal that ended it and what it said last."""
+    """Reason why a child failed, in one line: the signal that ended it and what it said last."""
     if missing := _missing_library(child.stderr):
         return f"Dr.Jit cannot be loaded, the system has no {missing}"
     lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
@@ -296,7 +296,7 @@ def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], 
 
 
 def cache_folder(environ: Mapping[str, str] = os.environ) -> Path:
-    """Where this program keeps what it can make again: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
+    """Folder where this program keeps what it can make again: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
     if chosen := environ.get("AERPAW_CMP_CACHE"):
         return Path(chosen)
     base = environ.get("XDG_CACHE_HOME") or "~/.cache"
@@ -304,7 +304,7 @@ def cache_folder(environ: Mapping[str, str] = os.environ) -> Path:
 
 
 def _verdict_file(library: Library) -> Path:
-    """Where a good trial is remembered: it holds for this file, these versions and this processor."""
+    """File where a good trial is remembered: it holds for this library file, these versions and this processor."""
     try:
         processor = next(
             (line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))),
@@ -391,7 +391,7 @@ INSTALL_AGAIN = "pip install --force-reinstall sionna-rt"
 
 
 def sionna_fails(trials: Sequence[Trial]) -> bool:
-    """Whether it is Sionna RT or a package that it needs which cannot be loaded, not an LLVM."""
+    """Check whether it is Sionna RT or a package that it needs which cannot be loaded, not an LLVM."""
     return bool(trials) and not trials[-1].ok and not trials[-1].blames_library and not trials[-1].missing
 
 
@@ -428,7 +428,7 @@ def apt_packages(search_output: str) -> list[str]:
 
 
 def _known_to_apt() -> str:
-    """What apt's lists say of LLVM runtimes of any version; nothing where there are no lists."""
+    """Entries of apt's lists for LLVM runtimes of any version; empty where there are no lists."""
     apt_cache = shutil.which("apt-cache")
     if apt_cache is None:
         return ""
@@ -461,7 +461,7 @@ def install_line() -> str:
 
 
 def root_prefix() -> list[str] | None:
-    """What to put before a command that needs root: nothing, sudo, or None when it may not be run."""
+    """Prefix of a command that needs root: nothing, sudo, or None when it may not be run."""
     if hasattr(os, "geteuid") and os.geteuid() == 0:
         return []
     sudo = shutil.which("sudo")

@@ -1,4 +1,4 @@
-"""How good is an interpolator? The paper's leave-one-out, and the tests that do not let neighbours give it away.
+"""Quality of an interpolator: the paper's leave-one-out, and tests in which neighbours do not give the answer away.
 
 Errors are in the unit of the field (rank, dB). Rank is not rounded: the paper's MAE (section VII-C) compares the
 interpolated number. A position without a value (NaN, out of coverage) is not scored; a position with a value but
@@ -20,7 +20,7 @@ from .grid import Grid
 
 
 class Predictor(Protocol):
-    """What :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging` and the baselines have in common."""
+    """Interface that :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging` and the baselines have in common."""
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> Any:
         """Store samples; returns itself."""
@@ -245,7 +245,7 @@ def along_trajectory(model: Predictor, grid: Grid, values: ArrayLike, trajectory
 
 @dataclass(frozen=True, slots=True)
 class IntervalCoverage:
-    """Whether the Kriging variance tells the truth.
+    """Coverage of the Kriging intervals: shows whether the Kriging variance is calibrated.
 
     Parameters
     ----------

@@ -167,7 +167,7 @@ def _sorted(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> tuple[FloatAr
 
 @dataclass(frozen=True, slots=True)
 class _Near:
-    """What an interpolant gets of t targets: m samples each (t, m, dims), their values (t, m, fields), distances."""
+    """Input of an interpolant at t targets: m samples each (t, m, dims), their values (t, m, fields), distances."""
 
     points_m: FloatArray
     values: FloatArray

@@ -44,7 +44,7 @@ Antennas = Literal["siso", "mimo"]
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """What the engine says of n positions and t towers; NaN (singular values: NaN or 0) where there is no path.
+    """Result of the engine at n positions and t towers; NaN (singular values: NaN or 0) where there is no path.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def _check(evaluated: Evaluation, n: int, towers: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class FoliageDifference:
-    """What foliage does to the joint maps.
+    """Effect of foliage on the joint maps.
 
     Parameters
     ----------
@@ -308,7 +308,7 @@ def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
 
 
 def _label(tower: str | None) -> tuple[str, str]:
-    """How a layer's name and title speak of a tower."""
+    """Give the parts of a layer's name and title that speak of a tower."""
     return (re.sub(r"\W", "_", tower), f", {tower}") if tower else ("joint", ", nearest tower")
 
 

@@ -438,7 +438,7 @@ def _contrasts(gamma: FloatArray) -> FloatArray:
 
 
 def _is_definite(gamma: FloatArray) -> BoolArray:
-    """Whether all variances of each system are positive (t,)."""
+    """Check whether all variances of each system are positive (t,)."""
     if gamma.shape[1] < 2:
         return np.ones(len(gamma), dtype=bool)
     covariance = _contrasts(gamma)

@@ -1,4 +1,4 @@
-"""Which samples an interpolator may use: the M nearest within a radius, or M at random within it.
+"""Choice of the samples that an interpolator may use: the M nearest within a radius, or M at random within it.
 
 The tie rule. Distances that agree to a micrometre are tied. Tied samples are taken by their offset from the
 target: lower first, then southern first, then western first. On a regular grid the rule gives every inner

@@ -1,4 +1,4 @@
-"""How alike the channel is at two positions: correlation against distance.
+"""Similarity of the channel at two positions: correlation against distance.
 
 Three correlations, all averaged over pairs of positions in bins of distance:
 
@@ -243,7 +243,7 @@ def fit_vertical_scale(
     vertical: BinnedCorrelation,
     bounds: tuple[float, float] = (0.1, 1000.0),
 ) -> float:
-    """How many horizontal metres one metre of height is worth: least squares of ``Phi(scale * height)``.
+    """Horizontal metres that one metre of height is worth: least squares of ``Phi(scale * height)``.
 
     Parameters
     ----------

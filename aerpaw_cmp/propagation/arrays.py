@@ -61,7 +61,7 @@ class Array:
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Where the UAV is and how it is turned.
+    """Positions and attitudes of the UAV.
 
     Parameters
     ----------

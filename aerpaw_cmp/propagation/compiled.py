@@ -1,4 +1,4 @@
-"""Whether and how compiled kernels run: the choice, the folder that keeps them, threads.
+"""Use of compiled kernels: the choice whether they run, the folder that keeps them, threads.
 
 numba is optional (extra ``fast``). Importing it and reading compiled code takes about a second, compiling it once a
 machine ten to thirty. So a job is compiled where NumPy would take longer than that: the estimated seconds of all jobs
@@ -118,7 +118,7 @@ def kernels_for(pairs: int) -> ModuleType | None:
 
 
 def beams_for(links: int, faces: int) -> bool:
-    """Whether compiled beams are worth it where mirror images in NumPy would do as well."""
+    """Check whether compiled beams are worth it where mirror images in NumPy would do as well."""
     return _worth(BEAMS, links * faces * MIRRORS_S) is not None
 
 

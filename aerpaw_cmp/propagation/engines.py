@@ -142,7 +142,7 @@ def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run)
 
 
 def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:
-    """Whether the image engine searches by compiled beams: a scene of triangles, many faces, or a large job."""
+    """Check whether the image engine searches by compiled beams: a scene of triangles, many faces, or a large job."""
     if search.engine != "image":
         return False
     if scene.surfaces is not None:
@@ -179,7 +179,7 @@ def _long_search(estimate: Estimate) -> None:
 def estimate_search(
     site: Site, link: Link, poses: Poses, search: Search | None = None, *, threads: int | None = None
 ) -> Estimate | None:
-    """What the path search of the image engine will take, from its first faces.
+    """Estimate the cost of the path search of the image engine, from its first faces.
 
     Parameters
     ----------

@@ -179,7 +179,7 @@ def _roof(building: Building, footprint: Polygon, solid: int) -> _Face:
 
 
 def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: float) -> BoolArray:
-    """Which points, taken as lying in the plane of their face, belong to the face.
+    """Check whether points, taken as lying in the plane of their face, belong to the face.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How every kernel is compiled; imported only where numba is there."""
+"""Compiler options of every kernel; imported only where numba is there."""
 
 from __future__ import annotations
 

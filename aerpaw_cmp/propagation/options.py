@@ -1,4 +1,4 @@
-"""What a replay is asked for, beside site, link and poses: how to search, what a path loses, how to run."""
+"""Options of a replay, beside site, link and poses: how to search, what a path loses, how to run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """What decides the paths besides the scene.
+    """Options that decide the paths, besides the scene.
 
     Parameters
     ----------
@@ -81,12 +81,12 @@ class Search:
 
     @property
     def rays(self) -> dict[str, Any]:
-        """What Sionna's search takes of this."""
+        """Options that Sionna's search takes."""
         return {name: getattr(self, name) for name in ("max_depth", "samples", "batch", "variant")}
 
     @property
     def deciding(self) -> dict[str, object]:
-        """What an entry of the path cache depends on."""
+        """Options that an entry of the path cache depends on."""
         names = ("engine", "max_depth", "samples", "batch", "power_cut_db", "variant")
         return {name: getattr(self, name) for name in names}
 
@@ -107,7 +107,7 @@ class Search:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """What decides the field of the paths besides arrays and materials.
+    """Options that decide the field of the paths, besides arrays and materials.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Whole:
-    """What a part of a replay must know of the others, so that it is the same as in one piece.
+    """Properties of the whole replay that a part must know, so that it is the same as in one piece.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ class Whole:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run(SearchRun):
-    """How a replay is run; nothing here changes a number.
+    """Options of running a replay; nothing here changes a number.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ LEVELS_AT_ONCE = 1024
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Replay:
-    """What a replay found.
+    """Result of a replay.
 
     Parameters
     ----------
@@ -299,7 +299,7 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
 def _checked_cut(
     site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, cache: PathCache | None
 ) -> list[str]:
-    """What the power cut costs at a few poses, spread over the flight, that are searched without it."""
+    """Effect of the power cut, in words, at a few poses, spread over the flight, that are searched without it."""
     some = spread(np.flatnonzero(np.isfinite(poses.position_m).all(axis=1)), CHECKED_POSES)
     cut_db = search.power_cut_db
     if not len(some) or cut_db is None or not search.check_power_cut:

@@ -1,4 +1,4 @@
-"""What was predicted before a flight, beside what it measured: record and numbers."""
+"""Record and numbers of the prediction made before a flight, beside what the flight measured."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class AgainstSeries:
 
     @property
     def stated(self) -> Verdict:
-        """Whether the errors are as large as was stated."""
+        """True if the errors are as large as was stated."""
         found = stated_errors(self.measured_db - self.level_db, self.sd_db, self.common_db)
         return replace(found, where=f"{self.tower} {self.channel}")
 
@@ -61,7 +61,7 @@ class Against:
 
     @property
     def words(self) -> str:
-        """What the flight says of the prediction."""
+        """Sentences on what the flight says of the prediction."""
         said = [after_flight(self.scores, [item.stated for item in self.series])] if self.series else []
         return " ".join([*said, *(rank_after_flight(tower, score) for tower, score in self.ranks.items())])
 

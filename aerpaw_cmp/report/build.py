@@ -1,4 +1,4 @@
-"""What stands around the numbers of a flight in its report: account of the logs, track, waypoints, warnings."""
+"""Parts of a flight's report that surround its numbers: account of the logs, track, waypoints, warnings."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def clock_warnings(clocks: Mapping[str, ClockResult]) -> tuple[str, ...]:
 
 
 def clock_warning(clock: ClockResult) -> str:
-    """What one receiver's clock does to its numbers, as a sentence; "" when there is nothing to know."""
+    """Sentence on what one receiver's clock does to its numbers; "" when there is nothing to know."""
     if clock.applied == NOT_APPLIED:
         return f"rss.lag: apply was asked for, but the radio clock was not corrected: {clock.reason}."
     low, high = clock.ci95_s
@@ -101,7 +101,7 @@ def clock_warning(clock: ClockResult) -> str:
 
 
 def rss_warnings(result: RssResult) -> tuple[str, ...]:
-    """What the reader must know of one tower and channel before believing its numbers."""
+    """Warnings that the reader must know of one tower and channel before believing its numbers."""
     out = []
     if result.score.n == 0:
         out.append(f"{result.name}: no sample could be compared; its numbers are missing, not zero.")
@@ -113,7 +113,7 @@ def rss_warnings(result: RssResult) -> tuple[str, ...]:
 
 
 def rank_warnings(result: RankResult) -> tuple[str, ...]:
-    """What the reader must know of the rank of one tower before believing its numbers."""
+    """Warnings that the reader must know of the rank of one tower before believing its numbers."""
     out = []
     if left_out := result.n_samples - len(result.time):
         out.append(f"Rank {result.tower}: {left_out} of {result.n_samples} samples are too low or have no pose.")

@@ -1,4 +1,4 @@
-"""What the page of a calibration shows: numbers in, nothing computed here."""
+"""Content of the page of a calibration: numbers in, nothing computed here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a campaign page is made of: finished numbers of many flights and settings, nothing to be computed."""
+"""Content of a campaign page: finished numbers of many flights and settings, nothing to be computed."""
 
 from __future__ import annotations
 
@@ -326,7 +326,7 @@ class RankTransfer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownTrack:
-    """Where one flight was sampled: ``time_s`` (n,) after its first sample, ``position_m`` (n, 3)."""
+    """Samples of one flight's track: ``time_s`` (n,) after its first sample, ``position_m`` (n, 3)."""
 
     flight: str
     time_s: FloatArray
@@ -404,7 +404,7 @@ class PlaceMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Season:
-    """What the flights say together.
+    """Result of all flights together.
 
     Parameters
     ----------

@@ -357,7 +357,7 @@ def figure_specs(data: CampaignData) -> list[FigureSpec]:
 
 
 def _season_specs(data: CampaignData) -> Iterator[FigureSpec]:
-    """What stands on the page where no script runs, and in print."""
+    """Figures of the season, for the page where no script runs and for print."""
     if not data.season.over_all():
         return
     some = f", {MOST_SETTINGS} of {len(data.settings)}" if len(data.settings) > MOST_SETTINGS else ""

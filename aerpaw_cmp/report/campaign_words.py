@@ -97,7 +97,7 @@ def headline(data: CampaignData) -> list[str]:
 
 
 def _rank_fold_words(fold: RankHeldOutFold) -> str:
-    """What a fit of rank is worth on flights that had no say."""
+    """Sentence on what a fit of rank is worth on flights that had no say."""
     held = [r for r in fold.rows if not r.fitted_here]
     kappa = [np.mean([getattr(r, f"{label}_kappa") for r in held]) for label in ("start", "fit")]
     agree = [np.mean([getattr(r, name) for r in held]) for name in ("fit_agreement", "majority_agreement")]
@@ -110,7 +110,7 @@ def _rank_fold_words(fold: RankHeldOutFold) -> str:
 
 
 def _ranked_words(data: CampaignData) -> list[str]:
-    """What the ranking by held-out error shows, and what it does not."""
+    """Sentences on what the ranking by held-out error shows, and what it does not."""
     ranking = data.season.over_all()
     if len(ranking) < 2 or not data.season.held_out:
         return []
@@ -122,7 +122,7 @@ def _ranked_words(data: CampaignData) -> list[str]:
 
 
 def warnings(data: CampaignData) -> list[str]:
-    """What must be known before the numbers are believed."""
+    """Warnings that must be known before the numbers are believed."""
     out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures[:FEW]]
     if len(data.failures) > FEW:
         out = [f"{len(data.failures)} flights or settings gave no numbers: they stand under Failures."]

@@ -1,4 +1,4 @@
-"""What stands around the numbers of a flight (:mod:`aerpaw_cmp.compare.result`) in its report.
+"""Parts of a flight's report that surround its numbers (:mod:`aerpaw_cmp.compare.result`).
 
 :mod:`aerpaw_cmp.report.build` fills these records; the rest of the room turns them into files. Whatever a flight may
 lack is optional: a flight with rank only has ``rss=()``, one without a path anywhere has NaN numbers, never invented
@@ -80,7 +80,7 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """Where samples stand in the logs: names of the files, and per sample its file's number and its line, (n,)."""
+    """Origin of samples in the logs: names of the files, and per sample its file's number and its line, (n,)."""
 
     files: tuple[str, ...]
     file: IntArray

@@ -1,4 +1,4 @@
-"""What changed between two reports of one flight: finished numbers, and the sentences that say what they mean."""
+"""Changes between two reports of one flight: finished numbers, and the sentences that say what they mean."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _level_clauses(one: LevelDifference, tolerance_db: float) -> Iterator[str]:
 
 
 def _alone(samples: Overlap) -> str:
-    """How many samples are in one report alone, and when."""
+    """Number of samples that are in one report alone, and when, in words."""
     sides = ((samples.only_first, samples.first_span, "first"), (samples.only_second, samples.second_span, "second"))
     sentences = [
         f"{n} samples only in the {name}" + (f" ({span[0]} to {span[1]})" if span else "")

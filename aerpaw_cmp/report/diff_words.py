@@ -63,7 +63,7 @@ def verdict(diff: ReportDiff) -> str:
 
 
 def _cause(diff: ReportDiff) -> str:
-    """What else differs, which may be the reason."""
+    """Sentence on what else differs, which may be the reason."""
     kinds = {"setting": diff.settings, "input": diff.inputs, "version": diff.versions}
     changed = {name: len(items) for name, items in kinds.items()}
     moved = max((level.measured_max_db for level in diff.levels if math.isfinite(level.measured_max_db)), default=0.0)

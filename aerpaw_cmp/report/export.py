@@ -253,7 +253,7 @@ def rank_tables(series: Sequence[RankResult]) -> Iterator[_Table]:
 
 
 def _number_columns(one: RankResult) -> dict[str, FloatArray]:
-    """What a receiver decides by; no path, a ratio of nothing and a vanishing singular value are empty cells."""
+    """Numbers a receiver decides by; no path, a ratio of nothing and a vanishing singular value are empty cells."""
     columns = {"level_dbm": one.level_dbm, **({} if one.tower_m is None else _places(one.tower_m, "tower_"))}
     columns |= {f"sigma{i}_over_sigma1_db": ratio for i, ratio in enumerate(one.singular_ratio_db.T, start=2)}
     if one.probability is not None:
@@ -308,7 +308,7 @@ def json_text(numbers: Mapping[str, Any], indent: int | None = 2) -> str:
 
 
 def about(page: Any) -> dict[str, Any]:
-    """When and by what a page was made, in metrics.json: its ``generated``, ``versions`` and ``stages_s``."""
+    """Record of when and by what a page was made, in metrics.json: ``generated``, ``versions``, ``stages_s``."""
     return {
         "generated": page.generated,
         "versions": dict(sorted(page.versions.items())),

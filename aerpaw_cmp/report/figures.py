@@ -108,7 +108,7 @@ def _track_specs(data: ReportData, track: Track) -> Iterator[FigureSpec]:
 
 
 def _band_words(panel: RssResult) -> str:
-    """What the band of learned antennas is made of, and whether it holds on this flight."""
+    """Sentences on what the band of learned antennas is made of, and whether it holds on this flight."""
     bars = panel.further.error_bars
     if not bars:
         return ""

@@ -1,4 +1,4 @@
-"""What the first screen of a report says: a verdict in two sentences, and up to four numbers beside their baselines."""
+"""First screen of a report: a verdict in two sentences, and up to four numbers beside their baselines."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _training(data: ReportData) -> str:
 
 
 def _baseline_sentence(panels: Sequence[RssResult]) -> str:
-    """What a model without anything learned leaves on the panels of a training flight."""
+    """Sentence on what a model without anything learned leaves on the panels of a training flight."""
     best = best_baseline([panel for panel in panels if panel.training])
     return "" if best is None else f"For comparison, {pretty(best[0])}: RMSE {best[1]:.1f} dB."
 
@@ -199,7 +199,7 @@ def _causes(panels: Sequence[RssResult]) -> str:
 
 
 def _fails(panels: Sequence[RssResult]) -> str:
-    """Where the error is largest."""
+    """Sentence on where the error is largest."""
     if not panels:
         return ""
     worst = max(panels, key=lambda p: p.score.rmse_db)

@@ -89,7 +89,7 @@ def _height(altitude_m: float) -> dict[str, str]:
 
 
 def layer_numbers(layer: MapLayer) -> dict[str, Any]:
-    """What the page says of a layer: share covered, percentiles, shares of classes (None where there is none)."""
+    """Numbers of a layer on the page: share covered, percentiles, shares of classes (None where there is none)."""
     finite = layer.values[np.isfinite(layer.values)]
     result: dict[str, Any] = {
         "quantity": layer.quantity,

@@ -83,7 +83,7 @@ def _reached(data: MapsData, one: RssMap) -> float:
 
 
 def warnings(data: MapsData) -> list[str]:
-    """What must be known before the maps are believed."""
+    """Warnings that must be known before the maps are believed."""
     out = []
     if data.site.illustrative:
         out.append(
@@ -105,7 +105,7 @@ def warnings(data: MapsData) -> list[str]:
 
 
 def notes(data: MapsData) -> list[str]:
-    """How the maps were made."""
+    """Notes on how the maps were made."""
     made = list(_made(data)) if "foliage" in data.settings else []
     return [*data.site.notes, *made, *data.notes]
 

@@ -1,4 +1,4 @@
-"""What the page of the `map` job is made of: finished maps and tables, nothing to be computed.
+"""Content of the page of the `map` job: finished maps and tables, nothing to be computed.
 
 All maps of a page lie on one grid. Row 0 is the south, column 0 the west. A position without any path ("Z") is NaN
 in a map of levels and 0 in a map of ranks.

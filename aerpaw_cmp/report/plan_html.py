@@ -23,7 +23,7 @@ from .html import write_page
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanPage:
-    """What the page of ``plan`` shows.
+    """Content of the page of ``plan``.
 
     ``candidates`` and ``curve`` hold rows of metrics.json; ``outline_m`` (k, 2) and ``holes_m`` bound where a route may
     run; ``track_m`` (n, 3); ``place_m`` (m, 3) with ``before_db`` and ``after_db`` (m,); ``towers`` by name (3,).

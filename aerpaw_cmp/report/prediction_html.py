@@ -27,7 +27,7 @@ from .prediction_words import FLAGS
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictionPage:
-    """What a page of ``predict`` shows; ``table`` as prediction.csv has it, ``rows`` of candidates and their errors."""
+    """Content of a page of ``predict``; ``table`` as prediction.csv has it, ``rows`` of candidates and their errors."""
 
     name: str
     kind: str

@@ -163,7 +163,7 @@ def field(correction: Correction) -> Verdict:
 
 
 def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Verdict]) -> str:
-    """What a flight says of the prediction made before it.
+    """Sentences on what a flight says of the prediction made before it.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Ver
 
 
 def rank_after_flight(tower: str, score: ForecastScore) -> str:
-    """What a flight says of the ranks that were predicted before it."""
+    """Sentence on what a flight says of the ranks that were predicted before it."""
     return (
         f"Rank at {tower}, predicted before this flight: kappa {score.kappa:.2f} (0 is chance), log score "
         f"{score.log_score:.2f}; the mean of the prediction, without positions: {score.constant_log_score:.2f}."

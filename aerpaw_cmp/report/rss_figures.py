@@ -404,7 +404,7 @@ def running_levels(
 
 
 def seen_from_antennas(panel: RssResult) -> Figure:
-    """Where the tower's antenna sees the UAV and the UAV's sees the tower, each in its own frame; colour: residual."""
+    """Directions from the tower's antenna to the UAV and back, each in its antenna's frame; colour: residual."""
     seen = panel.geometry
     views = [("UAV, tower antenna frame", seen["azimuth_deg"], seen.get("tower_elevation_deg", seen["elevation_deg"]))]
     if {"uav_azimuth_deg", "uav_elevation_deg"} <= set(seen):

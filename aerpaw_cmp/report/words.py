@@ -121,7 +121,7 @@ RANKING: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
 
 
 def ranking_sentence(verdicts: Mapping[str, str], most: int) -> str:
-    """What the intervals say of the settings behind the first, by name; at most ``most`` are named."""
+    """Sentence on what the intervals say of the settings behind the first, by name; at most ``most`` are named."""
     alike = [name for name, said in verdicts.items() if said != "worse"]
     named = ", ".join(alike[:most]) + (f" and {len(alike) - most} more" if len(alike) > most else "")
     return next(text for holds, text in RANKING if holds(set(verdicts.values()))).format(named=named)
@@ -213,7 +213,7 @@ def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetim
 
 
 def local_error(panel: RssResult, span: ErrorSpan) -> str:
-    """Where a channel is missed most, and what is known of the measurement that may explain it."""
+    """Sentences on where a channel is missed most, and what is known of the measurement that may explain it."""
     known = []
     if panel.clock_verdict == "cannot tell":
         known.append("the radio clock could not be confirmed")
@@ -298,7 +298,7 @@ DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
 
 
 def trust(data: ReportData) -> str:
-    """Whether the numbers can be believed, by the checks that were made."""
+    """Check whether the numbers can be believed, by the checks that were made."""
     facts = {
         "missing": count(_missing_paths(data)),
         "failed": count(_field_failures(data)),
@@ -396,7 +396,7 @@ def training_sentence(names: Sequence[str], what: str, digests: Sequence[str]) -
 
 
 def rss_verdict(panel: RssResult) -> str:
-    """How well one channel is predicted, and whether the baselines do better."""
+    """Sentences on how well one channel is predicted, and whether the baselines do better."""
     if panel.training:
         return training_sentence([panel.name], "the antennas", panel.further.trained_on or ())
     score = panel.score
@@ -420,7 +420,7 @@ def rss_verdict(panel: RssResult) -> str:
 
 
 def _detection_words(panel: RssResult) -> str:
-    """What a receiver adds that loses its lock or ends at a floor: both parts of its score."""
+    """Sentences added for a receiver that loses its lock or ends at a floor: both parts of its score."""
     score = panel.further.detection
     if score is None:
         return ""
@@ -434,7 +434,7 @@ def _detection_words(panel: RssResult) -> str:
 
 
 def learned_on(score: DetectionScore) -> str:
-    """Where a probability of detection comes from."""
+    """Origin of a probability of detection, in words."""
     return {
         "other flights": "learned on other flights",
         "held-out segments": "learned in other segments of this flight",
@@ -470,7 +470,7 @@ def lock_sentence(panels: Sequence[RssResult]) -> str:
 
 
 def _snr_words(panel: RssResult) -> str:
-    """What a ratio to the noise adds: its error with nothing fitted."""
+    """Sentence added for a ratio to the noise: its error with nothing fitted."""
     snr = panel.further.snr
     if snr is None:
         return ""
@@ -481,7 +481,7 @@ def _snr_words(panel: RssResult) -> str:
 
 
 def rank_verdict(panel: RankResult) -> str:
-    """Which K comes nearest to the modem, and how near."""
+    """Sentence on the K that comes nearest to the modem, and how near."""
     k = nearest_k(panel)
     if k is None:
         return f"{panel.tower} rank: nothing to score; no sample has both a reported rank and a simulated one."
@@ -504,7 +504,7 @@ def nearest_k(panel: RankResult) -> float | None:
 
 
 def _beside_kappa(panel: RankResult) -> str:
-    """What agreement needs no model, and what the modem's agreement with itself allows."""
+    """Agreement that needs no model, and the one that the modem's agreement with itself allows, in words."""
     said = ""
     commonest = panel.further.commonest
     if commonest.rank:
@@ -516,7 +516,7 @@ def _beside_kappa(panel: RankResult) -> str:
 
 
 def warnings(data: ReportData) -> list[str]:
-    """What must be known before a number is believed; those of the data first."""
+    """Warnings that must be known before a number is believed; those of the data first."""
     texts = list(data.warnings)
     if data.synthetic:
         texts.append("The logs are synthetic: they were made by simulation to show the tool, and measure nothing.")

@@ -1,1 +1,1 @@
-"""What stands at the site: towers, ground, buildings, trees, materials, antennas. No ray tracer here."""
+"""Model of the site: towers, ground, buildings, trees, materials, antennas. No ray tracer here."""

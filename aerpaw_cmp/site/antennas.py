@@ -380,7 +380,7 @@ def _check_units(rows: _Rows, path: Path) -> None:
 
 
 def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
-    """Whether theta is a full circle, and the rows as (phis, thetas, 7); both angles complete and equally spaced."""
+    """Give whether theta is a full circle, and rows as (phis, thetas, 7); both angles complete and equally spaced."""
     key = np.round(rows.values[:, :2], 5)
     phi, at_phi = np.unique(key[:, 0], return_inverse=True)
     theta, at_theta = np.unique(key[:, 1], return_inverse=True)
@@ -451,7 +451,7 @@ def _mirrored(half: ComplexArray) -> ComplexArray:
 
 
 def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
-    """Whether E_phi points along increasing phi: only then is the field near the poles one vector."""
+    """Check whether E_phi points along increasing phi: only then is the field near the poles one vector."""
     scores = []
     for sign in (1.0, -1.0):
         score = 0.0

@@ -86,7 +86,7 @@ class Dem:
             )
 
     def _covers_origin(self) -> bool:
-        """Whether the origin lies within the grid, whatever its cells hold."""
+        """Check whether the origin lies within the grid, whatever its cells hold."""
         column, row = self._cell(0.0, 0.0)
         rows, columns = self.height_m.shape
         return bool(0 <= column <= columns - 1 and 0 <= row <= rows - 1)
@@ -168,7 +168,7 @@ class Dem:
             begin = stop
 
     def clear(self, source_m: FloatArray, target_m: FloatArray, *, tolerance_m: float | FloatArray = 0.0) -> BoolArray:
-        """Which straight lines stay above the ground.
+        """Mask of the straight lines that stay above the ground.
 
         Parameters
         ----------

@@ -72,7 +72,7 @@ class SingleTree:
 
 @dataclass(slots=True)
 class Footprints:
-    """What was found in map files, in the site frame, and what was done to it.
+    """Elements found in map files, in the site frame, and the actions taken on them.
 
     ``actions`` are sentences for the user; those that ask for a look begin with ``warning:``. ``credits`` name those
     whose data they are.
@@ -634,7 +634,7 @@ def only_trees(trees: Sequence[SingleTree]) -> dict[str, Any]:
 
 
 def _kept_of_base(model: SiteModel, base: str | Path) -> str:
-    """What an import takes over from its base, in one sentence."""
+    """Sentence on the data that an import takes over from its base."""
     origin = f"{model.origin.latitude_deg:.6f}, {model.origin.longitude_deg:.6f}"
     ground = "flat ground" if model.dem is None else f"the elevation model {model.dem.path}"
     return (

@@ -21,7 +21,7 @@ from ..common.errors import UsageError
 
 
 class HeightReference(str, Enum):
-    """What a height is measured from."""
+    """Reference that a height is measured from."""
 
     ABOVE_TAKEOFF = "above_takeoff"
     ABOVE_GROUND = "above_ground"
@@ -73,7 +73,7 @@ class Height:
 
 @dataclass(frozen=True, slots=True)
 class VerticalDatum:
-    """Where the site's zero of up lies.
+    """Vertical datum of the site: the level where up is 0.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What mast and airframe do to the pattern of an antenna once it is mounted."""
+"""Effect of mast and airframe on the pattern of an antenna once it is mounted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What flights taught about a site, beside its file: ``NAME.learned/learned.yaml`` and the tables that it names.
+"""Calibrations of a site from flights, beside its file: ``NAME.learned/learned.yaml`` and the tables that it names.
 
 Each entry is a calibration: learned antennas by tower, channel and reader, its airframe, or a rank receiver, with the
 band and the logs (SHA-256) that it was learned from, its errors on flights left out, the source of the flights and the
@@ -32,7 +32,7 @@ class _Record(BaseModel):
 
 
 class Source(_Record):
-    """Whose flights these are, as calibration.yaml says."""
+    """Source of the flights, as calibration.yaml says."""
 
     title: str = ""
     doi: str = ""
@@ -52,7 +52,7 @@ class Errors(_Record):
 
 
 class LearnedLock(_Record):
-    """When a receiver is in lock: P = 1 / (1 + exp(-per_db (path gain - gain_db))) of the predicted path gain [dB].
+    """Lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) of the predicted path gain [dB].
 
     The scores are means over flights left out: Brier and log score (nat) beside those of the constant ``share``, and
     the RMSE [dB] of all samples where levels below the floor count as the floor.
@@ -146,7 +146,7 @@ def folder_of(site: str | Path) -> Path:
 
 
 def read_learned(site: str | Path) -> Learned:
-    """What a site remembers; nothing for a site without a memory.
+    """Read the memory of a site; empty for a site without one.
 
     Raises
     ------

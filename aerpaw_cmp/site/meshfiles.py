@@ -33,7 +33,7 @@ _TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class RawMesh:
-    """What a mesh file holds: vertices (n, 3), triangles (m, 3) int, and how many of its polygons were not flat."""
+    """Contents of a mesh file: vertices (n, 3), triangles (m, 3) int, and how many of its polygons were not flat."""
 
     vertices: FloatArray
     triangles: IntArray

@@ -68,7 +68,7 @@ class TriangleScene:
 
 @dataclass(slots=True)
 class _Reading:
-    """What has been collected so far."""
+    """Data collected so far."""
 
     path: Path
     folder: Path

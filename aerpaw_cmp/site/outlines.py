@@ -1,4 +1,4 @@
-"""What map files hold, before it is cleaned: outlines, single trees, tree rows; and how their positions are checked."""
+"""Contents of map files before cleaning: outlines, single trees, tree rows; and checks of their positions."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ MAX_CROSSINGS = 1000
 
 
 def is_tangled(ring: Polygon) -> bool:
-    """Whether a ring crosses itself at more than :data:`MAX_CROSSINGS` places; asked in pieces, with an early end."""
+    """Check whether a ring crosses itself at more than :data:`MAX_CROSSINGS` places; in pieces, with an early end."""
     line = np.asarray(ring.exterior.coords)[:, :2]
     segments = shapely.linestrings(np.stack([line[:-1], line[1:]], axis=1))
     if len(segments) * (len(segments) - 1) // 2 <= MAX_CROSSINGS:
@@ -101,7 +101,7 @@ def lonlat(point: Any, where: str, path: Path) -> Position:
 
 
 def reason(error: Exception) -> str:
-    """Why an element cannot be used, in words."""
+    """Give the reason why an element cannot be used, in words."""
     if isinstance(error, InputError):
         return error.found
     if isinstance(error, KeyError):

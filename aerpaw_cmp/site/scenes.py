@@ -160,7 +160,7 @@ GROUND_PART = 0.25
 
 
 def drawn_buildings(site: Site) -> tuple[Building, ...]:
-    """What pictures show as buildings: those of the site, and for a scene of triangles the outlines of its shapes.
+    """Buildings that pictures show: those of the site, and for a scene of triangles the outlines of its shapes.
 
     Prisms from the lowest to the highest corner of each part; level shapes and those under most of the plan are ground.
     Only pictures use them.

@@ -187,7 +187,7 @@ class Site:
 
     @property
     def wooded(self) -> bool:
-        """Whether trees or stands can shade a path."""
+        """True if trees or stands can shade a path."""
         return len(self.trees) > 0 or any(forest.height_m is not None for forest in self.forests)
 
     def _repr_html_(self) -> str:

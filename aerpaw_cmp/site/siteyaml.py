@@ -79,7 +79,7 @@ MaterialName = Annotated[str, AfterValidator(_known_material)]
 
 
 def _problem(shape: Polygon) -> str | None:
-    """What is wrong with an outline."""
+    """Fault of an outline; None where it has none."""
     if len(set(shape.exterior.coords)) < 3:
         return "has fewer than 3 distinct points"
     if not shape.is_valid or shape.area < 1e-3:
@@ -112,7 +112,7 @@ class AbsoluteHeightModel(HeightModel):
 
 
 class OriginModel(SiteBase):
-    """Where east = north = up = 0."""
+    """Point where east = north = up = 0."""
 
     latitude_deg: Latitude
     longitude_deg: Longitude

@@ -1,4 +1,4 @@
-"""What the tags of map data say: what stands there, how high, of what. OpenStreetMap's words."""
+"""Meaning of the tags of map data: what stands there, how high, of what. OpenStreetMap's words."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MATERIAL_WORDS = {
 
 
 def kind_of(tags: Mapping[str, str]) -> Kind | None:
-    """What an area is, or None when its tags do not say.
+    """Kind of an area, or None when its tags do not say.
 
     Examples
     --------
@@ -47,7 +47,7 @@ def kind_of(tags: Mapping[str, str]) -> Kind | None:
 
 
 def is_part(tags: Mapping[str, str]) -> bool:
-    """Whether an area is a part of a building that has its own outline."""
+    """Check whether an area is a part of a building that has its own outline."""
     return tags.get("building:part", "no").lower() not in _NOT
 
 

@@ -66,7 +66,7 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True)
 class TreeSizes:
-    """How large trees are.
+    """Sizes of trees.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def _scatter(area: BaseGeometry, wanted: int, spacing_m: float, random: np.rando
 
 
 def _first_come(points: FloatArray, spacing_m: float) -> BoolArray:
-    """Which points (n, 2) stay when each is refused by any earlier kept one closer than ``spacing_m``."""
+    """Mask of the points (n, 2) that stay when each is refused by any earlier kept one closer than ``spacing_m``."""
     keep = np.zeros(len(points), dtype=bool)
     open_ = np.ones(len(points), dtype=bool)
     pairs = cKDTree(points).query_pairs(np.nextafter(spacing_m, 0), output_type="ndarray") if len(points) else None

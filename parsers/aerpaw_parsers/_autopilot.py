@@ -60,7 +60,7 @@ def offset_s(utc_s: FloatArray, time_s: FloatArray) -> float | None:
 
 @dataclass
 class Flight:
-    """What a log of an autopilot holds.
+    """Content of a log of an autopilot.
 
     Parameters
     ----------

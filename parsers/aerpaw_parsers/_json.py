@@ -83,7 +83,7 @@ def _bare(text: bytes) -> bytes:
 
 
 def _loaded(text: bytes) -> tuple[Any, bool]:
-    """What a text is, None where it is no JSON; and whether it begins an object whose rest may stand on more lines."""
+    """Value of a text, None where it is no JSON; and whether it begins an object whose rest may stand on more lines."""
     try:
         return json.loads(text), False
     except json.JSONDecodeError as error:

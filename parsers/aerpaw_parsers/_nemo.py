@@ -1,4 +1,4 @@
-"""What the readers of Keysight Nemo exports share: the head of the compact CSV, and the rank of the scheduled PDSCH."""
+"""Common parts of the readers of Keysight Nemo exports: head of the compact CSV, and rank of the scheduled PDSCH."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NO_RANK = "no_rank_in_row"
 
 
 def sniff(head: bytes) -> bool:
-    """Whether the first line is the header."""
+    """Check whether the first line is the header."""
     return HEADER.fullmatch(head[:400].split(b"\n", 1)[0]) is not None
 
 

@@ -71,7 +71,7 @@ _MOST = 1e9
 
 
 def has_position(names: list[str]) -> bool:
-    """Whether plain names hold a latitude and a longitude."""
+    """Check whether plain names hold a latitude and a longitude."""
     return all(any(_sheet.matches(name, form[:1]) for name in names) for form in (LATITUDE, LONGITUDE))
 
 
@@ -110,7 +110,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
 
 
 def _is_px4_gps(sheet: _sheet.Sheet, latitude: int) -> bool:
-    """Whether positions are PX4's integers."""
+    """Check whether positions are PX4's integers."""
     return _PX4_GPS in sheet.plain and bool((np.abs(sheet.numbers(latitude)) > 180.0).any())
 
 
@@ -167,7 +167,7 @@ def _altitude(rows: _rows.Rows, sheet: _sheet.Sheet, lost: BoolArray) -> FloatAr
 
 
 def _begins_at_rest(rows: _rows.Rows, sheet: _sheet.Sheet, altitude: FloatArray, lost: BoolArray) -> bool:
-    """Whether the first seconds of a track have one place and one height: that of the ground."""
+    """Check whether the first seconds of a track have one place and one height: that of the ground."""
     seconds = (rows.time - rows.time[:1]) / np.timedelta64(1, "s")
     early = np.flatnonzero(~lost & np.isfinite(altitude) & (seconds <= _REST_S))
     if len(early) < 3:

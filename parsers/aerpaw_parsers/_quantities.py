@@ -1,4 +1,4 @@
-"""What a phone or a drive-test program calls its quantities, in one table for all of them."""
+"""Names that phones and drive-test programs give to their quantities, in one table for all of them."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def plain(name: str) -> str:
 
 
 def quantity(name: str) -> Quantity | None:
-    """What a name means, None if nothing that is known."""
+    """Quantity that a name means, None if nothing that is known."""
     text = plain(name)
     return next((meaning for pattern, meaning in _COMPILED if pattern.search(text)), None)
 
@@ -93,13 +93,13 @@ def in_common_words(names: list[str]) -> list[str]:
 
 
 def is_level(name: str) -> bool:
-    """Whether a name is that of a level."""
+    """Check whether a name is that of a level."""
     meaning = quantity(name)
     return meaning is not None and meaning.kind == "rss"
 
 
 def is_rank(name: str) -> bool:
-    """Whether a name is that of a rank."""
+    """Check whether a name is that of a rank."""
     meaning = quantity(name)
     return meaning is not None and meaning.kind == "rank"
 

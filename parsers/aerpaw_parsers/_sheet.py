@@ -76,7 +76,7 @@ def header_of(lines: Sequence[bytes], is_header: IsHeader) -> tuple[int, str, li
 
 
 def starts(head: bytes, is_header: IsHeader) -> bool:
-    """Whether a file begins with such a header, title lines aside, and a row of its width soon follows."""
+    """Check whether a file begins with such a header, title lines aside, and a row of its width soon follows."""
     lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
     found = header_of(lines, is_header)
     if found is None:
@@ -188,7 +188,7 @@ def _compiled(patterns: tuple[str, ...]) -> list[re.Pattern[str]]:
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
-    """Whether a plain name is wholly one of the patterns."""
+    """Check whether a plain name is wholly one of the patterns."""
     return _compiled(patterns)[0].fullmatch(name) is not None
 
 
@@ -295,11 +295,13 @@ _DECIMAL_COMMA = re.compile(r"-?\d{1,4},\d{1,9}")
 
 
 def _has_decimal_commas(sheet: Sheet) -> bool:
-    """Whether the first row has numbers with a decimal comma."""
+    """Check whether the first row has numbers with a decimal comma."""
     return bool(sheet.cells) and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in sheet.cells[0])
 
 
 _MOST_APART_NS = 1_500_000_000
+_MOST_NS = 2.0**62
+"""Half of what a time stamp holds."""
 
 
 def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:
@@ -308,9 +310,11 @@ def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:
     known = np.isfinite(milliseconds)
     if rows.relative or not known.any() or (time % 1_000_000_000).any():
         return
-    counted = np.round(np.where(known, milliseconds, 0.0) * 1e6).astype(np.int64)
+    counted_ns = np.round(np.where(known, milliseconds, 0.0) * 1e6)
+    fits = np.abs(counted_ns).max() < _MOST_NS
+    counted = counted_ns.astype(np.int64) if fits else np.zeros_like(time)
     zero = (time - counted)[known]
-    if zero.max() - zero.min() > _MOST_APART_NS:
+    if not fits or zero.max() - zero.min() > _MOST_APART_NS:
         rows.warnings.append("the column of milliseconds does not go with the times: it is left out")
         return
     rows.time = np.where(known, zero.max() + counted, time).astype("datetime64[ns]")

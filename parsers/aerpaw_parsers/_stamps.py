@@ -79,7 +79,7 @@ def _dated(text: str, day_first: bool) -> bytes | None:
 
 
 def _day_first(texts: Iterable[str]) -> bool | None:
-    """Whether the day stands before the month; None where every date can be read both ways."""
+    """Check whether the day stands before the month; None where every date can be read both ways."""
     dates = [found for text in texts if (found := _YEAR_LAST.fullmatch(text))]
     if dates and all(found[2] == "." for found in dates):
         return True  # 02.03.2025: where points stand, the day comes first
@@ -91,7 +91,7 @@ def _day_first(texts: Iterable[str]) -> bool | None:
 
 
 def _first_by_name(texts: Sequence[str], name: str) -> bool | None:
-    """Whether the day stands first if the first date is to be that of the file name; None where it is no help."""
+    """Check whether the day stands first if the first date is to be that of the file name; None where it is no help."""
     date = date_in_name(name)
     fits = [first for first in (True, False) if date and (_dated(texts[0], first) or b"").startswith(date.encode())]
     return fits[0] if len(fits) == 1 else None

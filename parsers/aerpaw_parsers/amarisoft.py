@@ -34,7 +34,7 @@ _WANTED = {"RNTI": 16, "cqi": 10, "ri": 10, "mcs": 10}
 
 
 def sniff(head: bytes) -> bool:
-    """Whether the table's title line stands behind a stamp."""
+    """Check whether the table's title line stands behind a stamp."""
     return _TITLE.search(head) is not None
 
 
@@ -85,7 +85,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def sniff_json(head: bytes) -> bool:
-    """Whether the first object is an answer about UEs."""
+    """Check whether the first object is an answer about UEs."""
     return head.lstrip()[:1] == b"{" and b'"ue_list"' in head and b'"cells"' in head and (
         b'"ue_get"' in head or re.search(rb'"(enb|ran|gnb)_ue_id"', head) is not None
     )  # fmt: skip

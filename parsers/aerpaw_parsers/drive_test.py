@@ -42,14 +42,14 @@ _TECH = re.compile(r"(?i)4g|5g|lte|nr")
 
 
 def is_header(names: list[str]) -> bool:
-    """Whether names hold a time and a level, ratio or rank."""
+    """Check whether names hold a time and a level, ratio or rank."""
     names = _quantities.in_common_words(names)
     times = any(_sheet.matches(name, (*_sheet.TIME_NAMES, "date")) for name in names)
     return times and any(pose_csv.has_radio(name) for name in names) and len(names) > 2
 
 
 def sniff(head: bytes) -> bool:
-    """Whether a header of such names stands in front, and it is none of the narrower formats."""
+    """Check whether a header of such names stands in front, and it is none of the narrower formats."""
     narrower = (_nemo.sniff, *(r.READER.sniff for r in (quectel_ri, aadm_snr, own_csv)))
     return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 

@@ -113,7 +113,7 @@ def _name(body: bytes, order: str) -> str | None:
 
 
 def sniff(head: bytes) -> bool:
-    """Whether it is a MATLAB file whose first variables are those of a merged flight.
+    """Check whether it is a MATLAB file whose first variables are those of a merged flight.
 
     Of a 7.3 file the names lie anywhere: those that stand in what sniffers see decide.
     """

@@ -133,7 +133,7 @@ def _bare(cell: str) -> bytes:
 
 
 def _counts(texts: Iterable[bytes]) -> bool:
-    """Whether times are numbers: the first that is a time in either form decides."""
+    """Check whether times are numbers: the first that is a time in either form decides."""
     for text in texts:
         if _PLAIN.fullmatch(text):
             return True

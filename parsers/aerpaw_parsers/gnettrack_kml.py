@@ -25,7 +25,7 @@ _PLACE = ("Longitude", "Latitude", "Altitude above sea level")
 
 
 def sniff(head: bytes) -> bool:
-    """Whether it is a KML with times and levels in named data."""
+    """Check whether it is a KML with times and levels in named data."""
     return b"<kml" in head[:2048] and all(sign.search(head) for sign in _SIGNS)
 
 

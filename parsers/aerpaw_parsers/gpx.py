@@ -26,7 +26,7 @@ _START = re.compile(rb"<(?:trkpt|wpt|rtept)\b")
 
 
 def sniff(head: bytes) -> bool:
-    """Whether it is a GPX with points."""
+    """Check whether it is a GPX with points."""
     return re.search(rb"<gpx\b", head[:4096]) is not None and _START.search(head) is not None
 
 

@@ -25,7 +25,7 @@ _NAME = re.compile(r"(\d{6,12})(?:\.0)?_(\d{4,10})(?:\.0)?_(\d{4})_(\d\d)_(\d\d)
 
 
 def sniff(head: bytes) -> bool:
-    """Whether its first variables are samples and device times."""
+    """Check whether its first variables are samples and device times."""
     return head.startswith(MAGIC) and "IQ" in flight_mat.names_of(head)
 
 

@@ -65,7 +65,7 @@ def _packet(data: bytes, at: int) -> tuple[int, int, int, bytes] | None:
 
 
 def sniff(head: bytes) -> bool:
-    """Whether the first three packets follow each other."""
+    """Check whether the first three packets follow each other."""
     at = 0
     for _ in range(3):
         found = _packet(head, at)

@@ -1,4 +1,4 @@
-"""What a Keysight Nemo phone measured, as KML: one placemark description per report, one quantity per file.
+"""Measurements of a Keysight Nemo phone, as KML: one placemark description per report, one quantity per file.
 
 Only the description lines are read, by pattern and not as XML: a report stands on one line, and a parser that
 resolves entities has no business with a file from elsewhere. All other lines are markup and count as comments.
@@ -32,7 +32,7 @@ _POSITION = ("latitude_deg", "longitude_deg", "altitude_m")
 
 
 def sniff(head: bytes) -> bool:
-    """Whether it is a KML with a Nemo description."""
+    """Check whether it is a KML with a Nemo description."""
     return b"<kml" in head[:2048] and _HINT.search(head) is not None and b"(lat, lon) = (" in head
 
 

@@ -40,7 +40,7 @@ _FRAMES_S = 1.28
 
 
 def sniff(head: bytes) -> bool:
-    """Whether it is OAI's talk with CSI or levels in it."""
+    """Check whether it is OAI's talk with CSI or levels in it."""
     return any(pattern.search(head) for pattern in (_CSI, _LEVEL, _UE)) and re.search(
         rb"\[(?:NR_)?(?:MAC|PHY)\]|Frame\.Slot|dlsch_rounds|\bi1 = ", head
     ) is not None  # fmt: skip

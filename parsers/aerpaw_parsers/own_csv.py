@@ -22,17 +22,17 @@ _TAP = ("time utc", "query", "status", "rank", "ri raw")
 
 
 def is_header(names: list[str]) -> bool:
-    """Whether plain names are those of one of the three tables."""
+    """Check whether plain names are those of one of the three tables."""
     return any(set(form) <= set(names) for form in (_RSS, _RANK, _TAP))
 
 
 def sniff(head: bytes) -> bool:
-    """Whether the first line is one of our headers."""
+    """Check whether the first line is one of our headers."""
     return head.lstrip(b"\xef\xbb\xbf").startswith(b"time_utc,") and _sheet.starts(head, is_header)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """What the table was made of."""
+    """Read back the records that the table was made of."""
     sheet = _sheet.read(data, is_header)
     if sheet is None:
         return _sheet.nothing(data, "own_csv", "no header of an export")

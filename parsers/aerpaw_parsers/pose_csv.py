@@ -19,7 +19,7 @@ _LIKE_A_LEVEL = re.compile(
 
 
 def is_header(names: list[str]) -> bool:
-    """Whether names hold a position and a time, and no quantity of a radio."""
+    """Check whether names hold a position and a time, and no quantity of a radio."""
     return (
         _pose.has_position(names)
         and _has_time(names)
@@ -28,7 +28,7 @@ def is_header(names: list[str]) -> bool:
 
 
 def has_radio(name: str) -> bool:
-    """Whether a plain name is that of a level or rank."""
+    """Check whether a plain name is that of a level or rank."""
     meaning = _quantities.quantity(name)
     return meaning is not None and (meaning.kind in ("rss", "rank") or meaning.name in ("SINR", "RSRQ"))
 
@@ -38,7 +38,7 @@ def _has_time(names: list[str]) -> bool:
 
 
 def sniff(head: bytes) -> bool:
-    """Whether a header with position and time stands in front, and it is not AERPAW's own layout."""
+    """Check whether a header with position and time stands in front, and it is not AERPAW's own layout."""
     narrower = (vehicle_out.READER.sniff, _nemo.sniff, quectel_ri.READER.sniff)
     return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 

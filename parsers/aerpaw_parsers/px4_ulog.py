@@ -49,7 +49,7 @@ _KINDS = frozenset(b"BFIMPQADLCSORT")
 
 
 def sniff(head: bytes) -> bool:
-    """Whether it begins with ULog's mark."""
+    """Check whether it begins with ULog's mark."""
     return head.startswith(_MAGIC)
 
 

@@ -26,7 +26,7 @@ _CSI = ("lte_csi", "nr5g_csi")
 
 
 def sniff(head: bytes) -> bool:
-    """Whether tables of AT answers stand in it."""
+    """Check whether tables of AT answers stand in it."""
     return b"|----+" in head and re.search(rb'\|\s*\d+\s*\|\s*"?\+Q(ENG|NWCFG):', head) is not None
 
 

@@ -82,7 +82,7 @@ _SINR_RANGE = (-23.0, 40.0)
 
 
 def sniff(head: bytes) -> bool:
-    """Whether most of the first lines, a bare OK aside, are AT answers behind a time."""
+    """Check whether most of the first lines, a bare OK aside, are AT answers behind a time."""
     lines = [line for line in _lines.first_lines(head) if line != b"OK"]
     return bool(lines) and 2 * sum(_ANY.match(line) is not None for line in lines) > len(lines)
 

@@ -40,7 +40,7 @@ _PLACE = (("latitude_deg", ("mY", "y", "latitude", "lat")), ("longitude_deg", ("
 
 
 def sniff(head: bytes) -> bool:
-    """Whether it is JSON with SigMF's three parts; the global one comes first as a rule."""
+    """Check whether it is JSON with SigMF's three parts; the global one comes first as a rule."""
     text = head.lstrip(b"\xef\xbb\xbf \r\n\t")
     return text[:1] == b"{" and b'"core:datatype"' in head and (b'"captures"' in head or b'"global"' in head)
 

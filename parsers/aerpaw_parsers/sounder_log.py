@@ -35,7 +35,7 @@ _FOOT = re.compile(_HEAD + rb"+([0-7]{7,12})[ \t]*$")
 
 
 def sniff(head: bytes) -> bool:
-    """Whether most of the first lines are od lines, with at least one sample."""
+    """Check whether most of the first lines are od lines, with at least one sample."""
     lines = _lines.first_lines(head)
     samples = sum(_ODD.match(line) is not None for line in lines)
     stars = sum(_STAR.match(line) is not None for line in lines)
@@ -116,7 +116,7 @@ def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
 
 @dataclass
 class _Piece:
-    """What a piece of a log holds: samples; ``*`` and foot lines (value NaN) with their texts; the account."""
+    """Content of a piece of a log: samples; ``*`` and foot lines (value NaN) with their texts; the account."""
 
     samples: _Samples
     marks: _Samples

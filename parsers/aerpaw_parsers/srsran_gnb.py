@@ -49,7 +49,7 @@ _TORN = re.compile(rb"^\[?[-0-9/]{10}[ T][0-9:.]{8,18}\]? +\d{1,4} +(?:0x)?[0-9a
 
 
 def sniff(head: bytes) -> bool:
-    """Whether it is the console with its title line, or the log with scheduler metrics."""
+    """Check whether it is the console with its title line, or the log with scheduler metrics."""
     return _TITLE.search(head) is not None or _SCHEDULER.search(head) is not None
 
 
@@ -70,7 +70,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def sniff_json(head: bytes) -> bool:
-    """Whether the first object holds a list of UEs with RI."""
+    """Check whether the first object holds a list of UEs with RI."""
     first = _json.first(head)
     if first is None:  # a first line longer than what sniffers see
         return head.lstrip()[:1] == b"{" and b'"ue_list"' in head and re.search(rb'"(dl_)?ri"\s*:', head) is not None

@@ -44,7 +44,7 @@ Answer = tuple[int, dict[str, Any], dict[str, Any], list[str]]
 
 
 def sniff(head: bytes) -> bool:
-    """Whether the first line is a header of the tap."""
+    """Check whether the first line is a header of the tap."""
     first = head.lstrip(b"\0\r\n \t").split(b"\n", 1)[0]
     return first.startswith(b'{"kind":"header"') and b'"schema":"aerpaw-cmp-tap/' in first
 
@@ -128,7 +128,7 @@ _RANKS = (("nr5g_csi", "nr5g"), ("lte_csi", "lte"))
 
 
 class _Log:
-    """What is kept of a log while it is read."""
+    """State kept of a log while it is read."""
 
     def __init__(self) -> None:
         self.header: dict[str, Any] | None = None
@@ -156,7 +156,7 @@ class _Log:
             self._note(record)
 
     def _note(self, record: dict[str, Any]) -> None:
-        """What a record says about the log as a whole: gaps, clock steps, lost records, its end."""
+        """Note what a record says about the log as a whole: gaps, clock steps, lost records, its end."""
         kind = record["kind"]
         if isinstance(record.get("n"), int):
             self.numbers.add(int(record["n"]))

@@ -59,7 +59,7 @@ _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while t
 
 
 def sniff(head: bytes) -> bool:
-    """Whether most of the first lines are telemetry rows."""
+    """Check whether most of the first lines are telemetry rows."""
     return _lines.mostly(head, _ROW) or _lines.mostly(head, _LONGER)
 
 

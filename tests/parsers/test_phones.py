@@ -179,6 +179,14 @@ def test_the_same_pose_from_every_program() -> None:
         assert converted[name] == own[name], name
 
 
+def test_milliseconds_beyond_any_time_stamp_are_left_out() -> None:
+    first = samples.AIRDATA.splitlines(keepends=True)[1]
+    wild = samples.AIRDATA.replace(first, b"9" * 16 + first[first.index(b",") :])
+    result = read("pose_csv", wild)
+    assert any("column of milliseconds" in text for text in result.warnings)
+    assert (result.streams[0].frame["time"].to_numpy().astype("int64") % 1_000_000_000 == 0).all()
+
+
 def test_title_lines_in_front_of_a_table() -> None:
     data = b"Flight of the second\nexported by x\n\n" + samples.AIRDATA
     assert read("pose_csv", data).accepted == 2

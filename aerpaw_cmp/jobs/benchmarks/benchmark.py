@@ -59,14 +59,14 @@ class FileEntry(Settings):
 
     @property
     def url(self) -> str:
-        """Where the file can be fetched."""
+        """URL from which the file can be fetched."""
         from urllib.parse import quote
 
         return f"https://raw.githubusercontent.com/{self.repository}/HEAD/{quote(self.path)}"
 
 
 class Task(Settings):
-    """What is predicted from what."""
+    """Definition of a task: what is predicted from what."""
 
     title: str
     kind: Literal["level", "rank"] = "level"
@@ -76,12 +76,12 @@ class Task(Settings):
 
     @property
     def own_offset(self) -> bool:
-        """Whether each series is scored about its own mean error: its own flight is not among what is known."""
+        """True if each series is scored about its own mean error: its own flight is not among what is known."""
         return self.split in ("flights", "sectors")
 
     @property
     def rule(self) -> str:
-        """What an entrant may know and how levels are counted, in words."""
+        """Rule in words: what an entrant may know and how levels are counted."""
         known = {
             "flights": "the training flights",
             "sectors": f"the training flights outside the sample's sector of {360 // SECTORS} degrees at the tower "
@@ -174,7 +174,7 @@ class Bench:
 
     @cached_property
     def places(self) -> dict[str, Path]:
-        """Where the files are."""
+        """Paths of the files, by name."""
         return locate(self.manifest, self.folder)
 
     @cached_property
@@ -213,7 +213,7 @@ class Bench:
         return [sample.part(sample.rank >= 1) for sample in samples]
 
     def skipped(self, task: str, *, training: bool) -> list[str]:
-        """What a task lacks, each file with its source; empty where it can be run."""
+        """Files that a task lacks, each with its source; empty where it can be run."""
         one = self.manifest.tasks[task]
         absent = [name for flight in (*one.test, *(one.train if training else ())) for name in self.missing(flight)]
         return [
@@ -278,7 +278,7 @@ def may_know(split: Split, known: Observed, asked: Observed, *, own: bool) -> Bo
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is known and what is asked: one fold of a task. ``rows`` (n,) of each asked series of the flight."""
+    """One fold of a task: what is known and what is asked. ``rows`` (n,) of each asked series of the flight."""
 
     train: list[Observed]
     asked: list[Observed]

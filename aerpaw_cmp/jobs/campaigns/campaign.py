@@ -211,7 +211,7 @@ def _inputs_of(files: Mapping[str, tuple[Path, FlightFile]], logs_root: Path | N
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Folds:
-    """What was fitted on some flights and scored on others, or why nothing was."""
+    """Fits on some flights with their scores on others, or the reason why there are none."""
 
     rss: tuple[HeldOutFold, ...] = ()
     rank: tuple[RankHeldOutFold, ...] = ()

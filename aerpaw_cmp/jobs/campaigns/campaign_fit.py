@@ -307,7 +307,7 @@ def _round(name: str, values: Sequence[float]) -> bool:
 
 
 def goes_round(values: Sequence[float] | FloatArray) -> bool:
-    """Whether increasing angles [deg] cover the circle: the gap from the last to the first is no wider than another."""
+    """Check whether increasing angles [deg] cover the circle: the gap from last to first is no wider than another."""
     angles = np.asarray(values, dtype=np.float64)
     if len(angles) < 3:
         return False

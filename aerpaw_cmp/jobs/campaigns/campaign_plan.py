@@ -1,4 +1,4 @@
-"""What of a campaign is kept and what is to do; tasks handed to workers, outcomes gathered."""
+"""Status of a campaign, what is kept and what is to do; tasks handed to workers, outcomes gathered."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class TaskState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignStatus:
-    """What ``campaign status`` tells.
+    """Answer of ``campaign status``.
 
     ``estimate_s`` is the time of what is to do with ``workers`` tasks side by side: for every task the mean cost of
     the kept tasks of its setting, else of all; None where nothing was measured yet.
@@ -86,7 +86,7 @@ class CampaignStatus:
 def campaign_status(
     name: str, tasks: Sequence[Task], failures: Sequence[Failure], store: OutcomeStore | None, *, workers: int = 1
 ) -> CampaignStatus:
-    """What of a campaign is kept, what is to do and how long that may take; nothing is computed.
+    """Status of a campaign: what is kept, what is to do and how long that may take; nothing is computed.
 
     Parameters
     ----------

@@ -94,7 +94,7 @@ def shares_by_rank(reported: IntArray, simulated: IntArray) -> FloatArray:
 
 
 def loss(benches: Sequence[RankBench], point: Point, criterion: str) -> float:
-    """What the search lowers, mean over flights: 1 - kappa, total variation, or the log score [nats]."""
+    """Loss that the search lowers, mean over flights: 1 - kappa, total variation, or the log score [nats]."""
     pairs = [bench.pairs(point) for bench in benches]
     pairs = [(reported, simulated) for reported, simulated in pairs if len(reported)]
     if not pairs:

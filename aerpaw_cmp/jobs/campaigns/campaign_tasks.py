@@ -93,7 +93,7 @@ def _logs(key: _Logs) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class _Logs:
-    """What the reading of logs depends on; settings that do not matter to it do not count in comparisons."""
+    """Inputs on which the reading of logs depends; settings that do not matter to it do not count in comparisons."""
 
     folder: Path
     logs_root: Path | None
@@ -156,7 +156,7 @@ def _failed(task: Task, message: str, error: BaseException) -> Outcome:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Order:
-    """What a worker is given: paths and the digest of what the outcome depends on, as the first process sees it.
+    """Order to a worker: paths and the digest of what the outcome depends on, as the first process sees it.
 
     ``key`` is None where an input cannot be read, or nothing is kept.
     """
@@ -167,7 +167,7 @@ class Order:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Done:
-    """What a worker gives back.
+    """Answer of a worker.
 
     ``about`` is the manifest of the outcome: what was read, where and when it was computed, what it cost.
     """
@@ -238,7 +238,7 @@ def _not_the_same(task: Task) -> Outcome:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facts:
-    """What an outcome depends on."""
+    """Settings and inputs on which an outcome depends, and its key."""
 
     settings: FlightFile
     inputs: list[dict[str, str]]

@@ -1,4 +1,4 @@
-"""What can be said only of several flights: shared offsets, repeatability, K chosen on the others."""
+"""Results that only several flights together can give: shared offsets, repeatability, K chosen on the others."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ...report.campaign_data import FlownRank, PooledOffset, RankPairing, RankRo
 
 
 class RepeatSettings(Settings):
-    """When two samples count as taken at the same place, and how residuals are gathered by place."""
+    """Settings for when two samples count as taken at the same place, and how residuals are gathered by place."""
 
     radius_m: Positive = 3.0
     heading_within_deg: Positive | None = 20.0

@@ -56,7 +56,7 @@ class PatternsSettings(Settings):
 
 
 class FitSettings(Settings):
-    """What is learned."""
+    """Selection of what is learned."""
 
     gain: Literal["both", "uav", "tower", "none"] = "both"
     mount: Literal["azimuth", "tilt", "none"] = "azimuth"
@@ -102,7 +102,7 @@ class GroundFit:
 
     @property
     def used_m(self) -> float | None:
-        """What a replay is to take: the most probable height, or None where no ground ray is as likely."""
+        """Height that a replay is to take: the most probable one, or None where no ground ray is as likely."""
         return None if math.isinf(self.likely_m[1]) else self.best_m
 
 

@@ -89,7 +89,7 @@ def _learned(flights: Sequence[_Levels]) -> LearnedLock | None:
 
 
 def lock_words(lock: LearnedLock) -> str:
-    """What flights left out say of P(lock), and of the level with a floor."""
+    """Sentences on P(lock), and on the level with a floor, from flights left out."""
     return (
         f"The predicted level gives the probability of lock with a Brier score of {lock.brier:.3f} on flights left out "
         f"(constant: {lock.constant_brier:.3f}), log score {lock.log_score:.3f} ({lock.constant_log_score:.3f}). Where "

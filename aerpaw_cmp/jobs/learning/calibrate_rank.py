@@ -100,7 +100,7 @@ class RankSamples:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """How reports follow the positions of a log: see :func:`~aerpaw_cmp.compare.receiver.time_means`.
+    """Time relation of reports to the positions of a log: see :func:`~aerpaw_cmp.compare.receiver.time_means`.
 
     ``log_score`` is that of the choice on sectors of the training flights left out [nat]; NaN where nothing was chosen.
     """
@@ -125,7 +125,7 @@ class FittedReceiver:
     timing: Timing = Timing()
 
     def knows(self, samples: RankSamples) -> bool:
-        """Whether it was fitted on these reports: by the content of their logs, or, in 0.3, the name of the flight."""
+        """Check whether it was fitted on these reports: by the content of their logs, or, in 0.3, the flight's name."""
         if not self.trained_on:
             return samples.flight in self.flights
         return not set(self.trained_on).isdisjoint(samples.logs)

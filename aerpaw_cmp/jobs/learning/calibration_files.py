@@ -116,7 +116,7 @@ def antenna_files(
 
 
 def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
-    """What the tower's file says about the gain towards both ends at once; nothing where none was learned."""
+    """Notes of the tower's file about the gain towards both ends at once; empty where none was learned."""
     fit = calibration.learned.fit
     term = next((t for t in fit.model.terms if t.frame == "pair"), None) if fit else None
     if fit is None or term is None or end == "uav":
@@ -250,7 +250,7 @@ def _place(calibration: Calibration, place: Learned) -> dict[str, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """What was learned from the flights of a calibration, and what is to be said of their logs."""
+    """Results learned from the flights of a calibration, and what is to be said of their logs."""
 
     settings: CalibrationFile
     flights: tuple[FlightData, ...]
@@ -310,7 +310,7 @@ def write_files(
 
 
 def site_entries(found: Calibrated, command: str) -> list[tuple[str, Entry, dict[str, bytes]]]:
-    """What a site remembers of a calibration: names of entries, the entries, and their tables by name."""
+    """Entries that a site remembers of a calibration: their names, the entries, and their tables by name."""
     name, out = found.settings.calibration, []
     if found.calibration is not None:
         out.append((name, *site_entry(found.calibration, command)))
@@ -321,7 +321,7 @@ def site_entries(found: Calibrated, command: str) -> list[tuple[str, Entry, dict
 
 
 def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str, bytes]]:
-    """What a site remembers of a calibration: the entry, and its tables by name."""
+    """Entry that a site remembers of a calibration, and its tables by name."""
     name, maps = calibration.settings.calibration, antenna_maps(calibration)
     tables: dict[str, bytes] = {}
     series = []
@@ -373,7 +373,7 @@ def _at_unit_gain(lock: LearnedLock | None, *ends: AntennaMap) -> LearnedLock | 
 def receiver_entry(
     settings: CalibrationFile, flights: Sequence[FlightData], ranked: RankCalibration, command: str
 ) -> tuple[Entry, dict[str, bytes]]:
-    """What a site remembers of rank receivers.
+    """Entry that a site remembers of rank receivers, and its tables.
 
     Parameters
     ----------

@@ -74,7 +74,7 @@ RATIOS = ("spread", "condition")
 
 @dataclass(frozen=True, slots=True)
 class MapSettings:
-    """What a map is made of; the defaults are the paper's (arXiv 2502.10324, table II and section VII).
+    """Settings of a map; the defaults are the paper's (arXiv 2502.10324, table II and section VII).
 
     Parameters
     ----------
@@ -307,7 +307,7 @@ class PieceOrder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PieceDone:
-    """What a worker gives back: an evaluation per foliage mode, and how many paths there were."""
+    """Answer of a worker: an evaluation per foliage mode, and how many paths there were."""
 
     modes: Mapping[str, Evaluation]
     paths: int
@@ -675,13 +675,13 @@ def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
 
 
 def _notes(outcome: MapOutcome) -> tuple[str, ...]:
-    """Where the loss in crowns is continued beyond its table."""
+    """Note on the loss in crowns where it is continued beyond its table."""
     note = p833_note(outcome.settings.carrier_hz) if "attenuating" in outcome.settings.foliage else None
     return () if note is None else (note,)
 
 
 def _metrics(outcome: MapOutcome) -> dict[str, Any]:
-    """What metrics.json holds beyond the tables of the page."""
+    """Content of metrics.json beyond the tables of the page."""
     result: dict[str, Any] = {
         "paths": outcome.paths,
         "paths_off_crowns": outcome.paths_off_crowns,

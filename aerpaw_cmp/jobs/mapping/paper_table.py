@@ -1,4 +1,4 @@
-"""What arXiv 2502.10324 states about its maps, beside the same quantity of a run.
+"""Values that arXiv 2502.10324 states about its maps, beside the same quantity of a run.
 
 Every row quotes the paper on one side; the other side is computed here from the run's own maps.
 """

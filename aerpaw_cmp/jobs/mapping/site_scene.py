@@ -21,7 +21,7 @@ LOCAL_NOTE = "this site has no georeference: latitude and longitude count from (
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a file is XML of a Mitsuba scene: its first element is 'scene'."""
+    """Check whether a file is XML of a Mitsuba scene: its first element is 'scene'."""
     try:
         with path.open("rb") as file:
             head = file.read(65536)
@@ -32,7 +32,7 @@ def is_scene(path: Path) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneOptions:
-    """What a Mitsuba scene does not say of itself.
+    """Facts that a Mitsuba scene does not state about itself.
 
     Parameters
     ----------

@@ -106,7 +106,7 @@ Candidate = tuple[Route, Pattern | None, str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CurvePoint:
-    """What a flight of some minutes leaves [dB]."""
+    """Standard deviation that a flight of some minutes leaves [dB]."""
 
     minutes: float
     length_m: float
@@ -259,7 +259,7 @@ def _open_ends(site: Site, asked: PlanAsked) -> dict[str, tuple[str, str]]:
 
 
 def _area(site: Site, asked: PlanAsked) -> Any:
-    """Where a route may run."""
+    """Area where a route may run."""
     if asked.fence is None:
         west, south, east, north = site.area_m
         fence = shapely.box(west, south, east, north)
@@ -416,7 +416,7 @@ CURVE_OF = 3
 def _curve(
     ranked: Sequence[Ranked], leaves_db: Callable[[Route], float], site: Site, area: Any, asked: PlanAsked
 ) -> list[CurvePoint]:
-    """What shorter and longer flights of the best candidates leave; of files, shorter ones."""
+    """Standard deviations that shorter and longer flights of the best candidates leave; of files, shorter ones."""
     out: list[CurvePoint] = []
     best = [r for r in ranked if not r.refused][:CURVE_OF]
     for share in SHARES:

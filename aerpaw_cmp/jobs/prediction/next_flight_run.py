@@ -57,7 +57,7 @@ def run_plan(target: str, flights: Sequence[Path], asked: PlanAsked, options: Ru
 
 
 def sentence(plan: FlightPlan) -> str:
-    """What the page opens with."""
+    """Opening text of the page."""
     best, minutes = plan.best, plan.best.route.duration_s / 60.0
     text = (
         f"Fly {best.route.name}: {best.route.length_m / 1000.0:.1f} km, {minutes:.0f} min. It lowers the standard "

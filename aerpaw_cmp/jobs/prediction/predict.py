@@ -397,7 +397,7 @@ def _outside(targets: Targets, flown: Sequence[LinkSamples]) -> BoolArray:
 
 
 def _flags(targets: Targets, mine: Sequence[LinkSamples], level: FloatArray) -> list[str]:
-    """What a reader must know of each target: empty, or why its level is a guess or missing."""
+    """Flag of each target for the reader: empty, or why its level is a guess or missing."""
     flag = np.where(_outside(targets, mine), "outside_flown", "").astype(object)
     flag[~targets.known] = "no_position"
     flag[targets.known & ~np.isfinite(level)] = "out_of_coverage"

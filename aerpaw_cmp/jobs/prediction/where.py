@@ -1,4 +1,4 @@
-"""Where a prediction is asked for: a grid over a site, a planned route, the plan or track of a flight, points."""
+"""Places asked for in a prediction: a grid over a site, a planned route, the plan or track of a flight, points."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def level_samples(
 
 
 def is_settings(path: Path) -> bool:
-    """Whether a path names a YAML file."""
+    """Check whether a path names a YAML file."""
     return path.suffix.lower() in (".yaml", ".yml")
 
 

@@ -103,7 +103,7 @@ def audit_replays(
 
 
 def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, object]:
-    """Whether opaque crowns reflect, and how many paths bounce off one."""
+    """Check whether opaque crowns reflect, and how many paths bounce off one."""
     if rt.foliage != "opaque":
         return {}
     bounced = sum(int(r.replay.paths.off_crown.sum()) for r in replays)
@@ -207,7 +207,7 @@ def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Si
 
 
 def _rays(parts: Sequence[Audit]) -> list[str]:
-    """How many rays PathSolver shot, and why, in the words of the series that needed most."""
+    """Number of rays that PathSolver shot, and why, in the words of the series that needed most."""
     most = max(parts, key=lambda p: p.samples)
     return [f"Rays were raised until two pilots agreed: {most.samples_reason}."] if most.samples_reason else []
 

@@ -705,6 +705,6 @@ def _receiver_forecast(
 def _repeated_rank(
     time: Any, position_m: FloatArray, rank: FloatArray, heading_deg: FloatArray | None
 ) -> dict[str, ranks.RankRepeat]:
-    """How well the modem agrees with itself where the second half of the flight passes places of the first."""
+    """Agreement of the modem with itself where the second half of the flight passes places of the first."""
     passes = _halves(time, position_m, rank, heading_deg)
     return {name: ranks.repeat_rank(*pair, PASSES_WITHIN_M) for name, pair in passes.items()}

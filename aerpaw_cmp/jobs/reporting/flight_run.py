@@ -21,7 +21,7 @@ from .ladder import FlightLadder, flight_ladder
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightRun:
-    """What was computed of one flight.
+    """Record of what was computed of one flight.
 
     Parameters
     ----------

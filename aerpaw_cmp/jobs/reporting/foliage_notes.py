@@ -1,4 +1,4 @@
-"""What must be said of foliage models: how far they are stretched or assumed."""
+"""Notes that must be given on foliage models: how far they are stretched or assumed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ...propagation.field.foliage import LEAFLESS_FACTOR, P833, P833_TABLE
 
 
 def foliage_notes(trees: int, rt: RtSettings, carriers_hz: Collection[float]) -> tuple[str, ...]:
-    """What a report must say of its foliage models, where the site has trees: how far they are stretched or assumed."""
+    """Notes a report must give on its foliage models, if the site has trees: how far they are stretched or assumed."""
     if not trees or rt.foliage != "attenuating":
         return ()
     notes = []

@@ -77,7 +77,7 @@ class Model:
 
     @property
     def name(self) -> str:
-        """What it holds, in words."""
+        """Content of the model in words."""
         parts = {
             "isotropic": [], "measured": ["antennas"], "installed": ["antennas with learned gain"],
             "learned": ["learned sphere"],
@@ -291,7 +291,7 @@ class _Climber:
 
     @cached_property
     def _learned_here(self) -> bool:
-        """Whether antennas or settings of the flight file were learned from a log of this very flight."""
+        """True if antennas or settings of the flight file were learned from a log of this very flight."""
         pairs = zip(self._data.rss, self._links, strict=True)
         return any(learned_here(self._data, series, link) for series, link in pairs)
 

@@ -28,7 +28,7 @@ class Levels:
 
 
 def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> Levels:
-    """What is compared of a series, as ``rss`` of the flight file asks."""
+    """Levels of a series that are compared, as ``rss`` of the flight file asks."""
     measured = series.measured_db
     if settings.window_s > 0:
         measured = rss.local_mean_db(series.time, measured, settings.window_s)

@@ -1,4 +1,4 @@
-"""What a likely cause is told from, gathered from a replayed series."""
+"""Evidence from which a likely cause is told, gathered from a replayed series."""
 
 from __future__ import annotations
 

@@ -111,14 +111,14 @@ class OutcomeStore:
             self._write(f"{key}.failed.json", _text(manifest))
 
     def manifest(self, key: str, *, failed: bool = False) -> dict[str, Any]:
-        """What stands beside an outcome (or a failure); empty where it cannot be read."""
+        """Manifest beside an outcome (or a failure); empty where it cannot be read."""
         try:
             return dict(json.loads((self.folder / f"{key}{'.failed' if failed else ''}.json").read_bytes()))
         except (OSError, ValueError, TypeError):
             return {}
 
     def has(self, key: str) -> bool:
-        """Whether there is an entry."""
+        """Check whether there is an entry."""
         return (self.folder / f"{key}.npz").is_file()
 
 

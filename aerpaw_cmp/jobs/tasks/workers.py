@@ -261,7 +261,7 @@ class Cluster:
         return killed
 
     def _result(self, future: Any) -> tuple[Any] | None:
-        """What a task that is done gave, or how it was lost; None where its workers were, again and again."""
+        """Result of a task that is done, or how it was lost; None where its workers were lost again and again."""
         try:
             return (future.result(),)
         except CancelledError:  # with its scheduler
@@ -378,7 +378,7 @@ def _scheduler(address: str, paths: Sequence[Path], progress: Progress) -> Itera
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerFacts:
-    """What a worker says of itself."""
+    """Facts that a worker states about itself."""
 
     host: str
     python: str

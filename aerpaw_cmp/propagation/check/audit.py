@@ -35,7 +35,7 @@ RANK_K = (10.0, 100.0, 1000.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """What one replay has and another has not, on the same poses.
+    """Differences between two replays of the same poses.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class Audit(Difference):
 
 @dataclass(frozen=True, slots=True)
 class Second:
-    """What is checked, and against what.
+    """Settings of an audit: the part that is checked, and the reference it is checked against.
 
     Parameters
     ----------

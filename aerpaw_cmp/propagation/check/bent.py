@@ -112,7 +112,7 @@ class _Bend:
         return np.array([point[0], point[1], 2.0 * self.ground - point[2]])
 
     def verdict(self) -> bool | None:
-        """Whether the path exists; None where that is a matter of rounding."""
+        """Check whether the path exists; None where that is a matter of rounding."""
         from scipy.optimize import minimize_scalar  # few audits have edges
 
         c = self.corner

@@ -1,4 +1,4 @@
-"""What the paths of one link are made of, term by term, and why others are not there.
+"""Composition of the paths of one link, term by term, and reasons why others are not there.
 
 The level of a path is the mean over element pairs of the power it brings. Each term is the ratio [dB] of that mean
 after and before a step (tower's antenna, reflections, spreading, UAV's antenna, polarisation), so the terms add up to
@@ -292,7 +292,7 @@ def power_sum_dbm(paths: tuple[ExplainedPath, ...]) -> float:
 def why_not(
     faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray, surfaces: Surfaces | None = None
 ) -> str:
-    """Why a sequence of faces (depth,) makes no path between two points; "" where it makes one.
+    """Give the reason why a sequence of faces (depth,) makes no path between two points; "" where it makes one.
 
     Parameters
     ----------
@@ -335,7 +335,7 @@ def why_not(
 
 
 def _prisms_only(faces: Faces) -> bool:
-    """Whether what hides is a set of prisms, each with a roof, and faces without a building are whole planes."""
+    """Check whether what hides is a set of prisms, each with a roof, and faces without a building are whole planes."""
     roofed = np.unique(faces.solid[(faces.normal[:, 2] == 1.0) & (faces.solid >= 0)])
     bare = faces.solid < 0
     return bool(np.isin(faces.solid[~bare], roofed).all() and np.isinf(faces.lower[bare]).all())
@@ -365,7 +365,7 @@ def near_an_edge(
     path: ExplainedPath,
     surfaces: Surfaces | None = None,
 ) -> bool:
-    """Whether float32 may decide a path otherwise: a reflection point within :data:`EDGE_M` of an edge of its face.
+    """Check whether float32 may decide a path otherwise: a reflection point within :data:`EDGE_M` of its face's edge.
 
     Parameters
     ----------

@@ -62,7 +62,7 @@ SIONNA_PATTERNS = {"iso": "iso", "hw_dipole": "hw_dipole", "tr38901": "tr38901"}
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What the settings of a flight say, for the second implementation."""
+    """Settings of a flight, for the second implementation."""
 
     link: ExpectedLink
     loss: ExpectedLoss = field(default_factory=ExpectedLoss)
@@ -316,7 +316,7 @@ class _OneLink:
         )  # fmt: skip
 
     def _beyond(self, bent: EdgePaths) -> str:
-        """What of the paths over edges the second implementation does not know."""
+        """Name the paths over edges that the second implementation does not know; "" where it knows all."""
         site = self.reference.site
         if (bent.edge[:, 1] >= 0).any() or (np.append(self.replay.faces.solid, -1)[bent.ground] >= 0).any():
             return "paths over two edges, or over an edge and a wall"
@@ -326,7 +326,7 @@ class _OneLink:
 
 
 def _another_rank(ours: ComplexArray, expected: ComplexArray, ks: Sequence[float]) -> bool:
-    """Whether a rank differs for a K at which no singular value lies near the threshold."""
+    """Check whether a rank differs for a K at which no singular value lies near the threshold."""
     from ...compare.rank import channel_rank
 
     sigma = np.linalg.svd(expected, compute_uv=False)
@@ -464,7 +464,7 @@ def per_pair(
     *,
     ks: Sequence[float],
 ) -> FieldAudit:
-    """What one set of paths per array centre leaves out: the audited links with each element pair's own paths.
+    """Error of one set of paths per array centre: the audited links with each element pair's own paths.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Why a sequence of open surfaces makes no path: for explanations, one path at a time, every triangle asked in NumPy.
+"""Reason why open surfaces make no path: for explanations, one path at a time, every triangle tested in NumPy.
 
 The same rules as the search in :mod:`aerpaw_cmp.propagation.search.beams`, by other code.
 """
@@ -15,7 +15,7 @@ NEAR_END_M = 1e-3
 
 
 def why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray) -> str:
-    """Why faces (depth,) make no path between two points; "" where they make one.
+    """Give the reason why faces (depth,) make no path between two points; "" where they make one.
 
     Parameters
     ----------

@@ -278,7 +278,7 @@ class Mirror:
         return _plus(p, self.normal, -2.0 * self.height(p))
 
     def margin(self, p: Vector) -> float:
-        """How far inside its edges a point of the plane lies [m]; negative outside."""
+        """Distance of a point of the plane from the edges of the face [m]; positive inside, negative outside."""
         if self.roof is not None:
             spot = Point(p[0], p[1])
             edge = float(self.roof.boundary.distance(spot))
@@ -330,7 +330,7 @@ class Blocks:
         self._shapes: dict[float, list[Polygon]] = {}
 
     def cut(self, a: Vector, b: Vector, grow_m: float, spared: tuple[int, ...] = ()) -> bool:
-        """Whether a segment runs through a building; those in ``spared`` (it ends on them) are shrunk a little.
+        """Check whether a segment runs through a building; those in ``spared`` (it ends on them) are shrunk a little.
 
         Parameters
         ----------
@@ -440,7 +440,7 @@ class Reference:
         return chains
 
     def verdict(self, sequence: Sequence[Mirror], target: Vector, margin_m: float = MARGIN_M) -> bool | None:
-        """Whether a path over the mirrors exists; None where a change of ``margin_m`` would decide."""
+        """Check whether a path over the mirrors exists; None where a change of ``margin_m`` would decide."""
         points = _bounces(sequence, self.source, target)
         if points is None:
             return False

@@ -1,1 +1,1 @@
-"""What reruns the stages of a replay: element pairs, a tower that moves, parts of a long flight."""
+"""Drivers that rerun the stages of a replay: element pairs, a tower that moves, parts of a long flight."""

@@ -153,7 +153,7 @@ def replay_moving(
 
 
 def _whole(link: Link, poses: Poses, sources_m: FloatArray) -> Whole:
-    """What a block must know of the others: one tolerance, and whether compiled code is worth loading."""
+    """Properties of all blocks that each must know: one tolerance, and whether compiled code is worth loading."""
     pairs = len(poses) * len(link.uav_array) * sum(map(len, link.tower_arrays.values()))
     points = np.concatenate([poses.position_m, sources_m])
     return Whole.of(points, 0, pairs * WORK_PER_POSE)  # each place has few faces in reach: mirror images

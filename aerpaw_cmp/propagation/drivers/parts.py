@@ -116,7 +116,7 @@ def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
 
 
 def _shared(one: Faces, other: Faces) -> int:
-    """How many faces from the first on are the same in both."""
+    """Number of faces, from the first on, that are the same in both."""
     count = min(len(one), len(other))
     same = (one.normal[:count] == other.normal[:count]).all(axis=1) & (one.offset_m[:count] == other.offset_m[:count])
     return count if same.all() else int(np.argmin(same))
@@ -126,7 +126,7 @@ _COUNT = re.compile(r"(\d+)(?: of (\d+))? (.*)", re.DOTALL)
 
 
 def _counted(parts: list[Replay]) -> list[str]:
-    """What was left out, each message once; counts at the front of a message are added up."""
+    """Messages on what was left out, each once; counts at the front of a message are added up."""
     counts: dict[str, list[int]] = {}
     for text in (text for part in parts for text in part.left_out):
         match = _COUNT.fullmatch(text)

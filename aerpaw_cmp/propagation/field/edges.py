@@ -105,7 +105,7 @@ def edge_channels(
     *,
     threads: int | None = None,
 ) -> tuple[ComplexArray, FloatArray]:
-    """What paths over edges add to the channel matrices.
+    """Contribution of paths over edges to the channel matrices.
 
     Parameters
     ----------

@@ -298,7 +298,7 @@ def crown_index(trees: Trees) -> CrownIndex:
 
 
 def _same(one: Trees, other: Trees) -> bool:
-    """Whether two sets of trees are equal to the last digit."""
+    """Check whether two sets of trees are equal to the last digit."""
     return all(np.array_equal(getattr(one, of.name), getattr(other, of.name)) for of in fields(Trees))
 
 

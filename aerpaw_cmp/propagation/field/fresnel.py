@@ -52,7 +52,7 @@ def half_space(cosine: Any, eta_re: Any, eta_im: Any) -> tuple[Any, Any, Any, An
 
 
 def echo(thickness: Any, root_re: Any, root_im: Any) -> tuple[Any, Any]:
-    """What a wave takes on through a slab and back: ``exp(-4 pi j thickness root)``, thickness in wavelengths."""
+    """Factor of a wave's way through a slab and back: ``exp(-4 pi j thickness root)``, thickness in wavelengths."""
     size = np.exp(4.0 * np.pi * thickness * root_im)
     sine, cosine = sine_cosine(-2.0 * thickness * root_re)
     return size * cosine, size * sine

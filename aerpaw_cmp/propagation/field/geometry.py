@@ -1,4 +1,4 @@
-"""What the field asks of paths and arrays, as columns: the space of the last image, and elements spread over pairs."""
+"""Geometry of paths and arrays for the field, as columns: the space of the last image, elements spread over pairs."""
 
 from __future__ import annotations
 
@@ -164,5 +164,5 @@ def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: d
 
 
 def plain(patterns: tuple[Pattern, ...]) -> bool:
-    """Whether every pattern is 1 along theta in all directions; a class derived from Isotropic may mean another."""
+    """Check whether every pattern is 1 along theta in all directions; a subclass of Isotropic may mean another."""
     return all(type(pattern) is Isotropic for pattern in patterns)

@@ -1,4 +1,4 @@
-"""Which buildings matter: those that could be left out without moving any RSS by more than a stated amount.
+"""Relevance of buildings: those that could be left out without moving any RSS by more than a stated amount.
 
 Judged from the paths that were found and their fields. With ``a_p`` the root-mean-square field of a path over element
 pairs and ``F`` that of the link with all of its paths, leaving out paths that add up to ``B`` in amplitude moves the

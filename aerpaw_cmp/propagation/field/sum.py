@@ -37,7 +37,7 @@ PATHS_PER_PART = 4096
 
 @dataclass(frozen=True, slots=True)
 class Fields:
-    """What the paths of a replay add up to.
+    """Sums over the paths of a replay.
 
     Parameters
     ----------

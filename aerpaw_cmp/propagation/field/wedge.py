@@ -148,7 +148,7 @@ def at_face(angle: Number, top: Number, rise: Number, exterior: Number, distance
 
 
 def along_face(gap: Number, face: Any) -> tuple[Any, Any]:
-    """How waves of both polarisations run along a face: twice the root of ``2j k s W`` for TE and TM.
+    """Propagation of waves of both polarisations along a face: twice the root of ``2j k s W`` for TE and TM.
 
     W is the attenuation of Sommerfeld's ground wave, ``1 / (1 + e^{j pi/4} sqrt(pi q) + 2 j q)`` with the numerical
     distance ``q = k s z^2 / 2`` and the impedance z of the face at grazing incidence: 1 on a conductor, ``1 / 2jq`` far

@@ -137,7 +137,7 @@ def grow_paths(
 def estimate(
     surfaces: Surfaces, links: Links, *, max_depth: int = 2, threads: int | None = None, solids: bool = False
 ) -> Estimate | None:
-    """What :func:`grow_paths` would take, from some faces of the first source; None where nothing is searched.
+    """Estimate the cost of :func:`grow_paths` from some faces of the first source; None where nothing is searched.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ class _Search:
         )  # fmt: skip
 
     def estimate(self, first: IntArray, threads: int) -> Estimate:
-        """What it will take to follow the faces ``first``; some of them are tried.
+        """Estimate the cost of following the faces ``first``; some of them are tried.
 
         Notes
         -----
@@ -344,7 +344,7 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
 def reflection_points(
     surfaces: Surfaces, sequence: IntArray, sources_m: FloatArray, targets_m: FloatArray, *, edge_m: float
 ) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Where paths over stated faces reflect, in float64.
+    """Place where paths over stated faces reflect, in float64.
 
     Parameters
     ----------
@@ -413,7 +413,7 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
 
 @kernel
 def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset, rules):  # type: ignore[no-untyped-def]
-    """Whether a triangle cuts the segment ``a`` - ``b``.
+    """Check whether a triangle cuts the segment ``a`` - ``b``.
 
     ``before`` and ``after`` are unit normals of mirrors at the ends, zero for an antenna: there a surface within the
     clearance of the mirror's plane, or of the antenna, cuts nothing. Moeller and Trumbore (1997), edges included.
@@ -534,7 +534,7 @@ def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-
 
 @kernel
 def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore[no-untyped-def]
-    """Whether one convex face lies between the source and every corner of the outline of face ``f``."""
+    """Check whether one convex face lies between the source and every corner of the outline of face ``f``."""
     _, _, _, _, window, convex, plane, _, _, _, _ = mirrors
     lower, upper, child, start, count, items = face_tree
     aim = np.zeros(3)
@@ -566,7 +566,7 @@ def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore
 
 @kernel
 def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
-    """Whether the convex face ``g`` cuts the lines from the source to all corners of the outline of ``f``.
+    """Check whether the convex face ``g`` cuts the lines from the source to all corners of the outline of ``f``.
 
     It must do so well inside its outline: its triangles may lie a merge tolerance off its plane.
     """
@@ -594,7 +594,7 @@ def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
 
 @kernel
 def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def]
-    """Whether a point lies in a convex outline, which runs counter-clockwise round ``normal``, by a margin."""
+    """Check whether a point lies in a convex outline, which runs counter-clockwise round ``normal``, by a margin."""
     for k in range(WINDOW):
         a, b = outline[k], outline[(k + 1) % WINDOW]
         e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -639,7 +639,7 @@ def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
 
 @kernel
 def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
-    """Whether one plane has the whole outline outside."""
+    """Check whether one plane has the whole outline outside."""
     for p in range(many):
         a, b, c, d = planes[p, 0], planes[p, 1], planes[p, 2], planes[p, 3]
         out = True
@@ -654,7 +654,7 @@ def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
 
 @kernel
 def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-def]
-    """Whether a point of the plane of a face lies in one of its triangles.
+    """Check whether a point of the plane of a face lies in one of its triangles.
 
     Parameters
     ----------

@@ -196,7 +196,7 @@ def way_over_box(lower, upper, node, reach):  # type: ignore[no-untyped-def]
 
 @kernel
 def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-def]
-    """Whether a box lies wholly outside one of the planes.
+    """Check whether a box lies wholly outside one of the planes.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
 
 @kernel
 def box_missed(lower, upper, node, a, inverse):  # type: ignore[no-untyped-def]
-    """Whether the segment from ``a`` with the component-wise ``inverse`` of its direction misses a box.
+    """Check whether the segment from ``a`` with the component-wise ``inverse`` of its direction misses a box.
 
     Parameters
     ----------

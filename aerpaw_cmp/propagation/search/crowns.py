@@ -84,7 +84,7 @@ class _Facets:
         )
 
     def contain(self, rows: IntArray, point_m: FloatArray, tolerance_m: float) -> BoolArray:
-        """Whether points (n, 3) in the planes of the facets ``rows`` (n,) lie inside them."""
+        """Check whether points (n, 3) in the planes of the facets ``rows`` (n,) lie inside them."""
         depth = np.einsum("nki,ni->nk", self.inward[rows], point_m) - self.edge_m[rows]
         return np.asarray((depth >= -tolerance_m).all(axis=1))
 
@@ -291,7 +291,7 @@ class _Search:
         return np.stack(points, axis=1), good
 
     def _free(self, source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray, tree: IntArray) -> BoolArray:
-        """Which paths no tree, building or terrain stops."""
+        """Check whether paths are free: no tree, building or terrain stops them."""
         source = np.broadcast_to(source_m, target_m.shape)
         crown = int(self.before)
         points = [source, *np.moveaxis(vertices_m, 1, 0), target_m]
@@ -313,7 +313,7 @@ class _Search:
         return free
 
     def _inside(self, point_m: FloatArray, tree: IntArray) -> BoolArray:
-        """Whether points (n, 3) lie in the round crowns of trees (n,)."""
+        """Check whether points (n, 3) lie in the round crowns of trees (n,)."""
         t = self.crowns.trees
         top, base = (t.ground_m + t.height_m)[tree], (t.ground_m + t.crown_base_m)[tree]
         width = t.crown_diameter_m[tree] / 2 * (top - point_m[:, 2]) / (top - base)
@@ -323,7 +323,7 @@ class _Search:
 
 @dataclass(frozen=True, slots=True)
 class _Beams:
-    """What a source lights by way of facets: pyramids from its images through them.
+    """Regions that a source lights by way of facets: pyramids from its images through them.
 
     ``facet`` (beams,) of the family; ``height_m`` (beams,) of the source above its plane; ``image_m`` (3, beams);
     ``ray_m`` (corners, 3, beams) from the image to the corners. Nothing is lit below ``floor_m`` (beams,) and above

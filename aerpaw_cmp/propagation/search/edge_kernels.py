@@ -22,7 +22,7 @@ PROBE_M = 0.01
 
 
 class Solids(NamedTuple):
-    """What hides: convex pieces of prisms, or triangles where ``rules`` has the clearances of beams.
+    """Obstacles: convex pieces of prisms, or triangles where ``rules`` has the clearances of beams.
 
     ``normal``, ``offset`` (planes, ...) are those of the pieces, one piece after another from ``first`` (pieces + 1,)
     on, ``lower`` and ``upper`` (pieces, 3) their boxes; ``corners`` (triangles, 3, 3); ``tree`` is over pieces or
@@ -108,7 +108,7 @@ def _round(b, point, a, reach):  # type: ignore[no-untyped-def]
 
 @kernel
 def _bounce(m, f, image, end, corner, out):  # type: ignore[no-untyped-def]
-    """Whether a leg from an image to an edge is bent by a face inside its bounds, and where."""
+    """Check whether a leg from an image to an edge is bent by a face inside its bounds, and where."""
     for axis in range(3):
         out[axis] = np.nan
     if f < 0:
@@ -129,7 +129,7 @@ def _bounce(m, f, image, end, corner, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def _pieces_cut(s, work, a, b):  # type: ignore[no-untyped-def]
-    """Whether the segment runs inside a convex piece, deeper than the tolerance (Cyrus and Beck, 1978)."""
+    """Check whether the segment runs inside a convex piece, deeper than the tolerance (Cyrus and Beck, 1978)."""
     lower, upper, child, start, count, items = s.tree
     inverse, todo = work
     for axis in range(3):
@@ -216,7 +216,7 @@ def _any_piece_cut(s, some, a, b):  # type: ignore[no-untyped-def]
 
 @kernel
 def _cut(s, m, work, a, b, f, g):  # type: ignore[no-untyped-def]
-    """Whether a segment is cut; ``f`` and ``g`` are the mirrors at its ends or -1."""
+    """Check whether a segment is cut; ``f`` and ``g`` are the mirrors at its ends or -1."""
     if not s.triangles:
         return _pieces_cut(s, work, a, b)
     before, after, none = m.normal[f], m.normal[g], np.zeros(3)
@@ -228,7 +228,7 @@ def _cut(s, m, work, a, b, f, g):  # type: ignore[no-untyped-def]
 
 @kernel
 def _leg_cut(s, m, work, end, bounce, corner, f):  # type: ignore[no-untyped-def]
-    """Whether a leg between an end and an edge is cut."""
+    """Check whether a leg between an end and an edge is cut."""
     if f < 0:
         return _cut(s, m, work, end, corner, -1, -1)
     return _cut(s, m, work, bounce, corner, f, -1) or _cut(s, m, work, end, bounce, -1, f)
@@ -236,7 +236,7 @@ def _leg_cut(s, m, work, end, bounce, corner, f):  # type: ignore[no-untyped-def
 
 @kernel
 def _covered(s, m, work, b, e, corner):  # type: ignore[no-untyped-def]
-    """Whether a triangle lies in the air round a point of an edge."""
+    """Check whether a triangle lies in the air round a point of an edge."""
     if not s.triangles:
         return False
     last, point = np.empty(3), np.empty(3)
@@ -253,7 +253,7 @@ def _covered(s, m, work, b, e, corner):  # type: ignore[no-untyped-def]
 
 @kernel
 def _allowed(b, before, after, tower, pose):  # type: ignore[no-untyped-def]
-    """Whether two faces may bend the legs of a link."""
+    """Check whether two faces may bend the legs of a link."""
     if before >= 0 and after >= 0 and (b.wall[before] or b.wall[after]):
         return False
     if before >= 0 and not b.wall[before] and before != b.ground_t[tower]:
@@ -264,7 +264,7 @@ def _allowed(b, before, after, tower, pose):  # type: ignore[no-untyped-def]
 
 @kernel
 def _over_pair(b, k, a_s, r_s, a_t, r_t, points):  # type: ignore[no-untyped-def]
-    """Where a path over a pair of edges meets them: straight in the plane of the face between them."""
+    """Find the points where a path over a pair of edges meets them: straight in the plane of the face between them."""
     t = b.turn[k]
     u_t, v_t = t[0] + t[1] * a_t + t[2] * r_t, t[3] + t[4] * a_t + t[5] * r_t
     if v_t <= 0.0:

@@ -269,7 +269,7 @@ def _below(surfaces: Surfaces, points_m: FloatArray) -> IntArray:
 
 
 class _Exposed:
-    """Whether both faces of an edge are in the air at a point: another building may touch one of them."""
+    """Test of whether both faces of an edge are in the air at a point: another building may touch one of them."""
 
     def __init__(self, faces: Faces, edges: Edges, hiding: Occlusion) -> None:
         own = np.unique(faces.solid[faces.solid >= 0])
@@ -285,7 +285,7 @@ class _Exposed:
         self.hiding = hiding
 
     def at(self, edge: IntArray, points_m: FloatArray) -> BoolArray:
-        """Which points (paths, 3) of edges (paths,) have air beside both faces."""
+        """Check whether points (paths, 3) of edges (paths,) have air beside both faces."""
         good = np.ones(len(edge), dtype=np.bool_)
         rows = np.flatnonzero(self.doubtful[edge])
         for side in (0, 1):
@@ -366,7 +366,7 @@ def _mirrored(faces: Faces, ground: int, points_m: FloatArray) -> FloatArray:
 
 
 def _on_ground(faces: Faces, ground: int, image_m: FloatArray, points_m: FloatArray) -> FloatArray:
-    """Where the lines from images to points (paths, 3) pass a ground plane; NaN for -1."""
+    """Points where the lines from images to points (paths, 3) pass a ground plane; NaN for -1."""
     if ground < 0:
         return np.full_like(points_m, np.nan)
     normal, offset = faces.normal[ground], faces.offset_m[ground]

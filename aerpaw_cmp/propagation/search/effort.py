@@ -1,4 +1,4 @@
-"""How a search runs among thousands of faces, and the statement beforehand of what it will take."""
+"""Running of a search among thousands of faces, and the estimate beforehand of its cost."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """What a search will take.
+    """Estimated cost of a search.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SearchRun:
-    """How a search is run; nothing here changes a number.
+    """Options of running a search; nothing here changes a number.
 
     Parameters
     ----------

@@ -269,7 +269,7 @@ def _facing(faces: Faces, box: _Bounds, tolerance_m: float) -> BoolArray:
 def _beam_meets(
     apex: FloatArray, window: FloatArray, centre: FloatArray, reach: FloatArray, tolerance_m: float
 ) -> BoolArray:
-    """Whether the beam from ``apex`` through the quadrilateral ``window`` may meet a parallelogram or a box.
+    """Check whether the beam from ``apex`` through the quadrilateral ``window`` may meet a parallelogram or a box.
 
     apex (n, 3), window (n, 4, 3), centre (n or 1, 3), reach (n or 1, axes, 3): half of each side. Conservative: True
     unless one side plane of the beam has all of it outside.

@@ -1,4 +1,4 @@
-"""Which segments the buildings cut: the open segment against the open solid.
+"""Occlusion of segments by buildings: the open segment against the open solid.
 
 A building is a prism: its footprint, cut into convex pieces, from its foot to its roof. A segment is cut when a part of
 it runs inside a piece, deeper than a tolerance that only takes up rounding; so a touch of a wall, an edge, a corner or
@@ -65,7 +65,7 @@ class Occlusion:
         """Per solid and convex piece: whether another piece, of any solid, touches it."""
 
     def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
-        """Which polylines source - vertices (paths, depth, 3) - target are cut (paths,)."""
+        """Check whether polylines source - vertices (paths, depth, 3) - target are cut (paths,)."""
         cut = np.zeros(len(sources_m), dtype=np.bool_)
         start = sources_m
         for step in range(vertices_m.shape[1] + 1):
@@ -76,7 +76,7 @@ class Occlusion:
         return cut
 
     def segments(self, start: FloatArray, end: FloatArray) -> BoolArray:
-        """Which segments (n, 3) - (n, 3) are cut."""
+        """Check whether segments (n, 3) - (n, 3) are cut."""
         cut = np.zeros(len(start), dtype=np.bool_)
         if not self.pieces:
             return cut
@@ -109,7 +109,7 @@ class Occlusion:
         return result
 
     def _boxes(self, start: FloatArray, end: FloatArray) -> BoolArray:
-        """Which segments meet which bounding boxes: slab test, (segments, solids)."""
+        """Check whether segments meet bounding boxes: slab test, (segments, solids)."""
         direction = end - start
         direction = np.where(direction == 0.0, 1e-300, direction)
         enter = np.zeros((len(start), len(self.pieces)))
@@ -147,7 +147,7 @@ class Occlusion:
     def _surrounded(
         self, start: FloatArray, end: FloatArray, runs: list[tuple[float, float, tuple[FloatArray, FloatArray]]]
     ) -> bool:
-        """Whether the pieces along which one segment runs fill the whole neighbourhood of one of its points."""
+        """Check whether the pieces along which one segment runs fill the whole neighbourhood of one of its points."""
         radius_m = NEIGHBOURHOOD * self.tolerance_m
         length_m = float(np.linalg.norm(end - start))
         breaks = np.unique([share for enter, leave, _ in runs for share in (enter, leave)])
@@ -256,7 +256,7 @@ def convex_pieces(footprint: Polygon) -> list[Polygon]:
 
 
 def _is_convex(polygons: Polygon | AnyArray) -> BoolArray:
-    """Whether a polygon, or each of an array, fills its hull."""
+    """Check whether a polygon, or each of an array, fills its hull."""
     hull = shapely.area(shapely.convex_hull(polygons))
     full = hull - shapely.area(polygons) <= ROUNDING * hull
     return np.asarray(full & (shapely.get_num_interior_rings(polygons) == 0))

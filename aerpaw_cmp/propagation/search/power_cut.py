@@ -47,7 +47,7 @@ def within_cut(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray, cut
 
 
 def loss_in_words(cut_db: float, whole: int, left_out: int, poses: int, change_db: FloatArray, lost: int) -> str:
-    """What a cut costs, as the full search of a few poses shows it.
+    """Describe the effect of a cut, as the full search of a few poses shows it.
 
     Parameters
     ----------

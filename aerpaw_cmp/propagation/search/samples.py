@@ -1,4 +1,4 @@
-"""How many rays PathSolver needs here: raised until two pilots agree.
+"""Number of rays that PathSolver needs here: raised until two pilots agree.
 
 PathSolver finds a wall of solid angle W with the chance ``1 - exp(-N W / 4 pi)``, so what a scene needs depends on its
 smallest and farthest walls. Pilots on a batch of poses spread over the flight, each with four times the rays of the one

@@ -410,7 +410,7 @@ class _Finder:
         )
 
     def _more_room(self) -> bool:
-        """Whether the last batch had more candidates than there was room for; then there is room for them now."""
+        """Check whether the last batch had more candidates than there was room for; then there is room for them now."""
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
         most = 0 if self.candidates is None else int(np.asarray(self.candidates.numpy()).max(initial=0))
@@ -452,7 +452,7 @@ class _Finder:
 
 
 def _arrays(paths: Any, count: int) -> dict[str, Any]:
-    """Which of Sionna's paths of the first ``count`` targets are valid, and what they meet."""
+    """Validity of Sionna's paths of the first ``count`` targets, and what they meet."""
     return {
         "valid": paths.valid.numpy()[:count],
         "kind": paths.interactions.numpy()[:, :count],
@@ -479,7 +479,7 @@ def _each_batch(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rays:
-    """How Sionna searches.
+    """Options of Sionna's search.
 
     Parameters
     ----------
@@ -551,7 +551,7 @@ def _in_batches(
     surfaces: Surfaces | None,
     progress: Progress | None = None,
 ) -> Iterator[Taken]:
-    """What ``take(paths of Sionna, arrays, scene, poses, towers)`` makes of each batch.
+    """Result of ``take(paths of Sionna, arrays, scene, poses, towers)`` for each batch.
 
     Sionna's own objects hold memory of the device: they are let go before the next batch.
     """

@@ -52,7 +52,7 @@ class ThroughWalls:
         )
 
     def of_link(self, pose: int, tower: int) -> bool:
-        """Whether a link has such a path."""
+        """Check whether a link has such a path."""
         return bool(((self.paths.pose == pose) & (self.paths.tower == tower)).any())
 
     def select(self, rows: AnyArray) -> ThroughWalls:

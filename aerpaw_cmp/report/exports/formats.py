@@ -1,4 +1,4 @@
-"""Which formats there are, and which of them are asked for; loads none of their writers."""
+"""Export formats that there are, and those that are asked for; loads none of their writers."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ class Line:
 
     @property
     def known(self) -> AnyArray:
-        """Where the position is known (n,)."""
+        """Mask (n,): True where the position is known."""
         return np.isfinite(self.east_m) & np.isfinite(self.north_m)
 
 
@@ -167,7 +167,7 @@ class Export:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What whoever opens a file must know."""
+        """Remarks that whoever opens a file must know."""
         said = [
             "Heights (up_m) are metres above the ground at the site origin.",
             "A missing number is out of coverage or unknown; a simulated rank of 0 means that there is no path.",
@@ -303,7 +303,7 @@ def _made(generated: str, versions: Mapping[str, str]) -> dict[str, str]:
 
 
 def _clock(times: Iterable[AnyArray]) -> bool:
-    """Whether the first known instant is a time of day."""
+    """Check whether the first known instant is a time of day."""
     known = [time[~np.isnat(time)] for time in times]
     first = [time.min() for time in known if len(time)]
     return bool(first) and has_wall_clock(min(first))

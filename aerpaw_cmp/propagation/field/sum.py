@@ -228,20 +228,6 @@ def pattern_ends(g: Geometry, elements: Elements, link: Link) -> Ends:
     return towers, None if plain_uav else pattern_fields(uav, pair // ports, rows_of(g.axes), away)
 
 
-def radiated(array: Array, turn: FloatArray, direction: FloatArray) -> ComplexArray:
-    """Field vectors (3, paths, elements) in site axes of an array's elements in one direction (3, paths) per path.
-
-    ``turn`` (paths, 3, 3) turns the device into the site; directions point away from the device.
-    """
-    m, (x, y, z) = rows_of(turn.transpose(0, 2, 1)), direction[:, :, None]
-    fields = None
-    if not plain(array.patterns):
-        x, y, z = (np.repeat(part, len(array), axis=1) for part in (x, y, z))
-        fields = pattern_fields(array, np.arange(len(array)), m, (x, y, z))
-    re, im = _vectors(m, (x, y, z), fields, np.cos(array.slant_rad), np.sin(array.slant_rad))
-    return np.stack([a + 1j * b for a, b in zip(re, im, strict=True)])
-
-
 def _check_patterns(arrays: Sequence[Array]) -> None:
     for array in arrays:
         if len(array.patterns) not in (1, len(array)):

@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any
 from weakref import WeakSet
 
 import numpy as np
@@ -66,12 +66,8 @@ MOST_SLOTS = 2**28
 LARGEST_BATCH = 100
 HALF_SPACE_THICKNESS_M = 10.0
 """Sionna knows slabs only; in this one no second echo returns. Its coefficients are not used for H."""
-WELD_M = 1e-3
-"""Corners of triangles this near are one: Sionna diffracts where two triangles share an edge."""
 EDGE_TOLERANCE_M = 1e-3
 """A float32 reflection point may lie this far outside its face."""
-
-Taken = TypeVar("Taken")
 
 _ALIVE: WeakSet[Any] = WeakSet()
 """Scenes in use. Dr.Jit compiles virtual calls for every material that is alive, those of dead scenes included, and may
@@ -433,11 +429,8 @@ class _Finder:
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = slots
         return True
 
-    def searched(self, targets_m: FloatArray, max_depth: int, samples: int) -> tuple[Any, dict[str, Any]]:
-        """Sionna's paths of one batch, and what they are as arrays.
-
-        Arrays, for the real (not padding) targets: valid, kind, shape, primitive, gain.
-        """
+    def searched(self, targets_m: FloatArray, max_depth: int, samples: int) -> dict[str, Any]:
+        """Sionna's paths of one batch, of the real (not padding) targets: valid, kind, shape, primitive, gain."""
         count = len(targets_m)
         paths = self.trace(_Ends.points(targets_m), max_depth, samples)
         real, imaginary = (np.asarray(part.numpy()) for part in paths.a)
@@ -448,7 +441,7 @@ class _Finder:
                 cause="take a smaller batch",
             )
         gain = np.sqrt((real**2 + imaginary**2).sum(axis=(1, 3)))[:count]
-        return paths, _arrays(paths, count) | {"gain": gain}
+        return _arrays(paths, count) | {"gain": gain}
 
 
 def _arrays(paths: Any, count: int) -> dict[str, Any]:
@@ -525,14 +518,7 @@ def find_paths(
     PathSet
         Sorted by pose, tower, depth, faces.
     """
-    sources_m, targets_m = links.sources_m, links.targets_m
-    tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
-
-    def take(_: Any, raw: dict[str, Any], built: _Scene, poses: IntArray, towers: IntArray) -> PathSet:
-        pose, tower, sequence = _sequences(raw, built.face_of, poses, towers, rays.max_depth)
-        return _refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m, surfaces)
-
-    pieces = list(_in_batches(take, faces, links, rays, carrier_hz=carrier_hz, surfaces=surfaces, progress=progress))
+    pieces = list(_refined(faces, links, rays, carrier_hz=carrier_hz, surfaces=surfaces, progress=progress))
     paths = merge(pieces, rays.max_depth, faces if surfaces is None else None)
     if surfaces is not None:
         from .beams import without_coincident
@@ -541,23 +527,14 @@ def find_paths(
     return paths if links.excluded is None else paths.select(~links.excluded[paths.tower, paths.pose])
 
 
-def _in_batches(
-    take: Callable[[Any, dict[str, Any], _Scene, IntArray, IntArray], Taken],
-    faces: Faces,
-    links: Links,
-    rays: Rays,
-    *,
-    carrier_hz: float,
-    surfaces: Surfaces | None,
-    progress: Progress | None = None,
-) -> Iterator[Taken]:
-    """Result of ``take(paths of Sionna, arrays, scene, poses, towers)`` for each batch.
-
-    Sionna's own objects hold memory of the device: they are let go before the next batch.
-    """
+def _refined(
+    faces: Faces, links: Links, rays: Rays, *, carrier_hz: float, surfaces: Surfaces | None, progress: Progress | None
+) -> Iterator[PathSet]:
+    """Paths of each batch, refined in float64."""
     sources_m, targets_m, batch = links.sources_m, links.targets_m, rays.batch
     if not 1 <= batch <= LARGEST_BATCH:
         raise UsageError(f"batch {batch}", expected=f"1 to {LARGEST_BATCH} poses per call")
+    tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
     load_variant(rays.variant)
     builder = _Builder(faces=faces, links=links, carrier_hz=carrier_hz, surfaces=surfaces)
 
@@ -567,11 +544,11 @@ def _in_batches(
     groups, alive, done = list(_groups(faces, sources_m, links.usable)), searched_links(links), 0
     count = sum(int(alive[towers].any(axis=0).sum()) for towers, _ in groups)
     for finder, towers, some in _each_batch(make, groups, alive):
-        traced, raw = finder.searched(targets_m[some], rays.max_depth, rays.samples)
+        raw = finder.searched(targets_m[some], rays.max_depth, rays.samples)
         _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
-        part = take(traced, raw, finder.built, some, towers)
-        del traced, raw
-        yield part
+        pose, tower, sequence = _sequences(raw, finder.built.face_of, some, towers, rays.max_depth)
+        del raw  # may be memory of the device, which the next batch needs
+        yield _refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m, surfaces)
         done += len(some)
         if progress:
             progress(done / count)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -16,13 +15,12 @@ from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.drivers.moving import loss_along, replay_moving
-from ..propagation.drivers.pairs import replay_pairs
-from ..propagation.drivers.parts import Each, replay_in_parts
+from ..propagation.drivers.parts import replay_in_parts
 from ..propagation.edges import EdgePaths
 from ..propagation.field.sum import Fields, channel_matrices
 from ..propagation.options import Engine, Field, Loss, Run, Search
 from ..propagation.paths import Faces, PathSet
-from ..propagation.replay import Replay, replay
+from ..propagation.replay import PER_LINK, Replay, replay
 from ..propagation.search.effort import Estimate
 from ..site.site import Site
 from .clock import Along, ClockChannel, ClockEstimate, judge_clock
@@ -332,7 +330,7 @@ def part_of(whole: Replay, start: int, stop: int) -> Replay:
 
     through = whole.through
     share = (stop - start) / max(len(whole.rss_dbm), 1)
-    columns: dict[str, Any] = {name: getattr(whole, name)[start:stop] for name in whole.per_link}
+    columns: dict[str, Any] = {name: getattr(whole, name)[start:stop] for name in PER_LINK}
     return dataclasses.replace(
         whole,
         **columns,
@@ -425,20 +423,19 @@ def replay_poses(
     towers = "+".join(link.tower_arrays)
     name = f"{engine} {towers}" if towers_m is None else f"replay {towers}, which moves"
     if towers_m is not None:
-        _check_moving(rt, engine, towers)
+        _check_moving(engine, towers)
     search = Search(
         engine,
         max_depth=rt.max_depth,
         samples=rt.advanced.samples,
         crowns=reflecting_crowns(site.trees, rt),
-        power_cut_db=rt.advanced.power_cut_db,
         diffraction=rt.diffraction,
         ridges=rt.advanced.ridges,
         refraction=rt.refraction,
         device=rt.advanced.device,
     )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
-    alone = engine == "image" and rt.advanced.relevance_db is None and search.crowns is None and site.dem is None
+    alone = engine == "image" and search.crowns is None and site.dem is None
     long = alone and len(poses) > BLOCK
     run = Run(
         cache_dir=None if rt.advanced.cache else "",
@@ -447,14 +444,12 @@ def replay_poses(
         progress=share_of(progress, name) if engine == "sionna" or long or towers_m is not None else None,
         on_estimate=lambda estimate: _tell(progress, name, estimate),
     )
-    field = Field(path_loss(site, rt, link.carrier_hz), rt.advanced.relevance_db)
-    each: Each = replay_pairs if rt.advanced.visibility == "pairs" and engine == "image" else replay
+    field = Field(path_loss(site, rt, link.carrier_hz))
     if towers_m is not None:
-        return replay_moving(site, link, poses, towers_m, search, field, run, each=each)
+        return replay_moving(site, link, poses, towers_m, search, field, run)
     if long:
-        each = partial(replay_in_parts, size=BLOCK, each=each)
-    replayed = each(site, link, poses, search, field, run)
-    return replayed
+        return replay_in_parts(site, link, poses, search, field, run, size=BLOCK)
+    return replay(site, link, poses, search, field, run)
 
 
 def _tell(progress: Progress, name: str, estimate: Estimate) -> None:
@@ -463,13 +458,13 @@ def _tell(progress: Progress, name: str, estimate: Estimate) -> None:
         progress(f"path search {name}: {estimate}")
 
 
-def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
+def _check_moving(engine: Engine, name: str) -> None:
     """Refuse what a tower that moves cannot be replayed with.
 
     Raises
     ------
     UsageError
-        Engine sionna; ``rt.advanced.relevance_db``; ``rt.advanced.power_cut_db``.
+        Engine sionna.
     """
     if engine != "image":
         raise UsageError(
@@ -477,16 +472,6 @@ def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
             expected="rt.engine: image (or --engine image)",
             cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
         )
-    for key, cause in (
-        ("relevance_db", "the relevance of a building depends on the place of the tower"),
-        ("power_cut_db", "what the cut costs is checked for one place of the tower"),
-    ):
-        if getattr(rt.advanced, key) is not None:
-            raise UsageError(
-                f"rt.advanced.{key} with towers.{name}, which moves",
-                expected=f"a tower that stands still, or no rt.advanced.{key}",
-                cause=cause,
-            )
 
 
 def fields_from(

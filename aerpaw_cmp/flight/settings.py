@@ -409,11 +409,6 @@ class AdvancedRt(Settings):
     gamma_db_per_m: Positive | None = None
     maximum_loss_db: Positive | None = None
     """Replace P.833's specific attenuation and largest loss at the carrier."""
-    relevance_db: Positive | None = None
-    power_cut_db: Positive | None = None
-    """Leave out reflections that their length alone puts this far below free space over their link."""
-    visibility: Literal["centre", "pairs"] = "centre"
-    """``pairs``: each element pair has its own paths (engine image); ``centre``: those of the array centres."""
     maximum_gap_s: Positive = 3.0
     """Telemetry gaps longer than this are not bridged."""
     cache: bool = True
@@ -426,7 +421,10 @@ class AdvancedRt(Settings):
 class RtSettings(GroupedSettings):
     """Settings of the replay of the flight."""
 
-    WITHOUT_EFFECT = ("batch", "interactions", "paired_foliage", "scattering_coefficient")
+    WITHOUT_EFFECT = (
+        "batch", "interactions", "paired_foliage", "power_cut_db", "relevance_db", "scattering_coefficient",
+        "visibility",
+    )  # fmt: skip
 
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
@@ -453,12 +451,6 @@ class RtSettings(GroupedSettings):
             raise ValueError(
                 "interactions of Sionna are no longer added to RSS; use diffraction: edges and refraction: true"
             )
-
-    @model_validator(mode="after")
-    def _goes_together(self) -> RtSettings:
-        if self.advanced.visibility == "pairs" and (self.diffraction != "none" or self.refraction):
-            raise ValueError("diffraction and refraction go with advanced.visibility: centre")
-        return self
 
 
 class PortSettings(Settings):

@@ -216,7 +216,7 @@ def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> P
     work, n = f"{len(poses)} poses, engine {rt.engine}", len(poses)
     if rt.engine != "image" or n == 0:
         return PlannedStage(name, work, None if n else 0.0)
-    search = Search(max_depth=rt.max_depth, power_cut_db=rt.advanced.power_cut_db)
+    search = Search(max_depth=rt.max_depth)
     if (searched := _searched(site, link, poses, search)) is not None:
         setup, estimate = searched
         return PlannedStage(name, f"{work}; path search {estimate}", setup + estimate.seconds)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..common.units import FloatArray
 from ..site.site import Site
 from .arrays import Link, Poses
 from .cache import PathCache
@@ -21,7 +20,6 @@ from .paths import PathSet
 from .scene import Scene, within_reach
 from .search import mirror
 from .search.effort import Estimate
-from .search.power_cut import ROUNDING, longest_m, within_cut
 from .search.samples import Choice, enough_samples, spread
 
 LONG_SEARCH_S = 60.0
@@ -101,7 +99,7 @@ def search_or_read(
 
 
 def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Run) -> PathSet:
-    """Paths by the engine of ``search``, those left out that the power cut does.
+    """Paths by the engine of ``search``.
 
     Parameters
     ----------
@@ -112,13 +110,6 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
     -------
     PathSet
     """
-    paths = _by_engine(scene, link, poses, search, run)
-    if search.power_cut_db is None:
-        return paths
-    return within_cut(paths, scene.sources_m, poses.position_m, search.power_cut_db)
-
-
-def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run) -> PathSet:
     depth = search.max_depth
     links = scene.links_to(poses)
     extent = None if run.whole is None else run.whole.extent_m
@@ -126,7 +117,6 @@ def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run)
         from .search import beams as search_beams
         from .search import prisms  # compiled: loaded where there are many faces
 
-        links = replace(links, longest_m=_longest_m(scene, poses, search))
         run = replace(run, on_estimate=run.on_estimate or _long_search)
         if scene.surfaces is not None:
             return search_beams.grow_paths(scene.surfaces, links, run, max_depth=depth)
@@ -164,13 +154,6 @@ def _links(scene: Scene, run: Run) -> int:
     return scene.excluded.size if run.whole is None else run.whole.links
 
 
-def _longest_m(scene: Scene, poses: Poses, search: Search) -> float | FloatArray:
-    """Longest path that need be searched for, a little more than counts."""
-    if search.power_cut_db is None:
-        return float(np.inf)
-    return longest_m(scene.sources_m, poses.position_m, search.power_cut_db) * (1.0 + ROUNDING)
-
-
 def _long_search(estimate: Estimate) -> None:
     if estimate.seconds > LONG_SEARCH_S:
         warnings.warn(f"the path search takes {estimate}", RuntimeWarning, stacklevel=2)
@@ -201,7 +184,7 @@ def estimate_search(
 
     return search_beams.estimate(
         scene.surfaces or prisms.solid_surfaces(scene.faces, scene.sources_m, poses.position_m),
-        replace(scene.links_to(poses), longest_m=_longest_m(scene, poses, search)),
+        scene.links_to(poses),
         max_depth=search.max_depth,
         threads=threads,
         solids=scene.surfaces is None,

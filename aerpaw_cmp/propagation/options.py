@@ -42,11 +42,6 @@ class Search:
     crowns : Crowns, optional
         Crowns that reflect: their paths are added to those of the engine, whichever it is. What crowns stop is the
         business of :class:`Field`.
-    power_cut_db : float, optional
-        Leave out paths at least this much weaker than free space over their link by their length alone
-        (:mod:`aerpaw_cmp.propagation.search.power_cut`).
-    check_power_cut : bool
-        Search a few poses without the cut and say in ``left_out`` what it costs.
     diffraction : {"none", "edges", "all"}
         Paths over one edge of a building: with the ground on either side ("edges"), and also with one wall or roof on
         one side ("all"). In H, levels and ranks, whichever engine finds the reflections.
@@ -66,8 +61,6 @@ class Search:
     samples: Samples = "auto"
     batch: int = 50
     crowns: Crowns | None = None
-    power_cut_db: float | None = None
-    check_power_cut: bool = True
     diffraction: Diffraction = "none"
     ridges: Ridges = "deygout"
     refraction: bool = False
@@ -87,7 +80,7 @@ class Search:
     @property
     def deciding(self) -> dict[str, object]:
         """Options that an entry of the path cache depends on."""
-        names = ("engine", "max_depth", "samples", "batch", "power_cut_db", "variant")
+        names = ("engine", "max_depth", "samples", "batch", "variant")
         return {name: getattr(self, name) for name in names}
 
     def check(self) -> None:
@@ -96,13 +89,12 @@ class Search:
         Raises
         ------
         UsageError
-            An unknown engine or diffraction, a ``power_cut_db`` that is not positive.
+            An unknown engine or diffraction.
         """
         if self.engine not in ("image", "sionna"):
             raise UsageError(f"unknown engine {self.engine!r}", expected="'image' or 'sionna'")
         if self.diffraction not in ("none", "edges", "all"):
             raise UsageError(f"unknown diffraction {self.diffraction!r}", expected="'none', 'edges' or 'all'")
-        _check_positive("power_cut_db", self.power_cut_db)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,16 +105,9 @@ class Field:
     ----------
     loss : callable, optional
         Further loss per path [dB], such as foliage; infinite where nothing gets through.
-    relevance_db : float, optional
-        Say in ``left_out`` which buildings move no RSS by more than this
-        (:mod:`aerpaw_cmp.propagation.field.relevance`).
     """
 
     loss: Loss | None = None
-    relevance_db: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_positive("relevance_db", self.relevance_db)
 
     def loss_db(self, paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray | None:
         """Further loss (paths,) [dB] between sources (towers, 3) and targets (poses, 3); None where none is lost."""
@@ -169,8 +154,3 @@ class Run(SearchRun):
 
     cache_dir: str | Path | None = None
     whole: Whole | None = None
-
-
-def _check_positive(name: str, value: float | None) -> None:
-    if value is not None and not value > 0.0:
-        raise UsageError(f"{name} {value:g}", expected="a positive number of dB")

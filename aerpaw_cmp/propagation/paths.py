@@ -29,15 +29,12 @@ class Links:
         Faces that may reflect for each tower (default: all). All faces hide.
     excluded : (towers, poses) bool, optional
         Links without any path, e.g. poses inside buildings.
-    longest_m : float or (towers, poses)
-        Longer paths may be left out [m]: the power cut.
     """
 
     sources_m: FloatArray
     targets_m: FloatArray
     usable: BoolArray | None = None
     excluded: BoolArray | None = None
-    longest_m: float | FloatArray = np.inf
 
 
 _ARRAYS = ("normal", "offset_m", "along", "across", "lower", "upper", "solid")

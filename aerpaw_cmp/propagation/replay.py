@@ -13,11 +13,9 @@ from ..common.errors import UsageError
 from ..common.units import BoolArray, ComplexArray, FloatArray, wavelength_m
 from ..site.site import Site
 from .arrays import Link, Poses
-from .cache import PathCache
 from .edges import EdgePaths, Edges
 from .engines import chosen_samples, path_cache, search_or_read
 from .field.edges import edge_channels
-from .field.relevance import idle_objects, in_words
 from .field.ridges import ridge_loss_db
 from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
 from .options import Field, Run, Search
@@ -25,13 +23,14 @@ from .paths import Faces, PathSet
 from .scene import Scene, buried_towers, within_reach
 from .search import mirror
 from .search.edges import find_edge_paths
-from .search.power_cut import CHECKED_POSES, loss_in_words, within_cut
-from .search.samples import spread
 from .search.terrain import on_terrain
 from .search.walls import ThroughWalls, paths_through
 from .surfaces import Surfaces
 
 LEVELS_AT_ONCE = 1024
+PER_LINK = ("rss_dbm", "rss_power_dbm", "h", "has_path")
+"""Arrays (poses, towers, ...) of a replay."""
+
 """Poses of which levels are made at once."""
 
 
@@ -65,8 +64,6 @@ class Replay:
         Rays per tower; 0 for an engine without rays.
     samples_reason : str
         Why so many, where the number was found by pilots.
-    pairs_differ : (poses, towers) bool, optional
-        Links whose element pairs do not all have the paths of the array centres; only with ``visibility="pairs"``.
     surfaces : Surfaces, optional
         What the faces are made of, where the site is a scene of triangles.
     edge_paths : EdgePaths, optional
@@ -89,16 +86,9 @@ class Replay:
     from_cache: bool = False
     samples: int = 0
     samples_reason: str = ""
-    pairs_differ: BoolArray | None = None
     surfaces: Surfaces | None = None
     edge_paths: EdgePaths | None = None
     through: ThroughWalls | None = None
-
-    @property
-    def per_link(self) -> tuple[str, ...]:
-        """Names of the arrays (poses, towers, ...)."""
-        names = ("rss_dbm", "rss_power_dbm", "h", "has_path", "pairs_differ")
-        return names if self.pairs_differ is not None else names[:-1]
 
     def __repr__(self) -> str:
         """One line: the arrays are too large to be shown."""
@@ -192,19 +182,18 @@ def replay(
     search = search if choice is None else replace(search, samples=choice.samples)
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
     notes += cache.warnings if cache else []
-    notes += _checked_cut(site, scene, link, poses, search, field, cache)
     bent, over, unmodelled = _bent(site, scene, link, poses, search, field, run)
     through, added = _passing(site, scene, link, poses, search, field, run)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
     more = [item for item in (over, added) if item is not None]
-    result, idle = _evaluated(scene, link, poses, paths, search, field, run, more)
+    result = _evaluated(scene, link, poses, paths, search, field, run, more)
     result = replace(result, edge_paths=bent, through=through)
     notes += [*stopped, *unmodelled]
     return replace(
         result,
         seconds=time.perf_counter() - started,
         search_seconds=search_seconds,
-        left_out=[*notes, *idle],
+        left_out=notes,
         from_cache=from_cache,
         samples=int(search.samples) if search.engine == "sionna" else 0,
         samples_reason=choice.reason if choice else "",
@@ -248,8 +237,6 @@ def passed(
     if scene.surfaces is not None:
         return scene, paths, [*notes, "reflections off crowns: they are not searched in a scene of triangles"]
     scene, bounces = scene.with_bounces(site, poses, search.crowns, search.max_depth)
-    if search.power_cut_db is not None:
-        bounces = within_cut(bounces, scene.sources_m, poses.position_m, search.power_cut_db)
     if search.max_depth > 1:
         notes = [*notes, "paths over a crown and a building, or over two crowns"]
     return scene, mirror.merge([paths, bounces], search.max_depth, None), notes
@@ -294,29 +281,6 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
         clear[rows] &= site.dem.clear(start, end)
         start = end
     return clear
-
-
-def _checked_cut(
-    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, cache: PathCache | None
-) -> list[str]:
-    """Effect of the power cut, in words, at a few poses, spread over the flight, that are searched without it."""
-    some = spread(np.flatnonzero(np.isfinite(poses.position_m).all(axis=1)), CHECKED_POSES)
-    cut_db = search.power_cut_db
-    if not len(some) or cut_db is None or not search.check_power_cut:
-        return []
-    few = Poses(poses.position_m[some], poses.rotation[some])
-    part = replace(scene, excluded=scene.excluded[:, some])
-    full, _, _ = search_or_read(part, link, few, replace(search, power_cut_db=None), Run(), cache)
-    full = full.select(_clear_of_terrain(site, part, few, full))
-    left = within_cut(full, scene.sources_m, few.position_m, cut_db)
-    level = []
-    for paths in (full, left):
-        loss_db = field.loss_db(paths, scene.sources_m, few.position_m)
-        h = channel_matrices(paths, scene.faces, scene.sources_m, few, link, loss_db).h
-        level.append(rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm))
-    both = np.isfinite(level[0]) & np.isfinite(level[1])
-    lost = int((np.isfinite(level[0]) & ~np.isfinite(level[1])).sum())
-    return [loss_in_words(cut_db, len(full), len(full) - len(left), len(some), level[1][both] - level[0][both], lost)]
 
 
 def _bent(
@@ -389,8 +353,8 @@ def _evaluated(
     field: Field,
     run: Run,
     more: Sequence[Fields] = (),
-) -> tuple[Replay, list[str]]:
-    """Fields of the paths, and which buildings hardly matter to them; times are the caller's."""
+) -> Replay:
+    """Fields of the paths; times are the caller's."""
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
     work = None if run.whole is None else run.whole.pairs
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=run.threads, work=work)
@@ -400,11 +364,6 @@ def _evaluated(
     for item in more:
         fields = Fields(fields.h + item.h, fields.path_power, fields.power + item.power)
         has_path |= item.power > 0.0
-    idle: list[str] = []
-    if field.relevance_db is not None:
-        power = mean_pair_power(fields.h)
-        labels, _ = idle_objects(paths, scene.faces, fields.path_power, power, field.relevance_db)
-        idle = in_words(labels, field.relevance_db)
     level_dbm, power_dbm = _levels(fields, has_path, link)
     return Replay(
         rss_dbm=level_dbm,
@@ -418,7 +377,7 @@ def _evaluated(
         engine=search.engine,
         towers=tuple(link.tower_arrays),
         surfaces=scene.surfaces,
-    ), idle
+    )
 
 
 def _levels(fields: Fields, has_path: BoolArray, link: Link) -> tuple[FloatArray, FloatArray]:

@@ -122,7 +122,7 @@ FLIGHT = {
         {"path": "USRP1.txt", "reader": "sounder_log", "node": "T", "channel": "USRP1"},
     ],
     "link": {"rss": {"carrier_hz": 3.3e9, "tower": {"layout": "single"}, "uav": {"layout": "single"}}},
-    "rt": {"audit_links": 3, "advanced": {"samples": 10_000, "cache": False, "power_cut_db": 30.0}},
+    "rt": {"audit_links": 3, "advanced": {"samples": 10_000, "cache": False}},
     "rss": {"lag": "off"},
 }  # fmt: skip
 
@@ -176,7 +176,6 @@ def test_a_report_of_a_scene_is_audited_and_its_paths_explained(
     assert audit["field"]["paths"] > 3
     assert audit["field"]["power_max_db"] < 0.1
     assert "the second implementation: it knows prisms, no scene of triangles" in audit["field"]["not_covered"]
-    assert any(text.startswith("rt.advanced.power_cut_db 30: ") for text in found["left_out"])
     capsys.readouterr()
     assert main(["explain", str(flown), "--time", "4", "--tower", "T", "--engine", "both", "--json", "--quiet"]) == 0
     told = json.loads(capsys.readouterr().out)

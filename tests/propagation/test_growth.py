@@ -14,10 +14,10 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.check.obstacles import why_not_there
 from aerpaw_cmp.propagation.engines import estimate_search
 from aerpaw_cmp.propagation.options import Run, Search
-from aerpaw_cmp.propagation.paths import Links, path_lengths
+from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.search import beams, power_cut, prisms
+from aerpaw_cmp.propagation.search import beams, prisms
 from aerpaw_cmp.propagation.search import mirror as image
 from aerpaw_cmp.propagation.search.beams import estimate, grow_paths, reflection_points
 from aerpaw_cmp.propagation.search.effort import SearchRun
@@ -178,36 +178,6 @@ def test_flipped_and_degenerate_triangles_change_nothing():
     assert surfaces.notes == ("1 triangles without an area were dropped",)
     paths = grow_paths(surfaces, Links(*ends), max_depth=2)
     assert np.allclose(paths.vertices_m, expected.vertices_m, equal_nan=True)
-
-
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("of_link", [False, True])
-def test_the_power_cut_leaves_out_long_paths_only(way, of_link):
-    """Faces that no short path goes over are not followed; a limit may be one for all or one of each link."""
-    rng = np.random.default_rng(5)
-    side = 60.0
-    walls = []
-    for low, one, two in (((0, 0, 0), 0, 1), ((0, 0, 0), 1, 2), ((0, 0, 0), 2, 0)):  # a closed room of six walls
-        for far in (0.0, side):
-            corner = np.array(low) + far * np.eye(3)[3 - one - two]
-            walls += quad(corner, side * np.eye(3)[one], side * np.eye(3)[two])
-    for low, high, size in ((5, 55, 7), (150, 400, 30)):  # things in it, and outside what no short path goes over
-        for _ in range(12):
-            walls += quad(rng.uniform(low, high, 3), size * rng.normal(size=3), size * rng.normal(size=3))
-    surfaces = merged(enumerate_.scene_of(walls, shapes=np.repeat(np.arange(30), 2)))
-    sources, targets = rng.uniform(15, 45, (2, 3)), rng.uniform(5, 55, (40, 3))
-    targets[7] = np.nan
-    longest = power_cut.longest_m(sources, targets, 9.0) if of_link else 80.0
-    short = Links(sources, targets, longest_m=longest)
-    every = grow_paths(surfaces, Links(sources, targets), max_depth=2, **way)
-    some = grow_paths(surfaces, short, max_depth=2, **way)
-    limit = np.broadcast_to(longest, (2, 40))[every.tower, every.pose]
-    kept = every.select((path_lengths(every, sources, targets) <= limit) | (every.depth == 0))
-    for depth in (1, 2):
-        assert 40 < (kept.depth == depth).sum() < (every.depth == depth).sum()
-    assert estimate(surfaces, short).sequences < estimate(surfaces, Links(sources, targets)).sequences
-    for column in ("pose", "tower", "faces"):
-        assert np.array_equal(getattr(kept, column), getattr(some, column)), column
 
 
 def test_the_estimate_of_a_search_comes_without_the_search(scenes):

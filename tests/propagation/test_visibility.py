@@ -22,7 +22,6 @@ def test_open_field_does_not_care(scenes, uav_transmits):
     link = scenes.link(site, tower_comparison_array(), uav, uav_transmits=uav_transmits)
     poses = scenes.poses(np.random.default_rng(1).uniform([-90, -90, 5], [90, 90, 40], (20, 3)))
     centre, pairs = replay(site, link, poses), replay_pairs(site, link, poses)
-    assert not pairs.pairs_differ.any()
     assert pairs.h == pytest.approx(centre.h, rel=1e-12)
     assert pairs.rss_power_dbm == pytest.approx(centre.rss_power_dbm, abs=1e-12)
 
@@ -67,13 +66,14 @@ def test_transposing_the_link_transposes_h(scenes):
 def test_few_links_of_the_bench_scene_differ():
     site, link, poses = random_scene(200)
     pairs = replay_pairs(site, link, poses)
-    assert 0 < pairs.pairs_differ.mean() < 0.1
     centre = replay(site, link, poses)
-    same = ~pairs.pairs_differ
-    assert np.abs(pairs.h - centre.h)[same].max() < 1e-12 * np.abs(centre.h).max()
+    change = np.abs(pairs.h - centre.h).max(axis=(2, 3)) / np.abs(centre.h).max(axis=(2, 3)).clip(min=1e-30)
+    differs = change > 1e-6
+    assert 0 < differs.mean() < 0.1
+    assert change[~differs].max() < 1e-9
 
 
 def test_pairs_need_the_image_engine(scenes):
     site = scenes.site()
-    with pytest.raises(UsageError, match="visibility 'pairs' with engine 'sionna'"):
+    with pytest.raises(UsageError, match="element pairs with engine 'sionna'"):
         replay_pairs(site, scenes.link(site), scenes.poses([[9.0, 0, 20]]), Search("sionna"))

@@ -149,7 +149,7 @@ def make_report() -> ReportData:
         links=18000,
         seconds=0.71,
         paths=38211,
-        settings={"max_depth": 2, "relevance_db": 0.01},
+        settings={"max_depth": 2},
         left_out=("shed (0.002 dB at most)",),
         audit=AuditResult(
             reference="sionna",

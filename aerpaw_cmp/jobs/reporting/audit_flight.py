@@ -173,7 +173,6 @@ def _of_series(
             max_depth=rt.max_depth,
             samples=rt.advanced.samples,
             crowns=reflecting_crowns(site.trees, rt),
-            power_cut_db=rt.advanced.power_cut_db,
         ),
         Field(loss=path_loss(site, rt, replayed.link.carrier_hz)),
         Run(cache_dir=None if rt.advanced.cache else ""),

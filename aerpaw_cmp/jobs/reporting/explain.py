@@ -153,10 +153,6 @@ def run_explain(
         differences = tuple(_differences(data.site, rt, replayed, link, pose, source, progress))
     if isinstance(series, RssSeries) and settings.rss.field != "coherent":
         notes.append(f"rss.csv holds rss.field: {settings.rss.field}; the level here is the coherent sum")
-    if replayed.pairs_differ is not None and replayed.pairs_differ.any():
-        notes.append(
-            "each element pair has its own paths (rt.advanced.visibility: pairs); these are those of the array centres"
-        )
     notes += edge_path_lines(replayed, np.asarray(source), pose, link)
     notes += wall_path_lines(replayed, np.asarray(source), pose, link)
     measured = float(series.measured_db[at]) if isinstance(series, RssSeries) else None
@@ -309,7 +305,7 @@ def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterato
 def _elsewhere(replayed: Replay) -> str:
     if replayed.engine == "sionna":
         return f"nothing is in its way: not found with {replayed.samples} samples per tower"
-    stopped = "stopped by the terrain, the ground of another tower, or left out by rt.advanced.power_cut_db"
+    stopped = "stopped by the terrain, or the ground of another tower"
     return f"geometry allows it: {stopped}"
 
 

@@ -162,10 +162,10 @@ def audit(
     -------
     Audit
     """
-    complete = second.complete and search.power_cut_db is None
+    complete = second.complete
     chosen = _spread(poses, None if second.links is None else -(-second.links // max(1, len(replay.towers))))
     other: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
-    search = replace(search, engine=other, check_power_cut=False)
+    search = replace(search, engine=other)
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
     checked = run_replay(site, link, few, search, Field(field.loss), run)
     rays = checked.samples or (FIELD_SAMPLES if search.samples == "auto" else search.samples)

@@ -257,8 +257,6 @@ class _OneLink:
         paths, replay = [], self.replay
         if replay.through is not None and replay.through.of_link(self.row, self.tower):
             return FieldAudit(not_covered=("paths through walls",))
-        if replay.pairs_differ is not None and replay.pairs_differ[self.row, self.tower]:
-            return FieldAudit(doubtful=1)  # H is not that of the centres' paths
         for path in self.mine:
             sequence = self.sequence(path)
             if sequence is None:

@@ -20,8 +20,8 @@ from ...site.site import Site, Tower
 from ..arrays import Link, Poses
 from ..options import Field, Loss, Run, Search, Whole
 from ..paths import PathSet
-from ..replay import Replay, replay
-from .parts import Each, put_together
+from ..replay import PER_LINK, Replay, replay
+from .parts import put_together
 
 PLACES_AT_ONCE = 64
 """Places of a node in one block: H of a block has this many times the links that count."""
@@ -94,8 +94,6 @@ def replay_moving(
     search: Search = Search(),  # noqa: B008 - frozen
     field: Field = Field(),  # noqa: B008
     run: Run = Run(),  # noqa: B008
-    *,
-    each: Each = replay,
 ) -> Replay:
     """Replay a flight against one tower that has a place of its own at every pose.
 
@@ -109,8 +107,6 @@ def replay_moving(
         Centre of the tower's array at each pose, east, north, up [m].
     search, field, run
         As for :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
-    each : callable
-        How a block is replayed: by array centres, or :func:`aerpaw_cmp.propagation.drivers.pairs.replay_pairs`.
 
     Returns
     -------
@@ -137,15 +133,14 @@ def replay_moving(
     parts: list[Replay] = []
     blocks = list(_blocks(sources_m))
     if not blocks:
-        return each(site, link, poses, search, field, run)
+        return replay(site, link, poses, search, field, run)
     if len(blocks) > 1:
         run = replace(run, whole=_whole(link, poses, sources_m))
     done = 0
     for block in blocks:
         here, several, some, links = _scene_of(site, link, name, poses, block)
-        part = each(here, several, some, replace(search, links=links), field, run)
+        part = replay(here, several, some, replace(search, links=links), field, run)
         parts.append(_of_one_tower(part, name, block))
-        search = replace(search, check_power_cut=False)  # one block tells what a cut costs
         done += len(block.rows)
         if progress is not None:
             progress(done / max(len(poses), 1))
@@ -188,7 +183,7 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     def own(values: AnyArray) -> AnyArray:
         return np.ascontiguousarray(values[row, block.own][:, None])
 
-    columns: dict[str, Any] = {name: own(getattr(replayed, name)) for name in replayed.per_link}
+    columns: dict[str, Any] = {name: own(getattr(replayed, name)) for name in PER_LINK}
     return replace(
         replayed,
         **columns,

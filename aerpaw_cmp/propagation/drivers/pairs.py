@@ -1,4 +1,4 @@
-"""Element pairs with paths of their own: every tower element is a source, every UAV element a pose."""
+"""Element pairs with paths of their own, for the audit: every tower element is a source, every UAV element a pose."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ from ..field.sum import channel_matrices, mean_pair_power, rss_dbm
 from ..options import Field, Run, Search
 from ..replay import Replay, passed, replay
 from ..scene import Scene, within_reach
-
-PAIRS_DIFFER = 1e-9
-"""Of the root of a link's power: more than rounding between H of the centres' paths and of each pair's own."""
 
 
 def replay_pairs(
@@ -37,8 +34,7 @@ def replay_pairs(
     Returns
     -------
     Replay
-        H and levels of the pairs' own paths; ``paths`` are those of the array centres, and ``pairs_differ`` says which
-        links they do not serve.
+        H and levels of the pairs' own paths; ``paths`` are those of the array centres.
 
     Raises
     ------
@@ -47,8 +43,8 @@ def replay_pairs(
     """
     if search.engine != "image":
         raise UsageError(
-            "visibility 'pairs' with engine 'sionna'",
-            expected="engine 'image', or visibility 'centre'",
+            "element pairs with engine 'sionna'",
+            expected="engine 'image'",
             cause="each element pair is searched for its own paths",
         )
     centre = replay(site, link, poses, search, field, run)
@@ -81,14 +77,12 @@ def replay_pairs(
     level = rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm)
     covered = np.isfinite(level)
     h = np.where(covered[:, :, None, None], h, 0.0)
-    size = np.sqrt(np.maximum(mean_pair_power(h), mean_pair_power(centre.h)))
     return replace(
         centre,
         rss_dbm=level,
         rss_power_dbm=rss_dbm(power, link.transmit_power_dbm, link.noise_floor_dbm),
         h=h,
         has_path=covered,
-        pairs_differ=np.abs(h - centre.h).max(axis=(2, 3)) > PAIRS_DIFFER * size,
     )
 
 

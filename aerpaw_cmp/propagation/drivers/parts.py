@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -15,15 +14,12 @@ from ..arrays import Link, Poses
 from ..edges import EdgePaths
 from ..options import Field, Run, Search, Whole
 from ..paths import Faces, PathSet, joined
-from ..replay import Replay, replay
+from ..replay import PER_LINK, Replay, replay
 from ..search.walls import ThroughWalls
-
-Each = Callable[[Site, Link, Poses, Search, Field, Run], Replay]
-"""How a part is replayed: :func:`replay`, or :func:`aerpaw_cmp.propagation.drivers.pairs.replay_pairs`."""
 
 
 def replay_in_parts(
-    site: Site, link: Link, poses: Poses, search: Search, field: Field, run: Run, *, size: int, each: Each = replay
+    site: Site, link: Link, poses: Poses, search: Search, field: Field, run: Run, *, size: int
 ) -> Replay:
     """Replay at most ``size`` poses at once.
 
@@ -33,8 +29,6 @@ def replay_in_parts(
         As for :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
     size : int
         Most poses of a part; the parts are of about one size.
-    each : callable
-        How a part is replayed.
 
     Returns
     -------
@@ -43,14 +37,13 @@ def replay_in_parts(
     """
     rows = np.array_split(np.arange(len(poses)), max(1, -(-len(poses) // size)))
     if len(rows) == 1:
-        return each(site, link, poses, search, field, run)
+        return replay(site, link, poses, search, field, run)
     links = len(poses) * len(link.tower_arrays)
     pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
     progress, run = run.progress, replace(run, progress=None, whole=Whole.of(poses.position_m, links, pairs))
     parts: list[Replay] = []
     for at in rows:
-        parts.append(each(site, link, Poses(poses.position_m[at], poses.rotation[at]), search, field, run))
-        search = replace(search, check_power_cut=False)  # one part tells what a cut costs
+        parts.append(replay(site, link, Poses(poses.position_m[at], poses.rotation[at]), search, field, run))
         if progress is not None:
             progress(float(at[-1] + 1) / len(poses))
     return put_together(parts, rows)
@@ -70,11 +63,10 @@ def put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
         "through": _through([part.through for part in parts if part.through is not None], rows),
         "edge_paths": None if first.edge_paths is None else _edge_paths([b for b in bent if b is not None], rows),
     }
-    names = first.per_link
-    columns = {name: [getattr(part, name) for part in parts] for name in names}
+    columns = {name: [getattr(part, name) for part in parts] for name in PER_LINK}
     parts.clear()
     arrays: dict[str, Any] = {}
-    for name in names:
+    for name in PER_LINK:
         values = columns.pop(name)
         arrays[name] = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
         for at, value in zip(rows, values, strict=True):

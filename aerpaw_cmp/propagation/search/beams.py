@@ -91,7 +91,6 @@ def grow_paths(
     ----------
     surfaces : Surfaces
     links : Links
-        Faces over which no path is as short as ``longest_m`` are not followed.
     run : SearchRun
         Threads, progress, and whom to tell before the first source is searched what it will take.
     max_depth : int
@@ -165,15 +164,12 @@ def _rules(surfaces: Surfaces, max_depth: int, *, solids: bool, beams: bool = Tr
 
 def _searches(surfaces: Surfaces, links: Links, rules: _Rules) -> Iterator[tuple[int, IntArray, _Search]]:
     """Tower, poses and search of every tower that has a pose to be searched for."""
-    shape = len(links.sources_m), len(links.targets_m)
-    longest = np.broadcast_to(np.asarray(links.longest_m, dtype=np.float64), shape)
     alive = searched_links(links)
     for tower in np.flatnonzero(alive.any(axis=1)).tolist():
         poses = np.flatnonzero(alive[tower])
         usable = None if links.usable is None else links.usable[tower]
         mirrors = _mirrors(surfaces, usable, front_only=rules.margin > 0.0)
-        ends = links.sources_m[tower], links.targets_m[poses], longest[tower, poses]
-        yield tower, poses, _Search(mirrors, surfaces, *ends, rules)
+        yield tower, poses, _Search(mirrors, surfaces, links.sources_m[tower], links.targets_m[poses], rules)
 
 
 def _mirrors(surfaces: Surfaces, usable: BoolArray | None = None, *, front_only: bool = False) -> _Mirrors:
@@ -206,12 +202,10 @@ class _Search:
         surfaces: Surfaces,
         source: FloatArray,
         targets: FloatArray,
-        longest: FloatArray,
         rules: _Rules,
     ) -> None:
         self.mirrors, self.source, self.rules = tuple(mirrors), np.ascontiguousarray(source), rules
         self.targets = np.ascontiguousarray(targets)
-        self.longest, self.window = np.ascontiguousarray(longest), mirrors.window
         self.corners, self.tree = surfaces.corners_m, tuple(surfaces.tree)
         self.face_tree = tuple(surfaces.face_tree)
         self.target_tree = tuple(box_tree(self.targets, self.targets))
@@ -224,19 +218,8 @@ class _Search:
 
     def first_faces(self) -> IntArray:
         """First faces worth following, in an order whose beginning is a fair sample."""
-        good = _first_faces(self.mirrors, self.face_tree, self.source, tuple(self.rules)) & self._near_enough()
+        good = _first_faces(self.mirrors, self.face_tree, self.source, tuple(self.rules))
         return np.random.default_rng(0).permutation(np.flatnonzero(good))
-
-    def _near_enough(self) -> BoolArray:
-        """Faces over which a path to the box of the targets may be short enough."""
-        outline, longest = self.window, self.longest.max()
-        if not np.isfinite(longest):
-            return np.ones(len(outline), dtype=np.bool_)
-        low, high = outline.min(axis=1), outline.max(axis=1)
-        ways = np.zeros(len(outline))
-        for near, far in ((self.source, self.source), (self.targets.min(axis=0), self.targets.max(axis=0))):
-            ways += np.linalg.norm(np.maximum(np.maximum(low - far, near - high), 0.0), axis=1)
-        return np.asarray(~(ways > longest + SLACK_M))
 
     def follow(self, some: IntArray) -> tuple[IntArray, IntArray, FloatArray, int]:
         """Paths whose first face is one of some, and how many sequences there were."""
@@ -244,7 +227,7 @@ class _Search:
 
     def _follow(self, some: IntArray, depth: int) -> tuple[IntArray, IntArray, FloatArray, int]:
         return _follow(  # type: ignore[no-any-return]
-            self.mirrors, self.face_tree, self.corners, self.tree, self.targets, self.target_tree, self.longest,
+            self.mirrors, self.face_tree, self.corners, self.tree, self.targets, self.target_tree,
             self.source, some, tuple(self.rules._replace(depth=depth)),
         )  # fmt: skip
 
@@ -694,12 +677,8 @@ def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-
 
 
 @kernel
-def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, source, firsts, rules):  # type: ignore[no-untyped-def]
-    """All paths whose first face is one of ``firsts``: a walk, depth first, along beams.
-
-    ``longest`` (targets,) is the length of the longest path that counts. A path from an image over a face to a target
-    is no shorter than the way from the image to the face's box and on to the box of all targets.
-    """
+def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, firsts, rules):  # type: ignore[no-untyped-def]
+    """All paths whose first face is one of ``firsts``: a walk, depth first, along beams."""
     normal, offset, along, across, window, _, plane, front_only, usable, first, flat = mirrors
     t_lower, t_upper, t_child, t_start, t_count, t_items = target_tree
     max_depth, side, beams = rules[0], rules[4], rules[5]
@@ -722,9 +701,6 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, so
     points = np.zeros((max_depth, 3))
     stack = np.empty(64, np.int64)
     none = np.zeros(3)
-    reach = np.empty(10)
-    reach[3:6], reach[6:9] = t_lower[0], t_upper[0]
-    reach[9] = longest.max()
     next_faces[0, : len(firsts)] = firsts
     waiting[0] = len(firsts)
     level = 0
@@ -803,9 +779,6 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, so
                 r = t_items[k]
                 point = targets[r]
                 good = True
-                x0, x1, x2 = point[0] - image[0], point[1] - image[1], point[2] - image[2]
-                if x0 * x0 + x1 * x1 + x2 * x2 > longest[r] * longest[r]:
-                    continue
                 for step in range(level, -1, -1):
                     g = chain[step]
                     top = signs[step] * _height(normal, offset, g, point)
@@ -853,8 +826,7 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, so
                     out_points[total, step] = points[step]
                 total += 1
         if level + 1 < max_depth:
-            reach[:3] = image
-            waiting[level + 1] = within_planes(face_tree, mine, many[level], reach, next_faces[level + 1])
+            waiting[level + 1] = within_planes(face_tree, mine, many[level], next_faces[level + 1])
             turn[level + 1] = 0
             level += 1
     return out_pose[:total].copy(), out_faces[:total].copy(), out_points[:total].copy(), followed

@@ -130,7 +130,7 @@ def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def within_planes(tree, planes, many, reach, hits):  # type: ignore[no-untyped-def]
+def within_planes(tree, planes, many, hits):  # type: ignore[no-untyped-def]
     """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``hits``; how many.
 
     A plane (4,) is ``a x + b y + c z + d >= 0`` inside.
@@ -142,8 +142,6 @@ def within_planes(tree, planes, many, reach, hits):  # type: ignore[no-untyped-d
         Normals pointing inwards, and offsets [m].
     many : int
         How many of them count.
-    reach : (10,)
-        A point, the corners of a box, and the longest way from the one to the other over a box that counts [m].
     hits : (items,) int
         Gets the items; has room for all of the tree.
 
@@ -161,37 +159,8 @@ def within_planes(tree, planes, many, reach, hits):  # type: ignore[no-untyped-d
         node = todo[waiting]
         if box_outside(lower, upper, node, planes, many):
             continue
-        if np.isfinite(reach[9]) and way_over_box(lower, upper, node, reach) > reach[9]:
-            continue
         waiting, total = _opened(tree, node, todo, waiting, hits, total)
     return total
-
-
-@kernel
-def way_over_box(lower, upper, node, reach):  # type: ignore[no-untyped-def]
-    """Shortest way [m] from a point to a box of a tree and on to another box; less where only a bound is known.
-
-    Parameters
-    ----------
-    lower, upper : (nodes, 3)
-        Corners of the boxes of a tree [m].
-    node : int
-        Which box.
-    reach : (10,)
-        As for :func:`within_planes`.
-
-    Returns
-    -------
-    float
-    """
-    to2 = on2 = 0.0
-    for axis in range(3):
-        low, high = lower[node, axis], upper[node, axis]
-        to = max(low - reach[axis], reach[axis] - high, 0.0)
-        on = max(low - reach[6 + axis], reach[3 + axis] - high, 0.0)
-        to2 += to * to
-        on2 += on * on
-    return np.sqrt(to2) + np.sqrt(on2)
 
 
 @kernel

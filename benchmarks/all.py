@@ -75,7 +75,6 @@ SMALLEST: dict[str, list[str]] = {
     "fuzz_inputs": ["--inputs", "20"],
     "ingest": ["--scale", "2000", "--format", "sounder_log"],
     "interval_weights": ["mean", "--sequences", "4"],
-    "kernel": ["--poses", "200", "--pairs", "1"],
     "kriging": ["--quick", "--pairs", "60"],
     "kriging_field": ["--quick"],
     "left_out_reports": ["--only", "lte50"],
@@ -96,7 +95,6 @@ SMALLEST: dict[str, list[str]] = {
     "tap_common": [],
     "tap_replug": ["--quick"],
     "tap_sigkill": ["--quick"],
-    "tap_soak": ["--quick"],
     "tap_web_soak": ["--quick"],
 }
 """How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards."""

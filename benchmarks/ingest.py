@@ -1,9 +1,9 @@
-"""Time and peak memory of reading a large log, beside pandas, pyarrow and polars on the same file.
+"""Time and peak memory of reading a large log, beside pandas on the same file.
 
     python benchmarks/ingest.py [--scale LINES] [--format READER ...] [--folder DIR]
 
 Every contestant is a process of its own. Ours gives UTC times, values and flags with every line accounted for; the
-peers give columns with their times converted.
+peer gives columns with their times converted.
 """
 
 from __future__ import annotations
@@ -82,66 +82,6 @@ def write_quectel(place: Path, lines: int) -> None:
             )
 
 
-def write_nemo(place: Path, lines: int) -> None:
-    """The rank table of a phone, relative times."""
-    rng = np.random.default_rng(8)
-    with place.open("wb") as file:
-        file.write(b"index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi\n")
-        for first, count in _blocks(lines):
-            level = rng.uniform(-110, -60, count).tolist()
-            file.writelines(
-                b"%d,%.2f,35.7300001,-78.7000002,%.1f,2.0,%.1f,21.5,12.0\n" % (n, 10.0 * n, n % 90, level[n - first])
-                for n in range(first, first + count)
-            )
-
-
-def write_nemo_digits(place: Path, lines: int) -> None:
-    """The same as phones write it: every digit of a position, two rows in three without a level."""
-    rng = np.random.default_rng(10)
-    with place.open("wb") as file:
-        file.write(b"index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi\n")
-        for first, count in _blocks(lines):
-            walk = rng.normal(0, 1e-6, (3, count)).cumsum(axis=1)
-            latitude, longitude, altitude = (35.7275 + walk[0], -78.696 + walk[1], 40 + 1e4 * walk[2])
-            level = rng.uniform(-110, -60, count).tolist()
-            track = zip(range(first, first + count), latitude.tolist(), longitude.tolist(), altitude.tolist(), level,
-                        strict=True)  # fmt: skip
-            file.writelines(
-                b"%d,%.11f,%r,%r,%r,%s\n"
-                % (n, 10.0 * n, north, east, up, b",%.1f,21.5," % value if n % 3 == 0 else b"2.0,,,")
-                for n, north, east, up, value in track
-            )
-
-
-def write_mapped(place: Path, lines: int) -> None:
-    """A CSV merged by hand: time, position, level."""
-    rng = np.random.default_rng(9)
-    with place.open("wb") as file:
-        file.write(b"Time,Lat,Lon,Level\n")
-        for first, count in _blocks(lines):
-            times = START + (first + np.arange(count)) * np.timedelta64(10_000_000, "ns")
-            level = rng.uniform(-110, -60, count).tolist()
-            file.writelines(
-                b"%sZ,35.7300001,-78.7000002,%.3f\n" % (time.encode(), value)
-                for time, value in zip(np.datetime_as_string(times, unit="ms").tolist(), level, strict=True)
-            )
-
-
-def write_poses(place: Path, lines: int) -> None:
-    """An autopilot's export: named columns, local times."""
-    rng = np.random.default_rng(11)
-    with place.open("wb") as file:
-        file.write(b"timestamp,Lat,Lng,Alt,Roll,Pitch,Yaw\n")
-        for first, count in _blocks(lines):
-            angles = rng.uniform(-20, 20, (3, count)).tolist()
-            rows = zip(_wall(first, count, 10_000_000).tolist(), range(first, first + count), *angles, strict=True)
-            file.writelines(
-                b"%s,35.73%05d,-78.70%05d,%.2f,%.3f,%.3f,%.2f\n"
-                % (time, n % 99991, n % 99989, n % 90, roll, pitch, 9 * yaw)
-                for time, n, roll, pitch, yaw in rows
-            )
-
-
 def write_drive_test(place: Path, lines: int) -> None:
     """A phone's log as G-NetTrack writes it, of eight cells: a neighbour in one row of two."""
     rng = np.random.default_rng(12)
@@ -167,31 +107,17 @@ def write_drive_test(place: Path, lines: int) -> None:
             )
 
 
-MAPPED = ReadOptions(
-    timezone=ZONE,
-    kind="rss",
-    unit="dBm",
-    columns={"time": "Time", "rss_db": "Level", "latitude_deg": "Lat", "longitude_deg": "Lon"},
-)
 SCALED: dict[str, tuple[Callable[[Path, int], None], str, ReadOptions]] = {
     "sounder_log": (write_sounder, "x_power_log.txt", ReadOptions(timezone=ZONE)),
     "vehicle_out": (write_vehicle, "x_vehicleOut.txt", ReadOptions(timezone=ZONE)),
     "quectel_csv": (write_quectel, "x_kpi.csv", ReadOptions(timezone=ZONE)),
-    "nemo_csv": (write_nemo, "x_nemo.csv", ReadOptions(time_origin="2025-03-02T15:00:00Z")),
-    "nemo_csv:all_digits": (write_nemo_digits, "x_nemo.csv", ReadOptions(time_origin="2025-03-02T15:00:00Z")),
-    "generic_csv": (write_mapped, "x_mapped.csv", MAPPED),
-    "pose_csv": (write_poses, "x_poses.csv", ReadOptions(timezone=ZONE)),
     "drive_test": (write_drive_test, "x_phone.csv", ReadOptions(timezone=ZONE)),
 }
-"""By reader, a colon and more for a second file of one."""
-TABLES: dict[str, tuple[int, int | None, list[int]]] = {
-    # rows above, place of the time (None: milliseconds in column 1), places of further numbers
+"""By reader."""
+TABLES: dict[str, tuple[int, int, list[int]]] = {
+    # rows above, place of the time, places of further numbers
     "vehicle_out": (0, 11, [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 13]),
     "quectel_csv": (0, 0, [2, 3, 4, 5, 7, 8, 9, 10]),
-    "nemo_csv": (1, None, [2, 3, 4, 5, 6, 7, 8]),
-    "nemo_csv:all_digits": (1, None, [2, 3, 4, 5, 6, 7, 8]),
-    "generic_csv": (1, 0, [1, 2, 3]),
-    "pose_csv": (1, 0, [1, 2, 3, 4, 5, 6]),
     "drive_test": (1, 0, [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]),
 }
 
@@ -204,14 +130,7 @@ def _peak_mib() -> float:
 
 def contest(who: str, what: str, place: Path) -> dict[str, float]:
     """CPU and wall seconds, peak MiB above the imports, and MiB of the records of one contestant, in this process."""
-    run = {
-        "ours": _ours,
-        "written": _written,
-        "pandas": _pandas,
-        "pandas_1": _pandas_1,
-        "pyarrow": _pyarrow,
-        "polars": _polars,
-    }[who]
+    run = CONTESTANTS[who]
     small = place.parent / f"small_{place.name}"
     with place.open("rb") as file:
         small.write_bytes(b"".join(file.readlines(100_000)))
@@ -226,13 +145,13 @@ def contest(who: str, what: str, place: Path) -> dict[str, float]:
 
 
 def _ours(what: str, place: Path) -> list[Any]:
-    (file,) = ingest(place, options=SCALED[what][2], reader=what.partition(":")[0])
+    (file,) = ingest(place, options=SCALED[what][2], reader=what)
     return [frame[name].to_numpy() for frame in (s.frame for s in file.result.streams) for name in frame]
 
 
 def _written(what: str, place: Path) -> list[Any]:
     """The same, and a flight file of it."""
-    files = ingest(place, options=SCALED[what][2], reader=what.partition(":")[0])
+    files = ingest(place, options=SCALED[what][2], reader=what)
     write_flight(place.with_suffix(".h5"), files)
     return [frame[name].to_numpy() for frame in (s.frame for s in files[0].result.streams) for name in frame]
 
@@ -252,10 +171,6 @@ def _pandas(what: str, place: Path) -> list[Any]:
         for column in (4, 6, 7, 9):
             frame[column] = frame[column].str.strip('"()').astype(np.float64)
     values = [frame[column].to_numpy() for column in numbers]
-    if at is None:
-        return [(START + frame[1] * np.timedelta64(1_000_000, "ns")).to_numpy(), *values]
-    if what == "generic_csv":
-        return [pd.to_datetime(frame[at], format="ISO8601").dt.tz_localize(None).to_numpy(), *values]
     return [_utc(pd.to_datetime(frame[at], format="%Y-%m-%d %H:%M:%S.%f")), *values]
 
 
@@ -266,75 +181,7 @@ def _pandas_1(what: str, place: Path) -> list[Any]:
     return _pandas(what, place)
 
 
-def _pyarrow(what: str, place: Path) -> list[Any]:
-    import pyarrow.compute as pc
-    from pyarrow import csv
-
-    skip = TABLES[what][0] if what in TABLES else 0
-    read = csv.ReadOptions(column_names=["line"], use_threads=False) if what not in TABLES else csv.ReadOptions(
-        autogenerate_column_names=True, skip_rows=skip, use_threads=False)  # fmt: skip
-    if what not in TABLES:
-        table = csv.read_csv(
-            place, read_options=read, parse_options=csv.ParseOptions(delimiter="\x01", quote_char=False)
-        )
-        line = table["line"]
-        clock = pc.cast(pc.utf8_slice_codeunits(line, 1, 27), "timestamp[us]")
-        level = pc.cast(pc.utf8_ltrim_whitespace(pc.utf8_slice_codeunits(line, -16)), "float64")
-        return [pc.assume_timezone(clock, ZONE).to_numpy(), level.to_numpy()]
-    at, numbers = TABLES[what][1:]
-    quote = False if what == "vehicle_out" else '"'
-    table = csv.read_csv(place, read_options=read, parse_options=csv.ParseOptions(quote_char=quote))
-    columns = [table[column] for column in numbers]
-    if what == "vehicle_out":
-        columns = [
-            pc.cast(pc.utf8_trim(column, '"()'), "float64") if number in (4, 6, 7, 9) else column
-            for number, column in zip(numbers, columns, strict=True)
-        ]
-    if at is None:
-        return [table[1].to_numpy(), *(column.to_numpy() for column in columns)]
-    clock = table[at]
-    if clock.type == "string":
-        clock = pc.cast(clock, "timestamp[us]")
-    if getattr(clock.type, "tz", None) is None and what != "generic_csv":
-        clock = pc.assume_timezone(clock, ZONE)
-    return [clock.to_numpy(), *(column.to_numpy() for column in columns)]
-
-
-def _polars(what: str, place: Path) -> list[Any]:
-    import polars as pl
-
-    if what == "sounder_log":
-        line = pl.col("line").str
-        clock = line.slice(1, 26).str.to_datetime("%Y-%m-%d %H:%M:%S%.f", time_zone=ZONE)
-        level = line.tail(16).str.strip_chars().cast(pl.Float64)
-        table = pl.read_csv(place, has_header=False, new_columns=["line"], separator="\x01", quote_char=None)
-        made = table.select(clock.dt.convert_time_zone("UTC").alias("time"), level.alias("level"))
-        return [made["time"].to_numpy(), made["level"].to_numpy()]
-    skip, at, numbers = TABLES[what]
-    table = pl.read_csv(place, has_header=False, skip_rows=skip, quote_char=None if what == "vehicle_out" else '"')
-    names = table.columns
-    wanted = [
-        pl.col(names[n]).str.strip_chars('"()').cast(pl.Float64) if what == "vehicle_out" and n in (4, 6, 7, 9)
-        else pl.col(names[n]) for n in numbers
-    ]  # fmt: skip
-    made = table.select(wanted)
-    values = [made[name].to_numpy() for name in made.columns]
-    if at is None:
-        return [table[names[1]].to_numpy(), *values]
-    form = "%Y-%m-%dT%H:%M:%S%.fZ" if what == "generic_csv" else "%Y-%m-%d %H:%M:%S%.f"
-    zone = "UTC" if what == "generic_csv" else ZONE
-    clock = table.select(pl.col(names[at]).str.to_datetime(form, time_zone=zone).dt.convert_time_zone("UTC"))
-    return [clock[names[at]].to_numpy(), *values]
-
-
-CONTESTANTS = {
-    "ours": _ours,
-    "written": _written,
-    "pandas_1": _pandas_1,
-    "pandas": _pandas,
-    "pyarrow": _pyarrow,
-    "polars": _polars,
-}
+CONTESTANTS = {"ours": _ours, "written": _written, "pandas_1": _pandas_1, "pandas": _pandas}
 
 
 def scale(lines: int, formats: list[str], contestants: list[str], folder: str | None) -> None:

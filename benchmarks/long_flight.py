@@ -65,8 +65,9 @@ def make_flight(folder: Path, hours: float, *, rank: bool) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "flight.yaml"
     path.write_text(yaml.safe_dump(flight_file(hours, rank=rank), sort_keys=False), encoding="utf-8")
-    subprocess.run([sys.executable, "-m", "aerpaw_cmp", "simulate", str(path)], check=True, stdout=subprocess.DEVNULL)
-    return path
+    command = [sys.executable, "-m", "aerpaw_cmp", "simulate", str(path), "-o", str(folder / "flown")]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return folder / "flown" / "flight.yaml"
 
 
 class Meter:
@@ -142,8 +143,8 @@ def run(hours: float, shares: list[float], *, rank: bool, keep: Path | None = No
         base = keep or Path(name)
         for share in shares:
             folder = base / f"{hours * share:.3f}h"
-            flight = folder / "flight.yaml"
-            if not flight.is_file() or not (folder / "truth.json").is_file():
+            flight = folder / "flown" / "flight.yaml"
+            if not flight.is_file():
                 flight = make_flight(folder, hours * share, rank=rank)
             command = [sys.executable, __file__, "--measure", str(flight), str(folder / "report")]
             done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)

@@ -13,10 +13,10 @@ library in C (output_faults.c, built here, by LD_PRELOAD) counts the calls that 
 - ``removed``: the folder above the output is removed at the n-th call, for ten n.
 - ``limit``: a real limit on the size of files (RLIMIT_FSIZE), and a real full tmpfs where one can be mounted.
 
-Two variants of each job follow each other into one target, for `simulate` beside a file of somebody else. After each:
-inputs and the foreign file have their bytes; the target is whole (its own SHA-256 list), of one variant (files that
-two clean runs write alike are compared), and there if it was there before; an error is exit code 3 with one message
-that names the output, and leaves no other file. What a kill left is cleared by the next run.
+Two variants of each job follow each other into one target. After each: inputs have their bytes; the target is whole
+(its own SHA-256 list), of one variant (files that two clean runs write alike are compared), and there if it was there
+before; an error is exit code 3 with one message that names the output, and leaves no other file. What a kill left is
+cleared by the next run.
 
 In the end the first job is tried with a planted fault, writing in place as the tool once did: the checks must fail.
 """
@@ -49,7 +49,6 @@ SAMPLE = HERE.parent / "sample_logs"
 VARIANTS = ("a", "b")
 NOTHING, BEFORE, AFTER, FAIL, COMMAND = range(5)
 ERRORS = {"full": (errno.ENOSPC, 1), "broken": (errno.EIO, 0), "read-only": (errno.EROFS, 1)}
-FOREIGN = "somebody.txt"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +57,7 @@ class Job:
 
     name: str
     kind: str
-    """file, folder or set."""
+    """file or folder."""
     commands: dict[str, list[str]]
 
 
@@ -96,22 +95,23 @@ def make_inputs(folder: Path, wanted: list[str] | None = None) -> dict[str, Job]
         plan["flight"]["plan"]["speed_mps"] = 9.0 + seed
         flight = place / "flight.yaml"
         flight.write_text(yaml.safe_dump(plan), encoding="utf-8")
-        if wanted != ["site import"] and main(["simulate", str(flight)]):
+        if wanted != ["site import"] and main(["simulate", str(flight), "-o", str(place / "flown")]):
             raise SystemExit("the small flight could not be simulated")
-        (place / "campaign.yaml").write_text(f"campaign: {variant}\nflights: [flight.yaml]\n", encoding="utf-8")
+        flown = place / "flown" / "flight.yaml"
+        (place / "campaign.yaml").write_text(f"campaign: {variant}\nflights: [flown/flight.yaml]\n", encoding="utf-8")
         (place / "map.json").write_text(json.dumps(_buildings(20 + seed)), encoding="utf-8")
         site = place / "site.yaml"
         if main(["site", "import", str(place / "map.json"), "-o", str(site)]):  # imports what the forks need, too
             raise SystemExit("the small map could not be imported")
         small = ["--spacing", "500", "--rss-altitude", "30", "--rank-altitude", "30", "-k", "10", "--foliage", "none"]
-        commands["ingest"][variant] = ["ingest", str(place), "--timezone", "America/New_York"]
+        commands["ingest"][variant] = ["ingest", str(flown.parent), "--timezone", "America/New_York"]
         commands["site import"][variant] = ["site", "import", str(place / "map.json")]
         commands["simulate"][variant] = ["simulate", str(flight)]
-        commands["report"][variant] = ["report", str(flight)]
+        commands["report"][variant] = ["report", str(flown)]
         commands["campaign"][variant] = ["campaign", str(place / "campaign.yaml")]
         carrier = ["--carrier-ghz", str(3.4 + seed / 10)]
         commands["map"][variant] = ["map", str(site), *small, *carrier, "--max-depth", "0", "--no-study"]
-    kinds = {"ingest": "file", "site import": "file", "simulate": "set"}
+    kinds = {"ingest": "file", "site import": "file"}
     chosen = {name: by for name, by in commands.items() if not wanted or name in wanted}
     return {name: Job(name, kinds.get(name, "folder"), by) for name, by in chosen.items()}
 
@@ -247,11 +247,11 @@ class Runs:
     # --- what is there
 
     def content(self) -> dict[str, str]:
-        """SHA-256 of the results by name, the foreign file left out."""
+        """SHA-256 of the results by name."""
         if self.target.is_file():
             return {"": _digest(self.target)}
         files = (p for p in self.target.rglob("*") if p.is_file() and ".aerpaw-" not in p.name)
-        return {p.relative_to(self.target).as_posix(): _digest(p) for p in files if p.name != FOREIGN}
+        return {p.relative_to(self.target).as_posix(): _digest(p) for p in files}
 
     def litter(self) -> list[str]:
         """Everything below the root that is neither target nor in it, and hidden places in it."""
@@ -282,25 +282,19 @@ class Runs:
         shutil.rmtree(self.root, ignore_errors=True)
         self.folder.mkdir(parents=True)
 
-    def plant_foreign(self) -> None:
-        """A file of somebody else among the logs of ``simulate``; folders of results with such are refused."""
-        if self.job.kind == "set" and self.target.is_dir() and not (self.target / FOREIGN).exists():
-            (self.target / FOREIGN).write_text("mine")
-
     def wrong(self, before: bool) -> str | None:
         """What is not whole or not of one run, or None."""
         found = self.content()
         if not os.path.lexists(self.target) or not found:
-            lost = before and self.job.kind != "set"
-            return "the output that was there is gone" if lost else None
+            return "the output that was there is gone" if before else None
         variants = [
             v for v in VARIANTS if all(found[n] == d for n, d in self.stable[v].items() if n in found)
         ]  # fmt: skip
         if not variants:
             return "files of two runs"
-        return {"file": self._wrong_file, "folder": self._wrong_folder, "set": self._wrong_set}[self.job.kind](found)
+        return self._wrong_file() if self.job.kind == "file" else self._wrong_folder(found)
 
-    def _wrong_file(self, _found: dict[str, str]) -> str | None:
+    def _wrong_file(self) -> str | None:
         from aerpaw_cmp.common.outputs import is_sealed
         from aerpaw_cmp.logs.flight_file import is_flight_file
 
@@ -316,13 +310,6 @@ class Runs:
         if sums != {name: digest for name, digest in found.items() if name != SUMS}:
             return "the folder is not what its list says"
         return None
-
-    def _wrong_set(self, found: dict[str, str]) -> str | None:
-        listing = self.target / "truth.json"
-        if not listing.exists():
-            return None  # an unfinished set says so by having no list
-        files = json.loads(listing.read_text(encoding="utf-8"))["files"]
-        return None if all(found.get(n) == d for n, d in files.items()) else "the set is not what its list says"
 
 
 def _digest(path: Path) -> str:
@@ -349,11 +336,9 @@ def try_job(
     found.calls = runs.clean("b")
     found.seconds = time.perf_counter() - start
 
-    def check(what: str, before: bool, foreign: bool) -> None:
+    def check(what: str, before: bool) -> None:
         found.done[what.split()[0]] += 1
         wrong = runs.wrong(before)
-        if wrong is None and foreign and not (runs.target / FOREIGN).exists():
-            wrong = "the foreign file is gone"
         if wrong is None and _tree(inputs) != original:
             wrong = "an input was changed"
         if wrong is not None:
@@ -363,7 +348,7 @@ def try_job(
     for number in range(kills):
         if number % 25 == 0:
             _next_run_clears(runs, found, absent=number % 50 == 0)
-        before, foreign = os.path.lexists(runs.target), (runs.target / FOREIGN).exists()
+        before = os.path.lexists(runs.target)
         variant = VARIANTS[number % 2]
         if number % 5 < 4:
             at, kind = 1 + number * found.calls // kills, (BEFORE, AFTER)[number // 2 % 2]
@@ -376,24 +361,21 @@ def try_job(
                 os.kill(child, signal.SIGKILL)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         found.done["killed"] += code == -signal.SIGKILL
-        check(what, before, foreign)
+        check(what, before)
 
     _next_run_clears(runs, found, absent=False)
     for what, variant, fault, limit in _errors(runs, found.calls) if errors else ():
         if not os.path.lexists(runs.target):
             _next_run_clears(runs, found, absent=False)
-        runs.plant_foreign()
-        before, foreign = os.path.lexists(runs.target), (runs.target / FOREIGN).exists()
+        before = os.path.lexists(runs.target)
         code = os.waitstatus_to_exitcode(os.waitpid(runs.start(variant, fault, limit), 0)[1])
-        removed = what.startswith("removed")
-        check(what, before and not removed, foreign and not removed)
+        check(what, before and not what.startswith("removed"))
         said = [line for line in runs.said().splitlines() if line.startswith("aerpaw-cmp: ")]
         told = code == 0 or (code == 3 and len(said) == 1 and str(runs.folder) in said[0])
         if not told:
             found.violations.append(f"{job.name}: {what}: exit {code}, said {said}")
         if rest := runs.litter():
-            journal = any(name.endswith("aerpaw-journal") for name in rest)  # which the next run finishes
-            if code and not journal:
+            if code:
                 found.violations.append(f"{job.name}: {what}: left {rest}")
             found.done["left for the next run"] += 1
             _next_run_clears(runs, found, absent=False)
@@ -410,7 +392,6 @@ def _next_run_clears(runs: Runs, found: Found, *, absent: bool) -> None:
         runs.reset()
     if absent:
         runs.reset()
-    runs.plant_foreign()
 
 
 def _errors(runs: Runs, calls: int) -> Iterator[tuple[str, str, tuple[int, int, int, int, str], int | None]]:
@@ -453,7 +434,7 @@ def plant() -> None:
         self.target.mkdir(parents=True, exist_ok=True)
         with outputs.explained_os_errors(self.named):
             yield self.target
-            names = [p for p in self.target.rglob("*") if p.is_file() and p.name not in (outputs.SUMS, FOREIGN)]
+            names = [p for p in self.target.rglob("*") if p.is_file() and p.name != outputs.SUMS]
             rows = "".join(f"{_digest(p)}  {p.relative_to(self.target).as_posix()}\n" for p in sorted(names))
             (self.target / outputs.SUMS).write_text(f"# aerpaw-cmp: planted\n{rows}")
 

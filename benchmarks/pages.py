@@ -106,15 +106,15 @@ def real_campaign(folder: Path, interval_s: float = 2.0) -> Path:
         place = folder / f"day_{number + 1}"
         place.mkdir()
         (place / "flight.yaml").write_text(yaml.safe_dump(content))
-        command("simulate", str(place / "flight.yaml"))
+        command("simulate", str(place / "flight.yaml"), "-o", str(place / "flown"))
     campaign = {
         "campaign": "three_days",
-        "flights": [f"day_{number + 1}/flight.yaml" for number in range(3)],
+        "flights": [f"day_{number + 1}/flown/flight.yaml" for number in range(3)],
         "settings": {"as written": {}, "line of sight": {"rt.max_depth": 0}},
         "calibration": "channel",
     }
     (folder / "campaign.yaml").write_text(yaml.safe_dump(campaign))
-    command("report", str(folder / "day_1" / "flight.yaml"), "-o", str(folder / "reports" / "day_1"))
+    command("report", str(folder / "day_1" / "flown" / "flight.yaml"), "-o", str(folder / "reports" / "day_1"))
     command("campaign", str(folder / "campaign.yaml"), "-o", str(folder / "reports" / "three_days"), "--fresh")
     return folder / "reports" / "three_days" / "campaign.html"
 

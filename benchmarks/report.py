@@ -64,8 +64,8 @@ def two_channels(folder: Path) -> tuple[Path, list[str], str]:
     content["logs"] = [log for log in content["logs"] if log.get("node") in (None, "LW1") and "ri" not in log["path"]]
     flight = folder / "flight.yaml"
     flight.write_text(yaml.safe_dump(content))
-    run([sys.executable, "-m", "aerpaw_cmp", "simulate", str(flight)])
-    return flight, [], "simulated, one tower, two channels"
+    run([sys.executable, "-m", "aerpaw_cmp", "simulate", str(flight), "-o", str(folder / "flown")])
+    return folder / "flown" / "flight.yaml", [], "simulated, one tower, two channels"
 
 
 def cold_and_warm(flight: Path, options: list[str], folder: Path, repeats: int) -> dict[str, dict[str, float]]:

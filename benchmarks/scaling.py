@@ -140,10 +140,10 @@ def flights(count: int, workers: int = 1) -> dict[str, float]:
             place = folder / f"f{number}"
             place.mkdir()
             (place / "flight.yaml").write_text(yaml.safe_dump(short_flight(number)), encoding="utf-8")
-            run_simulate(place / "flight.yaml")
+            run_simulate(place / "flight.yaml", out=place / "flown")
         content = {
             "campaign": "scaling",
-            "flights": [f"f{n}/flight.yaml" for n in range(count)],
+            "flights": [f"f{n}/flown/flight.yaml" for n in range(count)],
             "settings": {"as written": {}, "line of sight": {"rt.max_depth": 0}},
         }
         (folder / "campaign.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")

@@ -2,7 +2,7 @@
 
 python benchmarks/scenes.py [--scenes munich,etoile,florence] [--depths 1,2] [--receivers 200] [--check]
     [--prisms 1000,5000] [--sionna 100000,1000000] [--limits 1000000,10000000] [--slots 24,26]
-    [--growth] [--figure docs/images/scenes_growth.svg] [--json FILE] [--markdown]
+    [--json FILE]
 
 Scenes are those that the installed Sionna RT ships. Each row runs in a process of its own, which gives its memory; the
 compiled code must have been compiled before (the first row says how long that took). Receivers lie within 200 m of one
@@ -13,7 +13,6 @@ transmitter, half at street level, half 30 to 60 m up.
             (missing), ours that it lacks (extra), each of which is asked of Sionna's own scene: a ray test of every
             segment, shortened by 2 cm
 --limits, --slots   its max_num_paths_per_src and its table of candidates (2 to this power): each with each
---growth    seconds against receivers, towers, faces and depth, fitted as powers
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ def shipped(name: str) -> Path:
     return Path(folder) / "rt" / "scenes" / name / f"{name}.xml"
 
 
-def ends(name: str, receivers: int, towers: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def ends(name: str, receivers: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(1)
     source = np.array(SOURCES.get(name, (0.0, 0.0, 30.0)))
     away, angle = 200.0 * np.sqrt(rng.uniform(size=receivers)), rng.uniform(0.0, 2.0 * np.pi, receivers)
@@ -63,7 +62,7 @@ def ends(name: str, receivers: int, towers: int = 1) -> tuple[np.ndarray, np.nda
     if name == "simple_street_canyon":
         away = away / 5.0
     targets = np.column_stack([source[0] + away * np.cos(angle), source[1] + away * np.sin(angle), up])
-    return source + np.column_stack([np.arange(towers) * 7.0, np.zeros(towers), np.zeros(towers)]), targets
+    return source[None, :], targets
 
 
 def crop(scene: TriangleScene, middle: np.ndarray, triangles: int) -> TriangleScene:
@@ -106,19 +105,14 @@ def warm_up() -> float:
 
 def image_row(task: dict[str, Any]) -> dict[str, Any]:
     """One scene by the exact search."""
-    task = {"towers": 1, "triangles": None, "shadows": True, "beams": True, **task}
     compile_s = warm_up()
     clock = Clock()
     scene = read_scene(shipped(task["scene"]))
-    sources, targets = ends(task["scene"], task["receivers"], task["towers"])
-    if task["triangles"]:
-        scene = crop(scene, sources[0], task["triangles"])
+    sources, targets = ends(task["scene"], task["receivers"])
     surfaces = merged(scene)
     setup = clock.since()
     clock = Clock()
-    paths = grow_paths(
-        surfaces, Links(sources, targets), max_depth=task["depth"], shadows=task["shadows"], beams=task["beams"]
-    )
+    paths = grow_paths(surfaces, Links(sources, targets), max_depth=task["depth"])
     search = clock.since()
     row = {
         **task,
@@ -263,53 +257,6 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])  # type: ignore[no-any-return]
 
 
-def growth_tasks(scene: str, receivers: int) -> dict[str, list[tuple[float, dict[str, Any]]]]:
-    base = {"kind": "image", "scene": scene, "receivers": receivers, "depth": 2}
-    return {
-        "receivers": [(n, {**base, "receivers": n}) for n in (50, 200, 800, 3200)],
-        "towers": [(n, {**base, "towers": n}) for n in (1, 2, 4)],
-        "triangles": [(n, {**base, "triangles": n}) for n in (2500, 5000, 10_000, 20_000, 38_936)],
-        "depth": [(n, {**base, "triangles": 2500, "depth": n}) for n in (1, 2, 3)],
-    }
-
-
-def fitted(pairs: list[tuple[float, float]]) -> float:
-    """Exponent of a power, by least squares of logarithms."""
-    x, y = np.log(np.array(pairs)).T
-    return float(np.polyfit(x, y, 1)[0])
-
-
-def draw(found: dict[str, list[tuple[float, float]]], scene: str, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, len(found), figsize=(11, 2.8), constrained_layout=True)
-    for ax, (what, pairs) in zip(axes, found.items(), strict=True):
-        x, y = np.array(pairs).T
-        ax.plot(x, y, "o-", color="#1f5fa8")
-        ax.set_yscale("log")
-        ax.set_xscale("linear" if what == "depth" else "log")
-        label = (
-            f"power {fitted(pairs):.2f}"
-            if what != "depth"
-            else f"x {(y[-1] / y[0]) ** (1 / (x[-1] - x[0])):.1f} a reflection"
-        )
-        ax.set_title(label, fontsize=10)
-        ax.set_xlabel(what)
-        ax.set_xticks(x, [f"{v / 1000:.3g}k" if v >= 1000 else f"{v:g}" for v in x])
-        ticks = [m * 10.0**e for e in range(-4, 4) for m in (1, 2, 5)]
-        shown = [t for t in ticks if 0.7 * y.min() <= t <= 1.4 * y.max()]
-        ax.set_yticks(shown, [f"{t:g}" for t in shown])
-        ax.minorticks_off()
-        ax.set_ylim(0.7 * y.min(), 1.4 * y.max())
-        ax.grid(alpha=0.3)
-    axes[0].set_ylabel("CPU seconds of the search")
-    figure.suptitle(f"{scene}: growth of the exact search", fontsize=11)
-    figure.savefig(path)
-
-
 def table(rows: list[dict[str, Any]]) -> None:
     head = "scene", "engine", "depth", "set-up wall / CPU [s]", "search wall / CPU [s]", "MiB", "paths by depth"
     print("| " + " | ".join([*head, "missing / extra (of these free in Sionna's scene) / twice"]) + " |")
@@ -362,8 +309,6 @@ def main() -> None:
     parser.add_argument("--limits", type=numbers, default=[0])
     parser.add_argument("--slots", type=numbers, default=[0])
     parser.add_argument("--only-sionna", action="store_true")
-    parser.add_argument("--growth", action="store_true")
-    parser.add_argument("--figure", type=Path)
     parser.add_argument("--json", type=Path, help="- for standard output, last")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -384,16 +329,8 @@ def main() -> None:
                 f"{row['scene']} depth {row['depth']}: {row['differ_without_shadows']} paths differ with shadows off, "
                 f"{row['differ_without_beams_on_600_triangles']} with every cut off on 600 triangles"
             )
-    found: dict[str, list[tuple[float, float]]] = {}
-    if given.growth:
-        for what, tasks in growth_tasks(names[0], given.receivers).items():
-            found[what] = [(n, run(task)["search_s"][1]) for n, task in tasks]
-            power = f"power {fitted(found[what]):.2f}" if what != "depth" else ""
-            print(f"{names[0]}, {what}: " + ", ".join(f"{n:g}: {s:.2f} s" for n, s in found[what]), power)
-        if given.figure:
-            draw(found, names[0], given.figure)
     if given.json:
-        text = json.dumps({"rows": rows, "growth": found}, indent=1)
+        text = json.dumps({"rows": rows}, indent=1)
         print(text) if str(given.json) == "-" else given.json.write_text(text)
 
 

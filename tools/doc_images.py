@@ -1,6 +1,6 @@
-"""Remake the pictures of ``docs/images``: the sample's figures, the tutorial's page, the tap, the growth of cost.
+"""Remake the pictures of ``docs/images``: the sample's figures, the tutorial's page, the tap.
 
-python tools/doc_images.py [sample] [tutorial] [tap] [scenes]     (some 20 minutes for all)
+python tools/doc_images.py [sample] [tutorial] [tap]     (some 20 minutes for all)
 
 Figures of the gallery are drawn when the documentation is built; that of docs/performance.md by ``make bench-all``.
 """
@@ -48,12 +48,10 @@ def of_the_tutorial() -> None:
 
 def main(names: list[str]) -> None:
     """Remake the named parts, or all."""
-    growth = ("--scenes", "munich", "--depths", 1, "--growth", "--figure", IMAGES / "scenes_growth.svg")
     parts = {
         "sample": of_the_report,
         "tutorial": of_the_tutorial,
         "tap": lambda: run("tools/tap_picture.py", IMAGES / "tap_live.png", IMAGES / "tap_live_phone.png"),
-        "scenes": lambda: run("benchmarks/scenes.py", *growth),
     }
     if unknown := set(names) - set(parts):
         raise SystemExit(f"unknown: {', '.join(sorted(unknown))}; expected {', '.join(parts)}")

@@ -317,14 +317,14 @@ def calibrate(
     "simulate",
     examples=[
         "aerpaw-cmp simulate plan/flight.yaml",
-        "aerpaw-cmp simulate plan/flight.yaml -o planned_logs --json",
+        "aerpaw-cmp simulate plan/flight.yaml -o planned --json",
     ],
 )
 def simulate(
     flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
     out: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: the folder of flight.yaml]"),
+        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: simulated/<flight>]"),
     ] = None,
     force: Force = False,
     as_json: Json = False,

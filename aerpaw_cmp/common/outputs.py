@@ -1,13 +1,12 @@
 """Output files and folders: they replace nothing that is not this tool's, and appear whole or not at all.
 
-Three kinds of result, one rule:
+Two kinds of result, one rule:
 
 =====================  =======================================================  ==================================
 kind                   is this tool's own, so that it may be replaced           how the new one takes the name
 =====================  =======================================================  ==================================
 :class:`OutputFile`    a seal inside: the SHA-256 of the rest of the file       written beside, synced, renamed
 :class:`OutputFolder`  ``SHA256SUMS`` in it: the SHA-256 of every file of it    filled beside, synced, exchanged
-:class:`OutputSet`     a list beside them, with the SHA-256 of every file       by a journal that the next run ends
 =====================  =======================================================  ==================================
 
 An input is never replaced, with ``--force`` or without; inputs are known by device and inode, so through links, too.
@@ -24,15 +23,14 @@ import contextlib
 import ctypes
 import errno
 import hashlib
-import json
 import os
 import re
 import stat
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from .errors import OutputError, UsageError, add_note, one_line
 from .files import plain_mode, sync
@@ -247,31 +245,10 @@ def _ask(own: Callable[[Path], bool], path: Path) -> bool:
         return False
 
 
-class _SeveralFiles:
-    """End of outputs of several files: what is unfinished goes, and an interrupt says what stands."""
-
-    named: Path
-    _place: _Place | None
-    _made: list[Path]
-    """Parents made for this run, removed again where it fails."""
-    _written: bool
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        with held():
-            if self._place is not None:
-                self._place.leave()
-                self._place = None
-            _remove_folders(self._made)
-            if not self._written:
-                _say_kept(error, self.named)
-
-
 # --- a folder -------------------------------------------------------------------------------------
 
 
-class OutputFolder(_SeveralFiles):
+class OutputFolder:
     """A folder of results, replaced as a whole; a context around the whole command.
 
     Parameters
@@ -307,7 +284,7 @@ class OutputFolder(_SeveralFiles):
         self.named, self.target = Path(target), _real(Path(target))
         self._job, self._inputs, self._force = job, tuple(inputs), force
         self._place: _Place | None = None
-        self._made: list[Path] = []
+        self._made: list[Path] = []  # parents made for this run, removed again where it fails
         self._written = False
 
     def __enter__(self) -> OutputFolder:
@@ -323,6 +300,17 @@ class OutputFolder(_SeveralFiles):
                 self.__exit__(None, None, None)
                 raise
         return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with held():
+            if self._place is not None:
+                self._place.leave()
+                self._place = None
+            _remove_folders(self._made)
+            if not self._written:
+                _say_kept(error, self.named)
 
     def refuse(self) -> None:
         """UsageError where a run with this output would be refused; writes nothing."""
@@ -452,183 +440,6 @@ def _remove_folders(made: list[Path]) -> None:
     for place in reversed(made):
         with contextlib.suppress(OSError):
             place.rmdir()
-
-
-# --- several files beside files of others -----------------------------------------------------------
-
-
-class OutputSet(_SeveralFiles):
-    """Files in a folder that is not the tool's alone, with a list that names them; a context around the command.
-
-    Parameters
-    ----------
-    folder : Path
-        Made when missing.
-    listing : str
-        Name of the JSON file that lists the set: under ``files`` the SHA-256 of each, by its name in the folder.
-    names : iterable of str
-        The files of the set, as names in the folder.
-    inputs : iterable of Path
-        What the command reads.
-    force : bool
-        Replace files that the list does not have, or has with another content; never an input.
-
-    Raises
-    ------
-    UsageError
-        On entry: a file stands in the way that the list does not have, or another run is at work.
-    OutputError
-        If the disk does not take it.
-
-    Notes
-    -----
-    A folder with other files in it cannot be exchanged. The new files are written beside their places and synced;
-    then a journal is written, the old list and the old files are removed, and the new ones take their names, the list
-    last. Files of the old list that the new set has not (another flight's logs) stay in folder and list. A run killed
-    on the way leaves old files or new ones, never both, and no list before the set is whole; the
-    next run finishes what the journal says.
-    """
-
-    def __init__(
-        self, folder: Path, *, listing: str, names: Iterable[str], inputs: Iterable[Path] = (), force: bool = False
-    ) -> None:
-        self.named, self.folder = Path(folder), _real(Path(folder))
-        self._listing, self._names = listing, tuple(names)
-        self._inputs, self._force = tuple(inputs), force
-        self._known: dict[str, set[str]] = {}
-        self._made: list[Path] = []
-        self._place: _Place | None = None
-        self._written = False
-        self._journal = beside(self.folder / listing, "journal")
-
-    def __enter__(self) -> OutputSet:
-        with explained_os_errors(self.named):
-            try:
-                _make_folders(self.folder, self._made)
-                self._place = _Place(self.folder / self._listing, self.named, folder=False)
-                self._recover()
-                for name in (*self._names, self._listing):
-                    beside(self.folder / name, "new").unlink(missing_ok=True)  # of a run killed before its journal
-                self._remember(_listed(self.folder / self._listing))
-                self._refuse()
-            except BaseException:
-                self.__exit__(None, None, None)
-                raise
-        return self
-
-    def _remember(self, digests: Mapping[str, str]) -> None:
-        for name, digest in digests.items():
-            self._known.setdefault(name, set()).add(digest)
-
-    def _own(self, name: str) -> bool:
-        file = self.folder / name
-        return file.is_file() and file_digest(file) in self._known.get(name, ())
-
-    def _refuse(self) -> None:
-        """UsageError unless every file of the set may be written."""
-        listing = self.folder / self._listing
-        if os.path.lexists(listing) and not self._force and not _listed(listing):
-            raise UsageError(
-                "the file exists, and is not one that this command wrote",
-                expected="another folder, or --force to replace it",
-                path=listing,
-            )
-        foreign = []
-        for name in (*self._names, self._listing):
-            file = self.folder / name
-            for path in self._inputs:
-                if _identity(path) is not None and _identity(path) == _identity(file):
-                    raise _replaces_input(file, path)
-            if name != self._listing and os.path.lexists(file) and not self._own(name):
-                foreign.append(file)
-        if foreign and not self._force:
-            more = "" if len(foreign) == 1 else f", and so are {len(foreign) - 1} more"
-            raise UsageError(
-                f"the file exists and is not marked as synthetic{more}",
-                expected=f"another folder after -o, or --force to replace what {self._listing} does not list",
-                cause="a real log, or one that was changed",
-                path=foreign[0],
-            )
-
-    def write(self, contents: Mapping[str, bytes], listing: Mapping[str, Any]) -> list[Path]:
-        """Write the set; gives its paths, the list last. ``listing`` gets the key ``files``."""
-        digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
-        others = {
-            name: file_digest(self.folder / name) for name in self._known if name != self._listing and self._own(name)
-        }
-        text = json.dumps({**listing, "files": {**others, **digests}}, indent=1) + "\n"
-        everything = {**contents, self._listing: text.encode("utf-8")}
-        look()
-        with explained_os_errors(self.named), held():
-            try:
-                for name, content in everything.items():
-                    _write_synced(self._new(name), content)
-                self._refuse()  # what came there meanwhile
-                old = {name: file_digest(self.folder / name) for name in contents if self._own(name)}
-                digests[self._listing] = hashlib.sha256(everything[self._listing]).hexdigest()
-                _write_synced(self._journal, json.dumps({"old": old, "new": digests}).encode("ascii"))
-            except BaseException:
-                for name in everything:
-                    with contextlib.suppress(OSError):
-                        beside(self.folder / name, "new").unlink(missing_ok=True)
-                raise
-            _sync_folder(self.folder)
-            self._written = True
-            self._recover()
-        return [self.folder / name for name in everything]
-
-    def _new(self, name: str) -> Path:
-        file = self.folder / name
-        _make_folders(file.parent, self._made)
-        return beside(file, "new")
-
-    def _recover(self) -> None:
-        """Finish what the journal says; every step may be done twice."""
-        try:
-            journal = json.loads(self._journal.read_text(encoding="ascii"))
-            old, new = dict(journal["old"]), dict(journal["new"])
-        except FileNotFoundError:
-            return
-        except (ValueError, KeyError, TypeError):  # cut while it was written: nothing had been done
-            self._journal.unlink()
-            return
-        self._remember(old)
-        self._remember(new)
-        whole = all(
-            (self._new(name).is_file() and file_digest(self._new(name)) == digest)
-            or ((self.folder / name).is_file() and file_digest(self.folder / name) == digest)
-            for name, digest in new.items()
-        )
-        if whole:
-            for name in (self._listing, *old):
-                file = self.folder / name
-                now = file_digest(file) if file.is_file() else None
-                replaced = name == self._listing or now == old.get(name)
-                if now is not None and replaced and now != new.get(name):
-                    file.unlink()
-            for name in sorted(new, key=lambda name: name == self._listing):
-                if self._new(name).exists():
-                    self._new(name).replace(self.folder / name)
-                    _sync_folder((self.folder / name).parent)
-        self._journal.unlink()
-        _sync_folder(self.folder)
-
-
-def _listed(listing: Path) -> dict[str, str]:
-    """SHA-256 by name as a list of :class:`OutputSet` says them; empty where it is none."""
-    try:
-        files = json.loads(listing.read_text(encoding="utf-8"))["files"]
-        return {str(name): str(digest) for name, digest in files.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return {}
-
-
-def _write_synced(path: Path, content: bytes) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o666)
-    with os.fdopen(descriptor, "wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
 
 
 # --- the place beside -----------------------------------------------------------------------------

@@ -650,21 +650,24 @@ def load_flight(path: str | Path, learned: Path | None = None) -> FlightFile:
         flight = settings.flight.model_copy(update={"notes": [*settings.flight.notes, note]})
         settings = settings.model_copy(update={"flight": flight})
     if learned is not None:
-        settings = _joined(settings, _placed(load_yaml(learned, LearnedSettings), learned), learned)
+        knowledge = load_yaml(learned, LearnedSettings).model_dump(exclude_unset=True)
+        settings = _joined(settings, files_of(knowledge, learned.parent), learned)
     return with_learned(settings, Path(path).parent)
 
 
-def _placed(learned: LearnedSettings, path: Path) -> dict[str, Any]:
-    """The content of calibrated.yaml with the files that it names as absolute paths."""
+def files_of(content: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Settings of a file in a folder, with the files that they name as absolute paths."""
 
     def place(value: Any, key: str = "") -> Any:
         if isinstance(value, dict):
             return {name: place(item, name) for name, item in value.items()}
+        if isinstance(value, list):
+            return [place(item) for item in value]
         if key in ("file", "receiver") and isinstance(value, str):
-            return str((path.parent / value).absolute())
+            return str((folder / value).absolute())
         return value
 
-    return dict(place(learned.model_dump(exclude_unset=True)))
+    return dict(place(dict(content)))
 
 
 def _joined(settings: FlightFile, learned: Mapping[str, Any], path: Path) -> FlightFile:

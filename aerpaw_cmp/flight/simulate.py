@@ -1,12 +1,13 @@
 """Forward-simulate a planned flight into logs of the real formats, with the truth beside them.
 
 ``flight.plan`` of a flight.yaml says what flies and what is planted (offsets, fading, clock shifts, bad lines);
-its ``logs`` say which files to write and in which format (by ``reader``). The same file then drives
-``aerpaw-cmp report``, which must recover what was planted.
+its ``logs`` say which files to write and in which format (by ``reader``). The folder that is written holds a
+flight.yaml for ``aerpaw-cmp report``, which must recover what was planted.
 """
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,19 +20,23 @@ import pandas as pd
 
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
-from ..common.outputs import OutputSet
+from ..common.outputs import SUMS, OutputFolder
 from ..common.stages import Progress, silent
 from ..common.units import MINIMUM_HEIGHT_M, FloatArray, IntArray
+from ..common.yamlfile import dump_yaml
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
 from ..propagation.arrays import Poses, rotation_from_aircraft
 from ..propagation.options import Search
 from ..propagation.replay import replay
 from ..site.site import Site
-from .settings import FlightFile, LogSettings, PlanSettings
+from .data import site_place
+from .settings import FlightFile, LogSettings, PlanSettings, files_of
 
 TRUTH = "truth.json"
-"""What was planted, and the SHA-256 of every synthetic log."""
+"""What was planted."""
+FLIGHT = "flight.yaml"
+"""The flight file, beside the logs that it names."""
 LOWEST_DBM = -400.0
 """Below this the simulated level is no signal."""
 
@@ -237,29 +242,29 @@ class FlightSimulator:
     def run(
         self, out: Path, *, inputs: Iterable[Path] = (), force: bool = False, progress: Progress = silent
     ) -> list[Path]:
-        """Write every log of the flight file and truth.json below ``out``; gives the paths written.
+        """Write a folder with every log of the flight file, the file itself and truth.json; gives the paths written.
 
         Parameters
         ----------
         out : Path
-            Made when missing.
+            Made when missing, replaced as a whole; see :class:`~aerpaw_cmp.common.outputs.OutputFolder`.
         inputs : iterable of Path
-            Files that must not be replaced: the flight file and what it names.
+            Files that may not lie in it: the flight file and what it names.
         force : bool
-            Replace logs that truth.json does not list as synthetic, too.
+            Replace files that were changed after this tool wrote them, too.
         progress : Progress
             Gets the path of each log.
 
         Returns
         -------
         list of Path
-            Logs in the order of the flight file, then truth.json.
+            Logs in the order of the flight file, the flight file, truth.json.
 
         Raises
         ------
         UsageError
-            Without a plan or a time zone, for readers that have no writer, for towers the site does not have, where
-            a log that is not marked synthetic is in the way.
+            Without a plan or a time zone, for readers that have no writer, for towers the site does not have, for
+            a folder that holds what this tool did not write.
         OutputError
             If the disk does not take them.
         """
@@ -274,26 +279,40 @@ class FlightSimulator:
         start = _local_start(plan.start, self.settings.timezone)
         self.start_utc = start.tz_convert("UTC").tz_localize(None)
         self.truth_: dict[str, Any] = {"flight": self.settings.flight.name, "synthetic": True, "rss": {}, "rank": {}}
-        names = self._names(out)
-        with OutputSet(out, listing=TRUTH, names=names, inputs=inputs, force=force) as output:
-            contents = {}
+        self._check_names(out)
+        with OutputFolder(out, job="simulate", inputs=inputs, force=force) as output:
+            contents: dict[str, bytes] = {}
             for log in self.settings.logs:
                 progress(log.path)
                 contents[log.path], damage = self._with_bad_lines(self._log_bytes(log))
                 self.truth_.setdefault("bad_lines", {})[log.path] = damage
             self.truth_["plan"] = plan.model_dump(mode="json")
-            return output.write(contents, self.truth_)
+            contents |= {
+                FLIGHT: dump_yaml(self._flight_file()).encode("utf-8"),
+                TRUTH: (json.dumps(self.truth_, indent=1) + "\n").encode("utf-8"),
+            }
+            with output.filling() as folder:
+                for name, content in contents.items():
+                    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                    (folder / name).write_bytes(content)
+            return [out / name for name in contents]
 
-    def _names(self, out: Path) -> list[str]:
-        """The logs of the flight file; UsageError for those that would lie outside ``out``, or twice."""
+    def _flight_file(self) -> dict[str, Any]:
+        """The settings as they hold in another folder: site and antenna files by absolute paths."""
+        content: dict[str, Any] = self.settings.model_dump(mode="json", exclude_unset=True)
+        place = site_place(self.settings.site.file, self.folder)
+        content["site"] = {**content.get("site", {}), "file": place if isinstance(place, str) else str(place.resolve())}
+        return content | files_of({"link": content["link"]} if "link" in content else {}, self.folder)
+
+    def _check_names(self, out: Path) -> None:
+        """UsageError for logs of the flight file that would lie outside ``out``, or twice."""
         names = [log.path for log in self.settings.logs]
         for name in names:
             place = Path(os.path.normpath(out / name))
             if Path(name).is_absolute() or Path(os.path.normpath(out)) not in place.parents:
                 raise UsageError(f"log {name!r} lies outside the folder of the logs", expected="a path below it")
-            if names.count(name) > 1 or name == TRUTH:
+            if names.count(name) > 1 or name in (TRUTH, FLIGHT, SUMS):
                 raise UsageError(f"two files of this flight are named {name!r}", expected="a name of its own for each")
-        return names
 
     def _log_bytes(self, log: LogSettings) -> bytes:
         writers = {

@@ -125,16 +125,14 @@ def run_ingest(
 def run_simulate(
     flight: Path, *, out: Path | None = None, force: bool = False, progress: Progress = silent
 ) -> list[Path]:
-    """Write the logs that ``flight.plan`` describes, beside the flight file or below ``out``.
-
-    A log that is not marked as synthetic (in truth.json) is replaced with ``force`` only.
+    """Write a folder with the logs that ``flight.plan`` describes, the flight file and what was planted.
 
     Parameters
     ----------
     flight : Path
         flight.yaml with ``flight.plan``.
     out : Path, optional
-        Folder of the logs.
+        The folder; by default ``simulated/NAME``, after the flight.
     force : bool
     progress : Progress
         Gets the name of each log.
@@ -157,7 +155,8 @@ def run_simulate(
     site = choose_site(settings.site, flight.parent)
     simulator = FlightSimulator(settings, site, flight.parent)
     inputs = [flight, flight.parent / settings.site.file]
-    return simulator.run(out or flight.parent, inputs=inputs, force=force, progress=progress)
+    out = out or Path("simulated") / settings.flight.name
+    return simulator.run(out, inputs=inputs, force=force, progress=progress)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -52,7 +52,7 @@ LEAST_S = 0.25
 """A job that NumPy does in less stays there, whatever is loaded."""
 
 FIELD_S = 6e-7
-"""CPU seconds of NumPy per element pair of a link (``benchmarks/kernel.py``)."""
+"""CPU seconds of NumPy per element pair of a link (``benchmarks/replay.py``)."""
 MIRRORS_S = 1.6e-7
 """CPU seconds of NumPy per link and face, sequences of two reflections."""
 

@@ -14,7 +14,7 @@ import pytest
 
 from aerpaw_cmp.common import outputs
 from aerpaw_cmp.common.errors import OutputError, UsageError
-from aerpaw_cmp.common.outputs import SUMS, OutputFile, OutputFolder, OutputSet, is_sealed, sealed
+from aerpaw_cmp.common.outputs import SUMS, OutputFile, OutputFolder, is_sealed, sealed
 
 
 def write_file(target: Path, text: str = "new\n", **keys: object) -> None:
@@ -101,14 +101,12 @@ def test_what_comes_while_the_command_runs_is_not_replaced(tmp_path: Path) -> No
     assert content(tmp_path) == {"a.yaml": b"mine"}
 
 
-@pytest.mark.parametrize("kind", ["file", "folder", "set"])
+@pytest.mark.parametrize("kind", ["file", "folder"])
 def test_two_runs_into_one_place(tmp_path: Path, kind: str) -> None:
-    def output() -> OutputFile | OutputFolder | OutputSet:
+    def output() -> OutputFile | OutputFolder:
         if kind == "file":
             return OutputFile(tmp_path / "a", own=is_sealed)
-        if kind == "folder":
-            return OutputFolder(tmp_path / "a", job="test")
-        return OutputSet(tmp_path / "a", listing="truth.json", names=["log"])
+        return OutputFolder(tmp_path / "a", job="test")
 
     with output(), pytest.raises(UsageError, match="another run is writing here"), output():
         pass
@@ -333,71 +331,3 @@ def test_two_renames_where_the_system_cannot_exchange(
     assert found["a"] == (b"2" if step == 2 else b"1")
     assert set(found) == {"a", SUMS}
     assert [p.name for p in tmp_path.iterdir()] == ["report"]
-
-
-# --- a set ------------------------------------------------------------------------------------------------------------
-
-
-def write_set(folder: Path, files: dict[str, str], **keys: object) -> None:
-    with OutputSet(folder, listing="truth.json", names=list(files), **keys) as output:  # type: ignore[arg-type]
-        output.write({name: text.encode() for name, text in files.items()}, {"synthetic": True})
-
-
-def test_a_set_replaces_what_its_list_names(tmp_path: Path) -> None:
-    write_set(tmp_path / "logs", {"LW1/a.txt": "1", "b.txt": "1"})
-    write_set(tmp_path / "logs", {"LW1/a.txt": "2"})
-    assert set(content(tmp_path / "logs")) == {"LW1/a.txt", "b.txt", "truth.json"}  # b.txt: another flight's
-    write_set(tmp_path / "logs", {"b.txt": "2"})
-    (tmp_path / "logs" / "c.txt").write_text("raw")
-    for name in ("c.txt", "LW1/a.txt"):
-        (tmp_path / "logs" / name).write_text("raw")
-        with pytest.raises(UsageError, match="not marked as synthetic"):
-            write_set(tmp_path / "logs", {name: "3"})
-        assert (tmp_path / "logs" / name).read_text() == "raw"
-    write_set(tmp_path / "logs", {"c.txt": "3"}, force=True)
-    assert content(tmp_path / "logs")["LW1/a.txt"] == b"raw"  # not in the new set, and not ours
-    with pytest.raises(UsageError, match="replace an input"):
-        write_set(tmp_path / "logs", {"c.txt": "4"}, inputs=[tmp_path / "logs" / "c.txt"], force=True)
-
-
-_calls: list[Path] = []
-
-
-def dies_after(step: int, do: Callable[..., object]) -> Callable[..., object]:
-    """A method of Path that ends the process once as many calls of such methods were made."""
-
-    def counted(self: Path, *args: object, **keys: object) -> object:
-        if len(_calls) == step:
-            os._exit(9)
-        _calls.append(self)
-        return do(self, *args, **keys)
-
-    return counted
-
-
-def test_a_set_killed_at_every_step_is_of_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, step = tmp_path / "logs", 0
-    old, new = {"a": "old a", "b": "old b", "c": "old c"}, {"a": "new a", "b": "new b", "c": "new c", "d": "new d"}
-    while True:
-        shutil.rmtree(folder, ignore_errors=True)
-        write_set(folder, old)
-        child = os.fork()
-        if child == 0:
-            try:
-                for name in ("unlink", "replace", "rename"):
-                    monkeypatch.setattr(Path, name, dies_after(step, getattr(Path, name)))
-                write_set(folder, new)
-            finally:
-                os._exit(0)
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        seen = {name: text for name, text in content(folder).items() if "aerpaw" not in name and name != "truth.json"}
-        words = {text.split()[0] for text in seen.values()}
-        assert len(words) <= 1, (step, seen)
-        if "truth.json" in content(folder):  # then the set is whole
-            assert set(seen) == (set(old) if words == {b"old"} else set(new)), step
-        write_set(folder, new)
-        assert set(content(folder)) == {*new, "truth.json"}, step
-        if code == 0:
-            break
-        step += 1
-    assert step > 6

@@ -17,6 +17,7 @@ from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
 from tests.jobs.calibrated import calibrated
 from tests.json_page import unlisted
+from tests.simulated import simulate
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -64,7 +65,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("calibrate")
     for name in ROUTES:
         path = write(place / f"{name}.yaml", settings(name, {"model": "tr38901"}, YAW_DEG))
-        assert main(["simulate", str(path)]) == 0
+        simulate(path)
         write(path, settings(name, {"model": "iso"}))
     write(place / "calibration.yaml", {"calibration": "planted", "flights": ["first.yaml", "second.yaml"]})
     write(place / "aside_calibration.yaml", {"calibration": "aside", "flights": ["aside.yaml"]})

@@ -28,6 +28,7 @@ from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets,
 from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 from tests.json_page import unlisted
+from tests.simulated import simulate
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -79,7 +80,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for seed, name in enumerate(OFFSETS_DB, start=1):
         path = place / f"{name}.yaml"
         path.write_text(yaml.safe_dump(flight_settings(name, seed, YAW_DEG)), encoding="utf-8")
-        assert main(["simulate", str(path)]) == 0
+        simulate(path)
         path.write_text(yaml.safe_dump(flight_settings(name, seed, 0.0)), encoding="utf-8")
     return place
 
@@ -266,7 +267,7 @@ def test_a_planted_clock_shift_is_recovered_on_the_other_flight(folder: Path) ->
         settings = flight_settings(name, seed, YAW_DEG)
         settings["flight"]["plan"]["clock_shift_s"] = {"LW1": 1.5}
         (folder / f"late_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
-        assert main(["simulate", str(folder / f"late_{name}.yaml"), "-o", str(folder / "late")]) == 0
+        simulate(folder / f"late_{name}.yaml", folder / "late")
     path = write_campaign(
         folder,
         "late",
@@ -288,7 +289,7 @@ def test_a_lag_estimated_on_the_scored_samples_is_told(folder: Path) -> None:
         settings["rss"]["lag"] = "apply"
         settings["flight"]["plan"]["clock_shift_s"] = {"LW1": 1.5}
         (folder / f"apply_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
-        assert main(["simulate", str(folder / f"apply_{name}.yaml"), "-o", str(folder / "applied")]) == 0
+        simulate(folder / f"apply_{name}.yaml", folder / "applied")
     flights = ["apply_first.yaml", "apply_second.yaml"]
     campaign = load_campaign(
         write_campaign(folder, "apply", flights=flights, held_out={"fit": {YAW: [YAW_DEG]}, "fit_on": ["first"]})
@@ -519,7 +520,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
         settings["logs"] = [track, {"path": f"{name}/ri.csv", "reader": "quectel_ri", "node": "LW1"}]
         settings["rank"] = {"k": [10, 100], "advanced": {"bootstrap": 20}}
         (folder / f"rank_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
-        assert main(["simulate", str(folder / f"rank_{name}.yaml")]) == 0
+        simulate(folder / f"rank_{name}.yaml")
     found = result(folder, "ranks", "--export", "geojson", flights=["rank_first.yaml", "rank_second.yaml"])
     points = json.loads((folder / "ranks_out" / "exports" / "rank.geojson").read_text(encoding="utf-8"))["features"]
     for row in found["rank"]:

@@ -15,6 +15,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.jobs.reporting import explain
 from aerpaw_cmp.jobs.reporting.explain import run_explain
 from tests.json_page import unlisted
+from tests.simulated import simulate
 
 ANTENNA = {"layout": "single", "antenna": {"model": "dipole"}}
 SETTINGS = {
@@ -45,7 +46,7 @@ def flown(tmp_path_factory):
     folder = tmp_path_factory.mktemp("explain")
     path = folder / "flight.yaml"
     path.write_text(yaml.safe_dump(SETTINGS), encoding="utf-8")
-    assert main(["simulate", str(path), "--quiet"]) == 0
+    simulate(path)
     assert main(["report", str(path), "-o", str(folder / "out"), "--figures", "none", "--quiet"]) == 0
     return path, pd.read_csv(folder / "out" / "rss.csv")
 

@@ -17,6 +17,8 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.outputs import SUMS, changed_files, read_sums
+from aerpaw_cmp.flight.settings import load_flight
+from tests.simulated import simulate
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -94,19 +96,23 @@ def test_site_import_never_replaces_the_map(tmp_path: Path, capsys: pytest.Captu
     assert "--force" in refused(capsys, tmp_path, "site", "import", place, "-o", site)
 
 
-def test_simulate_writes_over_no_log_that_is_not_marked_synthetic(
-    logs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    said = refused(capsys, logs, "simulate", logs / "flight.yaml")
-    assert "not marked as synthetic" in said
+def test_simulate_replaces_its_own_folder_only(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Real logs stand in the flight's folder; a folder of simulated ones is a flight that a report takes."""
     out = logs.parent / "out"
-    assert main(["simulate", str(logs / "flight.yaml"), "-o", str(out)]) == 0
-    assert main(["simulate", str(logs / "flight.yaml"), "-o", str(out)]) == 0
+    assert "holds an input" in refused(capsys, logs, "simulate", logs / "flight.yaml", "-o", logs)
+    shutil.copytree(logs / "UAV", out / "UAV")
+    said = refused(capsys, out, "simulate", logs / "flight.yaml", "-o", out, "--force")
+    assert "did not write" in said
+    shutil.rmtree(out)
+    for _ in range(2):
+        assert main(["simulate", str(logs / "flight.yaml"), "-o", str(out)]) == 0
+    assert changed_files(out) == []
+    made, given = (load_flight(folder / "flight.yaml") for folder in (out, logs))
+    assert made == given
+    assert all((out / log.path).is_file() for log in made.logs)
     log = next(out.glob("UAV/*vehicleOut.txt"))
     log.write_bytes(log.read_bytes() + b"\n")
-    assert "not marked as synthetic" in refused(capsys, out, "simulate", logs / "flight.yaml", "-o", out)
-    said = refused(capsys, logs, "simulate", logs / "flight.yaml", "-o", logs)
-    assert "not marked as synthetic" in said
+    assert "was changed after" in refused(capsys, out, "simulate", logs / "flight.yaml", "-o", out)
 
 
 def test_simulate_writes_nothing_outside_its_folder(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -179,7 +185,7 @@ def tiny_flight(folder: Path) -> Path:
     ]
     content |= {"rt": {"engine": "image", "max_depth": 1, "audit_links": 0}, "rss": {"lag": "off"}}
     (folder / "flight.yaml").write_text(yaml.safe_dump(content))
-    assert main(["simulate", str(folder / "flight.yaml")]) == 0
+    simulate(folder / "flight.yaml")
     return folder / "flight.yaml"
 
 

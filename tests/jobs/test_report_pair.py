@@ -13,6 +13,7 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.report.exports.write import FORMATS
+from tests.simulated import simulate
 
 SETTINGS: dict[str, Any] = {
     "flight": {
@@ -53,7 +54,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("pair")
     path = folder / "flight.yaml"
     path.write_text(yaml.safe_dump(SETTINGS), encoding="utf-8")
-    assert main(["simulate", str(path), "--quiet"]) == 0
+    simulate(path)
     out = folder / "with", folder / "without"
     words = ["--figures", "none", "--quiet"]
     assert main(["report", str(path), "-o", str(out[0]), "--export", "all", *words]) == 0

@@ -16,6 +16,7 @@ from aerpaw_cmp.jobs.mapping.site_scene import SceneOptions, is_scene, run_scene
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.siteyaml import load_site
+from tests.simulated import simulate
 
 ROOM = """<scene version="2.1.0">
 <bsdf type="itu-radio-material" id="stone"><string name="type" value="marble"/><float name="thickness" value="0.2"/></bsdf>
@@ -131,7 +132,7 @@ FLIGHT = {
 def flown(room: Path, tmp_path: Path) -> Path:
     run_scene_import(room, tmp_path / "site.yaml", SceneOptions(origin="35.7,-78.7", towers=["T=-5,3,10"]))
     (tmp_path / "flight.yaml").write_text(yaml.safe_dump(FLIGHT))
-    assert main(["simulate", str(tmp_path / "flight.yaml"), "--quiet"]) == 0
+    simulate(tmp_path / "flight.yaml")
     return tmp_path / "flight.yaml"
 
 

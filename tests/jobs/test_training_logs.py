@@ -25,6 +25,7 @@ from aerpaw_cmp.jobs.diff_reports import run_diff
 from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankSamples
 from tests.jobs.calibrated import calibrated
 from tests.jobs.test_calibrate import YAW_DEG, settings, write
+from tests.simulated import simulate
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -37,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("training")
     for name in ("first", "second", "aside"):
         path = write(place / f"{name}.yaml", settings(name, {"model": "tr38901"}, YAW_DEG))
-        assert main(["simulate", str(path)]) == 0
+        simulate(path)
         write(path, settings(name, {"model": "iso"}))
     write(place / "calibration.yaml", {"calibration": "planted", "flights": ["first.yaml", "second.yaml"]})
     assert main(["calibrate", str(place / "calibration.yaml"), "-o", str(place / "calibrated.yaml")]) == 0

@@ -1,8 +1,8 @@
-"""Weights of the memories in ``aerpaw_cmp/compare/memory.py``: those whose 95 % intervals hold in every cell.
+"""Weights of the memories in ``aerpaw_cmp/compare/memory_weights.json``: those whose 95 % intervals hold in every cell.
 
 Sequences with AR(1) memory (and some with white noise besides) are simulated in cells of (samples, correlation of
 neighbours). The weights minimise the squared distance of every cell's coverage from 95 %, plus a little for the width
-of the intervals and for weights that are not smooth over the rate. Prints the table of the module, in tenths.
+of the intervals and for weights that are not smooth over the rate. Prints the table of that file, in tenths.
 
     python benchmarks/interval_weights.py mean|power|ratio [--sequences 300]
 """
@@ -119,7 +119,7 @@ def main() -> None:
         print(f"{100 * ((chance > TAIL) & (chance < 1 - TAIL)).mean():.1f}", end=" ")
     print()
     for row in np.round(10 * found.x.reshape(SHAPE)).astype(int).tolist():
-        print(tuple(row))
+        print(row)
 
 
 if __name__ == "__main__":

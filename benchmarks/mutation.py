@@ -44,7 +44,10 @@ import pytest
 ROOT = Path(__file__).parents[1]
 EQUIVALENT = Path(__file__).with_name("mutation_equivalent.txt")
 ROOMS = ("propagation", "compare", "flight", "maps")
-RULES = ("calibrate", "compare_flight", "levels", "audit_flight", "ladder", "flight_run", "over_flights")
+RULES = (
+    "learning/calibrate", "reporting/compare_flight", "reporting/levels", "reporting/audit_flight", "reporting/ladder",
+    "reporting/flight_run", "campaigns/over_flights",
+)  # fmt: skip
 """Modules of the room `jobs` that decide what is scored, and on what."""
 
 TESTS = (
@@ -53,11 +56,38 @@ TESTS = (
     "tests/test_equations.py",
     "tests/test_public_face.py",
 )
+_GROWTH, _ALIKE, _EDGES = (f"tests/propagation/test_{name}.py::test_" for name in ("growth", "compiled", "edges"))
+_BEAMS = (
+    *(f"{_GROWTH}only_a_convex_face_leaves_out_what_its_outline_covers[{name}]" for name in ("an L", "a frame")),
+    f"{_GROWTH}a_mirror_works_on_both_sides_and_hides_from_both", f"{_GROWTH}coincident_faces_give_one_path",
+    f"{_GROWTH}triangles_within_the_tolerance_are_one_face_and_others_are_not",
+    f"{_GROWTH}flipped_and_degenerate_triangles_change_nothing",
+    f"{_GROWTH}tilted_overlapping_open_quads_against_enumeration[0]",
+    f"{_GROWTH}tilted_overlapping_open_quads_against_enumeration[1]",
+    f"{_GROWTH}paths_can_be_recomputed_from_their_faces",
+    f"{_ALIKE}the_same_paths_at_any_depth_and_with_links_left_out[3]",
+    f"{_ALIKE}the_same_paths_among_aligned_and_touching_buildings[0]",
+    f"{_GROWTH}a_site_of_prisms_as_a_scene_has_the_paths_of_the_prism_engine",
+    f"{_GROWTH}prisms_by_beams_have_the_paths_of_the_image_engine[True]",
+)  # fmt: skip
+_OVER_EDGES = (
+    f"{_EDGES}the_border_of_a_sheet_is_a_half_plane", f"{_EDGES}a_link_turned_round_is_the_same",
+    f"{_EDGES}a_box_of_triangles_diffracts_as_a_prism",
+    f"{_EDGES}compiled_search_and_field_are_those_of_numpy",
+    f"{_EDGES}paths_of_every_kind_by_force[2-all]",
+)  # fmt: skip
 COMPILED = {
-    "aerpaw_cmp/propagation/field/kernels.py": ("tests/propagation/test_compiled.py",),
-    "aerpaw_cmp/propagation/search/boxtree.py": ("tests/propagation/test_growth.py",),
-}
-"""Of compiled code no line is seen running: these tests call it."""
+    "aerpaw_cmp/propagation/field/kernels.py": (
+        f"{_ALIKE}compiled_equals_numpy[False-one each]", f"{_ALIKE}compiled_equals_numpy[True-foreign]",
+        f"{_ALIKE}more_pairs_than_lanes_and_paths_in_any_order",
+    ),
+    "aerpaw_cmp/propagation/field/edge_kernels.py": _OVER_EDGES,
+    "aerpaw_cmp/propagation/search/edge_kernels.py": _OVER_EDGES,
+    "aerpaw_cmp/propagation/search/beams.py": _BEAMS,
+    "aerpaw_cmp/propagation/search/boxtree.py": _BEAMS,
+    "aerpaw_cmp/propagation/search/merging.py": _BEAMS,
+}  # fmt: skip
+"""Of compiled code no line is seen running: these tests call it, and it is interpreted for each mutant."""
 
 PRELOADED = (
     "numpy", "scipy.linalg", "scipy.signal", "scipy.spatial", "scipy.optimize", "scipy.stats", "pandas", "pytest",
@@ -370,7 +400,7 @@ class Trials:
             place = place_of(tree, of_code(tree)[mutant.node])
             near = within(self.budget_s, self.reach, mutant.path, None if place is None else place.lines)
             limit = 30 + 10 * sum(self.reach[name]["seconds"] for name in near)
-            if place is None or not near:
+            if place is None or not near or mutant.path in COMPILED:
                 tests = COMPILED.get(mutant.path) or tuple(near_tests(self.reach, mutant.path, None)[:MOST_ANEW])
                 kind = in_child(lambda one=mutant, those=tests: planted(one, one.source, those), limit + 300)
                 source = (ROOT / mutant.path).read_text(encoding="utf-8")
@@ -423,6 +453,9 @@ def within(budget_s: float, reach: Reach, path: str, lines: tuple[int, int] | No
 
 def planted(mutant: Mutant, source: str, tests: tuple[str, ...]) -> str:
     """In a child: whether a test fails when the module, and all that imports it, is imported anew from a source."""
+    if mutant.path in COMPILED:
+        numba = importlib.import_module("numba")
+        numba.config.DISABLE_JIT = True  # its cache would not see the change
     for name in [n for n in sys.modules if n.split(".")[0] in ("aerpaw_cmp", "aerpaw_parsers", "tests", "conftest")]:
         del sys.modules[name]
     sys.meta_path.insert(0, Planted(module_name(mutant.path), ROOT / mutant.path, source))

@@ -10,8 +10,10 @@ finds them by simulation). A flight that is one memory long gets a wide interval
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -32,25 +34,9 @@ WHITE_SHARES = (0.0, 2e-3, 3e-2)
 
 Kind = Literal["mean", "power", "ratio"]
 
-_TENTHS: dict[Kind, tuple[tuple[int, ...], ...]] = {
-    "mean": (
-        (-9, 15, 32, 24, 9, -4, -11, -8, 3, 23, 44, 29, 8, -6, -8, 3, 27, 62),
-        (-54, -41, -25, -2, 22, 23, 11, -1, -9, -13, -14, -15, -15, -14, -13, -11, -8, -6),
-        (-35, -35, -36, -35, -33, -29, -25, -20, -16, -13, -12, -12, -13, -13, -12, -10, -9, -6),
-    ),
-    "power": (
-        (-23, -1, 12, 1, -15, -26, -25, -13, 4, 15, 25, 23, 13, 5, 4, 11, 25, 45),
-        (-46, -33, -17, 2, 15, 10, -1, -3, -2, -3, -4, -5, -6, -7, -8, -7, -7, -6),
-        (-13, -17, -21, -24, -26, -26, -24, -21, -18, -14, -11, -9, -8, -8, -7, -7, -6, -5),
-    ),
-    "ratio": (
-        (-31, -25, -17, -5, 14, 39, 66, 71, 62, 57, 37, 11, -7, -16, -14, 0, 26, 63),
-        (-45, -40, -35, -28, -21, -15, -10, -8, -7, -7, -9, -12, -13, -14, -13, -11, -9, -7),
-        (-35, -35, -34, -32, -29, -24, -20, -16, -13, -11, -12, -13, -14, -14, -13, -11, -9, -7),
-    ),
-}
-"""Logarithms of the weights in tenths, by white share and rate; from 300 sequences in each of 54 cells of (samples,
-correlation of neighbours, white noise)."""
+_TENTHS = Path(__file__).with_name("memory_weights.json")
+"""Logarithms of the weights in tenths, by kind, white share and rate; from 300 sequences in each of 54 cells of
+(samples, correlation of neighbours, white noise)."""
 
 _PAIRS = 2048
 """Draws come in pairs of opposite sign, so that exchanging two models turns an interval about exactly."""
@@ -96,9 +82,11 @@ def _exponential(rate: float, terms: int) -> FloatArray:
     return np.asarray((np.diag(rate * np.where(order == 0, 2.0, 1.0) / pole) - ends) * np.outer(scale, scale))
 
 
+@cache
 def weights(kind: Kind) -> FloatArray:
     """Weight (m,) of each memory before any sample is seen."""
-    drawn = np.exp(0.1 * np.array(_TENTHS[kind], dtype=np.float64).ravel())
+    tenths = json.loads(_TENTHS.read_text(encoding="utf-8"))[kind]
+    drawn = np.exp(0.1 * np.array(tenths, dtype=np.float64).ravel())
     return np.asarray(drawn / drawn.sum())
 
 

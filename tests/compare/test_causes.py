@@ -6,7 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
+from scipy.stats import multivariate_normal
 
+from aerpaw_cmp.compare import causes
 from aerpaw_cmp.compare.causes import LevelEvidence, likely_cause
 from benchmarks.planted_causes import TROUBLES, flight
 
@@ -71,3 +74,151 @@ def test_too_few_samples_and_no_samples_accuse_nobody() -> None:
     assert likely_cause(silent).name == "none"
     short = np.arange(len(sound.time_s)) < 400  # 40 s
     assert likely_cause(replace(sound, measured_db=np.where(short, sound.measured_db + 9.0, np.nan))).name == "none"
+
+
+def _direction(degrees: np.ndarray) -> np.ndarray:
+    return degrees % 360.0
+
+
+def test_a_blocked_sector_comes_back_with_its_ends_and_loss() -> None:
+    sound = _evidence()
+    first = np.median(sound.tower_azimuth_deg) - 20.0
+    inside = (sound.tower_azimuth_deg - first) % 360.0 < 40.0
+    cause = likely_cause(replace(sound, measured_db=sound.measured_db - 12.0 * inside))
+    assert cause.name == "blocked"
+    assert cause.ci95[0] < cause.estimate < cause.ci95[1]
+    assert cause.estimate == pytest.approx(12.0, abs=2.0)
+    ends = [float(text) for text in cause.where.split(" to ")]
+    assert [_direction(end - start + 180.0) for end, start in zip(ends, (first, first + 40.0), strict=True)] == (
+        pytest.approx([180.0, 180.0], abs=8.0)
+    )
+    assert all(0.0 <= end < 360.0 for end in ends)
+
+
+def test_a_turned_antenna_another_tower_and_a_floor_come_back_as_planted() -> None:
+    sound = _evidence()
+    noise = sound.measured_db - sound.predicted_db
+    turned = likely_cause(replace(sound, measured_db=sound.measured_db + sound.turned_db[90.0]))
+    assert (turned.name, turned.estimate) == ("heading", pytest.approx(90.0, abs=10.0))
+    assert turned.ci95[0] < turned.estimate < turned.ci95[1]
+    swapped = likely_cause(replace(sound, measured_db=sound.other_towers_db["LW3"] + noise))
+    assert (swapped.name, swapped.where) == ("tower", "LW3")
+    floor = float(np.quantile(sound.measured_db, 0.4))
+    shown = np.maximum(sound.measured_db, floor) + np.random.default_rng(1).normal(0.0, 0.3, len(noise))
+    lost = likely_cause(replace(sound, measured_db=shown))
+    assert (lost.name, lost.estimate) == ("floor", pytest.approx(floor, abs=1.0))
+    for cause in (turned, swapped, lost):
+        assert cause.gain > causes.MARGIN
+        assert cause.rmse_with_db < 0.9 * cause.rmse_db
+
+
+def _residual(n: int = 80) -> tuple[np.ndarray, np.ndarray]:
+    generator = np.random.default_rng(4)
+    return np.cumsum(generator.normal(size=n)) + 3.0, generator.normal(size=(n, 2))
+
+
+@pytest.mark.parametrize("columns", [False, True])
+def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memory(columns: bool) -> None:
+    """Dense covariances phi^|i - j|, offset and coefficients by generalised least squares, the variance its own mean."""
+    residual, extra = _residual()
+    n = len(residual)
+    design = np.column_stack([np.ones(n), extra]) if columns else np.ones((n, 1))
+    best = (-np.inf, residual)
+    for phi in causes._PHI:
+        cover = phi ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / (1.0 - phi**2)
+        inverse = np.linalg.inv(cover)
+        coefficients = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ residual)
+        left = residual - design @ coefficients
+        variance = left @ inverse @ left / n
+        best = max(best, (multivariate_normal.logpdf(left, None, variance * cover), left), key=lambda one: one[0])
+    found = causes._fitted(residual, extra if columns else None)
+    assert found.log_likelihood == pytest.approx(best[0] + 0.5 * n * (np.log(2.0 * np.pi) + 1.0), abs=1e-6)
+    np.testing.assert_allclose(found.residual_db, best[1] - best[1].mean(), atol=1e-6)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.8])
+def test_shifts_are_those_of_least_squares_on_whitened_samples_with_an_offset(phi: float) -> None:
+    residual, _ = _residual()
+    masks = np.array([np.arange(80) >= 30, np.arange(80) % 7 < 3, np.zeros(80, dtype=bool)])
+    shift, taken = causes._shift(residual, masks, phi)
+    y = residual[1:] - phi * residual[:-1]
+    for k, mask in enumerate(masks[:2]):
+        design = np.column_stack([np.ones(79), mask[1:] - phi * mask[:-1]])
+        fit = lsq_linear(design, y)
+        assert shift[k] == pytest.approx(fit.x[1])
+        assert taken[k] == pytest.approx(np.square(y - y.mean()).sum() - 2.0 * fit.cost)
+        error = np.sqrt(2.0 * fit.cost / 79 * np.linalg.inv(design.T @ design)[1, 1])
+        assert causes._bounded(residual, mask, fit.x[1], phi) == pytest.approx(
+            (fit.x[1], fit.x[1] - 1.96 * error, fit.x[1] + 1.96 * error)
+        )
+    assert (shift[2], taken[2]) == (0.0, 0.0)
+
+
+def test_a_second_is_the_mean_of_its_samples_and_directions_turn_the_short_way() -> None:
+    time = np.arange(0.0, 90.0, 0.25)
+    level = np.sin(time)
+    level[5] = np.nan
+    around = 180.0 + 20.0 * np.cos(5.0 * time)  # on both sides of where angles jump
+    whole = replace(
+        _evidence(), time_s=time, measured_db=level, predicted_db=0.5 * time, uav_azimuth_deg=around,
+        uav_elevation_deg=time, tower_azimuth_deg=around - 180.0, turned_db={10.0: level + 1.0}, other_towers_db={"B": -time},
+    )  # fmt: skip
+    found = causes._binned(whole)
+    assert found is not None
+    for second in range(90):
+        some = [k for k in range(len(time)) if second <= time[k] < second + 1 and np.isfinite(level[k])]
+        assert found.measured_db[second] == pytest.approx(np.mean(level[some]))
+        assert found.predicted_db[second] == pytest.approx(np.mean(0.5 * time[some]))
+        assert found.other_towers_db["B"][second] == pytest.approx(-np.mean(time[some]))
+        assert _direction(found.uav_azimuth_deg[second]) == pytest.approx(np.mean(around[some]), abs=0.2)
+        assert found.tower_azimuth_deg[second] == pytest.approx(np.mean(around[some]) - 180.0, abs=0.2)
+    few = replace(whole, measured_db=np.where(time < causes.FEWEST_BINS - 1, level, np.nan))
+    enough = replace(whole, measured_db=np.where(time < causes.FEWEST_BINS, level, np.nan))
+    assert causes._binned(few) is None
+    assert causes._binned(enough) is not None
+
+
+def test_a_range_reaches_half_way_to_the_values_that_are_less_likely() -> None:
+    """Within half of chi-squared's 95 % point, 1.92, a value is as good as the best; at the end of the scale it ends there."""
+    heights = {0.0: -9.0, 1.0: -1.9, 2.0: 0.0, 4.0: -1.5, 8.0: -2.0}
+    fits = {value: causes._Fit(height, np.zeros(3)) for value, height in heights.items()}
+    assert causes._profiled("lag", fits)[:3] == ("lag", (2.0, 0.5, 6.0), "")
+    del fits[0.0], fits[8.0]
+    assert causes._profiled("lag", fits)[1] == (2.0, 1.0, 4.0)
+
+
+def test_above_a_floor_the_offset_is_that_of_the_samples_above_it() -> None:
+    """Planted: predicted levels 10 dB too high, a floor at -90 dB, and a spread of its own on either side."""
+    generator = np.random.default_rng(6)
+    sound = causes._binned(_evidence())
+    assert sound is not None
+    predicted = np.linspace(-100.0, -60.0, len(sound.time_s)) + generator.normal(0, 4, len(sound.time_s))
+    above = predicted - 10.0 > -90.0
+    noise = generator.normal(0.0, np.where(above, 2.0, 0.5))
+    planted = replace(sound, predicted_db=predicted, measured_db=np.maximum(predicted - 10.0, -90.0) + noise)
+    fit = causes._above_floor(planted, -90.0)
+    np.testing.assert_allclose(fit.residual_db, noise - noise[above].mean() * above, atol=0.25)
+    above = planted.measured_db - fit.residual_db > -90.0 + 1e-9
+    spread = np.where(above, fit.residual_db[above].std(), fit.residual_db[~above].std())
+    expected = causes._fitted(fit.residual_db / spread).log_likelihood - np.log(spread).sum()
+    assert fit.log_likelihood == pytest.approx(expected)
+    assert causes._above_floor(planted, -40.0).log_likelihood == -np.inf, "nothing lies above"
+    assert causes._above_floor(planted, -85.0).log_likelihood == -np.inf, "levels lie far below"
+    assert causes._floored(planted)[1][0] == pytest.approx(-90.0, abs=1.0)
+
+
+def test_harmonics_are_two_of_the_azimuth_and_two_powers_of_the_elevation() -> None:
+    sound = causes._binned(_evidence())
+    assert sound is not None
+    around, up = np.radians(sound.uav_azimuth_deg), np.radians(sound.uav_elevation_deg)
+    columns = causes._harmonics(sound)
+    assert np.abs(columns.mean(axis=0)).max() < 1e-12
+    for law in (
+        np.cos(around - 1.0),
+        np.sin(around) * np.cos(around),
+        np.cos(2.0 * around),
+        np.sin(up),
+        np.cos(up) ** 2,
+    ):
+        rest = np.linalg.lstsq(np.column_stack([columns, np.ones(len(up))]), law, rcond=None)[1]
+        assert rest == pytest.approx(0.0, abs=1e-9)

@@ -84,6 +84,13 @@ def test_values_land_where_they_belong(result):
     assert np.isnan(result.condition_db[2, 0][~seen]).all()
 
 
+def test_borders_part_equally_near_towers_and_end_at_the_edge_of_the_outer_cells(result):
+    ends = np.concatenate([border.line_m for border in result.borders])
+    away = [np.linalg.norm(ends - TOWERS[name][:2], axis=1) for name in ("A", "B")]
+    np.testing.assert_allclose(*away, atol=1e-6)
+    np.testing.assert_allclose(np.abs(ends).max(axis=1), GRID.east_m.max() + GRID.spacing_m / 2)
+
+
 def test_chunks_do_not_change_the_result(result):
     other = map_job(
         GRID, TOWERS, Engine(), rss_altitudes_m=(30, 70), rank_altitudes_m=(3, 30, 40, 50), ks=(10, 100), chunk=400

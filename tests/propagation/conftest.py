@@ -127,6 +127,7 @@ class Helpers:
     keys = staticmethod(path_keys)
     brute_force = staticmethod(brute_force)
     covered = staticmethod(_covered)
+    on_face = staticmethod(_on_face)
     carrier_hz = CARRIER_HZ
 
 

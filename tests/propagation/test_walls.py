@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -188,6 +189,44 @@ def test_parts_and_moving_towers_keep_the_paths() -> None:
         assert other.h == pytest.approx(whole.h, rel=1e-9)
         assert other.through is not None
         assert np.array_equal(np.bincount(other.through.paths.pose), np.bincount(whole.through.paths.pose))
+
+
+@pytest.mark.parametrize(("houses", "seen"), [(4, True), (5, False)])
+def test_eight_walls_are_passed_and_ten_are_not(houses: int, seen: bool) -> None:
+    """Each house takes the same two walls from the level ray; one more house than four takes the path."""
+    row = tuple(Building(f"{k}", box(20.0 + 9 * k, -9, 25.0 + 9 * k, 9), 20.0, material="wood") for k in range(houses))
+    lit = run(dataclasses.replace(town(), buildings=row), [100.0, 0.0, 10.0])
+    one, open_ = (run(dataclasses.replace(town(), buildings=row[:k]), [100.0, 0.0, 10.0]).h.item() for k in (1, 0))
+    assert lit.has_path.item() == seen
+    assert lit.h.item() == pytest.approx((one / open_) ** houses * open_ if seen else 0.0, rel=1e-9)
+
+
+def test_steps_of_a_path_are_its_walls_in_order_and_roofs_count() -> None:
+    """Each leg of a bent path cut with the boxes by shares: from the roof of the low one to the wall of the high one."""
+    boxes = [((20.0, -30.0), (30.0, 30.0), 9.0), ((60.0, -30.0), (70.0, 30.0), 12.0)]
+    row = tuple(Building(f"{k}", box(*low, *high), top, material="wood") for k, (low, high, top) in enumerate(boxes))
+    target = np.array([90.0, 8.0, 6.0])
+    found = run(dataclasses.replace(town(), buildings=row), target, max_depth=1)
+    assert found.through is not None
+    paths, kinds = found.through.paths, set()
+    for k in range(len(paths)):
+        depth = int(paths.depth[k])
+        faces, points = paths.faces[k, :depth], paths.vertices_m[k, :depth]
+        own = faces < len(found.through.faces) // 2
+        corners = np.array([[0.0, 0.0, 10.0], *points[own], target])
+        expected = []
+        for a, b in itertools.pairwise(corners):
+            shares = [0.0, 1.0]
+            for low, high, top in boxes:
+                with np.errstate(divide="ignore"):
+                    at = np.sort((np.array([[*low, -50.0], [*high, top]]) - a) / (b - a), axis=0)
+                enter, leave = at[0].max(), at[1].min()
+                if max(enter, 0.0) < min(leave, 1.0) - 1e-9:
+                    shares += [s for s in (enter, leave) if 0 < s < 1]
+            expected += [a + s * (b - a) for s in sorted(shares)[1:-1]] + [b]
+        assert np.abs(points - np.array(expected[:-1])).max() < 1e-9
+        kinds.add((int(own.sum()), int((~own).sum())))
+    assert {(0, 4), (1, 4)} <= kinds
 
 
 def test_the_audit_names_links_with_paths_through_walls_and_checks_the_others() -> None:

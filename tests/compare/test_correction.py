@@ -1,0 +1,176 @@
+"""The choice of a base and its correction: folds, scores and standard deviations a second way, by plain NumPy."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.compare import correction
+from aerpaw_cmp.compare.correction import BIN_S, BLOCK_M, OFF, Base, Channel, choose, fixed_base
+from aerpaw_cmp.compare.direction_gain import LinkSamples
+from aerpaw_cmp.compare.field_gp import FieldFit, FieldModel, Rows
+
+
+def samples(name: str, residual: FloatArray, place: FloatArray, channel: str = "A") -> LinkSamples:
+    """One sample in 4 s, so that bins change nothing."""
+    n = len(residual)
+    ahead = np.tile([1.0, 0.0, 0.0], (n, 1))
+    return LinkSamples(name, "T", channel, BIN_S * np.arange(n) + 0.5, place, ahead, -ahead, residual)
+
+
+def lawnmower(n: int, height: float = 40.0) -> FloatArray:
+    leg, part = np.divmod(np.linspace(0.0, 4.0, n, endpoint=False), 1.0)
+    return np.column_stack([np.where(leg % 2 == 0, part, 1 - part) * 280.0, leg * 60.0, np.full(n, height)])
+
+
+def flight(name: str, seed: int, channel: str = "A", field_db: float = 0.0) -> LinkSamples:
+    """Planted: a wave over the places that every flight meets, an offset of the flight, noise of 1 dB."""
+    generator, place = np.random.default_rng(seed), lawnmower(80)
+    wave = field_db * np.sin(place[:, 0] / 40.0) * np.cos(place[:, 1] / 50.0)
+    return samples(name, wave + generator.normal(0, 3) + generator.normal(0.0, 1.0, 80), place, channel)
+
+
+def gain(one: LinkSamples) -> FloatArray:
+    """A base that is wrong by a slope over the east."""
+    return np.asarray(0.02 * one.position_m[:, 0])
+
+
+FEW = {OFF: correction._STARTS[OFF], "field": FieldModel(place_sd_db=2.5, length_m=50.0, height_m=40.0, turn=math.inf)}
+
+
+@pytest.fixture(autouse=True)
+def few_titles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two in place of five, whose scales are as given: a fit of the nuisances takes seconds."""
+    monkeypatch.setattr(correction, "_STARTS", FEW)
+    monkeypatch.setattr(correction, "fit_field", lambda *given: given[1])
+
+
+def test_flights_are_asked_of_others_and_a_single_one_block_by_block() -> None:
+    three = [
+        flight(name, k, channel) for k, (name, channel) in enumerate([("a", "A"), ("a", "B"), ("b", "A"), ("c", "A")])
+    ]
+    folds = correction._folds(three)
+    assert [[s.flight for s in fold.asked] for fold in folds] == [["a", "a"], ["b"], ["c"]]
+    for fold in folds:
+        assert {s.flight for s in fold.known} | {s.flight for s in fold.asked} == {"a", "b", "c"}
+        assert not {s.flight for s in fold.known} & {s.flight for s in fold.asked}
+    place = np.random.default_rng(1).uniform(0, [900, 900, 1], (400, 3))
+    alone = samples("a", np.arange(400.0), place)
+    folds = correction._folds([alone])
+    counts = [len(fold.asked[0]) for fold in folds]
+    assert len(folds) == 6  # the fullest of nine blocks
+    assert counts == sorted(counts, reverse=True)
+    for fold in folds:
+        (asked,), (known,) = fold.asked, fold.known
+        assert len(asked) + len(known) == 400
+        assert sorted([*asked.residual_db, *known.residual_db]) == list(range(400))
+        block = {tuple(row) for row in (asked.position_m[:, :2] // BLOCK_M).tolist()}
+        assert len(block) == 1
+        assert block.isdisjoint(map(tuple, (known.position_m[:, :2] // BLOCK_M).tolist()))
+
+
+def test_blocks_spread_by_their_means() -> None:
+    place = np.array([[10.0, 10, 5], [290, 290, 5], [310, 10, 5], [-10, 10, 5], [-20, 10, 5]])
+    rows = Rows.of(samples("a", np.zeros(5), place), 0)
+    channel = Channel(rows=rows, left_db=np.array([1.0, 3.0, 5.0, -2.0, -4.0]), base_sd_db=np.zeros(5))
+    assert correction.between_blocks_db(channel) == pytest.approx(np.std([2.0, 5.0, -3.0], ddof=1))
+    one = Channel(rows=rows.part(slice(0, 2)), left_db=channel.left_db[:2], base_sd_db=np.zeros(2))
+    assert correction.between_blocks_db(one) == 0.0
+
+
+def by_hand(series: Sequence[LinkSamples], base: Base, model: FieldModel) -> tuple[FloatArray, FloatArray]:
+    """Errors of every flight from a fit to the others about its own mean, and the standard deviations."""
+    errors, sds = [], []
+    for name in dict.fromkeys(s.flight for s in series):
+        known, asked = [s for s in series if s.flight != name], [s for s in series if s.flight == name]
+        predictor = base(known)
+        for one in asked:
+            same = [s for s in known if s.antenna == one.antenna]
+            if not same:
+                errors.append(np.full(len(one), np.nan))
+                sds.append(np.ones(len(one)))
+                continue
+            names = list(dict.fromkeys(s.flight for s in known))
+            rows = Rows.joined([Rows.of(s, names.index(s.flight)) for s in same])
+            left = np.concatenate([s.residual_db - predictor(s)[0] for s in same])
+            mean, sd = FieldFit(model, rows, left).predict(Rows.of(one, -1), ("place", "drift"))
+            level, level_sd = predictor(one)
+            error = one.residual_db - level - mean
+            errors.append(error - error.mean())
+            sds.append(np.sqrt(sd**2 + level_sd**2 + model.noise_sd_db**2))
+    return np.concatenate(errors), np.concatenate(sds)
+
+
+def unsure(known: Sequence[LinkSamples]) -> object:
+    del known
+    return lambda one: (gain(one), np.full(len(one), 1.5))
+
+
+@pytest.mark.parametrize("base", [fixed_base(gain), unsure])
+def test_what_is_left_out_is_scored_as_by_hand(base: Base) -> None:
+    """Two flights share antenna A, the third alone has B: it is scored by nobody."""
+    series = [flight("a", 1), flight("b", 2), flight("c", 3, "B")]
+    found = choose(series, {"made": base})
+    for title, model in FEW.items():
+        assert model is not None
+        error, sd = by_hand(series, base, model)
+        got, stated = found.held_out["made", title]
+        np.testing.assert_allclose(got, error, atol=1e-9)
+        np.testing.assert_allclose(stated, found.sd_factor * sd, rtol=1e-9)
+        good = np.isfinite(error)
+        assert good.sum() == 160
+        assert found.rmse_db["made", title] == pytest.approx(np.sqrt(np.mean(error[good] ** 2)))
+        z = error[good] / sd[good]
+        crps = sd[good] * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))
+        assert found.crps_db["made", title] == pytest.approx(crps.mean())
+    error, sd = by_hand(series, base, FEW[found.title])  # type: ignore[arg-type]
+    ratio = np.sqrt(np.nanmean((error / sd) ** 2))
+    assert found.sd_factor == pytest.approx(min(max(ratio, 0.8), 1.6))
+
+
+def test_a_field_is_added_where_one_was_planted_and_the_nearer_base_wins() -> None:
+    bases = {"wrong": fixed_base(gain), "none": fixed_base(lambda one: np.zeros(len(one)))}
+    plain = choose([flight(name, k) for k, name in enumerate("abc")], bases)
+    waves = choose([flight(name, k, field_db=4.0) for k, name in enumerate("abc")], bases)
+    assert (plain.base, plain.title, plain.on) == ("none", OFF, False)
+    assert (waves.title, waves.on) == ("field", True)
+    assert waves.rmse_db["none", "field"] < 0.7 * waves.rmse_db["none", OFF]
+    asked = flight("b", 9, field_db=4.0)
+    level, sd = waves.predict(asked)
+    assert np.corrcoef(level, asked.residual_db)[0, 1] > 0.8
+    channel = waves.channels["T.A"]
+    assert len(channel.left_db) == 240
+    # of a flown flight its offset is known; of a new one it is not, unless samples count about their own mean
+    new, own = waves.predict(asked, "b")[1], waves.predict(asked, own_mean=True)[1]
+    assert (new < sd).all()
+    assert (own < sd).all()
+    fit = FieldFit(waves.model, channel.rows, channel.left_db).predict(Rows.of(asked, -1), exact=True)
+    expected = waves.sd_factor * np.sqrt(fit[1] ** 2 + waves.model.noise_sd_db**2)
+    np.testing.assert_allclose(sd, expected, rtol=1e-6)
+    np.testing.assert_allclose(level, fit[0] + waves.predictor(asked)[0], atol=1e-6)
+    with pytest.raises(InputError, match=r"no flight has T\.Z"):
+        waves.predict(dataclasses.replace(asked, channel="Z"))
+
+
+def test_headings_that_count_alike_add_their_spread() -> None:
+    found = choose([flight(name, k) for k, name in enumerate("ab")], {"made": fixed_base(gain)})
+    here = flight("n", 5)
+    turned = dataclasses.replace(
+        here, position_m=here.position_m + np.array([100.0, 0.0, 0.0])
+    )  # a gain that is 2 dB higher
+    level, sd = found.over_headings([here, turned])
+    one, one_sd = found.predict(here)
+    np.testing.assert_allclose(level, one + 1.0, atol=1e-9)
+    np.testing.assert_allclose((sd / found.sd_factor) ** 2, (one_sd / found.sd_factor) ** 2 + 1.0, rtol=1e-9)
+
+
+def test_nothing_to_learn_from_is_one_message() -> None:
+    with pytest.raises(InputError, match="no sample has a level and a pose"):
+        choose([samples("a", np.full(9, np.nan), np.zeros((9, 3)))], {"made": fixed_base(gain)})

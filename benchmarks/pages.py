@@ -5,11 +5,10 @@ the second frame after the page's script is done; "main thread" is the processor
 does not grow with what else the machine does. Limits: report 4 MB (sample) and 8 MB (50 000 samples), map 8 MB,
 campaign 5 MB, all below 2 s.
 
-    python benchmarks/pages.py [--only report,long,map,campaign,real] [--map PAGE] [--flights 200] [--settings 20]
+    python benchmarks/pages.py [--only report,long,map,campaign] [--map PAGE] [--flights 200] [--settings 20]
                                [--repeats 3] [--json]
 
-``map`` makes the paper's map without its study (minutes), or opens the page given by ``--map``; ``real`` simulates
-three flights from the sample's plan, reports one of them and runs a campaign of two settings over all.
+``map`` makes the paper's map without its study (minutes), or opens the page given by ``--map``.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 MB = 1e6
-LIMIT_MB = {"report": 4.0, "long": 8.0, "map": 8.0, "campaign": 5.0, "real": 5.0}
+LIMIT_MB = {"report": 4.0, "long": 8.0, "map": 8.0, "campaign": 5.0}
 LIMIT_S = 2.0
 READY = {
     "report.html": "window.explorer",
@@ -91,34 +90,6 @@ def campaign_page(folder: Path, flights: int, settings: int) -> tuple[Path, dict
     return page, {"rows": len(data.rss), "write_cpu_s": time.process_time() - begin}
 
 
-def real_campaign(folder: Path, interval_s: float = 2.0) -> Path:
-    """Three flights of the sample's plan on three days, a sample every so often, two settings, one with its report."""
-    content = yaml.safe_load((ROOT / "sample_logs" / "flight.yaml").read_text())
-    content["rt"] = {**content.get("rt", {}), "audit_links": 0}
-    for number in range(3):
-        content["flight"]["name"] = f"day_{number + 1}"
-        content["flight"]["plan"] |= {
-            "seed": 7 + number,
-            "start": f"2025-06-0{number + 1} 10:00:00",
-            "rss_interval_s": interval_s,
-            "rank_interval_s": interval_s,
-        }
-        place = folder / f"day_{number + 1}"
-        place.mkdir()
-        (place / "flight.yaml").write_text(yaml.safe_dump(content))
-        command("simulate", str(place / "flight.yaml"), "-o", str(place / "flown"))
-    campaign = {
-        "campaign": "three_days",
-        "flights": [f"day_{number + 1}/flown/flight.yaml" for number in range(3)],
-        "settings": {"as written": {}, "line of sight": {"rt.max_depth": 0}},
-        "calibration": "channel",
-    }
-    (folder / "campaign.yaml").write_text(yaml.safe_dump(campaign))
-    command("report", str(folder / "day_1" / "flown" / "flight.yaml"), "-o", str(folder / "reports" / "day_1"))
-    command("campaign", str(folder / "campaign.yaml"), "-o", str(folder / "reports" / "three_days"), "--fresh")
-    return folder / "reports" / "three_days" / "campaign.html"
-
-
 # --- the browser ------------------------------------------------------------------------------------------------------
 
 
@@ -154,7 +125,7 @@ def opened(page: Path, repeats: int) -> dict[str, float]:
 def main() -> None:
     """Make the pages, open them, print the table; exit code 1 where a limit is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="report,long,map,campaign,real")
+    parser.add_argument("--only", default="report,long,map,campaign")
     parser.add_argument("--map", type=Path, help="a map.html that was made before")
     parser.add_argument("--flights", type=int, default=200)
     parser.add_argument("--settings", type=int, default=20)
@@ -174,7 +145,7 @@ def main() -> None:
             elif kind == "map" and arguments.map:
                 page = arguments.map
             else:
-                make = {"report": report_page, "long": long_page, "map": map_page, "real": real_campaign}[kind]
+                make = {"report": report_page, "long": long_page, "map": map_page}[kind]
                 page = make(place)
             rows[kind] = {"mb": page.stat().st_size / MB, **opened(page, arguments.repeats), **more}
             rows[kind]["ok"] = rows[kind]["mb"] <= LIMIT_MB[kind] and rows[kind]["usable_s"] < LIMIT_S

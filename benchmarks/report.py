@@ -5,7 +5,6 @@
 2. The sample flight: seconds and peak memory; the same without audit.
    The first and the second report of part 1, as it comes and with ``--audit later``, caches empty before the first:
    over those imports, and over the imports without Sionna, which such a report does not load.
-3. The second report of a flight over the first, ``sionna`` engine, path cache empty before the first.
 
     python benchmarks/report.py [--quick] [--json]
 """
@@ -83,9 +82,9 @@ def cold_and_warm(flight: Path, options: list[str], folder: Path, repeats: int) 
 
 
 def main() -> None:
-    """Print the three parts."""
+    """Print both parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one run of each, 1e4 samples in part 3")
+    parser.add_argument("--quick", action="store_true", help="one run of each")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     repeats = 1 if arguments.quick else 3
@@ -97,24 +96,6 @@ def main() -> None:
         for number in range(repeats):  # in turns: a machine that slows down slows both
             imports.append(run([sys.executable, "-c", IMPORTS]))
             reports.append(run(report(flight, folder / f"r{number}", *options)))
-        cold = str(folder / "cache")
-        content = yaml.safe_load(flight.read_text())
-        content["rt"] = {
-            **content.get("rt", {}),
-            "audit_links": 0,
-            "advanced": {"samples": 10_000 if arguments.quick else 1_000_000},
-        }
-        traced = folder / "sionna.yaml"
-        if options:
-            traced.write_text(yaml.safe_dump(content))
-        else:
-            traced = flight.with_name("sionna.yaml")
-            traced.write_text(yaml.safe_dump(content))
-        both = [
-            run(report(traced, folder / "s", "--engine", "sionna", *options, "--json"), AERPAW_CMP_CACHE=cold)
-            for _ in range(2)
-        ]
-        stages = json.loads((folder / "s" / "metrics.json").read_text())["stages"]
         some = ROOT / "sample_logs" / "flight.yaml"
         sample = run(report(some, folder / "sample"))
         sample_later = run(report(some, folder / "sample_later", "--audit", "later"))
@@ -133,18 +114,11 @@ def main() -> None:
         "sample_later": sample_later,
         "now": now,
         "later": later,
-        "second_report": {
-            "first_s": both[0]["wall_s"],
-            "second_s": both[1]["wall_s"],
-            "times_faster": both[0]["wall_s"] / both[1]["wall_s"],
-            "second_replay_s": stages.get("replay_s"),
-            "samples": content["rt"]["advanced"]["samples"],
-        },
     }
     if arguments.json:
         print(json.dumps(result, indent=1))
         return
-    one, two, three = result["two_channels"], result["sample"], result["second_report"]
+    one, two = result["two_channels"], result["sample"]
     print(
         f"report of {one['flight']}: {one['report_s']:.1f} s, "
         f"{one['ratio']:.2f} x the imports of {one['imports_s']:.1f} s ({one['ratio_cpu']:.2f} x in processor time)"
@@ -155,10 +129,6 @@ def main() -> None:
     for name, row in {**now, **{f"{key}, --audit later": row for key, row in later.items()}}.items():
         print(f"{name}: {row['cpu_s']:.1f} s of processor ({row['wall_s']:.1f} s), {row['ratio']:.2f} x "
               f"the imports, {row['ratio_light']:.2f} x the imports without Sionna")  # fmt: skip
-    print(
-        f"second report, sionna, {three['samples']} samples: {three['first_s']:.1f} s, then {three['second_s']:.1f} s,"
-        f" {three['times_faster']:.1f} times faster (replay stage of the second: {three['second_replay_s']:.2f} s)"
-    )
 
 
 if __name__ == "__main__":

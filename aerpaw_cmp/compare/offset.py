@@ -7,16 +7,13 @@ at, not a result.
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.errors import InputError
 from ..common.units import FloatArray
 
 SPAN_DB = (-50.0, 50.0)
@@ -428,161 +425,3 @@ def pooled_moments(
             rmse = float(np.hypot(np.sqrt(own.variance_db2), own.mean_db - offset))
             fits[key] = OffsetFit(offset, rmse, own.n, at_edge)
     return {key: fits[key] for key in moments}
-
-
-@dataclass(frozen=True, slots=True)
-class ReferencePower:
-    """Reference power of one USRP setting.
-
-    Parameters
-    ----------
-    node, category, channel : str
-        Such as ``"lw1"``, ``"rx"``, ``"ch0"``.
-    amplifier : bool
-        Whether the power amplifier (or LNA) was on.
-    gain_db : float
-        USRP gain setting.
-    frequencies_hz, power_dbm : (f,)
-        Power that corresponds to full scale [dBm] at each carrier; NaN where not measured.
-    """
-
-    node: str
-    category: str
-    channel: str
-    amplifier: bool
-    gain_db: float
-    frequencies_hz: FloatArray
-    power_dbm: FloatArray
-
-    def at(self, frequency_hz: float) -> float:
-        """Reference power [dBm] at a carrier, interpolated; NaN outside the measured carriers."""
-        good = np.isfinite(self.power_dbm)
-        if not good.any():
-            return float("nan")
-        where, level = self.frequencies_hz[good], self.power_dbm[good]
-        return float(np.interp(frequency_hz, where, level, left=np.nan, right=np.nan))
-
-
-def read_reference_powers(path: str | Path) -> list[ReferencePower]:
-    """USRP reference powers from a CSV ``Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz,...``.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, a column is missing or a number is none; with the line.
-    """
-    try:
-        with Path(path).open(newline="", encoding="utf-8") as handle:
-            rows = list(csv.reader(handle))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read reference powers: {error}", path=path) from None
-    header = rows[0] if rows else []
-    fixed = ["Node", "Category", "Channel", "PA_Enabled", "Gain"]
-    carriers = [name for name in header[5:] if name.startswith("Freq_") and name.endswith("GHz")]
-    if header[:5] != fixed or not carriers or len(carriers) != len(header) - 5:
-        raise InputError("no table of reference powers", expected=",".join([*fixed, "Freq_3.30GHz", "..."]), path=path)
-    try:
-        frequencies = np.array([round(float(name[5:-3]) * 1e9) for name in carriers], dtype=np.float64)
-    except ValueError:
-        raise InputError(f"unreadable carrier in {carriers}", expected="Freq_3.30GHz", path=path, line=1) from None
-    powers = []
-    for line, row in enumerate(rows[1:], start=2):
-        if not row:
-            continue
-        try:
-            levels = np.array([float(cell) if cell.strip() else np.nan for cell in row[5:]])
-            if len(levels) != len(frequencies):
-                raise ValueError(f"{len(row)} columns where the header has {len(header)}")
-            amplifier, gain = bool(int(row[3])), float(row[4])
-        except (ValueError, IndexError) as error:
-            raise InputError(f"unreadable row: {error}", expected="numbers", path=path, line=line) from None
-        powers.append(
-            ReferencePower(
-                node=row[0].lower(),
-                category=row[1].lower(),
-                channel=row[2].lower(),
-                amplifier=amplifier,
-                gain_db=gain,
-                frequencies_hz=frequencies,
-                power_dbm=levels,
-            )
-        )
-    return powers
-
-
-def reference_power_dbm(
-    table: Iterable[ReferencePower],
-    *,
-    node: str,
-    category: Literal["tx", "rx"],
-    channel: str,
-    gain_db: float,
-    frequency_hz: float,
-    amplifier: bool = False,
-) -> float:
-    """The reference power [dBm] of one setting, at the nearest gain within 0.5 dB; NaN where the table has none.
-
-    Parameters
-    ----------
-    table : iterable of ReferencePower
-        As :func:`read_reference_powers` gives it.
-    node, channel : str
-        Of the USRP port; capitals do not count.
-    category : {"tx", "rx"}
-    gain_db : float
-        Gain setting of the port.
-    frequency_hz : float
-        Carrier; between the columns of the table powers are interpolated.
-    amplifier : bool
-        Whether the power amplifier was on.
-
-    Returns
-    -------
-    float
-        [dBm]
-    """
-    wanted = (node.lower(), category, channel.lower(), amplifier)
-    rows = [row for row in table if (row.node, row.category, row.channel, row.amplifier) == wanted]
-    near = sorted(
-        (abs(row.gain_db - gain_db), row.at(frequency_hz)) for row in rows if abs(row.gain_db - gain_db) <= 0.5
-    )
-    return near[0][1] if near else float("nan")
-
-
-def expected_offset_db(
-    *,
-    receiver_reference_dbm: float,
-    transmitter_reference_dbm: float = 0.0,
-    simulated_transmit_dbm: float = 0.0,
-    transmit_amplitude_dbfs: float = 0.0,
-    transmit_gain_db: float = 0.0,
-    receive_gain_db: float = 0.0,
-) -> float:
-    """Offset that the link budget predicts for a measurement in dB re full scale.
-
-    Parameters
-    ----------
-    receiver_reference_dbm : float
-        Power at the receiver's port that reads 0 dB re full scale [dBm].
-    transmitter_reference_dbm : float
-        Power at the transmitter's port at full scale [dBm].
-    simulated_transmit_dbm : float
-        Transmit power that the simulation assumed [dBm] (0 for a unit-power path gain in dB).
-    transmit_amplitude_dbfs : float
-        Digital amplitude of the waveform [dB re full scale].
-    transmit_gain_db, receive_gain_db : float
-        Amplifiers, minus cables, between port and antenna that the simulation does not contain [dB].
-
-    Returns
-    -------
-    float
-        ``measured + offset`` then is the simulated level: the measured level in dBm is ``reading + receiver
-        reference - receive gain``, and the simulation errs by its transmit power.
-
-    Examples
-    --------
-    >>> expected_offset_db(receiver_reference_dbm=-40.0, transmitter_reference_dbm=10.0, simulated_transmit_dbm=40.0)
-    -10.0
-    """
-    transmitted = transmitter_reference_dbm + transmit_amplitude_dbfs + transmit_gain_db
-    return receiver_reference_dbm - receive_gain_db + simulated_transmit_dbm - transmitted

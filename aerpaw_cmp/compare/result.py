@@ -79,16 +79,6 @@ class ModelLevel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExpectedOffset:
-    """Offset that the USRP reference powers predict, what it is made of, and how far the fitted one is from it."""
-
-    expected_db: float
-    receiver_reference_dbm: float
-    transmitter_reference_dbm: float
-    fitted_minus_expected_db: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SnrScore:
     """A ratio to the noise against the replay's level over thermal noise, nothing fitted, over ``n`` samples.
 
@@ -129,7 +119,6 @@ class RssFurther:
     compared_with: Mapping[str, PairedDifference]
     averaged: Mapping[str, Mapping[str, Fit]]
     censored: Censored | None = None
-    expected_offset: ExpectedOffset | None = None
     detection: DetectionScore | None = None
     """Of a receiver that loses its lock or ends at a floor."""
     snr: SnrScore | None = None

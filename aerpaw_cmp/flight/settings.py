@@ -453,31 +453,6 @@ class RtSettings(GroupedSettings):
             )
 
 
-class PortSettings(Settings):
-    """One USRP port of the table of reference powers, and what lies between it and the antenna."""
-
-    node: str
-    channel: str = "ch0"
-    gain_db: float
-    amplifier: bool = False
-    extra_gain_db: float = 0.0
-    """Amplifiers, minus cables, that the table does not contain."""
-
-
-class ReferencePowers(Settings):
-    """A link budget: the offset it predicts is shown beside the fitted one."""
-
-    file: str
-    """CSV ``Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz,...``."""
-    receivers: dict[str, PortSettings]
-    """By channel of the RSS logs."""
-    transmitter: PortSettings | None = None
-    """Without one, the link's transmit power is taken as true."""
-    transmit_amplitude_dbfs: float = 0.0
-    receiver_gain_removed: bool = True
-    """The sounder logs dB re full scale minus its gain setting."""
-
-
 MAXIMUM_OFFSETS = 1_000_000
 """The offset grid of a report may not be longer: 100 dB in steps of 0.0001 dB."""
 
@@ -494,7 +469,7 @@ class AdvancedRss(Settings):
 class RssSettings(GroupedSettings):
     """Settings of the comparison of RSS."""
 
-    WITHOUT_EFFECT = ("bootstrap",)
+    WITHOUT_EFFECT = ("bootstrap", "reference_powers")
 
     span_db: tuple[float, float] = (-50.0, 50.0)
     lag: Literal["off", "estimate", "apply"] | float = "estimate"
@@ -505,7 +480,6 @@ class RssSettings(GroupedSettings):
     """Measurement averaged (in power) over this window; 0 leaves samples as they are."""
     minimum_height_m: float | None = None
     """Samples below this height are left out of the comparison, and counted."""
-    reference_powers: ReferencePowers | None = None
     advanced: AdvancedRss = AdvancedRss()
 
     @model_validator(mode="after")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 from decimal import ROUND_HALF_DOWN, Decimal
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,20 +12,15 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.stats import norm
 
-from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.compare.offset import (
-    ReferencePower,
     censored_offset,
     difference_moments,
-    expected_offset_db,
     grid_offset,
     identifiable_range,
     nearest_offset,
     offset_curve,
     offset_grid,
     pooled_moments,
-    read_reference_powers,
-    reference_power_dbm,
     trimmed_offset,
 )
 
@@ -140,66 +133,6 @@ def test_no_path_counts_as_below_the_simulated_floor():
     assert np.isnan(both.offset_db)
 
 
-REFERENCES = """Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz,Freq_3.40GHz
-lw1,tx,ch0,0,60.0,-2.0,-1.0
-lw1,rx,ch0,1,30.0,-40.0,
-lw1,rx,ch0,0,30.0,-10.0,-12.0
-"""
-
-
-def test_reference_powers_give_the_expected_offset(tmp_path):
-    path = tmp_path / "refs.csv"
-    path.write_text(REFERENCES.replace("lw1,rx,ch0,1", "\nlw1,rx,ch0,1"))  # an empty line is passed over
-    table = read_reference_powers(path)
-    assert len(table) == 3
-    level = reference_power_dbm(table, node="LW1", category="rx", channel="ch0", gain_db=30.2, frequency_hz=3.35e9)
-    assert level == pytest.approx(-11.0)
-    amplified = reference_power_dbm(
-        table, node="LW1", category="rx", channel="ch0", gain_db=30, frequency_hz=3.4e9, amplifier=True
-    )
-    assert np.isnan(amplified)  # that cell is empty
-    assert np.isnan(
-        reference_power_dbm(table, node="LW9", category="rx", channel="ch0", gain_db=30, frequency_hz=3.4e9)
-    )
-    # full scale reads -11 dBm; sent with 2 dBm; simulated with unit power (30 dBm for 1 W, path gain 0 dBm)
-    offset = expected_offset_db(receiver_reference_dbm=level, transmitter_reference_dbm=2.0, simulated_transmit_dbm=0.0)
-    path_gain = -90.0
-    reading = path_gain + 2.0 - level
-    assert reading + offset == pytest.approx(path_gain)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("a,b\n1,2\n", "no table of reference powers"),
-        (REFERENCES + "lw1,rx,ch0,0,x,-1,-1\n", "line 5: unreadable row"),
-        (REFERENCES + "lw1,rx,ch0,0,1.0,-1\n", "line 5: unreadable row"),
-        (REFERENCES.replace("3.30", "x"), "unreadable carrier"),
-    ],
-)
-def test_a_broken_reference_table_is_named(tmp_path, text, message):
-    path = tmp_path / "refs.csv"
-    path.write_text(text)
-    with pytest.raises(InputError, match=message):
-        read_reference_powers(path)
-    with pytest.raises(InputError, match="cannot read"):
-        read_reference_powers(tmp_path / "missing.csv")
-
-
-@pytest.mark.field
-def test_the_real_reference_table_reads():
-    folder = os.environ.get("AERPAW_CMP_FIELD_DATA")
-    if not folder:
-        pytest.skip("AERPAW_CMP_FIELD_DATA is not set")
-    table = read_reference_powers(Path(folder) / "antennas" / "usrp_power_refs.csv")
-    assert len(table) == 5194
-    high, low = (
-        reference_power_dbm(table, node="lw1", category="rx", channel="ch0", gain_db=g, frequency_hz=3.3e9)
-        for g in (10, 40)
-    )
-    assert high - low == pytest.approx(30.0, abs=2.0)  # 30 dB more gain: full scale 30 dB lower
-
-
 @pytest.mark.parametrize("level", [1e30, -1e30, 1e18, -1e17, 1e308, -1e308, 60.0, -60.0, 50.0, 49.96])
 def test_the_edge_of_the_span_is_told_for_any_input(level: float) -> None:
     fit = grid_offset([0.0, 0.0], [level, level])
@@ -212,25 +145,6 @@ def test_the_edge_of_the_span_is_told_for_any_input(level: float) -> None:
 def test_a_grid_that_fits_in_no_memory_is_refused() -> None:
     with pytest.raises(ValueError, match="2e\\+16 offsets to try"):
         offset_grid(1e-7, (-1e9, 1e9))
-
-
-@pytest.mark.parametrize("path_loss_db", [60.0, 95.5])
-def test_the_expected_offset_closes_a_link_budget(path_loss_db: float) -> None:
-    """A signal followed by hand through amplifiers and cables to the reading; the offset brings it to the simulation."""
-    full_scale_out_dbm, backoff_db, amplifier_db = 12.0, -4.0, 17.0  # transmitter: reference, digital level, PA
-    full_scale_in_dbm, cable_db = -35.0, -2.5  # receiver: what reads 0 dBFS at the port; a cable in front of it
-    at_antenna_dbm = full_scale_out_dbm + backoff_db + amplifier_db - path_loss_db
-    reading_db = at_antenna_dbm + cable_db - full_scale_in_dbm
-    simulated_dbm = 40.0 - path_loss_db
-    offset = expected_offset_db(
-        receiver_reference_dbm=full_scale_in_dbm,
-        transmitter_reference_dbm=full_scale_out_dbm,
-        simulated_transmit_dbm=40.0,
-        transmit_amplitude_dbfs=backoff_db,
-        transmit_gain_db=amplifier_db,
-        receive_gain_db=cable_db,
-    )
-    assert reading_db + offset == pytest.approx(simulated_dbm)
 
 
 NAN = float("nan")
@@ -400,69 +314,3 @@ def test_the_grid_is_the_multiples_of_its_step(step, first, last):
     assert nearest_offset(np.array([-1.0, 0.0, 1.0]), 0.5, 1.0) == 1
     assert nearest_offset(np.array([-1.0, 0.0, 1.0]), -0.5, 1.0) == 1
     assert nearest_offset(np.array([-1.0, 0.0, 1.0]), 0.6, 1.0) == 2
-
-
-def test_powers_between_and_beyond_the_carriers_of_the_table():
-    one = ReferencePower(
-        "lw1", "rx", "ch0", False, 30.0, np.array([3.3e9, 3.4e9, 3.5e9]), np.array([-10.0, NAN, -14.0])
-    )
-    assert one.at(3.35e9) == pytest.approx(-11.0)
-    assert one.at(3.3e9) == -10.0
-    assert np.isnan(one.at(3.29e9))
-    assert np.isnan(one.at(3.51e9))
-    none = ReferencePower("lw1", "rx", "ch0", False, 30.0, np.array([3.3e9]), np.array([NAN]))
-    assert np.isnan(none.at(3.3e9))
-
-
-def test_a_setting_is_found_by_all_its_words_and_the_nearest_gain_within_half_a_decibel(tmp_path):
-    path = tmp_path / "refs.csv"
-    rows = [
-        "LW1,RX,CH0,0,30.0,-10",
-        "lw1,rx,ch0,0,30.6,-11",
-        "lw1,rx,ch0,1,30.0,-40",
-        "lw1,tx,ch0,0,30.0,5",
-        "lw1,rx,ch1,0,30.0,-20",
-    ]
-    path.write_text("Node,Category,Channel,PA_Enabled,Gain,Freq_3.4GHz\n" + "\n".join(rows) + "\n")
-    table = read_reference_powers(path)
-    assert [(one.node, one.category, one.channel, one.amplifier, one.gain_db) for one in table[:1]] == [
-        (
-            "lw1",
-            "rx",
-            "ch0",
-            False,
-            30.0,
-        )
-    ]
-    assert table[0].frequencies_hz.tolist() == [3.4e9]
-
-    def power(gain=30.0, **other):
-        given = {"node": "lw1", "category": "rx", "channel": "CH0", "frequency_hz": 3.4e9} | other
-        return reference_power_dbm(table, gain_db=gain, **given)
-
-    assert [power(), power(30.29), power(30.31), power(31.1)] == [-10.0, -10.0, -11.0, -11.0]
-    assert np.isnan([power(31.11), power(29.49), power(channel="ch2"), power(node="lw2")]).all()
-    assert (power(29.5), power(amplifier=True), power(category="tx"), power(channel="ch1")) == (
-        -10.0,
-        -40.0,
-        5.0,
-        -20.0,
-    )
-    assert expected_offset_db(
-        receiver_reference_dbm=-11.0, transmitter_reference_dbm=2.0, simulated_transmit_dbm=7.0
-    ) == pytest.approx(-11.0 - 2.0 + 7.0)
-
-
-@pytest.mark.parametrize(
-    "header",
-    [
-        "Node,Category,Channel,PA,Gain,Freq_3.4GHz", "Node,Category,Channel,PA_Enabled,Gain",
-        "Node,Category,Channel,PA_Enabled,Gain,Freq_3.4GHz,Note", "Node,Category,Channel,PA_Enabled,Gain,Freq_3.4",
-        "Node,Category,Channel,PA_Enabled,Gain,3.4GHz",
-    ],
-)  # fmt: skip
-def test_a_header_that_is_wrong_in_one_place_is_refused(tmp_path, header):
-    path = tmp_path / "refs.csv"
-    path.write_text(header + "\nlw1,rx,ch0,0,30.0,-10\n")
-    with pytest.raises(InputError, match="no table of reference powers"):
-        read_reference_powers(path)

@@ -341,22 +341,6 @@ link:
 """
 
 
-def test_reference_powers_give_the_expected_offset(tmp_path: Path) -> None:
-    at = np.arange(0, 60, 0.5)
-    (tmp_path / "powers.csv").write_text(
-        "Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz\nlw1,rx,ch0,0,30.0,-35.5\nuav,tx,ch0,1,70.0,12.0\n",
-        encoding="utf-8",
-    )
-    port = "{file: powers.csv, receivers: {USRP1: {node: LW1, gain_db: 30, extra_gain_db: 14}}, transmitter: {node: uav, gain_db: 70, amplifier: true}}"
-    level = free_space_db(at)
-    path = flight(tmp_path, rss={"USRP1": (at, level)}, rss_keys=f", reference_powers: {port}")
-    panel = compared_rss(path)[0]
-    found = panel.further.expected_offset
-    # reading + 30 dB gain removed + reference - 14 dB of amplifiers; the simulation sends 40 dBm where 12 were sent
-    assert found.expected_db == pytest.approx(30.0 - 35.5 - 14.0 + 40.0 - 12.0)
-    assert found.fitted_minus_expected_db == pytest.approx(panel.score.offset_db - found.expected_db)
-
-
 def test_same_footing_and_residual_tables_are_in_the_metrics(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     at = np.arange(0, 60, 0.25)

@@ -22,7 +22,6 @@ def folder(tmp_path: Path) -> Path:
     site["dem"] = {"path": "dem.tif"}
     (tmp_path / "own" / "site.yaml").write_text(yaml.safe_dump(site))
     (tmp_path / "own" / "dem.tif").write_bytes(b"heights")
-    (tmp_path / "powers.csv").write_text("node,channel\n")
     azimuth, elevation = np.meshgrid(np.arange(0, 360, 30.0), np.arange(-90, 91, 30.0))
     rows = [f"{a},{e},0" for a, e in zip(azimuth.ravel(), elevation.ravel(), strict=True)]
     (tmp_path / "antenna.csv").write_text("azimuth_deg,elevation_deg,gain_dbi\n" + "\n".join(rows))
@@ -32,7 +31,6 @@ flight: test
 site: own/site.yaml
 logs: [{path: log.txt}]
 link: {rss: {carrier_hz: 3.3e9, uav: {antenna: {model: file, file: antenna.csv}}}}
-rss: {reference_powers: {file: powers.csv, receivers: {A: {node: lw1, channel: ch0, gain_db: 30}}}}
 """
     )
     (tmp_path / "log.txt").write_text("x")
@@ -41,7 +39,7 @@ rss: {reference_powers: {file: powers.csv, receivers: {A: {node: lw1, channel: c
 
 def test_every_named_file_is_there_once_with_its_digest(folder: Path) -> None:
     found = {entry.path: entry for entry in other_inputs(load_flight(folder / "flight.yaml"), folder / "flight.yaml")}
-    assert set(found) == {"flight.yaml", "own/site.yaml", "dem.tif", "antenna.csv", "powers.csv"}
+    assert set(found) == {"flight.yaml", "own/site.yaml", "dem.tif", "antenna.csv"}
     for name, entry in found.items():
         place = folder / ("own/dem.tif" if name == "dem.tif" else name)
         assert entry.sha256 == sha256(place.read_bytes()).hexdigest()

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,6 @@ from ...compare.ladder import log_distance_level_db
 from ...compare.passes import Visit, repeatability
 from ...compare.result import (
     APPLIED,
-    ExpectedOffset,
     Fit,
     FlightResult,
     ModelLevel,
@@ -47,7 +45,7 @@ from ...flight.lock import LOCK_FLOOR_DB
 from ...flight.losses import direct_foliage_m
 from ...flight.remembered import errors_elsewhere, lock_elsewhere
 from ...flight.replay import FlightReplay, Replayed
-from ...flight.settings import PortSettings, ReferencePowers, RssSettings, RtSettings
+from ...flight.settings import RssSettings, RtSettings
 from ...flight.training import learned_here
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ...site.site import Site
@@ -248,7 +246,6 @@ def _further(
         compared_with={},
         averaged={},
         explained_by=explained_by,
-        expected_offset=_expected(settings.reference_powers, case.data.folder, series, score.offset_db),
         repeatability={name: repeatability(*pair, PASSES_WITHIN_M) for name, pair in passes.items()},
         simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
         error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
@@ -367,60 +364,6 @@ def _averaged(
         }
         for name, each in fits.items()
     }
-
-
-def _expected(
-    budget: ReferencePowers | None, folder: Path, series: RssSeries, offset_db: float
-) -> ExpectedOffset | None:
-    """Offset that the USRP reference powers predict; None where ``rss.reference_powers`` has none for the channel.
-
-    Parameters
-    ----------
-    budget : ReferencePowers, optional
-    folder : Path
-        Against which its table resolves.
-    series : RssSeries
-    offset_db : float
-        As fitted.
-
-    Returns
-    -------
-    ExpectedOffset or None
-
-    Raises
-    ------
-    InputError
-        If the table cannot be read.
-    """
-    receiver = None if budget is None else budget.receivers.get(series.channel)
-    if budget is None or receiver is None:
-        return None
-    table = offsets.read_reference_powers(folder / budget.file)
-
-    def reference(port: PortSettings, category: Any) -> float:
-        return offsets.reference_power_dbm(
-            table, node=port.node, category=category, channel=port.channel, gain_db=port.gain_db,
-            frequency_hz=series.link.carrier_hz, amplifier=port.amplifier,
-        )  # fmt: skip
-
-    received = reference(receiver, "rx")
-    if budget.receiver_gain_removed:  # the log holds dB re full scale minus the gain setting
-        received += receiver.gain_db
-    sent = reference(budget.transmitter, "tx") if budget.transmitter else series.link.transmit_power_dbm
-    expected = offsets.expected_offset_db(
-        receiver_reference_dbm=received,
-        transmitter_reference_dbm=sent,
-        simulated_transmit_dbm=series.link.transmit_power_dbm,
-        transmit_amplitude_dbfs=budget.transmit_amplitude_dbfs,
-        transmit_gain_db=budget.transmitter.extra_gain_db if budget.transmitter else 0.0,
-        receive_gain_db=receiver.extra_gain_db,
-    )
-    return ExpectedOffset(
-        expected_db=expected,
-        receiver_reference_dbm=received,
-        transmitter_reference_dbm=sent,
-        fitted_minus_expected_db=offset_db - expected,
-    )
 
 
 def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:

@@ -103,16 +103,6 @@ def test_snr_of_four_towers_is_scored_per_tower(report: Report) -> None:
         assert snr["rmse_db"] ** 2 - snr["mean_error_db"] ** 2 == pytest.approx(found["rmse_db"] ** 2, rel=1e-3)
 
 
-MOUNTED = ("dataset12_40m_mount", "dataset12_70m_mount")
-
-
-def test_antennas_fitted_on_the_other_flight_leave_at_most_4_db(report: Report) -> None:
-    """Measured: 3.70, 3.94, 3.99 and 3.55 dB where free space leaves 6.56, 5.47, 7.14 and 6.30."""
-    rmse = [channel["rmse_db"] for name in MOUNTED for channel in report(name)["rss"]["LW1"].values()]
-    assert max(rmse) < 4.1
-    assert sum(rmse) / len(rmse) < 3.9
-
-
 @pytest.mark.parametrize(("name", "limit"), [("nr_rank_flight1", 0.07), ("nr_rank_flight3", 0.10)])
 def test_slanted_ports_reproduce_the_histogram_of_measured_rank(report: Report, name: str, limit: float) -> None:
     """The order of the slants was chosen on flight 1; flight 3 had no say."""

@@ -96,15 +96,6 @@ class AntennaSettings(Settings):
     """Name of the grid inside a .mat file."""
     polarised: bool = True
     """Use both field components of a text pattern; false: its total gain on the element's slant."""
-    installed_db: list[float] = []
-    """Gain that mast or airframe adds: cosine and sine of 1, 2, ... times the azimuth [dB], fitted on other flights."""
-
-    @field_validator("installed_db")
-    @classmethod
-    def _pairs(cls, value: list[float]) -> list[float]:
-        if len(value) % 2:
-            raise ValueError("installed_db must hold pairs: cosine and sine of 1, 2, ... times the azimuth")
-        return value
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
@@ -171,15 +162,9 @@ class ArraySettings(Settings):
 
 def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | None = None) -> Pattern:
     """The element pattern of the settings; files resolve against ``folder``, the carrier chooses among frequencies."""
-    from ..site.installed import InstalledPattern
-
-    alone = _pattern_alone(settings, folder, carrier_hz)
-    return InstalledPattern(alone, tuple(settings.installed_db)) if settings.installed_db else alone
-
-
-def _pattern_alone(settings: AntennaSettings, folder: Path, carrier_hz: float | None) -> Pattern:
     from ..site import antennas
 
+    file = folder / str(settings.file)
     if settings.model == "dipole":
         return antennas.HalfWaveDipole()
     if settings.model == "tr38901":
@@ -187,16 +172,13 @@ def _pattern_alone(settings: AntennaSettings, folder: Path, carrier_hz: float | 
     if settings.model == "file":
         from ..site.pattern_files import read_pattern_file
 
-        file = folder / str(settings.file)
         return read_pattern_file(file, polarised=settings.polarised, carrier_hz=carrier_hz)
     if settings.model == "sphere":
-        from ..site.sphere_pattern import read_sphere_csv
-
-        return read_sphere_csv(folder / str(settings.file))
+        return read_sphere_csv(file)
     if settings.model == "gain_grid":
         if settings.variable is None:
             raise UsageError("a gain grid without 'variable'", expected="the name of the grid inside the .mat file")
-        return antennas.read_gain_grid(folder / str(settings.file), settings.variable)
+        return antennas.read_gain_grid(file, settings.variable)
     return Isotropic()
 
 

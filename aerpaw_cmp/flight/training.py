@@ -9,7 +9,6 @@ import numpy as np
 
 from ..common.provenance import union
 from ..propagation.arrays import Link
-from ..site.installed import InstalledPattern
 from ..site.sphere_pattern import SpherePattern
 from .data import FlightData, RankSeries, RssSeries
 
@@ -29,8 +28,7 @@ def flight_logs(data: FlightData) -> tuple[str, ...]:
 def learned_patterns(link: Link) -> list[SpherePattern]:
     """Antennas of both ends that were learned from flights."""
     arrays = [*link.tower_arrays.values(), link.uav_array]
-    each = [p.base if isinstance(p, InstalledPattern) else p for array in arrays for p in array.patterns]
-    return [p for p in each if isinstance(p, SpherePattern)]
+    return [p for array in arrays for p in array.patterns if isinstance(p, SpherePattern)]
 
 
 def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, ...]:

@@ -35,7 +35,6 @@ from aerpaw_cmp.propagation.search import mirror as image
 from aerpaw_cmp.propagation.search import prisms
 from aerpaw_cmp.propagation.search.effort import SearchRun
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
-from aerpaw_cmp.site.installed import InstalledPattern
 from aerpaw_cmp.site.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building
 
@@ -73,7 +72,6 @@ PATTERNS = {
     "tr38901": (TR38901(),),
     "field grid": (measured(),),
     "gain grid": (measured(2, polarised=False),),
-    "installed": (InstalledPattern(TR38901(), (1.0, -2.0, 0.5, 0.3)),),
     "foreign": (Foreign(),),
     "one each": (Isotropic(), measured(3), Foreign(), TR38901()),
 }

@@ -277,9 +277,9 @@ def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> 
 
 def _pattern(settings: AntennaSettings, folder: Path, carrier_hz: float) -> Pattern:
     """A formula or a table of gain a second time; other antenna files are taken as the replay reads them."""
-    if settings.model in PATTERNS and not settings.installed_db:
+    if settings.model in PATTERNS:
         return PATTERNS[settings.model]
-    if settings.model == "sphere" and not settings.installed_db:
+    if settings.model == "sphere":
         content = (folder / str(settings.file)).read_bytes()
         return gain_table(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
     pattern: Pattern = scalar_pattern(load_pattern(settings, folder, carrier_hz))

@@ -34,7 +34,6 @@ from ...propagation.field.sum import mean_pair_power, rss_dbm
 from ...propagation.options import Field, Run, Search
 from ...propagation.replay import Replay, replay
 from ...site.antennas import Isotropic
-from ...site.installed import InstalledPattern
 from ...site.site import Site
 from ...site.sphere_pattern import SpherePattern
 from .levels import Levels, levels_of
@@ -53,7 +52,7 @@ LINES = BASELINE_TITLE["constant"], BASELINE_TITLE["log_distance"]
 LEARNED_HERE = " (its antennas were learned on this flight, too: not scored)"
 """Behind the name of a rung that would be scored where it was fitted."""
 
-Antennas = Literal["isotropic", "measured", "installed", "learned"]
+Antennas = Literal["isotropic", "measured", "learned"]
 Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
 Trees = Literal["none", "p833", "weissberger", "opaque"]
 
@@ -79,8 +78,7 @@ class Model:
     def name(self) -> str:
         """Content of the model in words."""
         parts = {
-            "isotropic": [], "measured": ["antennas"], "installed": ["antennas with learned gain"],
-            "learned": ["learned sphere"],
+            "isotropic": [], "measured": ["antennas"], "learned": ["learned sphere"],
         }[self.antennas]  # fmt: skip
         parts += {"ignored": [], "level": ["heading"], "logged": ["attitude"]}[self.attitude]
         if self.ground != "none":
@@ -235,8 +233,6 @@ class _Climber:
             models.append(Model(antennas=kind, attitude="level"))
             if known.any():
                 models.append(Model(antennas=kind, attitude="logged"))
-        if any(isinstance(p, InstalledPattern) for p in patterns):
-            models += [dataclasses.replace(m, antennas="installed") for m in models[1:]]
         return models
 
     def _ground(self, best: Model) -> list[Model]:
@@ -296,7 +292,7 @@ class _Climber:
         return any(learned_here(self._data, series, link) for series, link in pairs)
 
     def _rung(self, model: Model) -> Rung:
-        learned = model.antennas in ("learned", "installed") or model.ground == "rough"
+        learned = model.antennas == "learned" or model.ground == "rough"
         if learned and self._learned_here:
             nothing = tuple(np.full(len(s.rows), np.nan) for s in self._series)
             return Rung(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
@@ -310,7 +306,9 @@ class _Climber:
         series, rt = self._series[index], self._data.settings.rt
         traced, search_s = self._paths(index, model.buildings)
         begin = time.perf_counter()
-        poses, link = self._poses(series, model.attitude), _link(self._links[index], model.antennas)
+        poses, link = self._poses(series, model.attitude), self._links[index]
+        if model.antennas == "isotropic":
+            link = _isotropic_link(link)
         paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
         wanted = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
         loss = path_loss(self._data.site, wanted, link.carrier_hz)
@@ -364,16 +362,11 @@ def _arrays(link: Link) -> list[Any]:
     return [*link.tower_arrays.values(), link.uav_array]
 
 
-def _link(link: Link, antennas: Antennas) -> Link:
-    """The link with isotropic elements, with measured ones without added gain, or as it is."""
-
-    def pattern(p: Any) -> Any:
-        if antennas == "isotropic":
-            return Isotropic()
-        return p.base if antennas == "measured" and isinstance(p, InstalledPattern) else p
+def _isotropic_link(link: Link) -> Link:
+    """The link with isotropic elements."""
 
     def other(array: Any) -> Any:
-        return dataclasses.replace(array, patterns=tuple(pattern(p) for p in array.patterns))
+        return dataclasses.replace(array, patterns=tuple(Isotropic() for _ in array.patterns))
 
     towers = {name: other(array) for name, array in link.tower_arrays.items()}
     return dataclasses.replace(link, tower_arrays=towers, uav_array=other(link.uav_array))
@@ -412,35 +405,26 @@ def recommended_settings(
         result["rt"].pop("diffraction", None)
     if model.trees not in ("p833", "weissberger"):
         result["rt"].pop("foliage_model", None)
-    if model.antennas not in ("installed", "learned"):
+    if model.antennas == "isotropic":
         link = dict(result.get("link", {}))
         for name in [key for key in ("rss",) if key in link]:
-            link[name] = _antennas_as(link[name], model.antennas)
+            link[name] = _isotropic(link[name])
         if "channels" in link:
-            link["channels"] = {name: _antennas_as(one, model.antennas) for name, one in link["channels"].items()}
+            link["channels"] = {name: _isotropic(one) for name, one in link["channels"].items()}
         if link:
             result["link"] = link
     return result
 
 
-def _antennas_as(value: Any, antennas: Antennas) -> Any:
-    """Nested link settings with isotropic antennas, or with measured ones without added gain."""
-    if isinstance(value, Mapping):
-        out = {}
-        for key, item in value.items():
-            if key in ("antenna", "antennas"):
-                several = [dict(entry) for entry in item] if isinstance(item, list) else [dict(item)]
-                changed = [
-                    {"model": "iso"}
-                    if antennas == "isotropic"
-                    else {k: v for k, v in entry.items() if k != "installed_db"}
-                    for entry in several
-                ]
-                out[key] = changed if isinstance(item, list) else changed[0]
-            else:
-                out[key] = _antennas_as(item, antennas)
-        return out
-    return value
+def _isotropic(value: Any) -> Any:
+    """Nested link settings with isotropic antennas."""
+    if not isinstance(value, Mapping):
+        return value
+    iso = {"model": "iso"}
+    return {
+        key: [iso for _ in item] if key == "antennas" and item else iso if key == "antenna" else _isotropic(item)
+        for key, item in value.items()
+    }
 
 
 def recommended_text(settings: FlightFile, ladder: FlightLadder | None, name: str) -> str:

@@ -130,7 +130,7 @@ def drawn(draw: random.Random, root: Path) -> Call:
         lambda: ["diff", path(), path()],
         lambda: ["explain", path(), "--time", draw.choice(["now", "2025-06-01T14:00:10Z", ""])],
         lambda: ["site", draw.choice(["import", "show", "export"]), path(), "-o", path()],
-        lambda: [draw.choice(["sample", "audit", "modem-sim"]), path(), draw.choice(["-q", "--json", "-x"])],
+        lambda: [draw.choice(["sample", "modem-sim"]), path(), draw.choice(["-q", "--json", "-x"])],
         lambda: ["tap", "--port", path(), "-o", path(), "--duration", "0.2", "--wait", "0.1"],
     ]
     words = draw.choices(lines, [60, 8, 6, 4, 3, 5, 5, 4])[0]()

@@ -7,7 +7,7 @@ that of the process while the stage ran (VmHWM of Linux, reset at its begin), so
 
     python benchmarks/long_flight.py [--hours 10] [--shares 0.0333 0.1 0.3333 1] [--rank] [--json]
 
-Without audit and speed table, whose cost does not depend on the length (``aerpaw-cmp audit`` adds them later).
+Without audit and speed table, whose cost does not depend on the length.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 1. A two-channel flight of 3304 samples, image engine: time over that of importing what it is made of
    (``import sionna.rt, matplotlib.pyplot, pandas``). The real one where AERPAW_CMP_FIELD_DATA is set, else a simulated.
 2. The sample flight: seconds and peak memory; the same without audit.
-   The first and the second report of part 1, as it comes and with ``--audit later``, caches empty before the first:
+   The first and the second report of part 1, as it comes and with ``--audit none``, caches empty before the first:
    over those imports, and over the imports without Sionna, which such a report does not load.
 
     python benchmarks/report.py [--quick] [--json]
@@ -98,9 +98,9 @@ def main() -> None:
             reports.append(run(report(flight, folder / f"r{number}", *options)))
         some = ROOT / "sample_logs" / "flight.yaml"
         sample = run(report(some, folder / "sample"))
-        sample_later = run(report(some, folder / "sample_later", "--audit", "later"))
+        sample_later = run(report(some, folder / "sample_later", "--audit", "none"))
         now = cold_and_warm(flight, options, folder / "now", repeats)
-        later = cold_and_warm(flight, [*options, "--audit", "later"], folder / "later", repeats)
+        later = cold_and_warm(flight, [*options, "--audit", "none"], folder / "later", repeats)
     result = {
         "two_channels": {
             "flight": source,
@@ -126,7 +126,7 @@ def main() -> None:
     print(f"sample flight: {two['wall_s']:.1f} s, peak memory {two['peak_mib']:.0f} MiB")
     print(f"sample flight without audit: {sample_later['cpu_s']:.1f} s of processor, "
           f"{sample_later['wall_s']:.1f} s, {sample_later['peak_mib']:.0f} MiB")  # fmt: skip
-    for name, row in {**now, **{f"{key}, --audit later": row for key, row in later.items()}}.items():
+    for name, row in {**now, **{f"{key}, --audit none": row for key, row in later.items()}}.items():
         print(f"{name}: {row['cpu_s']:.1f} s of processor ({row['wall_s']:.1f} s), {row['ratio']:.2f} x "
               f"the imports, {row['ratio_light']:.2f} x the imports without Sionna")  # fmt: skip
 

@@ -40,7 +40,7 @@ def report(
     ] = None,
     audit: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="Number of audited links, 'full', 'none', or 'later' ('aerpaw-cmp audit' adds it)."),
+        typer.Option(help="Number of audited links, 'full' or 'none'  [default: rt.audit_links]"),
     ] = None,
     recommend: Annotated[
         Optional[Path],  # noqa: UP045
@@ -108,47 +108,8 @@ def _nothing_compared(metrics: Mapping[str, Any]) -> int:
 def _verdict(outcome: Any, strict: bool) -> int:
     """Say each stated check that failed; 1 where that is asked to be a failure."""
     for check in outcome.failed_checks:
-        say.warn(f"{'note' if check.startswith('audit pending') else 'check failed'}: {check}")
+        say.warn(f"check failed: {check}")
     return 1 if strict and outcome.failed_checks else 0
-
-
-@command(
-    "audit",
-    examples=[
-        "aerpaw-cmp audit reports/mine",
-        "aerpaw-cmp audit flight.yaml -o reports/mine --strict",
-        "aerpaw-cmp audit reports/mine --links full --json",
-    ],
-)
-def audit(
-    target: Annotated[Path, typer.Argument(metavar="REPORT_OR_FLIGHT", help="A report's folder, or its flight.yaml.")],
-    out: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(
-            "-o", "--out", metavar="DIR", help="Folder of the report  [default: the named report, or reports/<flight>]"
-        ),
-    ] = None,
-    logs_root: LogsRoot = None,
-    links: Annotated[Optional[str], typer.Option(help="Number of audited links, or 'full'.")] = None,  # noqa: UP045
-    strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
-    force: Force = False,
-    as_json: Json = False,
-) -> int:
-    """Fill the audit into a report."""
-    from ..jobs import run
-
-    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
-    outcome = run.run_audit(target, options, links=links)
-    if as_json:
-        print_json(outcome.metrics)
-        return _verdict(outcome, strict)
-    recorded = (outcome.metrics["rt"] or {}).get("audit")
-    if recorded is None:
-        print("nothing to audit: no link was replayed")
-    else:
-        print(recorded["summary"])
-    print(f"report: {outcome.folder / 'report.html'}")
-    return _verdict(outcome, strict)
 
 
 _WARNINGS = 10
@@ -238,8 +199,6 @@ def _print_report_summary(outcome: Any) -> None:
     print(f"report: {outcome.folder / 'report.html'}")
     if audited := (outcome.metrics.get("rt") or {}).get("audit"):
         print(audited["summary"])
-    if outcome.metrics.get("audit_command"):
-        print(f"next: {outcome.metrics['audit_command']}")
 
 
 @command(

@@ -6,7 +6,6 @@ COMMANDS: dict[str, str] = {
     "ingest": "Read logs of any known format, account for every line, write a flight file.",
     "formats": "List the log formats that can be read, with a sample line of each.",
     "report": "Replay a flight, calibrate, compare with the measurement, write the report.",
-    "audit": "Fill the audit into a report that was written without it.",
     "campaign": "Many flights and settings: pooled offsets, held-out flights, repeatability.",
     "explain": "Every path of a link at an instant: faces, angles, each loss, the sum.",
     "diff": "Differences between two reports of a flight: settings, inputs, numbers with intervals.",

@@ -10,7 +10,7 @@ from pathlib import Path
 from .errors import AerpawCmpError, CheckError, InputError, OutputError, one_line
 
 _SETTINGS = (".yaml", ".yml")
-_OF_LOGS = [["report"], ["audit"], ["explain"], ["calibrate"], ["campaign"], ["predict"], ["plan"]]
+_OF_LOGS = [["report"], ["explain"], ["calibrate"], ["campaign"], ["predict"], ["plan"]]
 
 
 def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:

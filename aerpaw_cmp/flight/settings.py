@@ -513,12 +513,10 @@ class RankSettings(GroupedSettings):
 class ReportSettings(GroupedSettings):
     """Contents of the report."""
 
-    WITHOUT_EFFECT = ("speed_table",)
+    WITHOUT_EFFECT = ("speed_table", "audit")
 
     title: str | None = None
     waypoints: list[Waypoint] = []
-    audit: Literal["now", "later"] = "now"
-    """``later``: the report is written without the audit; ``aerpaw-cmp audit`` fills it in."""
     export: list[Literal["geojson", "geopackage", "kmz", "mat", "netcdf", "all"]] = []
     """Formats of the samples besides rss.csv and rank.csv."""
 

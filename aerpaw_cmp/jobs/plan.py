@@ -171,7 +171,7 @@ def report_plan(
     stages += [*rss, *rank]
     seconds = n_rss * cost["compare, per RSS sample"] + n_rank * cost["compare, per rank sample"]
     stages.append(PlannedStage("compare", f"{n_rss} RSS and {n_rank} rank samples", seconds))
-    if rt.audit_links > 0 and settings.report.audit == "now":
+    if rt.audit_links > 0:
         links = min(rt.audit_links, n_rss + n_rank)
         seconds = cost["audit"] + len(rss + rank) * cost["audit, per tower and array"]
         stages.append(PlannedStage("audit", f"{links} links by the other engine", seconds))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -166,8 +166,7 @@ class ReportOptions:
     Parameters
     ----------
     engine, audit : str, optional
-        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number); with "later" the audit is
-        left to :func:`run_audit`.
+        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number).
     recommend : Path, optional
         Where the flight file with the settings of the recommended model is written.
     learned : path, optional
@@ -190,25 +189,11 @@ class ReportOptions:
     style: str = "screen"
     export: Sequence[str] = ()
 
-    def made_from(self, folder: Path) -> dict[str, Any]:
-        """For metrics.json in ``folder``, so that the report can be made again."""
-        asked = {"engine": self.engine, "figures": self.figures, "style": self.style, "export": list(self.export)}
-        for name in ("learned", "against"):
-            if (place := getattr(self, name)) is not None:
-                asked[name] = os.path.relpath(place, folder)
-        return asked
-
 
 AS_IT_COMES = ReportOptions()
 
 
-def run_report(
-    flight: Path,
-    asked: ReportOptions = AS_IT_COMES,
-    options: RunOptions = DEFAULT,
-    *,
-    same_inputs: Sequence[Mapping[str, Any]] | None = None,
-) -> JobOutcome:
+def run_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOptions = DEFAULT) -> JobOutcome:
     """Replay a flight, calibrate, compare, report.
 
     Parameters
@@ -217,8 +202,6 @@ def run_report(
     asked : ReportOptions
     options : RunOptions
         ``out`` is ``reports/<flight>`` by default.
-    same_inputs : sequence of mapping, optional
-        ``inputs`` of the metrics.json of an earlier report: nothing is written if one of them has changed since.
 
     Returns
     -------
@@ -237,7 +220,6 @@ def run_report(
     from ..report.write import FIGURES, STYLES, write_report
     from .reporting.flight_run import run_flight
     from .reporting.ladder import recommended_text
-    from .reporting.later_audit import refuse_changed, with_later_audit
     from .reporting.report_record import report_record
     from .tasks.manifest import other_inputs
 
@@ -268,9 +250,6 @@ def run_report(
         if before is not None:
             extra = {**record.extra_metrics, "against": before.metrics()}
             record = replace(record, against=before, extra_metrics=extra)
-        record = with_later_audit(record, settings, flight, folder, options.logs_root, asked.made_from(folder))
-        if same_inputs is not None:
-            refuse_changed(same_inputs, record.inputs)
         if target is not None:
             target.write(sealed(recommended_text(load_flight(flight, learned), flight_run.ladder, flight.name)))
         with output.filling() as place:
@@ -300,38 +279,6 @@ def plan_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOp
     return report_plan(settings, flight.parent, options.logs_root, inputs=inputs, out=folder, figures=asked.figures)
 
 
-def run_audit(target: Path, options: RunOptions = DEFAULT, *, links: str | None = None) -> JobOutcome:
-    """Fill the audit into an existing report, whose folder is exchanged as a whole.
-
-    Parameters
-    ----------
-    target : Path
-        Folder of a report, or the flight file that it was made from.
-    options : RunOptions
-        ``out`` is the folder of the report where ``target`` is a flight file (default ``reports/<flight>``).
-    links : str, optional
-        Number of audited links or "full", in place of ``rt.audit_links``.
-
-    Raises
-    ------
-    UsageError
-        No report there, or no number of links.
-    InputError
-        An input is gone, or has changed since.
-    """
-    from .reporting.later_audit import earlier_report
-
-    if links is not None and links != "full" and not (links.isdecimal() and int(links)):
-        raise UsageError(f"--links {links!r}", expected="a number of links above 0, or 'full'")
-    earlier = earlier_report(target, options.out)
-    again = {
-        key: earlier.folder / value if key in ("learned", "against") else value for key, value in earlier.asked.items()
-    }
-    asked = ReportOptions(**again, audit=links or str(earlier.audit_links))
-    where = replace(options, out=earlier.folder, logs_root=options.logs_root or earlier.logs_root)
-    return run_report(earlier.flight, asked, where, same_inputs=earlier.inputs)
-
-
 def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
     """Paths in a flight file are relative to its folder: a changed one must stand beside it."""
     if logs_root is None and os.path.realpath(recommend.parent) != os.path.realpath(flight.parent):
@@ -349,14 +296,12 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
         if engine not in ("image", "sionna"):
             raise UsageError(f"--engine {engine!r}", expected="image or sionna")
         change["engine"] = engine
-    report = settings.report
     if audit is not None:
-        numbers = {"full": 10**9, "none": 0, "later": settings.rt.audit_links}
+        numbers = {"full": 10**9, "none": 0}
         if audit not in numbers and not audit.isdecimal():
-            raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full', 'none' or 'later'")
+            raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
         change["audit_links"] = numbers[audit] if audit in numbers else int(audit)
-        report = report.model_copy(update={"audit": "later" if audit == "later" else "now"})
-    return settings.model_copy(update={"rt": settings.rt.model_copy(update=change), "report": report})
+    return settings.model_copy(update={"rt": settings.rt.model_copy(update=change)})
 
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
@@ -368,8 +313,6 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
             failed.append(f"{link}: no sample could be compared")
         elif m["at_search_edge"]:
             failed.append(f"{link}: the best offset lies at the edge of the searched span")
-    if metrics.get("audit_command"):
-        failed.append(f"audit pending; run `{metrics['audit_command']}`")
     audit = (metrics.get("rt") or {}).get("audit") or {}
     if audit.get("missing_paths"):
         failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")

@@ -138,8 +138,6 @@ class ReportData(FlightResult):
         Seconds per named stage.
     extra_metrics : mapping
         Merged into ``metrics.json`` last, key by key.
-    audit_command : str
-        The command that fills in the audit, where it was put off; else empty.
     """
 
     title: str
@@ -158,6 +156,5 @@ class ReportData(FlightResult):
     stages_s: Mapping[str, float] = field(default_factory=dict)
     extra_metrics: Mapping[str, Any] = field(default_factory=dict)
     paths: tuple[PosePaths, ...] = ()
-    audit_command: str = ""
     against: Against | None = None
     """What was predicted before the flight, where a prediction is named."""

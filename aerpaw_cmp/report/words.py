@@ -283,8 +283,7 @@ DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
     (lambda d: any(p.score.at_edge for p in d.rss), "an offset lies at the edge of its search"),
     (lambda d: any(not p.score.n and not p.training for p in d.rss), "a channel could not be scored"),
     (lambda d: any(moved_by_outliers(p) for p in d.rss), "{outliers}"),
-    (lambda d: d.engine is not None and d.engine.audit is None and bool(d.audit_command), "audit pending"),
-    (lambda d: d.engine is not None and d.engine.audit is None and not d.audit_command, "no audit"),
+    (lambda d: d.engine is not None and d.engine.audit is None, "no audit"),
     (lambda d: _missing_paths(d) > 0, "the audit misses {missing} paths"),
     (lambda d: _field_failures(d) > 0, "the audit of the field failed {failed} times"),
     (lambda d: any(p.clock_verdict == "cannot tell" for p in d.rss), "the radio clock could not be confirmed"),
@@ -315,7 +314,6 @@ def _recommended(data: ReportData) -> str:
 
 NEXT: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
     (lambda d: _recommended(d) not in ("", AS_SET), "Next: `report --recommend FILE` writes the recommended model."),
-    (lambda d: bool(d.audit_command), "Next: `{audit}`."),
     (lambda d: bool(d.rss), "Next: `aerpaw-cmp calibrate` with two flights of this site."),
 )
 """What to do next where no likely cause says it."""
@@ -323,8 +321,7 @@ NEXT: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
 
 def next_step(data: ReportData) -> str:
     """The first step whose condition holds."""
-    text = next((text for holds, text in NEXT if holds(data)), "")
-    return text.format(audit=data.audit_command)
+    return next((text for holds, text in NEXT if holds(data)), "")
 
 
 MOVED_DB = 0.3
@@ -530,11 +527,7 @@ def warnings(data: ReportData) -> list[str]:
         texts += _rss_warnings(panel)
     audit = None if data.engine is None else data.engine.audit
     if data.engine is not None and audit is None:
-        texts.append(
-            f"Audit pending; run `{data.audit_command}`."
-            if data.audit_command
-            else "The replay engine was not audited against the other engine in this report."
-        )
+        texts.append("The replay engine was not audited against the other engine in this report.")
     if audit is not None and audit.missing_paths:
         texts.append(audit_summary(audit))
     if audit is not None and audit.fields is not None and audit.fields.failed:

@@ -67,7 +67,7 @@ NOT_COVERED = (
 def audit_replays(
     data: FlightData, replays: Sequence[Replayed], progress: Progress = silent, results: Sequence[RssResult] = ()
 ) -> EngineResult:
-    """The engine record, with the audit where ``rt.audit_links`` asks for one and ``report.audit`` is not ``later``.
+    """The engine record, with the audit where ``rt.audit_links`` asks for one.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def audit_replays(
     -------
     EngineResult
     """
-    rt, now = data.settings.rt, data.settings.report.audit == "now"
+    rt = data.settings.rt
     return EngineResult(
         engine=rt.engine,
         links=sum(len(r.poses) for r in replays),
@@ -98,7 +98,7 @@ def audit_replays(
             **_crown_settings(rt, replays),
         },
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
-        audit=_audit(data, replays, results, progress) if rt.audit_links and now else None,
+        audit=_audit(data, replays, results, progress) if rt.audit_links else None,
     )
 
 

@@ -417,7 +417,7 @@ settings:
   one: {}
   two: {rt.max_depth: 0, link.rss.uav.yaw_deg: 315}
 calibration: channel
-held_out: {setting: two, fit: {link.rss.uav.yaw_deg: [0, 10, 20]}}
+repeatability: {radius_m: 3, heading_within_deg: null}
 """
 
 

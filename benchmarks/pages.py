@@ -36,7 +36,7 @@ LIMIT_S = 2.0
 READY = {
     "report.html": "window.explorer",
     "map.html": "window.mapExplorer && mapExplorer.ready",
-    "campaign.html": "window.campaignExplorer && campaignExplorer.ready",
+    "campaign.html": "document.readyState === 'complete'",
 }
 
 

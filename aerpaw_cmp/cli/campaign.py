@@ -149,27 +149,4 @@ def _print_campaign_summary(outcome: Any) -> None:
         more = m["repeatability"]["pairs_total"] - len(rows)
         title = "Same places, two flights" + (f"; {more} more in {m['repeatability']['table']}" if more else "")
         table(["link", "flights", "pairs", "differ by dB", "residual corr. by place"], rows, title)
-    rows = [
-        [", ".join(fold["fitted_on"]), r["flight"], f"{r['tower']} {r['channel']}",
-         "fitted here" if r["fitted_here"] else "transferred", number(r["start_rmse_db"], "{:.2f}"),
-         number(r["rmse_db"], "{:.2f}"), number(r["transferred_rmse_db"], "{:.2f}")]
-        for fold in m["held_out"]["folds"]
-        for r in fold["scores"]
-    ]  # fmt: skip
-    if rows:
-        header = [
-            "fitted on",
-            "flight",
-            "link",
-            "parameters",
-            "as written dB",
-            "with the fit dB",
-            "offset transferred dB",
-        ]
-        table(header, rows, "Held-out fit, RMSE")
-    for fold in m["held_out"]["folds"]:
-        print(
-            f"fitted on {', '.join(fold['fitted_on'])}: "
-            + ", ".join(f"{k} = {v:g}" for k, v in fold["parameters"].items())
-        )
     print(f"report: {outcome.folder / 'campaign.html'}")

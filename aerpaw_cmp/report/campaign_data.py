@@ -225,87 +225,6 @@ class Repeat:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HeldOutRow:
-    """One flight, tower and channel under one fit.
-
-    ``fitted_here`` says that the parameters were fitted on this very flight. ``start_rmse_db`` is with the parameters
-    as written, ``rmse_db`` with the fitted ones, both with an offset of the row's own samples;
-    ``transferred_rmse_db`` also takes the offset from the flights of the fit (NaN on those flights). ``own`` names
-    what else was fitted on the row's own samples: always the offset, and the lag where the flight file applies one.
-    """
-
-    flight: str
-    tower: str
-    channel: str
-    fitted_here: bool
-    n: int
-    start_rmse_db: float
-    rmse_db: float
-    transferred_offset_db: float
-    transferred_rmse_db: float
-    own: tuple[str, ...] = ("offset_db",)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HeldOutFold:
-    """Parameters fitted on some flights and scored on all."""
-
-    setting: str
-    fitted_on: tuple[str, ...]
-    applied_to: tuple[str, ...]
-    parameters: Mapping[str, float]
-    at_bounds: tuple[str, ...]
-    evaluations: int
-    method: str
-    rows: tuple[HeldOutRow, ...]
-    without_effect: tuple[str, ...] = ()
-    """Parameters that change no flight of the fit by a hundredth of a dB: their values mean nothing."""
-    curves: Mapping[str, Mapping[str, tuple[FloatArray, FloatArray]]] = field(default_factory=dict)
-    """By parameter and flight: values tried, and RMSE [dB] with the other parameters as fitted."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RankHeldOutRow:
-    """Rank of one flight as written (``start_``) and with the fitted parameters (``fit_``).
-
-    The log score [nats] takes the shares of reported ranks per simulated rank from the flights of the fit, the constant
-    one their shares alone; ``majority_agreement`` is that of always saying their commonest rank.
-    """
-
-    flight: str
-    fitted_here: bool
-    n: int
-    majority_agreement: float
-    constant_log_score: float
-    start_kappa: float
-    start_agreement: float
-    start_total_variation: float
-    start_log_score: float
-    fit_kappa: float
-    fit_agreement: float
-    fit_total_variation: float
-    fit_log_score: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RankHeldOutFold:
-    """Parameters of the rank comparison, fitted on some flights and scored on all.
-
-    ``ties``: other values that the flights of the fit cannot tell from the fitted ones.
-    """
-
-    setting: str
-    criterion: str
-    fitted_on: tuple[str, ...]
-    applied_to: tuple[str, ...]
-    parameters: Mapping[str, Any]
-    evaluations: int
-    method: str
-    ties: tuple[Mapping[str, Any], ...]
-    rows: tuple[RankHeldOutRow, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RankTransfer:
     """Total variation of one flight at the K that the other flights would have chosen.
 
@@ -387,19 +306,14 @@ class Drift:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceMap:
-    """Mean residual of cells of the plan over flights, each (cells,); tower and channel empty: all together.
+    """Mean residual of cells of the plan over flights, towers and channels.
 
-    ``east_m``, ``north_m`` are the middles; ``mean_db`` is the mean over flights of the mean residual of each in the
-    cell, ``spread_db`` their standard deviation (NaN for one), ``n`` their number.
+    ``cells`` (n, 2) are column and row in multiples of the cell from the origin; ``mean_db`` (n,) is the mean over
+    flights, towers and channels of the mean residual of each in the cell.
     """
 
-    tower: str
-    channel: str
-    east_m: FloatArray
-    north_m: FloatArray
+    cells: IntArray
     mean_db: FloatArray
-    spread_db: FloatArray
-    n: IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -415,7 +329,7 @@ class Season:
     ranking : tuple of SettingRank
         Over all links, best first, then for each link where there are several.
     drift : tuple of Drift
-    places : tuple of PlaceMap
+    places : PlaceMap, optional
         Of the first setting.
     reports : mapping of str to str
         Address of a flight's report, against the campaign's folder.
@@ -425,7 +339,7 @@ class Season:
     started: Mapping[str, str] = field(default_factory=dict)
     ranking: tuple[SettingRank, ...] = ()
     drift: tuple[Drift, ...] = ()
-    places: tuple[PlaceMap, ...] = ()
+    places: PlaceMap | None = None
     reports: Mapping[str, str] = field(default_factory=dict)
 
     def over_all(self) -> tuple[SettingRank, ...]:
@@ -450,9 +364,6 @@ class CampaignData:
     pooled: tuple[PooledOffset, ...] = ()
     repeats: tuple[Repeat, ...] = ()
     rank_repeats: tuple[RankPairing, ...] = ()
-    held_out: tuple[HeldOutFold, ...] = ()
-    held_out_rank: tuple[RankHeldOutFold, ...] = ()
-    held_out_failure: str = ""
     rank_transfers: tuple[RankTransfer, ...] = ()
     tracks: tuple[FlownTrack, ...] = ()
     flown_ranks: tuple[FlownRank, ...] = ()

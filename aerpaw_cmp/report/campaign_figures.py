@@ -1,4 +1,4 @@
-"""Figures of a campaign: flights laid over each other, settings side by side, fits of held-out parameters."""
+"""Figures of a campaign: flights laid over each other, settings side by side, the season."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from ..common.units import FloatArray, IntArray
 from ..compare.statistics import Interval
 from ..site.site import Site
-from .campaign_data import CampaignData, HeldOutFold, RssRow, place_means
+from .campaign_data import CampaignData, RssRow, place_means
 from .canvas import (
     BASELINE,
     TOWER,
@@ -50,21 +50,6 @@ MOST_FLIGHTS = 12
 
 TALLEST = 40.0
 """No figure is higher than this [inch], however many flights there are."""
-
-
-UNITS = {"deg": "deg", "db": "dB", "dbi": "dBi", "dbm": "dBm", "hz": "Hz", "m": "m", "s": "s"}
-
-
-def with_unit(key: str) -> str:
-    """A settings key with the unit that its ending names.
-
-    Examples
-    --------
-    >>> with_unit("link.rss.uav.yaw_deg"), with_unit("rt.max_depth")
-    ('link.rss.uav.yaw_deg [deg]', 'rt.max_depth')
-    """
-    _, line, ending = key.rpartition("_")
-    return f"{key} [{UNITS[ending]}]" if line and ending in UNITS else key
 
 
 def look(number: int) -> dict[str, Any]:
@@ -157,17 +142,23 @@ def season_drift(data: CampaignData) -> Figure:
     ax = fig.subplots()
     dated = len(data.season.started) >= len(data.flights) / 2 and len(data.season.started) > 1
     numbers = {name: number for number, name in enumerate(data.flights)}
+    slopes = {
+        f"{d.tower} {d.channel}".strip(): f", {d.slope_db_per_30_days:+.1f} dB per 30 days"
+        for d in data.season.drift
+        if d.setting == data.reference and np.isfinite(d.slope_db_per_30_days)
+    }
     for number, (link, rows) in enumerate(grouped(data.reference_rows, lambda r: r.link).items()):
         good = [r for r in rows if np.isfinite(r.offset_db) and (not dated or r.flight in data.season.started)]
         at = [np.datetime64(data.season.started[r.flight][:-1]) if dated else numbers[r.flight] + 1 for r in good]
         ax.plot(
             np.array(at), [r.offset_db for r in good], linestyle="none", marker=MARKERS[number % len(MARKERS)],
-            markersize=3.5, color=COLOURS[number % len(COLOURS)], alpha=0.7, label=link,
+            markersize=3.5, color=COLOURS[number % len(COLOURS)], alpha=0.7,
+            label=link + slopes.get(link, ""),
         )  # fmt: skip
     ax.set_xlabel("Start of the flight (UTC)" if dated else "Number of the flight in the campaign")
     ax.set_ylabel("Offset [dB]")
     ax.tick_params(axis="x", labelsize=8, rotation=20 if dated else 0)
-    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return fig
 
 
@@ -220,9 +211,9 @@ def _frame(ax: Axes, data: CampaignData, cells: IntArray, towers: Iterable[str],
 
 def season_places(data: CampaignData) -> Figure:
     """Mean residual of each cell of the plan over flights, all towers and channels."""
-    maps = data.season.places
-    shown = maps[0] if len(maps) == 1 else next(p for p in maps if not p.tower)
-    cells = np.floor(np.column_stack([shown.east_m, shown.north_m]) / data.cell_m).astype(int)
+    shown = data.season.places
+    assert shown is not None
+    cells = shown.cells
     reach = max(float(np.percentile(np.abs(shown.mean_db), 98)), 0.1)
     towers = list(dict.fromkeys(row.tower for row in data.reference_rows))
     fig = figure((7.0, 5.0))
@@ -328,36 +319,13 @@ def rank_tv(data: CampaignData) -> Figure:
     return fig
 
 
-def held_out_curves(fold: HeldOutFold, numbers: dict[str, int]) -> Figure:
-    """RMSE of every flight along each parameter, the fitted value marked."""
-    columns = min(len(fold.curves), 3)
-    lines = -(-len(fold.curves) // columns)
-    fig = figure((9.2, 0.9 + 2.9 * lines))
-    axes = fig.subplots(lines, columns, squeeze=False)
-    for ax in axes.ravel()[len(fold.curves) :]:
-        ax.set_visible(False)
-    for ax, (name, flights) in zip(axes.ravel(), fold.curves.items(), strict=False):
-        for flight, (tried, error) in flights.items():
-            role = "fitted on it" if flight in fold.fitted_on else "held out"
-            number = numbers.get(flight, 0)
-            ax.plot(
-                tried, error, linewidth=1.6, label=f"{flight} ({role})", marker=MARKERS[number % len(MARKERS)],
-                markersize=3.5, **look(number),
-            )  # fmt: skip
-        ax.axvline(fold.parameters[name], color="#888888", linewidth=2.5, alpha=0.6, label="fitted value")
-        ax.set_xlabel(with_unit(name), fontsize=8)
-        ax.set_ylabel("RMSE [dB]")
-    fig.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    return fig
-
-
 def figure_specs(data: CampaignData) -> list[FigureSpec]:
     """Every figure that the campaign has numbers for."""
     return [*_season_specs(data), *_flight_specs(data)]
 
 
 def _season_specs(data: CampaignData) -> Iterator[FigureSpec]:
-    """Figures of the season, for the page where no script runs and for print."""
+    """Figures of the season."""
     if not data.season.over_all():
         return
     some = f", {MOST_SETTINGS} of {len(data.settings)}" if len(data.settings) > MOST_SETTINGS else ""
@@ -370,7 +338,7 @@ def _season_specs(data: CampaignData) -> Iterator[FigureSpec]:
         f"Each flight's own offset under “{data.reference}”, by tower and channel.",
         partial(season_drift, data),
     )  # fmt: skip
-    if any(len(p.n) for p in data.season.places):
+    if data.season.places is not None:
         yield FigureSpec(
             "season_places", "season", "Where the simulation errs, over all flights",
             f"Mean over flights of the mean residual in cells of {data.cell_m:g} m, “{data.reference}”, all towers and "
@@ -416,10 +384,3 @@ def _flight_specs(data: CampaignData) -> Iterator[FigureSpec]:
                 "comes back on another flight is an error of the model; one that does not is of that flight.",
                 partial(places, data, scored),
             )  # fmt: skip
-    for number, fold in enumerate(data.held_out[:MOST_FLIGHTS]):
-        yield FigureSpec(
-            f"held_out_{number + 1}", "held_out", f"Fitted on {', '.join(fold.fitted_on)}",
-            "RMSE along each parameter, the others as fitted; every point has its own offset. A flight whose least "
-            "RMSE lies elsewhere does not support the fit.",
-            partial(held_out_curves, fold, numbers),
-        )  # fmt: skip

@@ -16,7 +16,6 @@ from ..common.stages import Progress, silent
 from ..compare.passes import Repeated
 from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
-from .campaign_explorer import payload
 from .campaign_pairs import TABLE as PAIR_TABLE
 from .campaign_pairs import by_link, pair_frame, telling, telling_ranks
 from .campaign_words import (
@@ -34,7 +33,7 @@ from .canvas import Picture
 from .export import json_text, write_file
 from .exports.points import of_campaign
 from .exports.write import write_exports
-from .html import by_section, embedded, rendered
+from .html import by_section, rendered
 from .words import pretty
 
 MANY = 200
@@ -43,7 +42,7 @@ MANY = 200
 FEW_FLIGHTS = 20
 """Flights of a table that has a column or a heading for each."""
 
-ROWS_SHOWN, FOLD_ROWS = 300, 60
+ROWS_SHOWN = 300
 """Rows of a table on the page; the files beside it hold all."""
 
 COMPACT_ROWS = 2000
@@ -88,19 +87,12 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "rank_pairs": _entries(telling_ranks(data.rank_repeats)),
             "table": f"{PAIR_TABLE}.csv" if data.repeats or data.rank_repeats else None,
         },
-        "held_out": {
-            "failure": data.held_out_failure or None,
-            "folds": [
-                {**_entries([fold], ("rows", "curves"))[0], "scores": _entries(fold.rows)} for fold in data.held_out
-            ],
-            "rank": [{**_entries([fold], ("rows",))[0], "scores": _entries(fold.rows)} for fold in data.held_out_rank],
-        },
         "season": {
             "held_out": data.season.held_out,
             "started": data.season.started,
             "ranking": _entries(data.season.ranking),
             "drift": _entries(data.season.drift),
-            "places": [{"tower": p.tower, "channel": p.channel, "cells": len(p.n)} for p in data.season.places],
+            "cells": 0 if data.season.places is None else len(data.season.places.cells),
         },
         "workers": data.workers,
         "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
@@ -190,10 +182,8 @@ def halves(data: CampaignData) -> list[tuple[RssRow, Repeated | None, Repeated]]
 
 def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page."""
-    linked = payload(data)
     return rendered(
         "campaign",
-        ("common.js", "campaign_explorer.js") if linked else (),
         data=data,
         sections=by_section(pictures),
         mean_rmse=mean_rmse(data),
@@ -216,8 +206,6 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         many=MANY,
         few_flights=FEW_FLIGHTS,
         rows_shown=ROWS_SHOWN,
-        fold_rows=FOLD_ROWS,
-        explorer=embedded(linked),
     )
 
 

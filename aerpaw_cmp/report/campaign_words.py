@@ -8,7 +8,7 @@ import numpy as np
 
 from ..compare.rss import LEARNED_HERE
 from ..compare.verdicts import Verdict, campaign_verdict
-from .campaign_data import CampaignData, RankHeldOutFold, RssRow
+from .campaign_data import CampaignData, RssRow
 from .first_screen import most_telling, pooled_db
 from .names import k_key
 from .phrases import said_of
@@ -86,27 +86,7 @@ def headline(data: CampaignData) -> list[str]:
             )
         else:
             out.append("No two flights pass the same places within the radius, so there is no repeatability floor.")
-    for fold in data.held_out:
-        held = [r for r in fold.rows if not r.fitted_here]
-        if held:
-            out.append(
-                f"Fitted on {', '.join(fold.fitted_on)}: on {', '.join(fold.applied_to)} the mean RMSE goes from "
-                f"{np.mean([r.start_rmse_db for r in held]):.2f} to {np.mean([r.rmse_db for r in held]):.2f} dB."
-            )
-    return out + [_rank_fold_words(fold) for fold in data.held_out_rank if fold.applied_to]
-
-
-def _rank_fold_words(fold: RankHeldOutFold) -> str:
-    """Sentence on what a fit of rank is worth on flights that had no say."""
-    held = [r for r in fold.rows if not r.fitted_here]
-    kappa = [np.mean([getattr(r, f"{label}_kappa") for r in held]) for label in ("start", "fit")]
-    agree = [np.mean([getattr(r, name) for r in held]) for name in ("fit_agreement", "majority_agreement")]
-    ties = f"; {len(fold.ties)} other values fit as well" if fold.ties else ""
-    return (
-        f"Rank fitted on {', '.join(fold.fitted_on)}: on {', '.join(fold.applied_to)} kappa goes from {kappa[0]:.2f} "
-        f"to {kappa[1]:.2f}, {100 * agree[0]:.0f} % of the reports agree (always the commonest rank: "
-        f"{100 * agree[1]:.0f} %){ties}."
-    )
+    return out
 
 
 def _ranked_words(data: CampaignData) -> list[str]:
@@ -126,14 +106,6 @@ def warnings(data: CampaignData) -> list[str]:
     out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures[:FEW]]
     if len(data.failures) > FEW:
         out = [f"{len(data.failures)} flights or settings gave no numbers: they stand under Failures."]
-    if data.held_out_failure:
-        out.append(f"Held-out fit: {data.held_out_failure}")
-    for fold in data.held_out:
-        on = ", ".join(fold.fitted_on)
-        out += [f"Fitted on {on}: {name} ended at a bound of its values." for name in fold.at_bounds]
-        out += [f"Fitted on {on}: {name} has no effect; its value means nothing." for name in fold.without_effect]
-        if not fold.applied_to:
-            out.append(f"Fitted on {on}: no flight was held out, so every number of the fit is scored on its own data.")
     out += [
         f"{row.flight}, {row.setting}, {row.link}: its antennas were learned from this very log, so it is not scored."
         for row in data.rss

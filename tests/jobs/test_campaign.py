@@ -14,16 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
-from aerpaw_cmp.jobs.campaigns import campaign_fit
 from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, run
-from aerpaw_cmp.jobs.campaigns.campaign_fit import goes_round, search
 from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
@@ -102,7 +98,7 @@ def result(folder: Path, name: str, *arguments: str, code: int = 0, **keys: Any)
 
 @pytest.fixture(scope="module")
 def whole(folder: Path) -> dict[str, Any]:
-    """One campaign with everything: two settings, shared offsets, a fit on the first flight, a flight that is broken."""
+    """One campaign with everything: two settings, shared offsets, a flight that is broken."""
     broken = flight_settings("first", 1, 0.0)
     broken["flight"] = {"name": "broken"}
     broken["logs"][1]["path"] = "gone/<b>USRP1.txt"
@@ -113,50 +109,28 @@ def whole(folder: Path) -> dict[str, Any]:
         flights=["first.yaml", "second.yaml", "broken.yaml", "missing.yaml"],
         settings={"as written": {}, "right azimuth": {YAW: YAW_DEG}},
         calibration="channel",
-        held_out={"fit": {YAW: list(range(0, 360, 10))}, "fit_on": ["first"], "samples": 100},
-        export=["mat", "kmz"],
+        export=["geojson", "kmz"],
     )
 
 
 def test_the_samples_of_all_flights_are_exported(whole: dict[str, Any], folder: Path) -> None:
-    """Read by SciPy: each link's residual gives the RMSE of its row, and its times are those of the plan."""
-    from scipy.io import loadmat
-
+    """Read as JSON: each link's residual gives the RMSE of its row, and its times are those of the plan."""
     place = folder / "whole_out" / "exports"
-    links = loadmat(place / "samples.mat", simplify_cells=True)["rss"]
-    rows = {(r["flight"], f"{r['tower']} {r['channel']}"): r for r in whole["rss"] if r["setting"] == "as written"}
-    assert {(link["flight"], f"{link['tower']} {link['channel']}") for link in links} == set(rows)
-    for link in links:
-        rmse = np.sqrt(np.nanmean(link["residual_db"] ** 2))
-        assert rmse == pytest.approx(rows[link["flight"], f"{link['tower']} {link['channel']}"]["rmse_db"], abs=1e-3)
-        assert link["time_posix_s"][0] == pytest.approx(START_POSIX_S, abs=60)
+    points = json.loads((place / "rss.geojson").read_text(encoding="utf-8"))["features"]
+    links: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    for point in (p["properties"] for p in points):
+        links.setdefault((point["flight"], point["tower"], point["channel"]), []).append(point)
+    rows = {(r["flight"], r["tower"], r["channel"]): r for r in whole["rss"] if r["setting"] == "as written"}
+    assert set(links) == set(rows)
+    for key, samples in links.items():
+        residual = [p["residual_db"] for p in samples if p["residual_db"] is not None]
+        assert np.sqrt(np.mean(np.square(residual))) == pytest.approx(rows[key]["rmse_db"], abs=1e-3)
+        first = np.datetime64(samples[0]["time"].rstrip("Z")).astype("datetime64[s]").astype(int)
+        assert first == pytest.approx(START_POSIX_S, abs=60)
     with zipfile.ZipFile(place / "samples.kmz") as archive:
         assert archive.read("doc.kml").decode().count("<gx:Track>") == 2
-    assert "exports/samples.mat" in (folder / "whole_out" / "campaign.html").read_text(encoding="utf-8")
-    assert "exports/samples.mat" in (folder / "whole_out" / "SHA256SUMS").read_text(encoding="utf-8")
-
-
-def test_the_planted_azimuth_is_recovered_and_holds_on_the_other_flight(whole: dict[str, Any]) -> None:
-    (fold,) = whole["held_out"]["folds"]
-    assert fold["fitted_on"] == ["first"]
-    assert fold["applied_to"] == ["second"]
-    assert fold["parameters"] == {YAW: YAW_DEG}
-    assert fold["at_bounds"] == []
-    for row in fold["scores"]:
-        assert row["fitted_here"] == (row["flight"] == "first")
-        assert row["start_rmse_db"] > 4.0
-        assert row["rmse_db"] == pytest.approx(FADING_DB, abs=0.25)
-
-
-def test_the_transferred_offset_is_that_of_the_flight_of_the_fit(whole: dict[str, Any]) -> None:
-    """With the other flight's offset the RMSE has the difference of the two planted offsets in it, in quadrature."""
-    rows = {(r["flight"], r["channel"]): r for r in whole["held_out"]["folds"][0]["scores"]}
-    for channel, less in (("USRP1", 0.0), ("USRP2", 1.0)):
-        assert rows["first", channel]["transferred_rmse_db"] is None
-        row = rows["second", channel]
-        assert row["transferred_offset_db"] == pytest.approx(OFFSETS_DB["first"] - less, abs=0.3)
-        apart = OFFSETS_DB["first"] - OFFSETS_DB["second"]
-        assert row["transferred_rmse_db"] == pytest.approx(np.hypot(FADING_DB, apart), abs=0.4)
+    assert "exports/rss.geojson" in (folder / "whole_out" / "campaign.html").read_text(encoding="utf-8")
+    assert "exports/rss.geojson" in (folder / "whole_out" / "SHA256SUMS").read_text(encoding="utf-8")
 
 
 def test_settings_are_run_on_every_flight(whole: dict[str, Any]) -> None:
@@ -233,57 +207,10 @@ def test_every_figure_is_there_and_old_ones_are_not(whole: dict[str, Any], folde
     result(folder, "again", flights=["first.yaml"])
     names = {p.name for p in (folder / "again_out" / "figures").glob("*")}
     assert "tracks.svg" in names
-    assert "held_out_1.svg" not in names
-
-
-def test_without_fit_on_each_flight_is_left_out_once(folder: Path) -> None:
-    path = write_campaign(folder, "left_out", held_out={"fit": {YAW: [0, 60, 110, 160]}, "samples": 60})
-    data = run(load_campaign(path), folder)
-    assert [(f.fitted_on, f.applied_to) for f in data.held_out] == [
-        (("second",), ("first",)),
-        (("first",), ("second",)),
-    ]
-    assert all(fold.parameters == {YAW: YAW_DEG} for fold in data.held_out)
-
-
-def test_parameters_without_effect_and_at_a_bound_are_named(folder: Path) -> None:
-    path = write_campaign(
-        folder,
-        "flat",
-        held_out={
-            "fit": {"link.rss.uav.yaw_deg": [0, 90], YAW: [0, 50, 100]},
-            "fit_on": ["first"],
-            "samples": 60,
-        },
-    )
-    (fold,) = run(load_campaign(path), folder).held_out
-    assert fold.without_effect == ("link.rss.uav.yaw_deg",)
-    assert YAW in fold.at_bounds
-
-
-def test_a_planted_clock_shift_is_recovered_on_the_other_flight(folder: Path) -> None:
-    """Both radio clocks show 1.5 s too much; the fit on one flight says so, and the other flight agrees."""
-    for seed, name in enumerate(OFFSETS_DB, start=1):
-        settings = flight_settings(name, seed, YAW_DEG)
-        settings["flight"]["plan"]["clock_shift_s"] = {"LW1": 1.5}
-        (folder / f"late_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
-        simulate(folder / f"late_{name}.yaml", folder / "late")
-    path = write_campaign(
-        folder,
-        "late",
-        flights=["late_first.yaml", "late_second.yaml"],
-        held_out={"fit": {"rss.lag": [-1.5, 0.0, 0.5, 1.0, 1.5, 2.0]}, "fit_on": ["second"], "samples": 100},
-    )
-    (fold,) = run(load_campaign(path), folder, RunOptions(logs_root=folder / "late")).held_out
-    assert fold.parameters == {"rss.lag": 1.5}
-    held = [r for r in fold.rows if not r.fitted_here]
-    assert len(held) == 2
-    assert all(r.rmse_db < r.start_rmse_db for r in held)
-    assert all(r.own == ("offset_db",) for r in held)
 
 
 def test_a_lag_estimated_on_the_scored_samples_is_told(folder: Path) -> None:
-    """``rss.lag: apply`` fits the clock of every flight on itself, held out or not."""
+    """``rss.lag: apply`` fits the clock of every flight on itself."""
     for name in OFFSETS_DB:
         settings = flight_settings(name, 1, YAW_DEG)
         settings["rss"]["lag"] = "apply"
@@ -291,30 +218,10 @@ def test_a_lag_estimated_on_the_scored_samples_is_told(folder: Path) -> None:
         (folder / f"apply_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
         simulate(folder / f"apply_{name}.yaml", folder / "applied")
     flights = ["apply_first.yaml", "apply_second.yaml"]
-    campaign = load_campaign(
-        write_campaign(folder, "apply", flights=flights, held_out={"fit": {YAW: [YAW_DEG]}, "fit_on": ["first"]})
-    )
+    campaign = load_campaign(write_campaign(folder, "apply", flights=flights))
     data = run(campaign, folder, RunOptions(logs_root=folder / "applied"))
-    (fold,) = data.held_out
-    by = {(r.flight, r.channel): r.fitted for r in data.rss}
-    assert {(r.flight, r.channel): r.own for r in fold.rows} == by
-    assert any("lag_s" in own for own in by.values())
-
-
-def test_one_parameter_after_the_other_finds_what_all_combinations_find(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each channel's azimuth touches that channel only, so both searches must end at the same place."""
-    grid = list(range(0, 360, 30))
-    fit = {f"link.channels.{c}.tower.yaw_deg": grid for c in ("USRP1", "USRP2")}
-    path = write_campaign(folder, "sweeps", held_out={"fit": fit, "fit_on": ["first"], "samples": 60})
-    campaign = load_campaign(path)
-    (product,) = run(campaign, folder).held_out
-    monkeypatch.setattr(campaign_fit, "LARGEST_PRODUCT", 10)
-    (sweeps,) = run(campaign, folder).held_out
-    assert product.method == "every combination"
-    assert "after the other" in sweeps.method
-    assert sweeps.parameters == product.parameters == dict.fromkeys(fit, 120.0)
+    assert any("lag_s" in row.fitted for row in data.rss)
+    assert all("offset_db" in row.fitted for row in data.rss)
 
 
 def test_a_pool_of_processes_gives_the_same_numbers(folder: Path) -> None:
@@ -347,11 +254,8 @@ def test_json_is_alone_on_standard_output(folder: Path, capsys: pytest.CaptureFi
         ({"settings": {"x": {"rt.max_depth": 9}}}, "rt.max_depth"),
         ({"settings": {"x": {"rt.max_depth.y": 1}}}, "which is a value"),
         ({"settings": {"x": {"logs.7.path": "y"}}}, "no element '7'"),
-        ({"held_out": {"fit": {YAW: [10, 0]}}}, "increasing"),
-        ({"held_out": {"fit": {"rss.advanced.step_db": [1, 2]}}}, "below link, rt or site"),
-        ({"held_out": {"fit": {YAW: [0, 10]}, "fit_on": ["frist"]}}, "did you mean 'first'"),
-        ({"held_out": {"fit": {YAW: [0, 10]}, "setting": "as writen"}}, "as written"),
-        ({"held_out": {"fit": {"link.rss.towr.yaw_deg": [0, 10]}}}, "tower"),
+        ({"settings": {"x": {"link.rss.towr.yaw_deg": 10}}}, "tower"),
+        ({"held_out": {"fit": {YAW: [0, 10]}}}, "held_out is gone"),
         ({"flights": ["first.yaml", "first.yaml"]}, "two flights are named 'first'"),
         ({"calibratoin": "all"}, "calibration"),
         ({"keep": "s3://lab/season"}, "object stores are not written any more"),
@@ -500,12 +404,9 @@ def test_flights_without_a_sample_that_counts_give_no_number_and_end_nothing(fol
         "--strict",
         settings={"as written": {}, "high": {"rss.minimum_height_m": 500}},
         calibration="all",
-        held_out={"fit": {YAW: [0, 110]}, "fit_on": ["first"], "setting": "high"},
-        code=1,
     )
     rows = [r for r in found["rss"] if r["setting"] == "high"]
     assert [(r["n"], r["offset_db"], r["pooled_rmse_db"]) for r in rows] == [(0, None, None)] * 4
-    assert "nothing can be fitted on first" in found["held_out"]["failure"]
     assert found["mean_rmse_db"]["high"] == {"first": None, "second": None}
     assert found["mean_rmse_db"]["as written"]["first"] > 4.0
 
@@ -564,19 +465,10 @@ def real(name: str, folder: Path, **changes: Any) -> dict[str, Any]:
 @pytest.mark.field
 @needs_logs
 def test_two_real_flights(tmp_path: Path) -> None:
-    """The measured patterns need other azimuths than the paper's, and either flight says so for the other."""
-    azimuths = [60, 110, 160, 285]  # the best of a step of 50 degrees, its neighbours, the other side
-    fit = {f"link.channels.{channel}.tower.yaw_deg": azimuths for channel in ("USRP1", "USRP2")}
-    found = real("dataset12", tmp_path, held_out={"samples": 400, "fit": {"link.rss.uav.yaw_deg": [270, 315], **fit}})
+    """The measured patterns at the paper's azimuths, and what two flights differ by at the same places."""
+    found = real("dataset12", tmp_path)
     for name, rmse in (("dataset12_40m", (6.56 + 5.47) / 2), ("dataset12_70m", (7.14 + 6.30) / 2)):
         assert found["mean_rmse_db"]["isotropic, line of sight"][name] == pytest.approx(rmse, abs=0.05)
-    assert len(found["held_out"]["folds"]) == 2
-    for fold in found["held_out"]["folds"]:
-        assert fold["parameters"]["link.rss.uav.yaw_deg"] == 270
-        assert fold["parameters"]["link.channels.USRP1.tower.yaw_deg"] == 110
-        held = [r for r in fold["scores"] if not r["fitted_here"]]
-        assert np.mean([r["rmse_db"] for r in held]) < np.mean([r["start_rmse_db"] for r in held]) - 0.3
-        assert np.mean([r["rmse_db"] for r in held]) < 4.8
     for pair in found["repeatability"]["pairs"]:
         assert 3.0 < pair["rmse_db"] < 6.0
         assert pair["share"] < 0.25  # they meet on the way up and down only
@@ -631,29 +523,3 @@ def test_a_failed_task_leaves_its_traceback_in_a_file(folder: Path) -> None:
     text = (folder / "traced_out" / "failures" / "broken2__as_written.txt").read_text(encoding="utf-8")
     assert "there is no such log" in text
     assert "Traceback (most recent call last)" in text
-
-
-def test_what_goes_round() -> None:
-    assert goes_round(np.arange(0, 360, 10))
-    assert goes_round([-180.0, -60.0, 60.0])
-    assert goes_round(np.arange(0, 361, 10))
-    assert not goes_round(np.arange(0, 180, 10))
-    assert not goes_round([0.0, 10.0, 20.0, 350.0, 700.0])
-    assert not goes_round([0.0, 180.0])
-
-
-def test_an_azimuth_that_goes_round_has_no_bound(folder: Path) -> None:
-    """The best of values over the circle is the first of them; of values over a half it would be at a bound."""
-    for values, bound in (([110, 200, 290, 380], ()), ([110, 200], (YAW,))):
-        path = write_campaign(folder, "round", held_out={"fit": {YAW: values}, "fit_on": ["first"], "samples": 60})
-        (fold,) = run(load_campaign(path), folder).held_out
-        assert fold.parameters == {YAW: 110.0}
-        assert fold.at_bounds == bound
-
-
-@given(st.lists(st.floats(0, 1, width=32), min_size=1, max_size=5, unique=True), st.integers(1, 3))
-def test_the_search_gives_the_least_of_every_combination(values: list[float], keys: int) -> None:
-    grids = {str(key): sorted(values) for key in range(keys)}
-    found = search(lambda point: sum((x - 0.4) ** 2 for x in point.values()), grids)
-    assert set(found.point.values()) == {min(sorted(values), key=lambda x: (x - 0.4) ** 2)}
-    assert len(found.tried) == len(values) ** keys

@@ -75,9 +75,10 @@ def test_three_flights_whose_rounded_offsets_lie_on_a_line_are_not_certain():
 
 def test_the_planted_hill_lies_where_it_was_put(data):
     """Mean residual of all links by place: highest near (200 m, 300 m), north not flipped, east not exchanged."""
-    everything = next(p for p in data.season.places if not p.tower)
-    near = np.hypot(everything.east_m - 200, everything.north_m - 300) < 100
-    mirror = np.hypot(everything.east_m - 200, everything.north_m + 100) < 100
+    everything = data.season.places
+    east_m, north_m = (everything.cells.T + 0.5) * data.cell_m
+    near = np.hypot(east_m - 200, north_m - 300) < 100
+    mirror = np.hypot(east_m - 200, north_m + 100) < 100
     assert near.any()
     assert everything.mean_db[near].mean() > everything.mean_db[~near].mean() + 1.0
     if mirror.any():

@@ -2,59 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import json
 import re
-import zlib
 
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report import campaign_explorer, campaign_figures, campaign_html, campaign_pairs, canvas
+from aerpaw_cmp.report import campaign_figures, campaign_html, campaign_pairs, canvas
 from aerpaw_cmp.report.campaign_data import RankPairing, Repeat
-from aerpaw_cmp.report.explorer import as_json
-from aerpaw_cmp.report.packed import NONE
 from benchmarks import fabricated
 
 
 @pytest.fixture(scope="module")
 def data():
     return fabricated.season(30, 6, 2, 2)
-
-
-def columns(content):
-    block = zlib.decompress(base64.b64decode(content["packed"]["data"]))
-    arrays = [np.frombuffer(block, f"<{k}", count=n, offset=o) for k, o, n in content["packed"]["arrays"]]
-    return {name: arrays[number] for name, number in content["rows"].items()}
-
-
-def test_every_row_is_in_the_page_within_half_a_step(data):
-    content = json.loads(as_json(campaign_explorer.payload(data)))
-    rows = columns(content)
-    assert len(rows["flight"]) == len(data.rss)
-    for i in range(0, len(data.rss), 41):
-        row = data.rss[i]
-        assert content["flights"][rows["flight"][i]]["name"] == row.flight
-        assert content["settings"][rows["setting"][i]] == row.setting
-        assert content["links"][rows["link"][i]]["name"] == row.link
-        for name, value in (("own", row.rmse_db), ("held", row.held_out_rmse_db), ("offset", row.offset_db)):
-            assert rows[name][i] * content["step"] == pytest.approx(value, abs=content["step"] / 2 + 1e-9)
-
-
-def test_a_row_without_a_held_out_error_has_none(data):
-    rows = tuple(dataclasses.replace(r, held_out_rmse_db=float("nan")) for r in data.rss)
-    content = campaign_explorer.payload(dataclasses.replace(data, rss=rows))
-    assert (columns(content)["held"] == NONE["i2"]).all()
-
-
-def test_too_many_rows_cost_the_last_settings_and_the_page_says_so(data):
-    content = campaign_explorer.payload(data, most_rows=len(data.rss) // 2)
-    assert data.reference in content["settings"]
-    assert data.season.over_all()[0].setting in content["settings"]
-    assert len(content["settings"]) < 6
-    assert content["left_out"] == f"the {6 - len(content['settings'])} settings that stand last, of 6"
-    assert len(columns(content)["flight"]) <= len(data.rss) // 2
 
 
 def test_the_page_stays_small_and_tells_what_it_does_not_show(data):
@@ -88,7 +50,7 @@ def test_hostile_names_stay_text(data):
     )
     text = campaign_html.campaign_page(hostile, [], [])
     assert "<img" not in text
-    assert text.count("</script>") == 2
+    assert "<script" not in text
 
 
 def test_figures_of_a_season_are_few_and_can_be_drawn(data):

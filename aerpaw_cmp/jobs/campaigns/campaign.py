@@ -1,4 +1,4 @@
-"""Many flights and settings: run each, pool the offsets, fit on some flights and score on the others.
+"""Many flights and settings: run each, pool the offsets, compare flights at the same places.
 
 A campaign.yaml names flight files and, optionally, settings: labels with overrides of flight keys in dotted form
 (``rt.max_depth: 1``). Every setting runs on every flight. A flight that cannot be read is a row with its message.
@@ -6,28 +6,23 @@ A campaign.yaml names flight files and, optionally, settings: labels with overri
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field
 
-from ...common.errors import AerpawCmpError, InputError, UsageError
-from ...common.stages import Progress, Stages
+from ...common.errors import InputError, UsageError
+from ...common.stages import Stages
 from ...common.versions import versions
-from ...common.yamlfile import load_yaml, nearest
-from ...compare.rss import LEARNED_HERE
+from ...common.yamlfile import load_yaml
 from ...flight.overrides import Overrides, overridden
-from ...flight.settings import FlightFile, Settings, load_flight
-from ...report.campaign_data import CampaignData, Failure, HeldOutFold, RankHeldOutFold, RankRow, RssRow
+from ...flight.settings import FlightFile, GroupedSettings, load_flight
+from ...report.campaign_data import CampaignData, Failure
 from ..options import DEFAULT, RunOptions
 from ..tasks.workers import open_workers
-from .campaign_fit import HeldOutSettings, fit_all
 from .campaign_plan import compute, kept_outcomes
-from .campaign_rank_fit import K_KEY, fit_rank_all
 from .campaign_tasks import Task, counted_once, flight_data, outcome_store
 from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
 
@@ -35,7 +30,7 @@ AS_WRITTEN = "as written"
 """Label of the only setting of a campaign that names none."""
 
 
-class CampaignFile(Settings):
+class CampaignFile(GroupedSettings):
     """The whole campaign.yaml."""
 
     campaign: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
@@ -43,12 +38,17 @@ class CampaignFile(Settings):
     flights: Annotated[list[str], Field(min_length=1)]
     settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
     calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
-    held_out: HeldOutSettings | None = None
     repeatability: RepeatSettings = RepeatSettings()
     keep: str | None = None
     """Folder of outcomes, against this file's."""
     export: list[str] = Field(default_factory=list)
     """Formats of the samples: those of ``report.export`` of a flight."""
+
+    @classmethod
+    def refuse_gone(cls, data: Mapping[str, Any]) -> None:
+        """Raise a ValueError where a campaign of 0.3 asks for a fit."""
+        if "held_out" in data:
+            raise ValueError("held_out is gone: list the values under settings, or learn with aerpaw-cmp calibrate")
 
 
 def load_campaign(path: Path) -> CampaignFile:
@@ -57,36 +57,9 @@ def load_campaign(path: Path) -> CampaignFile:
     Raises
     ------
     UsageError
-        As :func:`aerpaw_cmp.common.yamlfile.load_yaml`; also an override that names no flight key, and values to
-        try that do not increase.
+        As :func:`aerpaw_cmp.common.yamlfile.load_yaml`.
     """
-    campaign = load_yaml(path, CampaignFile)
-    fit = campaign.held_out
-    for key, values in (fit.fit if fit else {}).items():
-        lists = bool(values) and isinstance(values[0], list)
-        if not values or (not lists and np.any(np.diff(values) <= 0)):
-            raise UsageError(f"held_out.fit.{key}: {values}", expected="increasing values", path=path)
-        _check_key(key, lists, of_rank=fit is not None and fit.criterion != "rmse", path=path)
-    labels = list(campaign.settings) or [AS_WRITTEN]
-    if fit and fit.setting is not None and fit.setting not in labels:
-        near = nearest(fit.setting, labels)
-        cause = f"did you mean {near!r}?" if near else None
-        raise UsageError(f"held_out.setting {fit.setting!r}", expected="one of settings", cause=cause, path=path)
-    return campaign
-
-
-def _check_key(key: str, lists: bool, *, of_rank: bool, path: Path) -> None:
-    """A key of the fit that its criterion can be fitted over."""
-    own = K_KEY if of_rank else "rss.lag"
-    if key.split(".")[0] not in ("link", "rt", "site") and key != own:
-        raise UsageError(
-            f"held_out.fit.{key}",
-            expected=f"a key below link, rt or site, or {own}",
-            cause=None if key != K_KEY else "criterion: kappa, log_score or total_variation fits rank",
-            path=path,
-        )
-    if lists and not of_rank:
-        raise UsageError(f"held_out.fit.{key}: lists", expected="numbers; lists are tried for rank alone", path=path)
+    return load_yaml(path, CampaignFile)
 
 
 # --- all of it --------------------------------------------------------------------------------------------------------
@@ -115,12 +88,12 @@ def run(
     Returns
     -------
     CampaignData
-        Rows of every flight and setting, pooled offsets, repeats, folds; a flight that failed is among ``failures``.
+        Rows of every flight and setting, pooled offsets, repeats; a flight that failed is among ``failures``.
 
     Raises
     ------
     UsageError
-        Overrides that no flight file could have, two flights of one name, an unknown flight in ``fit_on``.
+        Overrides that no flight file could have, two flights of one name.
     """
     stages, progress, logs_root = stages or Stages(), options.progress, options.logs_root
     if options.scheduler is not None:  # workers may stand in another folder
@@ -146,10 +119,6 @@ def run(
         rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
         repeated = repeats([r for r in rows if r.setting == next(iter(settings))], campaign.repeatability)
         ranks_again = rank_repeats(flown, campaign.repeatability.radius_m)
-    held_out = _Folds()
-    if campaign.held_out is not None:
-        with stages("held-out"):
-            held_out = _folds(campaign.held_out, tasks, rows, rank, progress)
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
     tracks = {o.track.flight: o.track for o in reversed(results) if o.track is not None}
     return CampaignData(
@@ -169,9 +138,6 @@ def run(
         pooled=tuple(pooled),
         repeats=tuple(repeated),
         rank_repeats=tuple(ranks_again),
-        held_out=held_out.rss,
-        held_out_rank=held_out.rank,
-        held_out_failure=held_out.failure,
         radius_m=campaign.repeatability.radius_m,
         heading_within_deg=campaign.repeatability.heading_within_deg,
         cell_m=campaign.repeatability.cell_m,
@@ -189,11 +155,10 @@ def campaign_tasks(
     Raises
     ------
     UsageError
-        Overrides that no flight file could have, two flights of one name, an unknown flight in ``fit_on``.
+        Overrides that no flight file could have, two flights of one name.
     """
     settings = campaign.settings or {AS_WRITTEN: {}}
     files, failures = _flight_files(campaign, folder, settings)
-    _check_names(campaign, files, failures)
     tasks = [
         Task(path, name, label, overrides, logs_root, reference=label == next(iter(settings)))
         for name, (path, _) in files.items()
@@ -207,44 +172,6 @@ def _inputs_of(files: Mapping[str, tuple[Path, FlightFile]], logs_root: Path | N
     paths = [path for path, _ in files.values()]
     paths += [(logs_root or path.parent) / log.path for path, flight in files.values() for log in flight.logs]
     return [path for path in paths if path.exists()]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Folds:
-    """Fits on some flights with their scores on others, or the reason why there are none."""
-
-    rss: tuple[HeldOutFold, ...] = ()
-    rank: tuple[RankHeldOutFold, ...] = ()
-    failure: str = ""
-
-
-def _folds(
-    settings: HeldOutSettings,
-    tasks: Sequence[Task],
-    rows: Sequence[RssRow],
-    rank: Sequence[RankRow],
-    progress: Progress,
-) -> _Folds:
-    """The held-out fit by its criterion; one that fails costs the other numbers of a campaign nothing."""
-    of_rank = settings.criterion != "rmse"
-    label, of = _tasks_of_fit(settings, tasks, rank if of_rank else rows)
-    try:
-        flights = {flight: flight_data(task) for flight, task in of.items()}
-        if of_rank:
-            return _Folds(rank=tuple(fit_rank_all(flights, settings, label, progress)))
-        return _Folds(rss=tuple(fit_all(flights, settings, label, progress)))
-    except AerpawCmpError as error:
-        return _Folds(failure=str(error))
-
-
-def _tasks_of_fit(
-    settings: HeldOutSettings, tasks: Sequence[Task], rows: Sequence[RssRow] | Sequence[RankRow]
-) -> tuple[str, dict[str, Task]]:
-    """Label of the setting that a fit starts from, and the task of each flight that gave rows under it."""
-    label = settings.setting or tasks[0].setting if tasks else ""
-    learned = {row.flight for row in rows if isinstance(row, RssRow) and LEARNED_HERE in row.fitted}
-    gave = {row.flight for row in rows if row.setting == label} - learned
-    return label, {task.flight: task for task in tasks if task.setting == label and task.flight in gave}
 
 
 def _flight_files(
@@ -272,28 +199,3 @@ def _flight_files(
                     f"settings.{label}: {error.found}", expected=error.expected, cause=error.cause
                 ) from None
     return files, failures
-
-
-def _check_names(
-    campaign: CampaignFile, files: Mapping[str, tuple[Path, FlightFile]], failures: Sequence[Failure]
-) -> None:
-    if campaign.held_out is None:
-        return
-    known = [*files, *(f.flight for f in failures)]
-    for name in campaign.held_out.fit_on or []:
-        if name not in known:
-            near = nearest(name, known)
-            raise UsageError(
-                f"held_out.fit_on names {name!r}",
-                expected="flights of the campaign: " + ", ".join(known),
-                cause=f"did you mean {near!r}?" if near else None,
-            )
-    first = {key: values[0] for key, values in campaign.held_out.fit.items() if key != K_KEY}
-    for path, flight in files.values():
-        for key, value in first.items():
-            try:
-                overridden(flight, {key: value})
-            except UsageError as error:
-                raise UsageError(
-                    f"held_out.fit for {path}: {error.found}", expected=error.expected, cause=error.cause
-                ) from None

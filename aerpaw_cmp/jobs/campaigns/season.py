@@ -56,7 +56,7 @@ def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) ->
             started={name: _iso(ns) for name, ns in started.items()},
             ranking=tuple(ranking),
             drift=tuple(drifts(rows, started)),
-            places=tuple(place_maps(data.reference_rows, data.cell_m)),
+            places=place_map(data.reference_rows, data.cell_m),
             reports=dict(reports or {}),
         ),
     )
@@ -199,29 +199,15 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
 # --- places -----------------------------------------------------------------------------------------------------------
 
 
-def place_maps(rows: Sequence[RssRow], cell_m: float) -> list[PlaceMap]:
-    """Mean residual of each cell of the plan over flights: of every tower and channel, and of all together."""
-    residuals: dict[tuple[str, str], dict[tuple[int, int], list[float]]] = {}
+def place_map(rows: Sequence[RssRow], cell_m: float) -> PlaceMap | None:
+    """Mean residual of each cell of the plan over flights, towers and channels; None without a cell."""
+    residuals: dict[tuple[int, int], list[float]] = {}
     for row in rows:
         for cell, (residual, _) in place_means(row, cell_m).items():
-            for key in ((row.tower, row.channel), ("", "")):
-                residuals.setdefault(key, {}).setdefault(cell, []).append(residual)
-    if len(residuals) == 2:  # one link: all together is the same
-        residuals.pop(("", ""))
-    return [_place_map(tower, channel, cells, cell_m) for (tower, channel), cells in residuals.items()]
-
-
-def _place_map(tower: str, channel: str, cells: Mapping[tuple[int, int], list[float]], cell_m: float) -> PlaceMap:
-    at = (np.array(list(cells), dtype=np.float64).reshape(-1, 2) + 0.5) * cell_m
-    return PlaceMap(
-        tower=tower,
-        channel=channel,
-        east_m=at[:, 0],
-        north_m=at[:, 1],
-        mean_db=np.array([np.mean(values) for values in cells.values()]),
-        spread_db=np.array([np.std(values, ddof=1) if len(values) > 1 else np.nan for values in cells.values()]),
-        n=np.array([len(values) for values in cells.values()]),
-    )
+            residuals.setdefault(cell, []).append(residual)
+    if not residuals:
+        return None
+    return PlaceMap(cells=np.array(list(residuals)), mean_db=np.array([np.mean(v) for v in residuals.values()]))
 
 
 # --- reports of the flights -------------------------------------------------------------------------------------------

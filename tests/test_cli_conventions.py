@@ -38,7 +38,6 @@ MISSING = [
     "ingest nope",
     "report nope.yaml",
     "report nope.yaml --dry-run",
-    "audit nope.yaml",
     "calibrate nope.yaml",
     "campaign nope.yaml",
     "benchmark --data nope",

@@ -40,10 +40,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on sta
 Force = Annotated[bool, typer.Option("--force", help="Replace files that this tool did not write; never an input.")]
 Export = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option(
-        help="Also write the samples as geojson, geopackage, kmz, mat, netcdf or all; names joined by commas, or "
-        "repeated."
-    ),
+    typer.Option(help="Also write the samples as geojson, kmz, netcdf or all; names joined by commas, or repeated."),
 ]
 LogsRoot = Annotated[
     Optional[Path],  # noqa: UP045

@@ -21,7 +21,7 @@ from .shown import number, print_files, print_json, print_plan, say, table
         "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
         "aerpaw-cmp report flight.yaml --dry-run",
         "aerpaw-cmp report flight.yaml --figures all --style paper",
-        "aerpaw-cmp report flight.yaml --export geopackage,kmz",
+        "aerpaw-cmp report flight.yaml --export geojson,kmz",
         "aerpaw-cmp report flight.yaml --with calibrated.yaml",
         "aerpaw-cmp report flight.yaml --against prediction",
         "aerpaw-cmp report flight.yaml --strict --json --quiet",

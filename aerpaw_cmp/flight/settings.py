@@ -517,7 +517,7 @@ class ReportSettings(GroupedSettings):
 
     title: str | None = None
     waypoints: list[Waypoint] = []
-    export: list[Literal["geojson", "geopackage", "kmz", "mat", "netcdf", "all"]] = []
+    export: list[Literal["geojson", "kmz", "netcdf", "all"]] = []
     """Formats of the samples besides rss.csv and rank.csv."""
 
 

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
-import itertools
 import json
-import sqlite3
 import sys
 import typing
 import zipfile
-from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -21,7 +17,7 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.compare.spread import NO_SPREAD, StatedSpread
 from aerpaw_cmp.flight.settings import ReportSettings
 from aerpaw_cmp.report.export import rank_frame, rss_frame
-from aerpaw_cmp.report.exports import formats, kmz, points, tables, vectors, write
+from aerpaw_cmp.report.exports import formats, kmz, points, write
 
 ODD = 'LW<4> & "ö"'
 DBM = "0.1 lg(re 1 mW)"
@@ -105,10 +101,10 @@ COLUMNS = {
 # --- one check per format, each against the CSVs ---------------------------------------------------------------------
 
 
-def check_vector(path, layer, kind, table, units):
-    """GeoJSON and GeoPackage, through GDAL."""
+def check_vector(path, kind, table, units):
+    """GeoJSON through GDAL."""
     pyogrio = pytest.importorskip("pyogrio")
-    meta, _, shapes, columns = pyogrio.raw.read(path, layer=layer)
+    meta, _, shapes, columns = pyogrio.raw.read(path)
     found = dict(zip(meta["fields"], columns, strict=True))
     assert meta["crs"] == "EPSG:4326"
     for name in COLUMNS[kind]:
@@ -126,52 +122,11 @@ def check_geojson(folder, frames):
         text = path.read_text(encoding="utf-8")
         head = json.loads(text, parse_constant=lambda name: pytest.fail(name))
         assert head["features"][0]["geometry"]["coordinates"][0] < -78, "longitude first (RFC 7946)"
-        check_vector(path, None, kind, table, {name: c["unit"] for name, c in head["columns"].items()})
+        check_vector(path, kind, table, {name: c["unit"] for name, c in head["columns"].items()})
     assert head["columns"]["simulated_rank_k10"]["codes"][0] == "out_of_coverage"
     towers = json.loads((folder / "towers.geojson").read_text())["features"]
     assert [t["properties"]["name"] for t in towers] == ["LW1", "LW2", "LW3", "LW4", "LW5"]
     assert towers[0]["geometry"]["coordinates"] == pytest.approx([-78.6960, 35.7275], abs=1e-7)
-
-
-def check_geopackage(folder, frames):
-    pyogrio = pytest.importorskip("pyogrio")
-    path = folder / "samples.gpkg"
-    assert [name for name, _ in pyogrio.list_layers(path)] == ["towers", "track", "rss", "rank", "layer_styles"]
-    with sqlite3.connect(path) as book:
-        assert book.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-        titles = book.execute("SELECT table_name, column_name, title FROM gpkg_data_columns").fetchall()
-    book.close()
-    for kind, table in frames.items():
-        units = {column: title.rsplit("[", 1)[-1].rstrip("]") for name, column, title in titles if name == kind}
-        check_vector(path, kind, kind, table, units)
-        box = pyogrio.read_info(path, layer=kind)["total_bounds"]
-        assert -78.71 < box[0] < box[2] < -78.68
-        assert 35.72 < box[1] < box[3] < 35.74
-    _, _, lines, _ = pyogrio.raw.read(path, layer="track")
-    assert len(lines) == 1
-    check_styles(path)
-
-
-def check_styles(path):
-    """The layers of samples have styles of QGIS: one by default, each of a column that the layer has."""
-    with sqlite3.connect(path) as book:
-        styles = book.execute("SELECT f_table_name, f_geometry_column, styleQML, useAsDefault FROM layer_styles")
-        styles = styles.fetchall()
-        columns = {name: {c[1] for c in book.execute(f"PRAGMA table_info({name})")} for name in ("rss", "rank")}
-    book.close()
-    assert [sum(one[3] for one in styles if one[0] == kind) for kind in columns] == [1, 1]
-    for kind, geometry, text, _ in styles:
-        tree = ElementTree.fromstring(text)
-        renderer = tree.find("renderer-v2")
-        assert geometry in columns[kind]
-        assert renderer.get("attr") in columns[kind]
-        rules = renderer.findall("*/range") + renderer.findall("*/category")
-        symbols = [one.get("name") for one in renderer.findall("symbols/symbol")]
-        assert [one.get("symbol") for one in rules] == symbols
-        assert len(symbols) > 3
-        bounds = [(float(one.get("lower")), float(one.get("upper"))) for one in rules if one.tag == "range"]
-        assert all(low < high for low, high in bounds)
-        assert all(before[1] == after[0] for before, after in itertools.pairwise(bounds)), "no value falls between"
 
 
 def check_netcdf(folder, frames):
@@ -194,26 +149,6 @@ def check_netcdf(folder, frames):
                 assert codes["flag_meanings"].split()[0] == "out_of_coverage"
                 assert codes["flag_values"][0] == 0
                 assert np.isnan(book["measured_rank"].values).any(), "no CSI stays missing"
-
-
-def check_mat(folder, frames):
-    from scipy.io import loadmat
-
-    book = loadmat(folder / "samples.mat", simplify_cells=True)
-    for kind, table in frames.items():
-        links = np.atleast_1d(book[kind])
-
-        def all_of(name, links=links):
-            return np.concatenate([np.atleast_1d(link[name]) for link in links])
-
-        for name in COLUMNS[kind]:
-            same(table, name, all_of(name))
-        same_times(table, pd.to_datetime(all_of("time_posix_s"), unit="s", utc=True))
-        same_places(table, all_of("latitude_deg"), all_of("longitude_deg"))
-        assert list(dict.fromkeys(link["tower"] for link in links)) == list(dict.fromkeys(table["tower"]))
-        assert book[f"{kind}_units"]["simulated_dbm" if kind == "rss" else "level_dbm"] == "dBm"
-    assert "synthetic" in book["about"]["remarks"]
-    assert book["towers"]["latitude_deg"][0] == pytest.approx(35.7275)
 
 
 def valid_kml(folder, text):
@@ -275,9 +210,7 @@ def check_kmz(folder, frames, data):
 
 CHECKS = {
     "geojson": check_geojson,
-    "geopackage": check_geopackage,
     "netcdf": check_netcdf,
-    "mat": check_mat,
     "kmz": check_kmz,
 }  # fmt: skip
 
@@ -303,7 +236,7 @@ def changed(export, change):
 
 def swap_places(monkeypatch, data):
     real = points.latitude_longitude
-    for module in (points, vectors, kmz):
+    for module in (points, kmz):
         monkeypatch.setattr(module, "latitude_longitude", lambda *places: real(*places)[::-1])
     return points.of_report(data)
 
@@ -433,10 +366,10 @@ def test_a_long_flight_is_thinned_with_its_extremes(data, tmp_path, monkeypatch)
 
 
 def test_formats_are_chosen_by_name():
-    assert formats.chosen_formats(["MAT, kmz", "kmz"]) == ("kmz", "mat")
+    assert formats.chosen_formats(["GeoJSON, kmz", "kmz"]) == ("geojson", "kmz")
     assert formats.chosen_formats(["all"]) == write.FORMATS
     assert formats.chosen_formats([]) == ()
-    with pytest.raises(UsageError, match=r"'shapefile'.*geopackage"):
+    with pytest.raises(UsageError, match=r"'shapefile'.*netcdf"):
         formats.chosen_formats(["shapefile"])
     asked = typing.get_args(typing.get_args(ReportSettings.model_fields["export"].annotation)[0])
     assert set(asked) == {*write.FORMATS, formats.ALL}
@@ -469,19 +402,3 @@ def test_a_limit_of_the_disk_is_an_oserror_in_every_format(name, data, tmp_path,
             write.write_exports(export, tmp_path, [name])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-def test_a_full_disk_is_an_oserror_for_sqlite_too(data, tmp_path, monkeypatch):
-    def full(*_):
-        raise sqlite3.OperationalError("database or disk is full")
-
-    monkeypatch.setattr(vectors, "_fill", full)
-    with pytest.raises(OSError, match="full") as caught:
-        vectors.write_geopackage(points.of_report(data), tmp_path)
-    assert caught.value.errno == errno.ENOSPC
-
-
-def test_a_flight_too_long_for_matlab_is_told(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "LARGEST_MAT", 1000)
-    with pytest.raises(UsageError, match="MATLAB 5"):
-        tables.write_mat(points.of_report(data), tmp_path)

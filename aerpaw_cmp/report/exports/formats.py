@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from ...common.errors import UsageError
 
-FORMATS = ("geojson", "geopackage", "kmz", "mat", "netcdf")
+FORMATS = ("geojson", "kmz", "netcdf")
 _NEEDS = {"netcdf": ("netCDF4", "xarray")}
 """By format: the modules that it needs besides the default installation."""
 
@@ -25,8 +25,8 @@ def chosen_formats(*lists: str | Iterable[str]) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> chosen_formats(["mat,kmz", "mat"], "geojson")
-    ('geojson', 'kmz', 'mat')
+    >>> chosen_formats(["netcdf,kmz", "kmz"], "geojson")
+    ('geojson', 'kmz', 'netcdf')
     """
     names = [name for some in lists for name in ([some] if isinstance(some, str) else some)]
     wanted = [part.strip().lower() for name in names for part in name.split(",") if part.strip()]

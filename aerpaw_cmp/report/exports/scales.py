@@ -1,4 +1,4 @@
-"""Colours of levels, residuals and ranks: of the lines in Google Earth, of the points in QGIS."""
+"""Colours of levels, residuals and ranks: of the lines in Google Earth."""
 
 from __future__ import annotations
 

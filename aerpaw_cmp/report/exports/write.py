@@ -7,18 +7,16 @@ from pathlib import Path
 
 from ...common.stages import Progress, silent
 from .formats import FOLDER, FORMATS, missing_module
+from .geojson import write_geojson
 from .kmz import write_kmz
+from .netcdf import write_netcdf
 from .points import Export
-from .tables import write_mat, write_netcdf
-from .vectors import write_geojson, write_geopackage
 
 __all__ = ["FORMATS", "write_exports"]
 
 _WRITERS: dict[str, Callable[[Export, Path], list[Path]]] = {
     "geojson": write_geojson,
-    "geopackage": write_geopackage,
     "kmz": write_kmz,
-    "mat": write_mat,
     "netcdf": write_netcdf,
 }
 
@@ -42,8 +40,6 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
 
     Raises
     ------
-    UsageError
-        If a format cannot hold the samples.
     OSError
         If the disk does not take a file.
     """

@@ -1,103 +1,18 @@
-"""Samples as tables of numbers: MATLAB 5, NetCDF after CF-1.11."""
+"""Samples as tables of numbers: NetCDF after CF-1.11."""
 
 from __future__ import annotations
 
-import io
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...common.cf import WGS84, dataset, file_attributes, netcdf_bytes
-from ...common.errors import UsageError
 from .points import LABELS, PLACES, Column, Export, Points
-
-LARGEST_MAT = 2**31 - 2**20
-"""Bytes of one variable of a MATLAB 5 file, a little below its limit."""
 
 NO_CODE = -1
 """Stands for a missing code in NetCDF; attribute ``_FillValue``."""
 
-
-# --- MATLAB ---------------------------------------------------------------------------------------------------------
-
-
-def write_mat(export: Export, folder: Path) -> list[Path]:
-    """``samples.mat``: ``about``, ``towers``, ``units``, and each kind as a struct array with one element per link.
-
-    Raises
-    ------
-    UsageError
-        If a variable would be larger than the format takes.
-    """
-    from scipy.io import savemat
-
-    towers = export.site.towers.values()
-    content: dict[str, Any] = {
-        "about": {
-            "name": export.name,
-            "title": export.title,
-            "remarks": " ".join(export.remarks),
-            "time": "time_posix_s counts seconds since 1970-01-01 UTC: datetime(x, 'ConvertFrom', 'posixtime')",
-            "has_clock": export.clock,
-            "synthetic": export.synthetic,
-            **export.attributes,
-        },
-        "towers": {
-            "name": np.array([t.name for t in towers], dtype=object)[:, None],
-            "latitude_deg": np.array([t.latitude_deg for t in towers]),
-            "longitude_deg": np.array([t.longitude_deg for t in towers]),
-            "position_m": np.array([t.position_m for t in towers]).reshape(-1, 3),
-        },
-    }
-    for points in export.sets:
-        largest = len(points) * (len(points.columns) + 7) * 8
-        if largest > LARGEST_MAT:
-            raise UsageError(
-                f"{points.kind} has {len(points)} samples, {largest / 2**30:.1f} GiB: too many for a MATLAB 5 file",
-                expected="another format, such as netcdf (which MATLAB reads, too)",
-            )
-        content[points.kind] = _structs(points)
-        content[f"{points.kind}_units"] = {_field(c.name): c.shown_unit or "1" for c in points.columns}
-    buffer = io.BytesIO()
-    savemat(buffer, content, long_field_names=True, do_compression=True, oned_as="column")
-    path = folder / "samples.mat"
-    path.write_bytes(buffer.getbuffer())
-    return [path]
-
-
-def _field(name: str) -> str:
-    """A name that MATLAB takes.
-
-    Examples
-    --------
-    >>> _field("simulated_rank_k12.5")
-    'simulated_rank_k12_5'
-    """
-    return re.sub(r"\W", "_", name)[:63]
-
-
-def _structs(points: Points) -> Any:
-    """A struct array (1, links)."""
-    structs = []
-    for flight, tower, channel, rows in points.links():
-        time = rows["time"].to_numpy()
-        struct: dict[str, Any] = {
-            "flight": flight,
-            "tower": tower,
-            "channel": channel,
-            "unit": str(rows["unit"].iloc[0]),
-        }
-        struct["time_posix_s"] = np.where(np.isnat(time), np.nan, time.astype(np.int64) / 1e9)[:, None]
-        names = (*PLACES, *(c.name for c in points.columns))
-        structs.append(struct | {_field(name): rows[name].to_numpy()[:, None] for name in names})
-    array = np.empty((1, len(structs)), dtype=[(name, object) for name in structs[0]])
-    array[0] = [tuple(struct.values()) for struct in structs]
-    return array
-
-
-# --- NetCDF ---------------------------------------------------------------------------------------------------------
 
 _TITLES = {"rss": "Received level, measured and replayed", "rank": "Channel rank, reported and replayed"}
 

@@ -16,7 +16,6 @@ from .shown import number, print_json, say, table
     examples=[
         "aerpaw-cmp explain sample_logs/flight.yaml --time 20 --tower LW1",
         "aerpaw-cmp explain flight.yaml --time 2025-06-01T14:00:20Z --tower LW1 --channel USRP2 --json",
-        "aerpaw-cmp explain flight.yaml --time 20 --tower LW1 --engine both",
     ],
 )
 def explain(
@@ -28,10 +27,8 @@ def explain(
         typer.Option(help="Channel of the RSS logs, or 'rank'  [default: first log of the tower]"),
     ] = None,
     engine: Annotated[
-        Optional[Literal["image", "sionna", "both"]],  # noqa: UP045
-        typer.Option(
-            help="Path search; both: also paths that one search misses, with the reason  [default: rt.engine]"
-        ),
+        Optional[Literal["image", "sionna"]],  # noqa: UP045
+        typer.Option(help="Path search  [default: rt.engine]"),
     ] = None,
     logs_root: LogsRoot = None,
     as_json: Json = False,
@@ -93,14 +90,5 @@ def _print(explanation: Any) -> None:
         print(f"measured {number(explanation.measured_db, '{:.2f}')} {explanation.unit}, before any offset")
     for path, reason in explanation.absent:
         print(f"not there: {path}: {reason}")
-    if explanation.differences is not None:
-        if not explanation.differences:
-            print("both engines have the same paths")
-        for difference in explanation.differences:
-            other = "sionna" if difference.found_by == "image" else "image"
-            level = number(difference.level_dbm, "{:.2f}")
-            print(
-                f"{difference.found_by} has and {other} has not: {difference.path} ({level} dBm): {difference.reason}"
-            )
     for note in explanation.notes:
         print(f"note: {note}")

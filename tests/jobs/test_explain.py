@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 import numpy as np
@@ -12,7 +11,6 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.jobs.reporting import explain
 from aerpaw_cmp.jobs.reporting.explain import run_explain
 from tests.json_page import unlisted
 from tests.simulated import simulate
@@ -107,35 +105,3 @@ def test_command_line_and_json(flown, capsys):
 def test_bad_input_is_one_message(flown, change, message):
     with pytest.raises(UsageError, match=message):
         run_explain(flown[0], **{"time": "4", "tower": "LW1", **change})
-
-
-def test_paths_that_one_engine_lacks_are_named_with_the_reason(flown, monkeypatch):
-    """Sionna stands for itself with samples missing and a path through a wall: what it says is made up here."""
-    path, _ = flown
-    true = explain.replay_poses
-
-    def replay_poses(site, rt, link, pose, *, engine=None, **_):
-        found = true(site, rt, link, pose, engine="image")
-        if engine != "sionna":
-            return found
-        few = rt.advanced.samples == "auto"
-        paths = found.paths.select(found.paths.depth < (1 if few else 2))
-        return dataclasses.replace(found, paths=paths, engine="sionna", samples=1000)
-
-    monkeypatch.setattr(explain, "replay_poses", replay_poses)
-    found = run_explain(path, time="4", tower="LW1", engine="both")
-    assert {one.found_by for one in found.differences} == {"image"}
-    budget = [one for one in found.differences if "sample budget: found with 10000" in one.reason]
-    assert "ground" in {one.path for one in budget}
-
-    def no_direct_path(site, rt, link, pose, *, engine=None, **_):
-        found = true(site, rt, link, pose, engine="image")
-        return (
-            found if engine == "sionna" else dataclasses.replace(found, paths=found.paths.select(found.paths.depth > 0))
-        )
-
-    monkeypatch.setattr(explain, "replay_poses", no_direct_path)
-    found = run_explain(path, time="4", tower="LW1", engine="both")
-    (one,) = found.differences
-    assert (one.found_by, one.path, one.reason) == ("sionna", "line of sight", "no reason found")
-    assert found.absent[0][0] == "line of sight"

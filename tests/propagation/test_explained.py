@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.propagation.check.explain import near_an_edge, why_not
+from aerpaw_cmp.propagation.check.explain import why_not
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.mirror import find_paths
@@ -35,25 +35,6 @@ def test_reasons_of_geometry(scenes):
         there = set(found.faces[(found.pose == pose) & (found.depth == 1), 0].tolist())
         for face in range(len(faces)):
             assert (why_not(faces, source, place, np.array([face])) == "") == (face in there)
-
-
-def test_a_point_near_an_edge_is_known_as_such(scenes):
-    faces = site_faces(scenes.site((Building("barn", box(20, -10, 30, 10), 15.0),)))
-    wall = int(np.flatnonzero(faces.normal[:, 0] < -0.9)[0])
-    source = np.array([0.0, 0, 10])
-    for north, near in ((19.9995, True), (10.0, False)):
-        target = np.array([0.0, north, 10])
-        point = np.array([20.0, north / 2, 10.0])
-        path = type("P", (), {"bounces": (), "planes": ()})()
-        bounce = type("B", (), dict(zip(("east_m", "north_m", "up_m"), point, strict=True)))()
-        path.bounces, path.planes = (bounce,), (wall,)
-        assert near_an_edge(faces, source, target, path) == near
-    # a line of sight that passes half a millimetre, or five, above a roof
-    faces = site_faces(scenes.site((Building("barn", box(20, -10, 30, 10), 15.0),)))
-    for above, near in ((5e-4, True), (5e-3, False)):
-        ends = np.array([[0.0, 0, 15 + above], [60.0, 0, 15 + above]])
-        line = type("P", (), {"bounces": (), "planes": ()})()
-        assert near_an_edge(faces, *ends, line) == near
 
 
 def test_a_scene_of_triangles_is_no_error(scenes):

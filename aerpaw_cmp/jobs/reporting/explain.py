@@ -1,4 +1,4 @@
-"""``aerpaw-cmp explain``: every path of one link at one instant, and what the other engine makes of it."""
+"""``aerpaw-cmp explain``: every path of one link at one instant."""
 
 from __future__ import annotations
 
@@ -24,30 +24,15 @@ from ...propagation.check.explain import (
     ExplainedPath,
     edge_path_lines,
     explain_paths,
-    near_an_edge,
     power_sum_dbm,
     simple_paths,
     wall_path_lines,
     why_not,
 )
 from ...propagation.drivers.moving import site_with_tower_at
-from ...propagation.paths import joined
+from ...propagation.options import Engine
 from ...propagation.replay import Replay
-from ...propagation.search.mirror import planes_of
 from ...site.site import Site
-
-MORE_SAMPLES = 10
-"""Times the samples with which Sionna is asked again for paths that it lacks."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OtherEngine:
-    """A path that one engine has and the other has not, in words, with its level where it has one and the reason."""
-
-    found_by: str
-    path: str
-    level_dbm: float | None
-    reason: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,8 +47,6 @@ class Explanation:
         Of the paths' powers.
     absent : tuple of (str, str)
         Line of sight or ground reflections that are not there, and why.
-    differences : tuple of OtherEngine, optional
-        Where both engines were asked.
     """
 
     flight: str
@@ -81,7 +64,6 @@ class Explanation:
     measured_db: float | None
     unit: str
     absent: tuple[tuple[str, str], ...]
-    differences: tuple[OtherEngine, ...] | None
     notes: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -89,8 +71,6 @@ class Explanation:
         result = {name: getattr(self, name) for name in self.__slots__}
         result["paths"] = [path.as_dict() for path in self.paths]
         result["absent"] = [{"path": path, "reason": reason} for path, reason in self.absent]
-        if self.differences is not None:
-            result["differences"] = [dataclasses.asdict(difference) for difference in self.differences]
         for name in ("level_dbm", "power_sum_dbm", "measured_db"):
             if result[name] is not None and not np.isfinite(result[name]):
                 result[name] = None
@@ -103,7 +83,7 @@ def run_explain(
     time: str,
     tower: str,
     channel: str | None = None,
-    engine: str | None = None,
+    engine: Engine | None = None,
     logs_root: Path | None = None,
     progress: Progress = silent,
 ) -> Explanation:
@@ -117,8 +97,8 @@ def run_explain(
     tower : str
     channel : str, optional
         Of the RSS logs; "rank" for the rank log. Default: the first series of the tower.
-    engine : {"image", "sionna", "both"}, optional
-        Whose paths; default ``rt.engine``. "both" also says what each has that the other has not.
+    engine : {"image", "sionna"}, optional
+        Whose paths; default ``rt.engine``.
     logs_root : Path, optional
     progress : Progress
 
@@ -142,15 +122,11 @@ def run_explain(
         _known(known, series, at)
         data = dataclasses.replace(data, site=site_with_tower_at(data.site, tower, place[0]))
     rt = settings.rt.model_copy(update={"engine": "sionna"}) if engine == "sionna" else settings.rt
-    chosen = rt.engine if engine in (None, "both") else engine
-    replayed = replay_poses(data.site, rt, link, pose, engine=chosen, progress=progress)  # type: ignore[arg-type]
+    replayed = replay_poses(data.site, rt, link, pose, engine=engine or rt.engine, progress=progress)
     source = data.site.towers[tower].position_m
     if tower in data.nodes:
         notes.append(f"{tower} moves: it was at {source[0]:.1f} m east, {source[1]:.1f} m north, {source[2]:.1f} m up")
     paths = _paths(data.site, rt, replayed, link, pose, source)
-    differences = None
-    if engine == "both":
-        differences = tuple(_differences(data.site, rt, replayed, link, pose, source, progress))
     if isinstance(series, RssSeries) and settings.rss.field != "coherent":
         notes.append(f"rss.csv holds rss.field: {settings.rss.field}; the level here is the coherent sum")
     notes += edge_path_lines(replayed, np.asarray(source), pose, link)
@@ -172,7 +148,6 @@ def run_explain(
         measured_db=measured,
         unit=series.unit if isinstance(series, RssSeries) else "",
         absent=tuple(_absent(replayed, source, pose.position_m[0])),
-        differences=differences,
         notes=(*notes, *(f"left out: {what}" for what in replayed.left_out)),
     )
 
@@ -309,59 +284,4 @@ def _elsewhere(replayed: Replay) -> str:
     return f"geometry allows it: {stopped}"
 
 
-def _differences(
-    site: Site, rt: RtSettings, replayed: Replay, link: Link, pose: Poses, source: FloatArray, progress: Progress
-) -> Iterator[OtherEngine]:
-    """Paths of one engine that the other has not, both ways, with the reason."""
-    engines = {replayed.engine: replayed}
-    for name in ("image", "sionna"):
-        if name not in engines:
-            engines[name] = replay_poses(site, rt, link, pose, engine=name, progress=progress)  # type: ignore[arg-type]
-    ours, theirs = engines["image"], engines["sionna"]
-    target = pose.position_m[0]
-    mine, others = _by_plane(ours, theirs)
-    explained = {p.planes: p for p in _paths(site, rt, ours, link, pose, source)}
-    missing = [key for key in mine if key not in others]
-    more: set[tuple[int, ...]] = set()
-    if missing:
-        knobs = {"samples": MORE_SAMPLES * max(theirs.samples, 1), "cache": False}
-        wide = rt.model_copy(update={"advanced": rt.advanced.model_copy(update=knobs)})
-        more = set(_by_plane(ours, replay_poses(site, wide, link, pose, engine="sionna", progress=progress))[1])
-    for key in missing:
-        path = explained[mine[key]]
-        if near_an_edge(ours.faces, source, target, path, ours.surfaces):
-            reason = "within 1 mm of an edge: float32 decides otherwise"
-        elif key in more:
-            reason = f"sample budget: found with {MORE_SAMPLES * theirs.samples} samples, not with {theirs.samples}"
-        else:
-            reason = f"not found with {MORE_SAMPLES * theirs.samples} samples either: a small face or a weak reflection"
-        yield OtherEngine(found_by="image", path=path.words, level_dbm=_level(path.level_dbm), reason=reason)
-    levels = {p.planes: p for p in _paths(site, rt, theirs, link, pose, source)}
-    for key, sequence in others.items():
-        if key in mine:
-            continue
-        reason = why_not(theirs.faces, source, target, np.array(sequence, dtype=np.int64), theirs.surfaces)
-        path = levels[sequence]
-        yield OtherEngine(
-            found_by="sionna", path=path.words, level_dbm=_level(path.level_dbm), reason=reason or "no reason found"
-        )
-
-
-def _level(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
-_Rows = dict[tuple[int, ...], tuple[int, ...]]
-
-
-def _by_plane(first: Replay, second: Replay) -> tuple[_Rows, _Rows]:
-    """Face sequences of two replays by their planes: coplanar faces are the same mirror."""
-    plane = np.split(planes_of(joined(first.faces, second.faces)), [len(first.faces)])
-    rows: list[_Rows] = []
-    for replay, number in zip((first, second), plane, strict=True):
-        sequences = [tuple(row[row >= 0].tolist()) for row in replay.paths.faces]
-        rows.append({tuple(number[list(s)].tolist()) if s else (): s for s in sequences})
-    return rows[0], rows[1]
-
-
-__all__ = ["Explanation", "OtherEngine", "run_explain"]
+__all__ = ["Explanation", "run_explain"]

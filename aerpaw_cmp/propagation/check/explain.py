@@ -33,10 +33,7 @@ from ..replay import Replay, edges_of
 from ..search.mirror import images_of, scene_tolerance_m, trace_back
 from ..search.occlusion import Occlusion
 from ..surfaces import Surfaces
-from .obstacles import first_obstacle, why_not_there
-
-EDGE_M = 1e-3
-"""A point this near the edge of its face, or a segment this near a building, is beyond what float32 can decide."""
+from .obstacles import why_not_there
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -356,47 +353,6 @@ def _outside_m(faces: Faces, face: int, point: FloatArray) -> float:
         return float(polygon.distance(spot)) or -float(polygon.exterior.distance(spot))
     over = np.maximum(faces.lower[face] - place, place - faces.upper[face])
     return float(np.linalg.norm(np.maximum(over, 0.0))) if (over > 0.0).any() else float(over.max())
-
-
-def near_an_edge(
-    faces: Faces,
-    source_m: FloatArray,
-    target_m: FloatArray,
-    path: ExplainedPath,
-    surfaces: Surfaces | None = None,
-) -> bool:
-    """Check whether float32 may decide a path otherwise: a reflection point within :data:`EDGE_M` of its face's edge.
-
-    Parameters
-    ----------
-    faces : Faces
-    source_m, target_m : (3,)
-        Ends of the path [m].
-    path : ExplainedPath
-    surfaces : Surfaces, optional
-        The triangles, where the site is a scene of them.
-
-    Returns
-    -------
-    bool
-        Also where a segment runs that near to another building.
-    """
-    points = np.array([[b.east_m, b.north_m, b.up_m] for b in path.bounces]).reshape(-1, 3)
-    if surfaces is not None:  # moved by that much in any direction it meets a triangle
-        moves = EDGE_M * np.concatenate([np.eye(3), -np.eye(3)])
-        line = np.concatenate([source_m[None], points, target_m[None]])
-        return any(first_obstacle(surfaces, line + move, np.array(path.planes, np.int64)) is not None for move in moves)
-    if any(_outside_m(faces, face, point) > -EDGE_M for face, point in zip(path.planes, points, strict=True)):
-        return True
-    corners = np.concatenate([source_m[None], points, target_m[None]])
-    tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
-    if not _prisms_only(faces):
-        return False
-    # moved by that much in any direction it meets a building, other than those it reflects at
-    own = np.isin(faces.solid, faces.solid[list(path.planes)]) | (faces.solid < 0)
-    wide = Occlusion(faces.select(np.flatnonzero(~own)), tolerance)
-    moves = EDGE_M * np.concatenate([np.eye(3), -np.eye(3)])
-    return any(wide.segments(corners[:-1] + move, corners[1:] + move).any() for move in moves)
 
 
 def simple_paths(replay: Replay) -> list[tuple[str, IntArray]]:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.offset import offset_curve
 from aerpaw_cmp.compare.rank import channel_rank, commonest_rank, compare_rank, singular_values
 from aerpaw_cmp.compare.result import Fit, ModelLevel, RankFurther, RankResult, RssFurther, RssResult
 from aerpaw_cmp.compare.rss import compare_rss, error_spans
@@ -118,7 +117,6 @@ def rss_result(
     baselines = {name: level for name, level in levels.items() if name not in ("measured", "simulated")}
     measured, simulated = levels["measured"], levels["simulated"]
     score = compare_rss(time, measured, simulated, baselines=baselines)
-    curve = offset_curve(measured, simulated)
     further = RssFurther(
         n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out, block_length=1,
         identifiable_db=score.identifiable_db, trimmed=Fit(offset_db=score.offset_db, rmse_db=score.rmse_db),
@@ -133,7 +131,7 @@ def rss_result(
     }  # fmt: skip
     return RssResult(
         tower=tower, channel=channel, time=time, measured_db=measured, simulated_dbm=simulated, position_m=position_m,
-        score=score, curve_offset_db=curve[0], curve_rmse_db=curve[1],
+        score=score,
         baselines={
             name: ModelLevel(level_dbm=level, offset_db=score.baselines[name].offset_db,
                              rmse_db=score.baselines[name].rmse_db, rmse_ci95_db=score.baseline_intervals[name])

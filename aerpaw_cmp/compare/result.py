@@ -160,8 +160,6 @@ class RssResult:
         Offset, RMSE, correlation and their intervals.
     baselines : mapping of str to ModelLevel
         Free space, two-ray and lines.
-    curve_offset_db, curve_rmse_db : (m,)
-        RMSE against candidate offset.
     spans : tuple of ErrorSpan
         Stretches with the largest errors.
     residual_by : mapping of str to ResidualBins
@@ -181,8 +179,6 @@ class RssResult:
     geometry: Mapping[str, FloatArray]
     score: RssComparison
     baselines: Mapping[str, ModelLevel]
-    curve_offset_db: FloatArray
-    curve_rmse_db: FloatArray
     spans: tuple[ErrorSpan, ...]
     residual_by: Mapping[str, ResidualBins]
     further: RssFurther

@@ -23,14 +23,11 @@ from .rank_figures import (
 )
 from .rss_figures import (
     altitude,
-    channel_difference,
     detection_reliability,
     ladder,
     overview,
     residual_against_geometry,
-    rss_diagnostics,
     rss_over_time,
-    seen_from_antennas,
     trajectory,
 )
 from .serving_figures import serving_spec
@@ -61,16 +58,6 @@ def _figures(data: ReportData) -> Iterator[FigureSpec]:
     for panel in data.rss:
         if len(panel.time):
             yield from _rss_specs(data, panel)
-    for pair in data.pairs:
-        yield FigureSpec(
-            "_".join(["pair", *map(safe_name, (pair.tower, pair.first, pair.second))]),
-            f"pair/{pair.tower}/{pair.first}/{pair.second}",
-            f"{pair.tower}: {pair.first} against {pair.second}",
-            "Difference of two channels of one tower, recorded at the same instants. What one place and one path "
-            "cannot explain, antennas and their mounting must.",
-            partial(channel_difference, data, pair),
-            page=False,
-        )
     if any(np.isfinite(row.rmse_heldout_db) for row in data.ladder):
         yield FigureSpec(
             "ladder", "ladder", "Models from the simplest to the richest",
@@ -142,13 +129,6 @@ def _rss_specs(data: ReportData, panel: RssResult) -> Iterator[FigureSpec]:
         + drawn * (len(panel.time) > POINTS_PER_CLOUD),
         partial(rss_over_time, data, panel),
     )  # fmt: skip
-    yield FigureSpec(
-        f"rss_check_{stem}", section, f"{panel.name}: can the number be trusted?",
-        "Sample against sample; the distribution of the residual; and the RMSE that every candidate offset would "
-        "leave: a sharp minimum inside the searched span means that the offset is well defined.",
-        partial(rss_diagnostics, panel),
-        page=False,
-    )  # fmt: skip
     score = panel.further.detection
     if score is not None and score.reliability:
         yield FigureSpec(
@@ -163,15 +143,6 @@ def _rss_specs(data: ReportData, panel: RssResult) -> Iterator[FigureSpec]:
             f"rss_residual_{stem}", section, f"{panel.name}: where it fails",
             "Residual against the geometry of the link. Lines: running median, and the 10 and 90 % points.",
             partial(residual_against_geometry, panel),
-            page=False,
-        )  # fmt: skip
-    if {"azimuth_deg", "elevation_deg"} <= set(panel.geometry):
-        yield FigureSpec(
-            f"rss_angles_{stem}", section, f"{panel.name}: from where the antennas see each other",
-            "Azimuth (from the boresight towards its left) and elevation of the UAV in the frame of the tower antenna, "
-            "and of the tower in the frame of the UAV antenna, which turns with the aircraft where rt.attitude says "
-            "so. Patches of one colour point to an antenna pattern or its mounting.",
-            partial(seen_from_antennas, panel),
             page=False,
         )  # fmt: skip
 

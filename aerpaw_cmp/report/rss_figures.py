@@ -10,17 +10,14 @@ import numpy as np
 from ..common.units import FloatArray
 from ..compare.detection import DetectionScore
 from ..compare.ladder import LadderRow
-from ..compare.result import PairResult, RankResult, RssResult
-from ..compare.rss import PART_DB
+from ..compare.result import RankResult, RssResult
 from .canvas import (
     MEASURED,
-    POINTS_PER_CLOUD,
     POINTS_PER_LINE,
     SIMULATED,
     TOWER,
     WAYPOINT,
     baseline_style,
-    beyond,
     cloud,
     colour_bar,
     dots,
@@ -34,7 +31,6 @@ from .canvas import (
     lonely,
     robust_limits,
     seconds_since,
-    spread_out,
     start_of,
     thinned,
     thinned_plan,
@@ -204,90 +200,6 @@ def _offset(offset_db: float) -> str:
     return f"offset {signed(offset_db)} dB" if np.isfinite(offset_db) else "no offset"
 
 
-def rss_diagnostics(panel: RssResult) -> Figure:
-    """Measured against simulated, histogram of the residual, RMSE against offset, residual against distance."""
-    fig = figure((9.2, 3.1))
-    curve = len(panel.curve_offset_db) > 0
-    axes = fig.subplots(1, 3 if curve else 2)
-    scatter_levels(axes[0], panel)
-    residual_histogram(axes[1], panel)
-    if curve:
-        offset_curve(axes[2], panel)
-    return fig
-
-
-def scatter_levels(ax: Axes, panel: RssResult) -> None:
-    """Calibrated measurement against simulation, with the line of equality."""
-    label = f"sample ({count(panel.score.n)})"
-    dots(ax, panel.simulated_dbm, panel.calibrated_db, alpha=0.5, color="#0072B2", label=label)
-    both = np.isfinite(panel.simulated_dbm) & np.isfinite(panel.calibrated_db)
-    if both.any():
-        values = np.concatenate([panel.simulated_dbm[both], panel.calibrated_db[both]])
-        low, high = np.percentile(values, [0.2, 99.8])
-        low, high = low - 2.0, high + 2.0
-        ax.plot([low, high], [low, high], color=SIMULATED, linewidth=1.0, label="equal")
-        ax.set_xlim(low, high)
-        ax.set_ylim(low, high)
-    ax.set_aspect("equal", adjustable="box")
-    ax.set_xlabel("Simulated RSS [dBm]")
-    ax.set_ylabel("Measured RSS after offset [dBm]")
-    ax.set_title("Sample by sample")
-    ax.legend(loc="upper left", markerscale=4)
-
-
-def residual_histogram(ax: Axes, panel: RssResult) -> None:
-    """Histogram of the residual beside the normal curve of the same RMSE."""
-    residual = panel.residual_db[np.isfinite(panel.residual_db)]
-    if len(residual):
-        reach = max(float(np.percentile(np.abs(residual), 99.8)), 1.0)
-        bins = np.linspace(-reach, reach, 41)
-        ax.hist(
-            np.clip(residual, -reach, reach), bins.tolist(), density=True, color=MEASURED, edgecolor="white",
-            linewidth=0.3, label=f"residual ({count(len(residual))})",
-        )  # fmt: skip
-        if (rmse := panel.score.rmse_db) > 0:
-            at = np.linspace(-reach, reach, 200)
-            height = np.exp(-0.5 * (at / rmse) ** 2) / (rmse * np.sqrt(2 * np.pi))
-            ax.plot(at, height, color=SIMULATED, linewidth=1.0, linestyle=(0, (4, 2)), label="normal, same RMSE")
-        ax.set_ylim(top=1.35 * ax.get_ylim()[1])  # room for the legend above the bars
-        ax.legend(loc="upper left", fontsize=7)
-    ax.set_xlabel("Measured − simulated [dB]")
-    ax.set_ylabel("Density [1/dB]")
-    ax.set_title("Residual")
-
-
-def offset_curve(ax: Axes, panel: RssResult) -> None:
-    """RMSE against the candidate offset, with the chosen one and those of the baselines."""
-    tried, rmse, score = panel.curve_offset_db, panel.curve_rmse_db, panel.score
-    ax.plot(*thinned(tried, rmse), color=SIMULATED, linewidth=1.2, label="ray tracing")
-    span = (float(np.min(tried)), float(np.max(tried)))
-    if np.isfinite(score.offset_db):
-        edge = " (edge of the search!)" if score.at_edge else ""
-        ax.plot(
-            score.offset_db, score.rmse_db, marker="o", color=TOWER, linestyle="none",
-            label=f"chosen: {signed(score.offset_db)} dB{edge}",
-        )  # fmt: skip
-    for number, (name, baseline) in enumerate(panel.baselines.items()):
-        colour, dashes = baseline_style(name, number)
-        if np.isfinite(baseline.offset_db):
-            ax.axvline(baseline.offset_db, color=colour, linestyle=dashes, linewidth=1.0, label=pretty(name))
-    centres = [score.offset_db, *(model.offset_db for model in panel.baselines.values())]
-    near = [c for c in centres if np.isfinite(c)]
-    if near:
-        # the shape near the minimum decides; the rest of the span is a straight line
-        low, high = min(near) - 10.0, max(near) + 10.0
-        shown = (tried >= low) & (tried <= high) & np.isfinite(rmse)
-        ax.set_xlim(low, high)
-        ax.set_ylim(0.0, 1.5 * float(np.max(rmse[shown], initial=1.0)))
-        for a, b in ((low, span[0]), (span[1], high)):
-            if a < b:
-                ax.axvspan(a, b, color="#DDDDDD", hatch="///", linewidth=0, label="not searched")
-    ax.set_xlabel(f"Offset added [dB]\n(searched {span[0]:.0f} to {span[1]:.0f})".replace("-", "−"))
-    ax.set_ylabel("RMSE [dB]")
-    ax.set_title("Is the offset well defined?")
-    ax.legend(loc="upper center", fontsize=7)
-
-
 def detection_reliability(score: DetectionScore) -> Figure:
     """Share of detected samples over the probability that the predicted level gave them; area: samples."""
     said, seen, n = np.array(score.reliability, dtype=np.float64).T
@@ -401,67 +313,6 @@ def running_levels(
         if inside.sum() >= FEWEST_PER_BIN:
             levels[number] = quantity[inside].mean(), *np.percentile(values[inside], [10, 50, 90])
     return levels
-
-
-def seen_from_antennas(panel: RssResult) -> Figure:
-    """Directions from the tower's antenna to the UAV and back, each in its antenna's frame; colour: residual."""
-    seen = panel.geometry
-    views = [("UAV, tower antenna frame", seen["azimuth_deg"], seen.get("tower_elevation_deg", seen["elevation_deg"]))]
-    if {"uav_azimuth_deg", "uav_elevation_deg"} <= set(seen):
-        views.append(("tower, UAV antenna frame", seen["uav_azimuth_deg"], seen["uav_elevation_deg"]))
-    residual = panel.residual_db
-    known = residual[np.isfinite(residual)]
-    reach = float(np.percentile(np.abs(known), 98)) if known.size else 1.0
-    fig = figure((9.2, 3.6))
-    axes = fig.subplots(1, len(views), squeeze=False)[0]
-    for ax, (words, azimuth, elevation) in zip(axes, views, strict=True):
-        good = np.isfinite(residual) & np.isfinite(azimuth) & np.isfinite(elevation)
-        if (~good).any():
-            rest = np.flatnonzero(~good)
-            rest = rest[spread_out(len(rest), POINTS_PER_CLOUD)]
-            ax.plot(
-                azimuth[rest], elevation[rest], linestyle="none", marker="x", markersize=3, color="#888888",
-                rasterized=True, label=f"not scored ({count(int((~good).sum()))})",
-            )  # fmt: skip
-        rows = np.flatnonzero(good)
-        rows = rows[cloud(residual[rows])]
-        points = ax.scatter(
-            azimuth[rows], elevation[rows], c=residual[rows], s=6, cmap="cividis", vmin=-reach, vmax=reach,
-            linewidths=0, rasterized=True, label=f"sample ({count(int(good.sum()))}; colour: residual)",
-        )  # fmt: skip
-        ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
-        ax.set_facecolor("#F4F4F4")
-        ax.set_xlim(-180, 180)
-        ax.set_xticks(range(-180, 181, 90))
-        ax.set_xlabel(f"Azimuth of the {words} [deg]")
-        ax.set_ylabel("Elevation in that frame [deg]")
-    colour_bar(fig, points, list(axes), "Measured − simulated [dB]", beyond(known, -reach, reach))
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=2)
-    return fig
-
-
-def channel_difference(data: ReportData, pair: PairResult) -> Figure:
-    """First minus second channel over time, measured and simulated, with the limit beyond which they part."""
-    start = start_of(data)
-    seconds = seconds_since(pair.time, start)
-    fig = figure((9.2, 3.2))
-    ax = fig.subplots()
-    label = f"measured ({count(int(np.isfinite(pair.difference_db).sum()))})"
-    dots(ax, seconds, pair.difference_db, 2.5, color=MEASURED, label=label, zorder=3)
-    ax.plot(*thinned(seconds, pair.simulated_difference_db), color=SIMULATED, linewidth=0.9, label="ray tracing")
-    for sign in (-1, 1):
-        ax.axhline(
-            sign * PART_DB, color=TOWER, linewidth=0.9, linestyle=(0, (5, 2)),
-            label=f"{PART_DB:g} dB apart" if sign == 1 else None,
-        )  # fmt: skip
-    draw_waypoints(ax, data, start)
-    robust_limits(ax, [pair.difference_db, pair.simulated_difference_db], around=0.0)
-    reach = max(ax.get_ylim()[1], 1.1 * PART_DB)  # the limit is drawn, so it is seen
-    ax.set_ylim(-reach, reach)
-    time_axis(ax, start)
-    ax.set_ylabel(f"{pair.first} − {pair.second} [dB]")
-    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4, markerscale=3)
-    return fig
 
 
 def ladder(rows: Sequence[LadderRow]) -> Figure:

@@ -159,7 +159,7 @@ def test_odd_flights_are_drawn_without_a_warning(report_data, drawn_before, chan
     data = dataclasses.replace(report_data, **change(report_data))
     left_alone = data.track is report_data.track and data.site is report_data.site
     for spec in figures.figure_specs(data):
-        if left_alone and spec.section.startswith(("flight", "pair/")):  # these have of the panels only what is named:
+        if left_alone and spec.section.startswith("flight"):  # these have of the panels only what is named:
             what = (spec.name, canvas.start_of(data), *canvas.used_towers(data))
             if what in drawn_before:
                 continue
@@ -263,24 +263,6 @@ def test_a_log_axis_says_plain_numbers(small_report):
     shown = [t.get_text() for t in fig.axes[0].get_xticklabels() if t.get_text()]
     assert "100" in shown
     assert not any("$" in text for text in shown)
-
-
-def test_both_antennas_are_shown_in_their_own_frames(small_report):
-    panel = small_report.rss[0]
-    n = len(panel.time)
-    own = {"tower_elevation_deg": np.linspace(-70, 70, n)}
-    with canvas.style():
-        (one, _) = rss_figures.seen_from_antennas(dataclasses.replace(panel, geometry={**panel.geometry, **own})).axes
-    drawn = one.collections[0].get_offsets()
-    assert drawn[:, 1].min() < -60, "the elevation in the antenna's frame, not the one above the horizon"
-    both = {**panel.geometry, **own, "uav_azimuth_deg": np.full(n, 12.0), "uav_elevation_deg": np.full(n, -8.0)}
-    with canvas.style():
-        axes = rss_figures.seen_from_antennas(dataclasses.replace(panel, geometry=both)).axes
-    assert [ax.get_xlabel() for ax in axes[:2]] == [
-        "Azimuth of the UAV, tower antenna frame [deg]",
-        "Azimuth of the tower, UAV antenna frame [deg]",
-    ]
-    assert {tuple(row) for row in axes[1].collections[0].get_offsets().tolist()} == {(12.0, -8.0)}
 
 
 ODD_NAMES = ("A_$", r"$\frac{", "_hidden", "a$b$c_{", "<b>&amp;", "%s {0} \\")

@@ -156,13 +156,9 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
     quantities = {**case.geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
     residual_by = {name: rss.bin_residual(score.residual_db, values) for name, values in quantities.items()}
-    curve_offset_db, curve_rmse_db = offsets.offset_curve(
-        levels.measured_db, levels.simulated_db, step_db=settings.advanced.step_db, span_db=settings.span_db
-    )
     spans = _worst(series.time, score.residual_db, case.position_m, case.geometry, direct)
     if case.trained:
         score, residual_by, spans = rss.without_errors(score), {}, []
-        curve_offset_db = curve_rmse_db = np.zeros(0)
     stated = stated_spread(replayed, settings.window_s)
     return RssResult(
         tower=series.tower,
@@ -178,8 +174,6 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         geometry=case.geometry,
         score=score,
         baselines=_baselines(case.simple, score),
-        curve_offset_db=curve_offset_db,
-        curve_rmse_db=curve_rmse_db,
         spans=tuple(spans),
         residual_by=residual_by,
         further=_further(case, score, stated, {name: table.explained for name, table in residual_by.items()}),

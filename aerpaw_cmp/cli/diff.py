@@ -21,7 +21,7 @@ from .shown import number, print_json, say, table
     ],
 )
 def diff(
-    first: Annotated[Path, typer.Argument(help="Folder of a report, or its metrics.json.")],
+    first: Annotated[Path, typer.Argument(help="Folder of a report.")],
     second: Annotated[Path, typer.Argument(help="The other report of the same flight.")],
     out: Annotated[
         Optional[Path],  # noqa: UP045

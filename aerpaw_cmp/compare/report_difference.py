@@ -20,7 +20,6 @@ from .statistics import (
     autocorrelation,
     bootstrap_means,
     interval,
-    mean_interval,
     paired_difference,
 )
 
@@ -37,17 +36,11 @@ class Changed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overlap:
-    """Samples of the first report, of the second, in both, and in one only.
-
-    ``first_span`` and ``second_span`` are the first and the last instant of those in that report alone, as its table
-    writes them.
-    """
+    """Samples of the first report, of the second, in both, and in one only."""
 
     first: int
     second: int
     common: int
-    first_span: tuple[str, str] | None = None
-    second_span: tuple[str, str] | None = None
 
     @property
     def only_first(self) -> int:
@@ -77,8 +70,6 @@ class LevelDifference:
     rmse : PairedDifference
         On common scored samples, each report with its own best offset on them; first minus second of that record is
         second minus first report.
-    mae_db : Changed
-        Mean absolute error about the same offsets.
     """
 
     tower: str
@@ -90,7 +81,6 @@ class LevelDifference:
     simulated_rms_db: float
     offset_db: Changed
     rmse: PairedDifference
-    mae_db: Changed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,7 +122,7 @@ def level_difference(
     Returns
     -------
     LevelDifference
-        How far levels, offset, RMSE and mean absolute error moved, with intervals.
+        How far levels, offset and RMSE moved, with an interval.
     """
     moved = _apart(first[1], second[1])
     both = np.isfinite(first[2]) & np.isfinite(second[2])
@@ -147,7 +137,6 @@ def level_difference(
         simulated_rms_db=float(np.sqrt(np.mean(moved**2))) if len(moved) else float("nan"),
         offset_db=_changed(*offsets_db),
         rmse=paired_difference(second_error, first_error),
-        mae_db=mae_difference(first_error, second_error),
     )
 
 
@@ -163,35 +152,6 @@ def _largest(values: FloatArray) -> float:
 
 def _changed(first: float, second: float) -> Changed:
     return Changed(first=first, second=second, difference=second - first)
-
-
-def mae_difference(error_db: FloatArray, other_db: FloatArray) -> Changed:
-    """Difference of the mean absolute errors about each one's mean, with a 95 % interval.
-
-    Parameters
-    ----------
-    error_db, other_db : (n,)
-        Errors of the first and of the second model on the same samples in time order, without NaN [dB].
-
-    Returns
-    -------
-    Changed
-        Mean absolute errors [dB], second minus first, and its interval.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> mae_difference(np.array([1.0, -1.0]), np.array([3.0, -3.0])).difference
-    2.0
-    """
-    if not len(error_db):
-        nan = float("nan")
-        return Changed(first=nan, second=nan, difference=nan)
-    first, second = np.abs(error_db - error_db.mean()), np.abs(other_db - other_db.mean())
-    loss = second - first
-    estimate = float(loss.mean())
-    bounds = mean_interval(loss)
-    return Changed(first=float(first.mean()), second=float(second.mean()), difference=estimate, ci95=bounds)
 
 
 def pooled_difference(links: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> PairedDifference:
@@ -232,8 +192,6 @@ def rank_difference(
     samples : Overlap
     first, second : tuple of two (n,)
         Reported and simulated rank of each report on the common samples in time order; NaN: none, 0: no path.
-    replicates, seed : int
-        Of the bootstrap.
 
     Returns
     -------

@@ -227,14 +227,12 @@ class RssResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairResult:
-    """Two channels of one tower at their common instants: ``time`` (n,), differences (n,) first minus second [dB]."""
+    """Two channels of one tower at their common instants ``time`` (n,)."""
 
     tower: str
     first: str
     second: str
     time: AnyArray
-    difference_db: FloatArray
-    simulated_difference_db: FloatArray
     score: ChannelDifference
 
 

@@ -31,7 +31,7 @@ from ..report.names import RANK_COLUMNS, RSS_COLUMNS
 TOLERANCE_DB = 0.01
 """Differences up to this count as none: the tables hold four decimals, offsets one."""
 
-_NEEDED = ("flight", "versions", "inputs", "settings", "rss", "rank", "stages")
+_NEEDED = ("flight", "versions", "inputs", "settings", "rss", "rank")
 _SIMULATED = "simulated_rank_k"
 _VOLATILE = ("generated", "stages", "versions", "inputs", "settings", "warnings", "speed", "title", "flight")
 """What changes without meaning anything, or is compared on its own."""
@@ -39,7 +39,7 @@ _VOLATILE = ("generated", "stages", "versions", "inputs", "settings", "warnings"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadReport:
-    """A report as it lies on the disk: metrics.json, and the tables where there are any."""
+    """A report as it lies on the disk: metrics.json and its tables of samples."""
 
     place: Path
     files: tuple[Path, ...]
@@ -57,7 +57,7 @@ def run_diff(
     Parameters
     ----------
     first, second : Path
-        Folders of reports, or their metrics.json (then without samples).
+        Folders of reports.
     out : Path, optional
         Folder of the results.
     tolerance_db : float
@@ -103,23 +103,18 @@ def read_report(place: Path) -> ReadReport:
     InputError
         With what was found, what was expected, and the likely cause.
     """
-    folder = place if place.is_dir() else None
-    file = place / "metrics.json" if folder else place
-    metrics = _metrics(file, place)
-    remarks = []
-    tables: dict[str, Any] = {"rss": None, "rank": None}
-    files = [file]
-    if folder is not None:
-        for kind, columns in (("rss", RSS_COLUMNS), ("rank", RANK_COLUMNS)):
-            files.append(folder / f"{kind}.csv")
-            tables[kind] = _table(files[-1], kind, columns)
-        changed = [name for name in changed_files(folder) if name in ("metrics.json", "rss.csv", "rank.csv")]
-        remarks = [f"{folder / name} was changed after the report wrote it." for name in changed]
-        remarks += _against_metrics(metrics, tables["rss"], folder)
-    else:
-        remarks.append(f"{file}: no samples beside it were asked for; only the reported numbers are compared.")
+    metrics = _metrics(place / "metrics.json", place)
+    files = {kind: place / f"{kind}.csv" for kind in ("rss", "rank")}
+    rss, rank = (_table(files[kind], kind, columns) for kind, columns in (("rss", RSS_COLUMNS), ("rank", RANK_COLUMNS)))
+    changed = [name for name in changed_files(place) if name in ("metrics.json", "rss.csv", "rank.csv")]
+    remarks = [f"{place / name} was changed after the report wrote it." for name in changed]
     return ReadReport(
-        place=place, files=tuple(files), metrics=metrics, remarks=tuple(remarks), rss=tables["rss"], rank=tables["rank"]
+        place=place,
+        files=(place / "metrics.json", *files.values()),
+        metrics=metrics,
+        remarks=(*remarks, *_against_metrics(metrics, rss, place)),
+        rss=rss,
+        rank=rank,
     )
 
 
@@ -166,7 +161,7 @@ def _metrics(file: Path, named: Path) -> dict[str, Any]:
 
 def _misshapen(content: Mapping[str, Any]) -> list[str]:
     """Keys whose value is not of the kind that a report writes."""
-    mappings = ("versions", "settings", "rss", "rank", "stages")
+    mappings = ("versions", "settings", "rss", "rank")
     wrong = [key for key in mappings if not isinstance(content[key], dict)]
     inputs = content["inputs"]
     if not isinstance(inputs, list) or not all(isinstance(i, dict) and isinstance(i.get("path"), str) for i in inputs):
@@ -266,7 +261,6 @@ def compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float =
         settings=tuple(_entries(first.metrics["settings"], second.metrics["settings"])),
         inputs=tuple(_inputs(first.metrics["inputs"], second.metrics["inputs"])),
         versions=tuple(_entries(first.metrics["versions"], second.metrics["versions"])),
-        stages=tuple(_stages(first.metrics["stages"], second.metrics["stages"])),
         numbers=tuple(_numbers(first.metrics, second.metrics, tolerance_db)),
         levels=tuple(levels),
         ranks=tuple(_ranks(first, second)),
@@ -321,11 +315,6 @@ def _entries(first: Any, second: Any) -> Iterator[Entry]:
     for key in [*first_values, *(key for key in second_values if key not in first_values)]:
         if (key in first_values) != (key in second_values) or first_values[key] != second_values[key]:
             yield Entry(key=key, first=first_values.get(key), second=second_values.get(key))
-
-
-def _stages(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[Entry]:
-    for key in dict.fromkeys([*first, *second]):
-        yield Entry(key=key.removesuffix("_s"), first=first.get(key), second=second.get(key))
 
 
 def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterator[InputEntry]:
@@ -390,19 +379,8 @@ def _matched(mine: Any, theirs: Any) -> tuple[Overlap, Any, Any]:
     if first.index.equals(second.index):
         return Overlap(first=len(first), second=len(second), common=len(first)), first, second
     common = first.index.intersection(second.index, sort=False)
-    overlap = Overlap(
-        first=len(first),
-        second=len(second),
-        common=len(common),
-        first_span=_span(first.index.difference(common, sort=False)),
-        second_span=_span(second.index.difference(common, sort=False)),
-    )
+    overlap = Overlap(first=len(first), second=len(second), common=len(common))
     return overlap, first.loc[common], second.loc[common]
-
-
-def _span(alone: Any) -> tuple[str, str] | None:
-    """First and last instant of samples that one report alone has, in the order of its table."""
-    return (str(alone[0][0]), str(alone[-1][0])) if len(alone) else None
 
 
 def _values(table: Any, name: str) -> FloatArray:
@@ -426,8 +404,6 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[LevelDifference]
     """Each link that both have, and the residuals of its common samples."""
     differences: list[LevelDifference] = []
     residuals: list[_Residuals] = []
-    if mine.rss is None or theirs.rss is None:
-        return differences, residuals
     names = ("measured_db", "simulated_dbm", "residual_db")
     for tower, channels in mine.metrics["rss"].items():
         for channel, numbers in channels.items():
@@ -450,8 +426,6 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[LevelDifference]
 
 
 def _ranks(first: ReadReport, second: ReadReport) -> Iterator[RankDifference]:
-    if first.rank is None or second.rank is None:
-        return
     ks = [
         c.removeprefix(_SIMULATED) for c in first.rank.columns if c.startswith(_SIMULATED) and c in second.rank.columns
     ]

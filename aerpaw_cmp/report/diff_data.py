@@ -52,12 +52,10 @@ class ReportDiff:
         Those that differ.
     inputs : tuple of InputEntry
         Those that differ.
-    stages : tuple of Entry
-        Seconds of every stage.
     numbers : tuple of Entry
         Numbers of metrics.json, as reported, that differ by more than the tolerance.
     levels, ranks : tuple
-        On common samples; empty where a side has no tables.
+        On common samples.
     pooled : PairedDifference, optional
         RMSE over all links.
     new_warnings, gone_warnings : tuple of str
@@ -74,7 +72,6 @@ class ReportDiff:
     settings: tuple[Entry, ...]
     inputs: tuple[InputEntry, ...]
     versions: tuple[Entry, ...]
-    stages: tuple[Entry, ...]
     numbers: tuple[Entry, ...]
     levels: tuple[LevelDifference, ...]
     ranks: tuple[RankDifference, ...]
@@ -100,9 +97,7 @@ def _differences(diff: ReportDiff) -> Iterator[str]:
         yield from (f"{level.tower} {level.channel}: {text}" for text in _level_clauses(level, diff.tolerance_db))
     for rank in diff.ranks:
         yield from (f"{rank.tower} K = {rank.k}: {text}" for text in _rank_clauses(rank))
-    if not diff.levels and not diff.ranks and diff.numbers:
-        yield f"{len(diff.numbers)} numbers of metrics.json"
-    elif diff.numbers:
+    if diff.numbers:
         yield f"{len(diff.numbers)} reported numbers, the first {diff.numbers[0].key}"
 
 
@@ -121,14 +116,9 @@ def _level_clauses(one: LevelDifference, tolerance_db: float) -> Iterator[str]:
 
 
 def _alone(samples: Overlap) -> str:
-    """Number of samples that are in one report alone, and when, in words."""
-    sides = ((samples.only_first, samples.first_span, "first"), (samples.only_second, samples.second_span, "second"))
-    sentences = [
-        f"{n} samples only in the {name}" + (f" ({span[0]} to {span[1]})" if span else "")
-        for n, span, name in sides
-        if n
-    ]
-    return ", ".join(sentences)
+    """Number of samples that are in one report alone, in words."""
+    sides = ((samples.only_first, "first"), (samples.only_second, "second"))
+    return ", ".join(f"{n} samples only in the {name}" for n, name in sides if n)
 
 
 def _rank_clauses(one: RankDifference) -> Iterator[str]:

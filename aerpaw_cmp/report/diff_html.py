@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,49 +19,9 @@ def diff_metrics(diff: ReportDiff) -> dict[str, Any]:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Whisker:
-    """One row of the picture: where its dot and its interval lie, in percent of the width."""
-
-    name: str
-    at: float
-    low: float
-    high: float
-    verdict: str
-
-
-def whiskers(diff: ReportDiff) -> tuple[list[Whisker], float]:
-    """Differences of RMSE with their intervals, and the reach of the axis on either side of zero [dB]."""
-    rows = [(f"{level.tower} {level.channel}", level.rmse) for level in diff.levels if level.rmse.n]
-    if diff.pooled is not None and len(rows) > 1:
-        rows.append(("all links", diff.pooled))
-    sizes = [abs(x) for _, p in rows for x in (p.difference_db, *p.difference_ci95_db) if x == x]  # not NaN
-    reach = max([diff.tolerance_db, *sizes]) * 1.08
-
-    def percent(value: float) -> float:
-        return 50.0 + 50.0 * value / reach
-
-    drawn = []
-    for name, one in rows:
-        low, high = one.difference_ci95_db
-        known = low == low
-        at = percent(one.difference_db)
-        drawn.append(
-            Whisker(
-                name=name,
-                at=at,
-                low=percent(low) if known else at,
-                high=percent(high) if known else at,
-                verdict=one.verdict,
-            )
-        )
-    return drawn, reach
-
-
 def diff_page(diff: ReportDiff) -> str:
     """The whole page."""
-    rows, reach = whiskers(diff)
-    return rendered("diff", diff=diff, verdict=verdict(diff), whiskers=rows, reach=reach)
+    return rendered("diff", diff=diff, verdict=verdict(diff))
 
 
 def write_diff(diff: ReportDiff, folder: Path) -> list[Path]:

@@ -56,7 +56,7 @@ def verdict(diff: ReportDiff) -> str:
     ranked = max((rank.samples.common for rank in diff.ranks), default=0)
     if not diff.differences:
         seen = [f"{count(common)} RSS samples"] * bool(common) + [f"{count(ranked)} rank samples"] * bool(ranked)
-        on = f" on {' and '.join(seen)}" if seen else " in metrics.json (no samples were compared)"
+        on = f" on {' and '.join(seen)}" if seen else ""
         return f"No difference: the numbers agree within {diff.tolerance_db:g} dB{on}.{_cause(diff)}"
     parts = [text for text in (_level_verdict(diff), _rank_verdict(diff)) if text]
     return " ".join(parts or ["The reported numbers differ."]) + _cause(diff)

@@ -141,8 +141,7 @@ def make_report() -> ReportData:
         spans=list(rss[0].spans),
     )  # fmt: skip
     pair = PairResult(
-        tower="LW1", first="USRP1", second="USRP2", time=track.time, difference_db=difference,
-        simulated_difference_db=np.zeros(len(difference)), score=parted,
+        tower="LW1", first="USRP1", second="USRP2", time=track.time, score=parted,
     )  # fmt: skip
     engine = EngineResult(
         engine="image",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 
@@ -13,10 +12,9 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.outputs import OutputFolder
-from aerpaw_cmp.compare.report_difference import mae_difference, pooled_difference
-from aerpaw_cmp.compare.statistics import autocorrelation
+from aerpaw_cmp.compare.report_difference import pooled_difference
 from aerpaw_cmp.jobs.diff_reports import run_diff
-from aerpaw_cmp.report.diff_html import diff_page, whiskers
+from aerpaw_cmp.report.diff_html import diff_page
 from aerpaw_cmp.report.diff_words import verdict
 from aerpaw_cmp.report.write import write_report
 from tests.json_page import unlisted
@@ -77,7 +75,6 @@ def test_equal_reports_have_no_difference(two, capsys):
     assert verdict(found).startswith("No difference: the numbers agree within 0.01 dB on 2")
     assert {one.rmse.difference_db for one in found.levels} == {0.0}
     assert {one.kappa.difference for one in found.ranks} == {0.0}
-    assert any(one.key == "read" and one.second == 99.0 for one in found.stages)
     assert main(["diff", str(two[0]), str(two[1]), "--strict"]) == 0
     assert "No difference" in capsys.readouterr().out
 
@@ -134,9 +131,6 @@ def test_noise_on_one_link_is_found_there_and_sized(noisy):
     assert hit.simulated_rms_db == pytest.approx(np.sqrt(np.nanmean(apart**2)))
     assert hit.simulated_max_db == pytest.approx(np.nanmax(np.abs(apart)))
     assert hit.measured_max_db == 0.0
-    about = [table.loc[on(table), "residual_db"].dropna() for table in tables]
-    mae = [float((r - r.mean()).abs().mean()) for r in about]
-    assert (hit.mae_db.first, hit.mae_db.second, hit.mae_db.difference) == pytest.approx((*mae, mae[1] - mae[0]))
     assert {one.rmse.difference_db for one in by_link.values()} == {0.0}
     assert "significantly worse: +" in verdict(found)
     assert any("was changed after the report wrote it" in text for text in found.remarks)
@@ -147,7 +141,6 @@ def test_the_other_way_round_has_the_other_sign(noisy):
     one, two = run_diff(first, second), run_diff(second, first)
     for there, back in zip(one.levels, two.levels, strict=True):
         assert there.rmse.difference_db == -back.rmse.difference_db
-        assert there.mae_db.difference == pytest.approx(-back.mae_db.difference)
     assert one.pooled.verdict == "worse"
     assert two.pooled.verdict == "better"
     assert "significantly better: -" in verdict(two)
@@ -202,9 +195,6 @@ def test_samples_of_one_report_alone_are_counted_and_left_out(two):
     assert (found.samples.only_first, found.samples.only_second) == (gone, 0)
     assert found.samples.common == found.samples.first - gone
     assert found.rmse.difference_db == 0.0
-    times = table.loc[on(table) & (table["time_s"] > 900), "time_utc"]
-    assert found.samples.first_span == (times.iloc[0], times.iloc[-1])
-    assert found.samples.second_span is None
     assert any(f"{gone} samples only in the first" in text for text in run_diff(*two).differences)
 
 
@@ -248,19 +238,6 @@ def test_ranks_that_changed_are_counted_and_agreement_is_that_of_the_pairs(two):
     assert hit.n_reported_changed == 0
     assert found["100"].n_changed == 0
     assert "simulated ranks differ" in verdict(run_diff(*two))
-
-
-def test_intervals_of_the_mae_hold_the_truth_as_often_as_they_say():
-    """White noise of two sizes: the mean absolute error of a normal is sigma sqrt(2 / pi)."""
-    rng = np.random.default_rng(3)
-    truth = (2.4 - 2.0) * np.sqrt(2 / np.pi)
-    held = 0
-    for _ in range(150):
-        shared = rng.normal(0, 2.0, 500)
-        bounds = mae_difference(shared, rng.normal(0, 2.4, 500)).ci95
-        held += bounds[0] <= truth <= bounds[1]
-    assert held >= 0.88 * 150
-    assert autocorrelation(shared).enough
 
 
 # --- what cannot be compared -----------------------------------------------------------------------------------------
@@ -332,15 +309,6 @@ def test_a_renamed_flight_with_the_same_logs_is_the_same(two):
     assert run_diff(*two).differences == ()
 
 
-def test_metrics_alone_give_the_reported_numbers(two):
-    change_metrics(two[1], lambda m: m["rss"]["LW1"]["USRP1"].update(rmse_db=99.0))
-    found = run_diff(two[0] / "metrics.json", two[1] / "metrics.json")
-    assert found.levels == ()
-    assert [(e.key, e.second) for e in found.numbers] == [("rss.LW1.USRP1.rmse_db", 99.0)]
-    assert found.differences
-    assert "only the reported numbers" in found.remarks[0]
-
-
 def test_links_of_one_report_alone_are_named(two):
     change_metrics(two[1], lambda m: m["rss"].pop("LW4"))
     found = run_diff(*two)
@@ -376,14 +344,3 @@ def test_the_page_has_no_script_and_escapes_what_it_shows(noisy):
     assert hostile not in page
     assert "&lt;img" in page
     assert "script-src &#39;none&#39;" in page or "script-src 'none'" in page
-
-
-def test_the_picture_shows_every_link_at_its_number(noisy):
-    found = run_diff(*noisy[0])
-    rows, reach = whiskers(found)
-    assert [row.name for row in rows] == [*(f"{one.tower} {one.channel}" for one in found.levels), "all links"]
-    for row, one in zip(rows, found.levels, strict=False):
-        assert (row.at - 50) / 50 * reach == pytest.approx(one.rmse.difference_db)
-        assert 0 <= row.low <= row.at <= row.high <= 100
-    equal = dataclasses.replace(found, levels=(), pooled=None)
-    assert whiskers(equal)[0] == []

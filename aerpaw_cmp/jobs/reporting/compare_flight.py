@@ -459,8 +459,6 @@ def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
                 first=channel.channel,
                 second=other_channel.channel,
                 time=channel.time[here],
-                difference_db=first - second,
-                simulated_difference_db=channel.simulated_dbm[here] - other_channel.simulated_dbm[there],
                 score=rss.channel_difference(channel.time[here], first, second, position_m=position, context=context),
             )
         )

@@ -98,9 +98,9 @@ def print_plan(plan: Any, as_json: bool = False) -> None:
         print_json(plan.as_dict())
         return
     rows = [[stage.name, stage.work, number(stage.seconds, "{:.1f}")] for stage in plan.stages]
-    unknown = "" if all(stage.seconds is not None for stage in plan.stages) else " and what has a dash"
-    table(["stage", "work", "s"], [*rows, ["all", "", f"{plan.seconds:.0f}{unknown}"]], f"{plan.job}, not run")
-    print(plan.measured)
+    rows.append(["all", "", f"{plan.seconds:.0f} and what has a dash"])
+    table(["stage", "work", "s"], rows, f"{plan.job}, not run")
+    print(plan.as_dict()["measured"])
     print(f"reads {len(plan.inputs)} files; would write {plan.output}")
 
 

@@ -1,8 +1,7 @@
 """Plan of what a command would do and about how long it would take: ``report --dry-run`` and ``map --dry-run``.
 
-The replay is timed: a few poses of the job itself, on this machine, now. Stages that cannot be tried in a second are
-:data:`MEASURED` CPU seconds per unit of work on the sample flight and site, times what this machine needs for a small
-replay of that site. ``python benchmarks/estimate.py`` measures both again and compares plans with runs.
+The replay is timed: a few poses of the job itself, on this machine, now. Stages that cannot be tried in a second have
+no time.
 """
 
 from __future__ import annotations
@@ -18,34 +17,14 @@ import numpy as np
 from ..common.stages import Stages
 from ..flight.data import FlightData
 from ..flight.settings import FlightFile, RtSettings
-from ..propagation.arrays import Link, Poses, single_element
+from ..propagation.arrays import Link, Poses
 from ..propagation.engines import estimate_search
 from ..propagation.options import Search
-from ..propagation.replay import replay
 from ..site.site import Site
 from ..site.siteyaml import load_site
 
-MEASURED = {
-    "imports": 2.5,
-    "clocks, per receiver": 0.5,
-    "compare, per RSS sample": 0.06e-3,
-    "compare, per rank sample": 0.15e-3,
-    "ladder, replays of the RSS": 8.0,
-    "audit": 2.8,
-    "audit, per tower and array": 0.2,
-    "page": 0.6,
-    "figures": 1.0,
-    "figures, per channel": 0.3,
-    "study, per position": 5.8e-3,
-    "export, per layer and position": 0.02e-3,
-    "map pages": 4.0,
-}
-"""CPU seconds, measured on the sample flight and the packaged site by ``benchmarks/estimate.py``."""
+MEASURED = "CPU seconds of reading and replay, tried on a few poses now; a stage with a dash was not tried"
 
-PROBE_S = 0.006
-"""CPU seconds of :func:`probe` on that machine."""
-
-MEASURED_ON = "2026-11-23, one core of an AMD EPYC, Python 3.11"
 TRIED_POSES = (32, 160)
 """Of the two replays that a time is extrapolated from."""
 
@@ -56,7 +35,7 @@ class PlannedStage:
 
     name: str
     work: str
-    seconds: float | None
+    seconds: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,15 +50,12 @@ class Plan:
     output : Path
         What would be written; it was looked at and would be taken.
     stages : tuple of PlannedStage
-    measured : str
-        Where the seconds come from.
     """
 
     job: str
     inputs: tuple[Path, ...]
     output: Path
     stages: tuple[PlannedStage, ...]
-    measured: str
 
     @property
     def seconds(self) -> float:
@@ -95,30 +71,14 @@ class Plan:
             "stages": [dataclasses.asdict(stage) for stage in self.stages],
             "seconds": self.seconds,
             "not_estimated": [stage.name for stage in self.stages if stage.seconds is None],
-            "measured": self.measured,
+            "measured": MEASURED,
         }
-
-
-def probe() -> float:
-    """CPU seconds of a small replay of the packaged site: how fast this machine is."""
-    site = load_site("lake_wheeler")
-    link = Link(3.3e9, {"LW1": single_element()}, single_element())
-    line = np.linspace(50.0, 400.0, 200)
-    poses = Poses(np.column_stack([line, 0.3 * line, np.full(200, 40.0)]), np.tile(np.eye(3), (200, 1, 1)))
-    return min(_cpu_seconds(lambda: replay(site, link, poses, Search(max_depth=2))) for _ in range(5))
 
 
 def _cpu_seconds(work: Any) -> float:
     start = time.process_time()
     work()
     return time.process_time() - start
-
-
-def _measured_text(factor: float) -> str:
-    return (
-        f"CPU seconds: the replay tried on a few poses now, the rest as measured {MEASURED_ON}, times {factor:.2g} "
-        "for this machine; a loaded machine takes longer"
-    )
 
 
 def report_plan(
@@ -155,35 +115,22 @@ def report_plan(
     start = time.process_time()
     data = load_data(settings, folder, logs_root)
     reading = time.process_time() - start
-    factor = probe() / PROBE_S
-    cost = {name: seconds * factor for name, seconds in MEASURED.items()}
     n_rss, n_rank = (sum(len(item.time) for item in series) for series in (data.rss, data.rank))
     rss, rank = _tried_replays(data)
     rt = settings.rt
     stages = [
-        PlannedStage("imports", "libraries", cost["imports"]),
         PlannedStage("read", f"{len(inputs)} files", reading),
     ]
     if n_rss and settings.rss.lag in ("estimate", "apply"):
-        towers = len({series.tower for series in data.rss})
-        seconds = towers * cost["clocks, per receiver"]
-        stages.append(PlannedStage("clocks", f"{towers} receivers", seconds))
-    stages += [*rss, *rank]
-    seconds = n_rss * cost["compare, per RSS sample"] + n_rank * cost["compare, per rank sample"]
-    stages.append(PlannedStage("compare", f"{n_rss} RSS and {n_rank} rank samples", seconds))
+        stages.append(PlannedStage("clocks", f"{len({series.tower for series in data.rss})} receivers"))
+    stages += [*rss, *rank, PlannedStage("compare", f"{n_rss} RSS and {n_rank} rank samples")]
     if rt.audit_links > 0:
-        links = min(rt.audit_links, n_rss + n_rank)
-        seconds = cost["audit"] + len(rss + rank) * cost["audit, per tower and array"]
-        stages.append(PlannedStage("audit", f"{links} links by the other engine", seconds))
+        stages.append(PlannedStage("audit", f"{min(rt.audit_links, n_rss + n_rank)} links by the other engine"))
     if n_rss and rt.engine == "image":
-        known_s = [stage.seconds for stage in rss if stage.seconds is not None]
-        seconds = MEASURED["ladder, replays of the RSS"] * sum(known_s)
-        stages.append(PlannedStage("ladder", "simpler and richer models", seconds))
+        stages.append(PlannedStage("ladder", "simpler and richer models"))
     drawn = 0 if figures == "none" else len(data.rss) + len(data.rank)
-    drawing = (cost["figures"] + drawn * cost["figures, per channel"]) * (3.0 if figures == "all" else 1.0)
-    seconds = cost["page"] + (drawing if drawn else 0.0)
-    stages.append(PlannedStage("report", f"page, figures of {drawn} channels", seconds))
-    return Plan(job="report", inputs=tuple(inputs), output=out, stages=tuple(stages), measured=_measured_text(factor))
+    stages.append(PlannedStage("report", f"page, figures of {drawn} channels"))
+    return Plan(job="report", inputs=tuple(inputs), output=out, stages=tuple(stages))
 
 
 def _tried_replays(data: FlightData) -> tuple[list[PlannedStage], list[PlannedStage]]:
@@ -285,9 +232,7 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
     positions = len(Grid.over_area(place.area_m, settings.spacing_m))
     heights = len(set(settings.rss_altitudes_m) | set(settings.rank_altitudes_m))
     links = positions * heights * len(place.towers)
-    factor = probe() / PROBE_S
-    cost = {name: seconds * factor for name, seconds in MEASURED.items()}
-    stages = [PlannedStage("imports", "libraries", cost["imports"])]
+    stages = []
     searched = _map_searched(place, settings, heights) if settings.engine == "image" else None
     for mode in settings.foliage:
         work = f"{links} links: {positions} positions, {heights} heights, {len(place.towers)} towers"
@@ -303,9 +248,7 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
             seconds = _cpu_seconds(lambda one=coarse: make_maps(place, one, Stages())) * positions / tried
         stages.append(PlannedStage(f"maps, foliage {mode}", work, seconds))
     if settings.study:
-        seconds = positions * cost["study, per position"]
-        stages.append(PlannedStage("study", "correlation and interpolation", seconds))
+        stages.append(PlannedStage("study", "correlation and interpolation"))
     layers = heights * len(place.towers) * len(settings.foliage) * (1 + len(settings.ks))
-    seconds = cost["map pages"] + positions * layers * cost["export, per layer and position"]
-    stages.append(PlannedStage("export, page", f"some {layers} layers", seconds))
-    return Plan(job="map", inputs=tuple(inputs), output=out, stages=tuple(stages), measured=_measured_text(factor))
+    stages.append(PlannedStage("export, page", f"some {layers} layers"))
+    return Plan(job="map", inputs=tuple(inputs), output=out, stages=tuple(stages))

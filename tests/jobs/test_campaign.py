@@ -192,7 +192,7 @@ def test_broken_flights_are_rows_with_their_message(whole: dict[str, Any], folde
     }
     page = (folder / "whole_out" / "campaign.html").read_text(encoding="utf-8")
     assert "gone/&lt;b&gt;USRP1.txt" in page
-    assert page.count("<script") == 2  # its data and its own script
+    assert "<script" not in page
     assert page.rstrip().endswith("</html>")
 
 
@@ -200,7 +200,7 @@ def test_every_figure_is_there_and_old_ones_are_not(whole: dict[str, Any], folde
     figures = folder / "whole_out" / "figures"
     expected = {
         "settings_rmse", "tracks", "distance_LW1_USRP1", "distance_LW1_USRP2", "places_LW1_USRP1", "places_LW1_USRP2",
-        "held_out_1", "season_errors", "season_drift", "season_places",
+        "season_errors", "season_drift", "season_places",
     }  # fmt: skip
     assert {p.stem for p in figures.glob("*.svg")} == {p.stem for p in figures.glob("*.png")} == expected
     shutil.copytree(folder / "whole_out", folder / "again_out")

@@ -25,6 +25,7 @@ DATA = (
     "made for a test", "Towers of another source differ by up to 9 m.", "repeated lines were re-expanded from",
     "Tower heights are 10 m.", "A season that was never flown", "samples (expected at least", "settings flights",
     "fields instead of", "a null of the two-ray pattern", "everything else is synthetic", "of woodland covers",
+    "A synthetic flight sample was replayed",
 )  # fmt: skip
 """Words of the made-up records themselves."""
 
@@ -89,7 +90,7 @@ def diff(_: Fixture) -> str:
     return diff_html.diff_page(
         ReportDiff(
             first=sides_of[0], second=sides_of[1], settings=(Entry(key="rt.max_depth", first=2, second=1),), inputs=(),
-            versions=(), stages=(Entry(key="read", first=1.0, second=1.1),), numbers=(), levels=(level,), ranks=(),
+            versions=(), numbers=(), levels=(level,), ranks=(),
             pooled=pooled_difference([(time, first, second)]), new_warnings=(), gone_warnings=(),
             links_first_only=(), links_second_only=(), tolerance_db=0.01, remarks=(),
         )

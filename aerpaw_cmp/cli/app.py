@@ -16,7 +16,7 @@ import functools
 import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Optional, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
 from typer.core import TyperCommand
@@ -39,22 +39,22 @@ app.add_typer(site_app, name="site", help=COMMANDS["site"])
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else there.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace files that this tool did not write; never an input.")]
 Export = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(help="Also write the samples as geojson, kmz, netcdf or all; names joined by commas, or repeated."),
 ]
 LogsRoot = Annotated[
-    Optional[Path],  # noqa: UP045
+    Path | None,
     typer.Option("--logs-root", help="Folder against which the paths of the logs resolve."),
 ]
 
 
 Workers = Annotated[int, typer.Option(min=1, help="Workers of this machine that share the tasks.")]
 Scheduler = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option("--scheduler", "--cluster", help="Address of a Dask scheduler, instead of local workers."),
 ]
 Flights = Annotated[
-    Optional[list[Path]],  # noqa: UP045
+    list[Path] | None,
     typer.Option("--with", metavar="FLIGHT", help="Flown flight.yaml to learn from; repeatable."),
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print stages and time estimate; write nothing.")]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 
@@ -25,7 +25,7 @@ ACTIONS = ("run", "score", "template", "fetch", "tasks")
 )
 def benchmark(
     words: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Argument(
             metavar="[run|tasks|template|fetch|score PREDICTIONS]",
             help="run: our own models; tasks: the rules; template: the table to fill; score: a predictions.csv.",
@@ -33,7 +33,7 @@ def benchmark(
     ] = None,
     data: Annotated[Path, typer.Option(help="Folder of the published logs, whatever the files are called.")] = Path(),
     out: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "-o",
             "--out",
@@ -41,16 +41,12 @@ def benchmark(
             help="Output folder; of template a CSV  [default: reports/benchmark, predictions.csv; of fetch --data]",
         ),
     ] = None,
-    task: Annotated[Optional[list[str]], typer.Option(help="Only this task; repeatable.")] = None,  # noqa: UP045
-    entrant: Annotated[Optional[list[str]], typer.Option(help="Only this model of ours; repeatable.")] = None,  # noqa: UP045
+    task: Annotated[list[str] | None, typer.Option(help="Only this task; repeatable.")] = None,
+    entrant: Annotated[list[str] | None, typer.Option(help="Only this model of ours; repeatable.")] = None,
     leaderboard: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="leaderboard.json that gets a row for the scored file."),
+        Path | None, typer.Option(help="leaderboard.json that gets a row for the scored file.")
     ] = None,
-    manifest: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="Another manifest [default: the packaged one]"),
-    ] = None,
+    manifest: Annotated[Path | None, typer.Option(help="Another manifest [default: the packaged one]")] = None,
     accept_levels: Annotated[
         bool, typer.Option("--accept-levels", help="Score levels whose sign or unit looks wrong.")
     ] = False,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 
@@ -32,15 +32,13 @@ def campaign(
         ),
     ],
     out: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/<campaign>]"),
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/<campaign>]")
     ] = None,
     logs_root: LogsRoot = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,
     keep: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="Folder for task outcomes; a rerun computes missing outcomes only."),
+        Path | None, typer.Option(help="Folder for task outcomes; a rerun computes missing outcomes only.")
     ] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Ignore stored outcomes and store none.")] = False,
     dry_run: Annotated[

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 
@@ -24,7 +24,7 @@ def diff(
     first: Annotated[Path, typer.Argument(help="Folder of a report.")],
     second: Annotated[Path, typer.Argument(help="The other report of the same flight.")],
     out: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "-o", "--out", metavar="DIR", help="Folder for diff.html and diff.json  [default: none is written]"
         ),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -23,13 +23,9 @@ def explain(
     time: Annotated[str, typer.Option(help="Seconds after the first sample, or ISO 8601 (time_utc of rss.csv).")],
     tower: Annotated[str, typer.Option(help="Tower of the link.")],
     channel: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Channel of the RSS logs, or 'rank'  [default: first log of the tower]"),
+        str | None, typer.Option(help="Channel of the RSS logs, or 'rank'  [default: first log of the tower]")
     ] = None,
-    engine: Annotated[
-        Optional[Literal["image", "sionna"]],  # noqa: UP045
-        typer.Option(help="Path search  [default: rt.engine]"),
-    ] = None,
+    engine: Annotated[Literal["image", "sionna"] | None, typer.Option(help="Path search  [default: rt.engine]")] = None,
     logs_root: LogsRoot = None,
     as_json: Json = False,
 ) -> int:

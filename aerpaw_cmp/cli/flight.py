@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -30,28 +30,22 @@ from .shown import number, print_files, print_json, print_plan, say, table
 def report(
     flight: Annotated[Path, typer.Argument(help="flight.yaml")],
     out: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/<flight>]"),
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/<flight>]")
     ] = None,
     logs_root: LogsRoot = None,
-    engine: Annotated[
-        Optional[Literal["image", "sionna"]],  # noqa: UP045
-        typer.Option(help="Path search  [default: rt.engine]"),
-    ] = None,
+    engine: Annotated[Literal["image", "sionna"] | None, typer.Option(help="Path search  [default: rt.engine]")] = None,
     audit: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Number of audited links, 'full' or 'none'  [default: rt.audit_links]"),
+        str | None, typer.Option(help="Number of audited links, 'full' or 'none'  [default: rt.audit_links]")
     ] = None,
     recommend: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("--recommend", help="Write a flight.yaml with the recommended model."),
+        Path | None, typer.Option("--recommend", help="Write a flight.yaml with the recommended model.")
     ] = None,
     learned: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--with", metavar="CALIBRATED", help="calibrated.yaml with antennas, ground and receiver."),
     ] = None,
     against: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("--against", metavar="PREDICTION", help="Score what 'predict' said of this flight (its folder)."),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
@@ -60,8 +54,7 @@ def report(
         typer.Option(help="Figures to draw: those of the page, none, or all in one format or in every format."),
     ] = "page",
     style: Annotated[
-        Literal["screen", "paper"],
-        typer.Option(help="Figure style: screen, or paper (IEEE width, fonts embedded)."),
+        Literal["screen", "paper"], typer.Option(help="Figure style: screen, or paper (IEEE width, fonts embedded).")
     ] = "screen",
     export: Export = None,
     dry_run: DryRun = False,
@@ -213,7 +206,7 @@ def _print_report_summary(outcome: Any) -> None:
 def calibrate(
     calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
     out: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "-o",
             "--out",
@@ -223,14 +216,13 @@ def calibrate(
     ] = None,
     logs_root: LogsRoot = None,
     into_site: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(
             "--into-site", metavar="SITE", help="Site that stores the learned antennas; drafts then use them by name."
         ),
     ] = None,
     score: Annotated[
-        Optional[list[Path]],  # noqa: UP045
-        typer.Option(help="flight.yaml to score with the learned settings; repeatable."),
+        list[Path] | None, typer.Option(help="flight.yaml to score with the learned settings; repeatable.")
     ] = None,
     force: Force = False,
     as_json: Json = False,
@@ -282,8 +274,7 @@ def calibrate(
 def simulate(
     flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
     out: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: simulated/<flight>]"),
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: simulated/<flight>]")
     ] = None,
     force: Force = False,
     as_json: Json = False,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.core import TyperCommand
@@ -43,7 +43,7 @@ class WebCommand(TyperCommand):
 )
 def tap(
     port: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Argument(help="Serial port, or several  [default: the first AT port of a Quectel modem]"),
     ] = None,
     out: Annotated[
@@ -58,24 +58,20 @@ def tap(
     ] = False,
     ri_hz: Annotated[float, typer.Option(help="Rate of the rank indicator.")] = 2.0,
     other_hz: Annotated[float, typer.Option(help="Rate of each other query.")] = 1.0,
-    no_csi_alarm: Annotated[Optional[float], typer.Option(help="Seconds without CSI until the bell rings.")] = None,  # noqa: UP045
+    no_csi_alarm: Annotated[float | None, typer.Option(help="Seconds without CSI until the bell rings.")] = None,
     no_csi_exit: Annotated[bool, typer.Option("--no-csi-exit", help="Exit with code 1 on that alarm.")] = False,
     sync_s: Annotated[float, typer.Option(help="Longest time between a record and its sync to disk [s].")] = 1.0,
-    duration: Annotated[Optional[float], typer.Option(help="Stop after this many seconds.")] = None,  # noqa: UP045
+    duration: Annotated[float | None, typer.Option(help="Stop after this many seconds.")] = None,
     wait: Annotated[float, typer.Option(help="Seconds to wait for the port.")] = 0.0,
     web: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(help=f"Also show the flight as a page, at HOST:PORT [default: {WEB}]; 0.0.0.0 asks for a token."),
     ] = None,
     play: Annotated[
-        Optional[list[Path]],  # noqa: UP045
-        typer.Option(help="Earlier log to show on the page; nothing is tapped; repeatable."),
+        list[Path] | None, typer.Option(help="Earlier log to show on the page; nothing is tapped; repeatable.")
     ] = None,
     speed: Annotated[float, typer.Option(help="Seconds of the log per second, with --play.")] = 1.0,
-    export: Annotated[
-        Optional[Literal["csv"]],  # noqa: UP045
-        typer.Option(help="Write the log below OUT as a table and stop."),
-    ] = None,
+    export: Annotated[Literal["csv"] | None, typer.Option(help="Write the log below OUT as a table and stop.")] = None,
     flight: Annotated[Path | None, typer.Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
     telemetry: Annotated[Path | None, typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,
     force: Force = False,
@@ -191,7 +187,7 @@ def modem_sim(
     telemetry: Annotated[
         Path | None, typer.Option(help="New telemetry file for --flight; it grows during the flight.")
     ] = None,
-    fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045
+    fault: Annotated[list[str] | None, typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,
     as_json: Json = False,
 ) -> int:
     """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Literal
 
 import typer
 
@@ -22,30 +22,28 @@ from .shown import print_json, say, table
 def ingest(
     paths: Annotated[list[Path], typer.Argument(help="Log files and folders.")],
     out: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             "-o", "--out", metavar="FILE", help="Flight file (HDF5) with every record  [default: none is written]"
         ),
     ] = None,
-    draft: Annotated[Optional[Path], typer.Option(help="Also write a first flight.yaml that names these logs.")] = None,  # noqa: UP045
+    draft: Annotated[Path | None, typer.Option(help="Also write a first flight.yaml that names these logs.")] = None,
     site: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Site of the draft; its learned antennas are used  [default: lake_wheeler]"),
+        str | None, typer.Option(help="Site of the draft; its learned antennas are used  [default: lake_wheeler]")
     ] = None,
-    reader: Annotated[Optional[str], typer.Option(help="Reader for all files  [default: detected by content]")] = None,  # noqa: UP045
+    reader: Annotated[str | None, typer.Option(help="Reader for all files  [default: detected by content]")] = None,
     timezone: Annotated[
         str | None, typer.Option(help="IANA time zone of clocks without a zone, such as America/New_York.")
     ] = None,
     time_origin: Annotated[str | None, typer.Option(help="Start time (ISO 8601) of logs with relative times.")] = None,
     ri_base: Annotated[
-        Optional[Literal["zero", "one"]],  # noqa: UP045
-        typer.Option(help="Number that the log prints for rank 1."),
+        Literal["zero", "one"] | None, typer.Option(help="Number that the log prints for rank 1.")
     ] = None,
     columns: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        list[str] | None,
         typer.Option("--map", metavar="COLUMN=QUANTITY", help="Content of a CSV column: time, rss_db, rank, ..."),
     ] = None,
-    unit: Annotated[Optional[str], typer.Option(help="Unit of levels, if the file does not state it.")] = None,  # noqa: UP045
+    unit: Annotated[str | None, typer.Option(help="Unit of levels, if the file does not state it.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:

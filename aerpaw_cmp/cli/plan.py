@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 
@@ -30,28 +30,25 @@ def plan(
         typer.Argument(help="Target: sphere (all directions), a site (a grid), a route, or points."),
     ],
     flights: Flights = None,
-    site: Annotated[Optional[str], typer.Option(help="Site, where no flight names it.")] = None,  # noqa: UP045
+    site: Annotated[str | None, typer.Option(help="Site, where no flight names it.")] = None,
     tower: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option(help="Tower whose antenna counts, without --with; repeatable  [default: all]"),
+        list[str] | None, typer.Option(help="Tower whose antenna counts, without --with; repeatable  [default: all]")
     ] = None,
-    geofence: Annotated[Optional[Path], _FENCE] = None,  # noqa: UP045
-    avoid: Annotated[Optional[list[Path]], _AVOID] = None,  # noqa: UP045
-    routes: Annotated[Optional[list[Path]], _ROUTES] = None,  # noqa: UP045
+    geofence: Annotated[Path | None, _FENCE] = None,
+    avoid: Annotated[list[Path] | None, _AVOID] = None,
+    routes: Annotated[list[Path] | None, _ROUTES] = None,
     minutes: Annotated[float, typer.Option(min=1.0, max=240.0, help="Battery: longest flight [min].")] = 15.0,
     speed: Annotated[float, typer.Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
     height: Annotated[
-        Optional[list[float]],  # noqa: UP045
+        list[float] | None,
         typer.Option(help="Height of the tool's own patterns above take-off [m]; repeatable  [default: 40]"),
     ] = None,
     target_height: Annotated[
-        Optional[list[float]],  # noqa: UP045
-        typer.Option(help="Height of a target that is a site [m]; repeatable  [default: 40]"),
+        list[float] | None, typer.Option(help="Height of a target that is a site [m]; repeatable  [default: 40]")
     ] = None,
     tower_distance: Annotated[float, typer.Option(min=0.0, help="Least distance to towers [m].")] = 30.0,
     out: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/plan-<TARGET>]"),
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/plan-<TARGET>]")
     ] = None,
     logs_root: LogsRoot = None,
     force: Force = False,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 
@@ -31,21 +31,19 @@ def predict(
     ],
     flights: Flights = None,
     out: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/prediction-<WHERE>]"),
     ] = None,
     height: Annotated[
-        Optional[list[float]],  # noqa: UP045
+        list[float] | None,
         typer.Option(help="Height of a grid [m], repeatable; of route points without one  [default: 40]"),
     ] = None,
     spacing: Annotated[float, typer.Option(min=1.0, help="Spacing of a grid [m].")] = 30.0,
     heading: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(help="Heading of the nose on a grid [deg]; without it all headings count alike."),
+        float | None, typer.Option(help="Heading of the nose on a grid [deg]; without it all headings count alike.")
     ] = None,
     threshold: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(help="Also the probability that the level exceeds this, in the unit of the logs."),
+        float | None, typer.Option(help="Also the probability that the level exceeds this, in the unit of the logs.")
     ] = None,
     logs_root: LogsRoot = None,
     force: Force = False,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -26,39 +26,34 @@ from .shown import print_files, print_json, print_plan, say, table
 def site_import(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The site.yaml to write.")],
     files: Annotated[
-        Optional[list[Path]],  # noqa: UP045
+        list[Path] | None,
         typer.Argument(help="Map files, or one Mitsuba XML  [default: none; with --canopy or --buildings]"),
     ] = None,
     base: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Site that gives towers and settings  [default: lake_wheeler; none for a scene]"),
+        str | None, typer.Option(help="Site that gives towers and settings  [default: lake_wheeler; none for a scene]")
     ] = None,
     origin: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Scene: latitude,longitude[,ground height] of its (0, 0, 0), or 'local'."),
+        str | None, typer.Option(help="Scene: latitude,longitude[,ground height] of its (0, 0, 0), or 'local'.")
     ] = None,
     tower: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option(help="Scene: name=east,north,height [m] of an antenna; repeatable."),
+        list[str] | None, typer.Option(help="Scene: name=east,north,height [m] of an antenna; repeatable.")
     ] = None,
     material: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option(help="Scene: id=concrete, for a material without radio properties; repeatable."),
+        list[str] | None, typer.Option(help="Scene: id=concrete, for a material without radio properties; repeatable.")
     ] = None,
     turn: Annotated[float, typer.Option(help="Scene: angle of the x axis, counter-clockwise from east [deg].")] = 0.0,
     merge_m: Annotated[
         float, typer.Option(help="Scene: largest distance of a face's corners from its plane [m].")
     ] = 1e-3,
     untagged: Annotated[
-        Optional[Literal["building", "forest", "geofence"]],  # noqa: UP045
-        typer.Option(help="Kind of the areas without a tag."),
+        Literal["building", "forest", "geofence"] | None, typer.Option(help="Kind of the areas without a tag.")
     ] = None,
     canopy: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(metavar="FILE", help="Canopy heights (GeoTIFF): stands and trees in place of all others."),
     ] = None,
     buildings: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(metavar="FILE", help="Surface model (GeoTIFF) that gives the buildings their heights."),
     ] = None,
     force: Force = False,
@@ -122,10 +117,9 @@ def site_show(
         str | None, typer.Argument(help="site.yaml or packaged site  [default: that of --flight, else lake_wheeler]")
     ] = None,
     out: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/site-<site>]"),
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/site-<site>]")
     ] = None,
-    flight: Annotated[Optional[Path], typer.Option(help="Draw the track of this flight.yaml.")] = None,  # noqa: UP045
+    flight: Annotated[Path | None, typer.Option(help="Draw the track of this flight.yaml.")] = None,
     logs_root: LogsRoot = None,
     export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
     force: Force = False,
@@ -156,48 +150,39 @@ def site_show(
 def map_(
     site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
     out: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/map-<site>]"),
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/map-<site>]")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A coarse map in seconds: 120 m, three heights.")] = False,
     foliage: Annotated[
-        Optional[list[str]],  # noqa: UP045
-        typer.Option(help="none, attenuating, opaque or all; repeatable  [default: all]"),
+        list[str] | None, typer.Option(help="none, attenuating, opaque or all; repeatable  [default: all]")
     ] = None,
     crown_reflections: Annotated[
         bool, typer.Option("--crown-reflections/--no-crown-reflections", help="Opaque crowns also reflect.")
     ] = True,
-    spacing: Annotated[Optional[float], typer.Option(help="Distance between positions [m]  [default: 30]")] = None,  # noqa: UP045
+    spacing: Annotated[float | None, typer.Option(help="Distance between positions [m]  [default: 30]")] = None,
     rss_altitude: Annotated[
-        Optional[list[float]],  # noqa: UP045
-        typer.Option(help="Height of RSS maps [m]; repeatable  [default: 30, 70, 110]"),
+        list[float] | None, typer.Option(help="Height of RSS maps [m]; repeatable  [default: 30, 70, 110]")
     ] = None,
     rank_altitude: Annotated[
-        Optional[list[float]],  # noqa: UP045
-        typer.Option(help="Height of rank maps [m]; repeatable  [default: 3 and 30 to 110 by 10]"),
+        list[float] | None, typer.Option(help="Height of rank maps [m]; repeatable  [default: 3 and 30 to 110 by 10]")
     ] = None,
     k: Annotated[
-        Optional[list[float]],  # noqa: UP045
+        list[float] | None,
         typer.Option("-k", "--k", help="Singular-value ratio K; repeatable  [default: 10, 100, 1000]"),
     ] = None,
-    carrier_ghz: Annotated[Optional[float], typer.Option(help="Carrier frequency [GHz]  [default: 3.4]")] = None,  # noqa: UP045
-    engine: Annotated[
-        Optional[Literal["image", "sionna"]],  # noqa: UP045
-        typer.Option(help="Path search  [default: image]"),
-    ] = None,
+    carrier_ghz: Annotated[float | None, typer.Option(help="Carrier frequency [GHz]  [default: 3.4]")] = None,
+    engine: Annotated[Literal["image", "sionna"] | None, typer.Option(help="Path search  [default: image]")] = None,
     max_depth: Annotated[
         int | None, typer.Option(min=0, max=3, help="Largest number of reflections  [default: 2]")
     ] = None,
-    samples: Annotated[Optional[int], typer.Option(min=1, help="Rays per tower (sionna only)  [default: 1e6]")] = None,  # noqa: UP045
+    samples: Annotated[int | None, typer.Option(min=1, help="Rays per tower (sionna only)  [default: 1e6]")] = None,
     flight: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="flight.yaml whose track is the training set of the test 'along a flight'."),
+        Path | None, typer.Option(help="flight.yaml whose track is the training set of the test 'along a flight'.")
     ] = None,
     flights: Flights = None,
     logs_root: LogsRoot = None,
     threshold_dbm: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(help="Lowest level in coverage [dBm]  [default: any path is coverage]"),
+        float | None, typer.Option(help="Lowest level in coverage [dBm]  [default: any path is coverage]")
     ] = None,
     study: Annotated[
         bool, typer.Option("--study/--no-study", help="Also spatial correlation and interpolation.")

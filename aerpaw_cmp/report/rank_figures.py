@@ -239,6 +239,28 @@ def draw_singular_values(ax: Axes, seconds: FloatArray, panel: RankResult) -> No
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
 
 
+def draw_counts(ax: Axes, counts: FloatArray) -> Any:
+    """A matrix of counts (rows, columns), coloured by each one's share of its row [%]; a row without any stays white.
+
+    Parameters
+    ----------
+    ax : Axes
+    counts : (rows, columns)
+
+    Returns
+    -------
+    matplotlib.image.AxesImage
+        For a colour bar.
+    """
+    total = counts.sum(axis=1, keepdims=True)
+    share = 100 * np.divide(counts, total, out=np.full(counts.shape, np.nan), where=total > 0)
+    for (row, column), number in np.ndenumerate(counts):
+        colour = "white" if share[row, column] < 55 else "black"
+        ax.text(column, row, count(int(number)), ha="center", va="center", fontsize=8, color=colour)
+    ax.grid(visible=False)
+    return ax.imshow(share, cmap="cividis", vmin=0, vmax=100, aspect="auto")
+
+
 def confusion(panel: RankResult) -> Figure:
     """Measured rank against simulated rank for every K, as counts and shares of the measured rank."""
     fits = panel.score.simulated
@@ -247,24 +269,15 @@ def confusion(panel: RankResult) -> Figure:
     image = None
     for ax, (k, fit) in zip(axes, fits.items(), strict=True):
         table = np.asarray(fit.confusion[1:], dtype=float)  # no report is no row
-        total = table.sum(axis=1, keepdims=True)
-        share = 100 * np.divide(table, total, out=np.zeros_like(table), where=total > 0)
-        image = ax.imshow(np.where(total > 0, share, np.nan), cmap="cividis", vmin=0, vmax=100, aspect="auto")
+        image = draw_counts(ax, table)
         ax.plot(RANKS, range(len(RANKS)), "s", markersize=25, markerfacecolor="none", markeredgecolor=TOWER,
                 markeredgewidth=1.2, clip_on=False, label="equal")  # fmt: skip
-        for row in range(table.shape[0]):
-            for column in range(table.shape[1]):
-                ax.text(
-                    column, row, f"{int(table[row, column])}", ha="center", va="center", fontsize=8,
-                    color="white" if total[row] > 0 and share[row, column] < 55 else "black",
-                )  # fmt: skip
         ax.set_xticks(range(5), ["Z", "1", "2", "3", "4"])
         ax.set_yticks(range(4), [f"{r}" for r in RANKS])
         ax.set_xlabel("Simulated rank")
         samples = count(int(table.sum()))
         equal = f": equal in {100 * fit.agreement:.0f} % of {samples}" if np.isfinite(fit.agreement) else ""
         ax.set_title(f"K = {k_key(k)}{equal}")
-        ax.grid(visible=False)
     axes[0].set_ylabel("Measured rank")
     if image is not None:
         colour_bar(fig, image, list(axes), "Share of the measured rank [%]")

@@ -9,6 +9,7 @@ import numpy as np
 from ..common.units import AnyArray
 from ..compare.serving import ServingComparison
 from .canvas import TOWER, FigureSpec, colour_bar, figure
+from .rank_figures import draw_counts
 from .words import count
 
 MOST_CELLS = 16
@@ -39,26 +40,18 @@ def shown_confusion(serving: ServingComparison, most: int = MOST_CELLS) -> tuple
 def confusion(serving: ServingComparison) -> Any:
     """Cell that served against cell predicted strongest: counts, coloured by their share of the row."""
     names, table = shown_confusion(serving)
-    total = table.sum(axis=1, keepdims=True)
-    share = 100 * np.divide(table, total, out=np.zeros(table.shape), where=total > 0)
     longest = max((len(name) for name in names), default=0)
     fig = figure((min(9.2, 3.6 + 0.62 * len(names) + 0.05 * longest), 1.9 + 0.42 * len(names)))
     ax = fig.subplots()
-    image = ax.imshow(np.where(total > 0, share, np.nan), cmap="cividis", vmin=0, vmax=100, aspect="auto")
+    image = draw_counts(ax, table.astype(np.float64))
     for row, name in enumerate(names):
         if name != OTHER:
             ax.add_patch(_frame(row))
-        for column in range(table.shape[1]):
-            ax.text(
-                column, row, count(int(table[row, column])), ha="center", va="center", fontsize=8,
-                color="white" if total[row] > 0 and share[row, column] < 55 else "black",
-            )  # fmt: skip
     ax.set_xticks(range(len(names) + 1), [*names, NONE], rotation=45 if len(names) > 4 else 0,
                   ha="right" if len(names) > 4 else "center", fontsize=8)  # fmt: skip
     ax.set_yticks(range(len(names)), names, fontsize=8)
     ax.set_xlabel("Cell predicted strongest")
     ax.set_ylabel("Cell that served")
-    ax.grid(visible=False)
     colour_bar(fig, image, [ax], "Share of the cell that served [%]")
     return fig
 

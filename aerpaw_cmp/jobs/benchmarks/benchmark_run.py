@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import http.client
 import json
 import time
 import urllib.error
@@ -19,6 +20,7 @@ from typing import Any
 from ... import __version__
 from ...common.cells import guarded
 from ...common.errors import InputError, OutputError, UsageError
+from ...common.files import atomic_path
 from ...common.outputs import OutputFile, OutputFolder, is_sealed
 from ...common.stages import Progress, silent
 from . import entrants
@@ -35,7 +37,6 @@ from .benchmark import (
     score_task,
     truth,
 )
-from .benchmark_repeat import repeat_of
 
 Scores = dict[str, dict[str, dict[str, Any]]]
 """By task and entrant."""
@@ -199,8 +200,7 @@ def _page(bench: Bench, scores: Scores) -> str:
     tables = []
     for task, rows in scores.items():
         one = bench.manifest.tasks[task]
-        rule = f"{one.rule} {repeat_of(bench, task).words}"
-        about = {"title": one.title, "rule": rule, "kind": one.kind, "flights": bench.tests(task)}
+        about = {"title": one.title, "rule": one.rule, "kind": one.kind, "flights": bench.tests(task)}
         tables.append(task_table(task, {**about, "skipped": bench.skipped(task, training=False)}, rows))
     lacking = dict.fromkeys(text for task in bench.manifest.tasks for text in bench.skipped(task, training=True))
     made = datetime.now(timezone.utc).isoformat(timespec="seconds")
@@ -312,9 +312,9 @@ def write_template(
 
 
 def fetch(out: Path, *, manifest: Path | None = None, progress: Progress = silent) -> list[Path]:
-    """Download the published files that a folder lacks; a file is kept once its SHA-256 is right.
+    """Download the published files that a folder lacks; a file is kept where its SHA-256 is right.
 
-    Proxies are taken from the environment; a download that was cut is taken up where it ended.
+    Proxies are taken from the environment.
 
     Raises
     ------
@@ -331,36 +331,20 @@ def fetch(out: Path, *, manifest: Path | None = None, progress: Progress = silen
         if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == one.sha256:
             continue
         progress(f"{name}: {one.bytes / 1e6:.1f} MB from {one.repository}")
-        part = path.with_name(path.name + ".part")
-        _download(one.url, part, one.bytes)
-        digest = hashlib.sha256(part.read_bytes()).hexdigest()
+        try:
+            with urllib.request.urlopen(one.url, timeout=60) as answer:
+                content = answer.read(one.bytes)
+        except (urllib.error.URLError, http.client.IncompleteRead, OSError) as error:
+            raise OutputError(
+                f"{one.url} could not be fetched: {error}",
+                expected="a network, or the files copied by hand into the folder (docs/benchmark.md names them)",
+                path=path,
+            ) from None
+        digest = hashlib.sha256(content).hexdigest()
         if digest != one.sha256:
-            part.unlink()
-            raise InputError(
-                f"SHA-256 {digest}", expected=one.sha256, cause=f"{one.repository} changed the file", path=path
-            )
-        part.replace(path)
+            cause = f"the answer was cut, or {one.repository} changed the file"
+            raise InputError(f"SHA-256 {digest} of {len(content)} bytes", expected=one.sha256, cause=cause, path=path)
+        with atomic_path(path) as part:
+            part.write_bytes(content)
         made.append(path)
     return made
-
-
-def _download(url: str, part: Path, size: int) -> None:
-    """Append what a partial file lacks, never more than the published size."""
-    have = part.stat().st_size if part.exists() else 0
-    request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
-    try:
-        with urllib.request.urlopen(request, timeout=60) as answer, part.open("ab" if have else "wb") as stream:
-            if have and answer.status != 206:
-                stream.truncate(0)
-                have = 0
-            while have < size and (piece := answer.read(min(1 << 20, size - have))):
-                have += len(piece)
-                stream.write(piece)
-            if have < size:
-                raise OSError(f"the answer ended after {have} of {size} bytes")
-    except (urllib.error.URLError, TimeoutError, OSError) as error:
-        raise OutputError(
-            f"{url} could not be fetched: {error}",
-            expected="a network, or the files copied by hand into the folder (docs/benchmark.md names them)",
-            path=part,
-        ) from None

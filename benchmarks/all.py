@@ -67,7 +67,6 @@ SMALLEST: dict[str, list[str]] = {
     "coverage_of_intervals": ["--flights", "20", "--replicates", "100"],
     "diffraction": ["--poses", "100", "--pairs", "1"],
     "drafts": ["sample_logs"],
-    "estimate": [],
     "exports": ["--samples", "20000"],
     "fabricated": [],
     "freeze": ["record", "{folder}/record.npz"],

@@ -57,7 +57,6 @@ DEAREST = (
     "live/test_tap.py",
     "report/test_diff.py",
     "jobs/test_compare_flight.py",
-    "report/test_browser_campaign.py",
     "report/test_browser_map.py",
     "machine/test_llvm.py",
     "live/test_log.py",

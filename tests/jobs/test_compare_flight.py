@@ -239,7 +239,6 @@ def test_two_channels_part_where_one_was_pushed_down(tmp_path: Path, capsys: pyt
     (pair,) = pairs_of(compared_rss(path))
     assert (pair.first, pair.second) == ("USRP1", "USRP2")
     assert len(pair.time) == len(at)  # 0.05 s is less than half a sampling interval
-    assert abs(np.nanmedian(pair.difference_db)) < 5.0  # each channel after its own offset
     (span,) = pair.score.spans
     begin, end = instants(pair.time, span)
     start = np.datetime64(ORIGIN.removesuffix("Z"), "ns")

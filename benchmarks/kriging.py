@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import time
 import warnings
@@ -23,6 +24,7 @@ import numpy as np
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.kriging import OrdinaryKriging
 from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL as PAPER
+from aerpaw_cmp.propagation import compiled
 
 M, RADIUS_M, SEED = 20, 150.0, 20250210
 FIELDS = 27  # 9 altitudes x 3 K
@@ -126,14 +128,16 @@ def moving_window(quick, repeats):
 
     Totals hold what each side sets up (PyKrige: statistics of its fit and all distances between samples; ours: a tree).
     The marginal cost is the slope between the two largest numbers of targets, without it. PyKrige has no several
-    fields: one run is timed and counts 27 times.
+    fields: one run is timed and counts 27 times. Ours runs in NumPy, as small jobs do, and compiled, as jobs of some
+    100 000 targets do; what a process pays to load the compiled code stands apart.
     """
     _, points, values = samples(quick)
     rng, low, high = np.random.default_rng(3), points.min(axis=0), points.max(axis=0)
     counts = (len(points), 200, 400) if quick else (len(points), 20_000, 100_000)
     targets = {n: rng.uniform(low, high, (n, 2)) for n in counts}
 
-    def ours(n, fields):
+    def ours(n, fields, switch="never"):
+        os.environ[compiled.SWITCH] = switch
         return OrdinaryKriging(exponential, M, np.inf).fit(points, values[:, :fields]).predict(targets[n])[0]
 
     def peer(n):
@@ -141,7 +145,11 @@ def moving_window(quick, repeats):
         return model.execute("points", *targets[n].T, backend="C", n_closest_points=M)[0]
 
     jobs = {("pykrige", n): (peer, (n,)) for n in counts} | {("ours", n): (ours, (n, 1)) for n in counts}
+    jobs |= {("compiled", n): (ours, (n, 1, "always")) for n in counts}
     jobs["ours", f"{counts[0]}_27_fields"] = ours, (counts[0], FIELDS)
+    start = time.process_time()
+    compiled.load(compiled.TRIANGLES)
+    load_s = time.process_time() - start
     least = dict.fromkeys(jobs, np.inf)
     for _ in range(repeats):
         for key, (job, arguments) in jobs.items():
@@ -150,14 +158,16 @@ def moving_window(quick, repeats):
             least[key] = min(least[key], time.process_time() - start)
     marginal = {
         side: (least[side, counts[2]] - least[side, counts[1]]) / (counts[2] - counts[1])
-        for side in ("ours", "pykrige")
+        for side in ("ours", "compiled", "pykrige")
     }
     every = least["ours", f"{counts[0]}_27_fields"]
     row = {f"{side}_{n}_s": seconds for (side, n), seconds in least.items()}
     row |= {f"ratio_total_{n}": least["pykrige", n] / least["ours", n] for n in counts}
+    row |= {f"ratio_total_compiled_{n}": least["pykrige", n] / least["compiled", n] for n in counts}
     row |= {f"ratio_total_{counts[0]}_27_fields": FIELDS * least["pykrige", counts[0]] / every}
     row |= {f"{side}_marginal_us": 1e6 * slope for side, slope in marginal.items()}
-    row["ratio_marginal"] = marginal["pykrige"] / marginal["ours"]
+    row |= {f"ratio_marginal_{side}": marginal["pykrige"] / marginal[side] for side in ("ours", "compiled")}
+    row["compiled_load_s"] = load_s
     row["largest_difference_C"] = float(np.abs(np.asarray(peer(counts[0])) - ours(counts[0], 1)[:, 0]).max())
     return row
 

@@ -31,13 +31,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray
+from ..propagation.compiled import triangles_for
 from . import neighbours as choose
 
 Correlation = Callable[[FloatArray], FloatArray]
@@ -50,7 +51,7 @@ SOUND_CONDITION = 1e6
 """Below this bound of the condition number a Cholesky solution has 9 digits and more, and needs no second look."""
 CHUNK = 2048
 """Targets that may share weights; bounds the memory."""
-LANES = 512
+LANES, COMPILED_LANES = 512, 128
 """Systems factored at once: enough to hide the calls, few enough for a processor's cache."""
 
 
@@ -254,14 +255,18 @@ class OrdinaryKriging:
         weight = np.zeros(chosen.index.shape)
         variance = np.full(len(targets), np.nan)
         regularised = np.zeros(len(targets), dtype=bool)
+        order, coordinates = choose.in_strips(targets, CHUNK), np.ascontiguousarray(samples.T)
         for m in np.unique(count[count > 0]):
-            same = np.flatnonzero(count == m)
+            same = order[count[order] == m]
+            kernels = triangles_for(len(same), m)
             for start in range(0, len(same), CHUNK):
                 rows = same[start : start + CHUNK]
                 # targets on the last axis: each operation runs along many systems at once
-                offset = samples.T[:, chosen.index[rows, :m].T] - targets[rows].T[:, None]
+                near = np.ascontiguousarray(chosen.index[rows, :m].T)
+                offset = coordinates[:, near]
+                offset -= targets[rows].T[:, None]
                 example, group = _same_geometry(offset)
-                w, v, r = self._solve(offset[:, :, example])
+                w, v, r = self._solve(offset[:, :, example], samples, near[:, example], kernels)
                 weight[rows, :m], variance[rows], regularised[rows] = w.T[group], v[group], r[group]
         return Weights(chosen.index, weight, variance, regularised)
 
@@ -295,19 +300,41 @@ class OrdinaryKriging:
             raise UsageError("the correlation is not finite at some distance", expected="a number at every distance")
         return np.asarray(np.maximum(gamma, 0.0))
 
-    def _solve(self, offset_m: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _between(self, samples: FloatArray, near: IntArray) -> Callable[[slice], FloatArray]:
+        """Semivariances (pairs, some targets) between the neighbours ``near`` (m, t), in the order of a lower triangle.
+
+        Targets close together share neighbours: there each distance between two samples is taken once.
+        """
+        first, second = np.triu_indices(len(near), 1)
+        number = np.zeros(len(samples), dtype=np.int64)
+        number[near] = 1
+        used = np.flatnonzero(number)
+        if len(used) ** 2 > len(first) * near.shape[1]:
+            places = samples.T[:, near]
+            return lambda some: self._semivariance(places[:, :, some][:, second] - places[:, :, some][:, first])
+        number[used] = np.arange(len(used))
+        offset = samples[used].T[:, :, None] - samples[used].T[:, None]
+        np.fill_diagonal(offset[0], 1.0)  # not asked for, and a correlation need not be finite at 0
+        table = self._semivariance(offset).ravel()
+        column, row = number[near], number[near] * len(used)
+        return lambda some: table[row[:, some][first] + column[:, some][second]]
+
+    def _solve(
+        self, offset_m: FloatArray, samples: FloatArray, near: IntArray, kernels: Any
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Weights (m, t), normalised variance (t,), near-singular flag (t,) of neighbours at offsets (dims, m, t)."""
         m, t = offset_m.shape[1:]
         to_target = self._semivariance(offset_m)
-        here = (offset_m**2).sum(axis=0) < choose.TIE_M**2
+        here = np.einsum("dmt,dmt->mt", offset_m, offset_m) < choose.TIE_M**2
         if self.exact:
             to_target[here] = 0.0
         weight, variance, regularised = np.empty((m, t)), np.empty(t), np.zeros(t, dtype=bool)
-        for start in range(0, t, LANES):
-            some = slice(start, start + LANES)
-            part, right = offset_m[:, :, some], to_target[:, some]
-            between = self._semivariance(_pair_offsets(part))
-            weight[:, some], variance[some], sound = _solve_schur(between, right)
+        semivariances = self._between(samples, near)
+        solve, lanes = (solve_schur, LANES) if kernels is None else (kernels.solve_schur, COMPILED_LANES)
+        for start in range(0, t, lanes):
+            some = slice(start, start + lanes)
+            between, right = semivariances(some), to_target[:, some]
+            weight[:, some], variance[some], sound = solve(between, np.ascontiguousarray(right))
             if not sound.all():
                 hard = start + np.flatnonzero(~sound)
                 w, v, r = _solve_doubtful(_square(between[:, ~sound], m), right.T[~sound])
@@ -320,39 +347,29 @@ class OrdinaryKriging:
         return weight, variance, regularised
 
 
-def _pair_offsets(offset_m: FloatArray) -> FloatArray:
-    """Offsets (dims, m (m - 1) / 2, t) between samples at offsets (dims, m, t): 1 to 0, 2 to 0, ..., 2 to 1, ..."""
-    dims, m, t = offset_m.shape
-    pairs, end = np.empty((dims, m * (m - 1) // 2, t)), 0
-    for j in range(m - 1):
-        start, end = end, end + m - 1 - j
-        np.subtract(offset_m[:, j + 1 :], offset_m[:, j : j + 1], out=pairs[:, start:end])
-    return pairs
-
-
 def _square(pairs: FloatArray, m: int) -> FloatArray:
-    """Symmetric matrices (t, m, m) with zeros on the diagonal, of pairs in the order of :func:`_pair_offsets`."""
+    """Symmetric matrices (t, m, m) with zeros on the diagonal, of the pairs of a lower triangle by columns."""
     first, second = np.triu_indices(m, 1)
     gamma = np.zeros((pairs.shape[1], m, m))
     gamma[:, first, second] = gamma[:, second, first] = pairs.T
     return gamma
 
 
-def _solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Weights (m, t), variance (t,) and whether both are beyond doubt, of systems with a covariance ``1 - gamma``.
 
     Parameters
     ----------
     gamma : (m (m - 1) / 2, t)
-        Semivariances between samples, in the order of :func:`_pair_offsets`.
+        Semivariances between samples: 1 to 0, 2 to 0, ..., 2 to 1, ...
     to_target : (m, t)
 
     Notes
     -----
     With ``C = 1 - gamma = L L'`` and ``c = 1 - gamma_0`` the bordered system is ``C w = c + mu 1``: a Cholesky factor,
     and the Lagrange multiplier ``mu`` from the Schur complement ``1' C^-1 1``. The trace of ``C^-1``, the sum of
-    squares in ``L^-1``, bounds the condition number of C by ``m trace``. One system of 20 costs some 3 us of NumPy;
-    LAPACK on one small matrix after the other costs as much and bounds nothing.
+    squares in ``L^-1``, bounds the condition number of C by ``m trace``. One system of 20 costs some 3 us of NumPy and
+    0.9 us compiled; LAPACK on one small matrix after the other costs as much as NumPy and bounds nothing.
     """
     m, t = to_target.shape
     factor, inverse = np.empty((m + 2, m, t)), np.zeros((m, m, t))  # two rows more: L^-1 c and L^-1 1
@@ -508,11 +525,11 @@ def _merge_places(points: FloatArray, fields: FloatArray) -> tuple[FloatArray, F
     return points[first[order]], mean, place
 
 
-def _same_geometry(offset_m: FloatArray) -> tuple[IntArray, IntArray]:
+def _same_geometry(offset_m: FloatArray) -> tuple[IntArray | slice, IntArray | slice]:
     """Targets whose neighbours lie at the same offsets (dims, m, t): (one of each group, group of each target)."""
     t = offset_m.shape[2]
-    alone = np.arange(t), np.arange(t)
-    if len(np.unique(np.round(offset_m.sum(axis=(0, 1)) / choose.TIE_M))) == t:
+    alone = slice(None), slice(None)
+    if len(np.unique(np.round(offset_m[:, 0].sum(axis=0) / choose.TIE_M))) == t:
         return alone  # scattered samples: seen at a tenth of the cost
     offset = np.round(offset_m.reshape(-1, t) / SHARE_M).astype(np.int64)
     # one number tells a target: the sum with random odd factors, modulo 2^64

@@ -73,8 +73,9 @@ def nearest(
     tree = cKDTree(samples_m)
     least = m + 1 + (skip is not None)
     wanted = least
+    order = in_strips(targets_m, CHUNK)
     for start in range(0, len(targets_m), CHUNK):
-        part = np.arange(start, min(start + CHUNK, len(targets_m)))
+        part = order[start : start + CHUNK]
         todo = _fill_nearest(tree, targets_m, part, radius_m, skip, wanted, chosen)
         # scattered samples have no ties; on the paper's grid a ring of equal distance holds up to 12 cells
         wanted = m + 13 if len(todo) > len(part) // 4 else least
@@ -83,6 +84,15 @@ def nearest(
             todo = _fill_nearest(tree, targets_m, todo, radius_m, skip, ask, chosen)
             ask *= 2
     return chosen
+
+
+def in_strips(places_m: FloatArray, together: int) -> IntArray:
+    """Order of places in which ``together`` of them in a row fill a square: strips from south to north."""
+    if not len(places_m):
+        return np.empty(0, dtype=np.int64)
+    east, north = (places_m - places_m.min(axis=0)).T[:2]
+    width = max(float(np.sqrt(east.max() * north.max() * together / len(places_m))), TIE_M)
+    return np.argsort(np.floor(north / width) * (east.max() + TIE_M) + east)
 
 
 def _fill_nearest(

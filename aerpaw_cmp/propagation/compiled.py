@@ -32,19 +32,22 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.units import AnyArray
 
-ROOM = Path(__file__).parent
+ROOM = Path(__file__).parents[1]
 SWITCH = "AERPAW_CMP_COMPILED"
-FIELD, BEAMS = "field.kernels", "search.beams"
-EDGES, EDGE_FIELD = "search.edge_kernels", "field.edge_kernels"
+FIELD, BEAMS = "propagation.field.kernels", "propagation.search.beams"
+EDGES, EDGE_FIELD = "propagation.search.edge_kernels", "propagation.field.edge_kernels"
+TRIANGLES = "maps.triangle_kernels"
 SOURCES = (
-    "field/dyads.py", "field/fresnel.py", "field/kernels.py",
-    "field/wedge.py", "field/edges.py", "field/edge_kernels.py", "search/edge_kernels.py",
-    "search/beams.py", "search/merging.py", "search/boxtree.py", "search/mirror.py", "edges.py",
-    "compiled.py", "numba_options.py",
+    *(f"propagation/{name}.py" for name in (
+        "field/dyads", "field/fresnel", "field/kernels", "field/wedge", "field/edges", "field/edge_kernels",
+        "search/edge_kernels", "search/beams", "search/merging", "search/boxtree", "search/mirror", "edges",
+        "compiled", "numba_options",
+    )),
+    "maps/triangle_kernels.py",
 )  # fmt: skip
 """Files of kernels, and those whose functions and constants they take in."""
 
-COMPILE_S = {FIELD: 10.0, BEAMS: 25.0, EDGES: 20.0, EDGE_FIELD: 20.0}
+COMPILE_S = {FIELD: 10.0, BEAMS: 25.0, EDGES: 20.0, EDGE_FIELD: 20.0, TRIANGLES: 1.6}
 """CPU seconds of the first compilation on a machine."""
 READ_S = 0.4
 """CPU seconds of NumPy from which numba's import and reading what was compiled before pay off."""
@@ -61,6 +64,8 @@ CANDIDATES_S = 1.2e-7
 """CPU seconds of NumPy per candidate of a path over an edge."""
 EDGE_FIELD_S = 7e-6
 """CPU seconds of NumPy per path over an edge."""
+TRIANGLE_S = 4e-10
+"""CPU seconds of NumPy per system and cube of its size."""
 
 _in_numpy_s = dict.fromkeys(COMPILE_S, 0.0)
 """Estimated seconds of this process so far."""
@@ -165,6 +170,11 @@ def edge_field_for(paths: int) -> ModuleType | None:
     return _worth(EDGE_FIELD, paths * EDGE_FIELD_S)
 
 
+def triangles_for(systems: int, size: int) -> ModuleType | None:
+    """Compiled triangles of small systems, or None where NumPy is quicker."""
+    return _worth(TRIANGLES, systems * size**3 * TRIANGLE_S)
+
+
 def _worth(name: str, numpy_s: float) -> ModuleType | None:
     """Compiled code for a job that takes NumPy so many CPU seconds; None where that is quicker."""
     chosen = switch()
@@ -179,7 +189,7 @@ def _worth(name: str, numpy_s: float) -> ModuleType | None:
 
 def _cost_s(name: str) -> float:
     """CPU seconds until compiled code runs: it is loaded, kept on disk, or has to be compiled."""
-    if f"{__package__}.{name}" in sys.modules:
+    if f"aerpaw_cmp.{name}" in sys.modules:
         return LEAST_S
     folder = cache_folder() if find_spec("numba") else None
     return READ_S if folder is not None and (folder / f"{name}.compiled").exists() else COMPILE_S[name]
@@ -197,7 +207,7 @@ def load(name: str) -> State:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numba's own, about its cache
-            kernels = import_module(f".{name}", __package__)
+            kernels = import_module(f"aerpaw_cmp.{name}")
             kernels.try_out()
             if (folder := cache_folder()) is not None:
                 (folder / f"{name}.compiled").touch()
@@ -210,7 +220,7 @@ def load(name: str) -> State:
 @lru_cache(maxsize=1)
 def warn_once(reason: str) -> None:
     """Say why compiled code is not there."""
-    warnings.warn(f"{reason}: the replay runs in NumPy, some ten times slower", RuntimeWarning, stacklevel=4)
+    warnings.warn(f"{reason}: the job runs in NumPy, up to ten times slower", RuntimeWarning, stacklevel=4)
 
 
 def thread_count(threads: int | None) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from aerpaw_cmp.maps import kriging
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.kriging import OrdinaryKriging
 from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL as PAPER
+
+needs_numba = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed (extra fast)")
 
 
 def exponential(d):
@@ -593,7 +596,10 @@ def test_targets_with_neighbours_at_equal_offsets_are_told_from_others():
     assert len(example) == 3
     assert (pick[example][group] == pick).all()
     swapped = np.stack([shapes[0], shapes[0][::-1], shapes[0] + [0.0, 1e-3]])
-    assert len(kriging._same_geometry(np.moveaxis(swapped, 0, 2).swapaxes(0, 1))[0]) == 3
+    assert len(np.arange(3)[kriging._same_geometry(np.moveaxis(swapped, 0, 2).swapaxes(0, 1))[0]]) == 3
+    first_alike = shapes.copy()
+    first_alike[:, 0] = shapes[0, 0]
+    assert len(np.arange(3)[kriging._same_geometry(np.moveaxis(first_alike, 0, 2).swapaxes(0, 1))[0]]) == 3
 
 
 def test_estimates_do_not_depend_on_how_many_are_made_at_once(monkeypatch):
@@ -631,8 +637,50 @@ def smooth(d):
     return np.exp(-((np.asarray(d) / 110.0) ** 2))
 
 
+@pytest.fixture(params=["never", pytest.param("always", marks=needs_numba)])
+def way(request, monkeypatch):
+    """In NumPy and compiled."""
+    monkeypatch.setenv("AERPAW_CMP_COMPILED", request.param)
+    return request.param
+
+
+@pytest.mark.parametrize("m", [1, 2, 7])
+def test_many_targets_among_few_samples_equal_the_textbook(way, m):
+    """Each distance between samples is taken once, and never that of a sample to itself."""
+    points, targets = scattered(25, 51, 200.0), scattered(2 * kriging.COMPILED_LANES + 3, 52, 200.0)
+    values = np.random.default_rng(53).normal(size=25)
+
+    def correlation(d):
+        assert (d > 0).all()
+        return exponential(d)
+
+    estimate, variance = OrdinaryKriging(correlation, m, np.inf, sill=1.0).fit(points, values).predict(targets)
+    for t, target in enumerate(targets):
+        near = np.argsort(np.linalg.norm(points - target, axis=1))[:m]
+        expected = textbook(points[near], values[near], target, exponential)
+        np.testing.assert_allclose((estimate[t], variance[t]), expected, rtol=0, atol=1e-9)
+
+
+@needs_numba
+def test_compiled_and_numpy_doubt_the_same_systems_and_agree(monkeypatch):
+    """From well conditioned to singular, some samples a hair apart, targets at samples, and a curve that is none."""
+    rng = np.random.default_rng(54)
+    points, targets = rng.uniform(0, 300, (300, 2)), rng.uniform(0, 300, (1500, 2))
+    points[::50] = points[1::50] + 3e-6
+    targets[:40] = points[:40]
+    for correlation in (with_nugget, smooth, lambda d: np.where(d < 60.0, 0.95, 0.0)):
+        rules = []
+        for switch in ("never", "always"):
+            monkeypatch.setenv("AERPAW_CMP_COMPILED", switch)
+            rules.append(OrdinaryKriging(correlation, 9, np.inf).fit(points, np.zeros(300)).weights(targets))
+        for name in ("index", "regularised"):
+            np.testing.assert_array_equal(getattr(rules[0], name), getattr(rules[1], name))
+        for name in ("weight", "variance"):
+            np.testing.assert_allclose(getattr(rules[0], name), getattr(rules[1], name), rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize(("correlation", "doubted"), [(with_nugget, (0, 0)), (smooth, (1, 39))])
-def test_weights_are_those_of_fifty_digits(correlation, doubted):
+def test_weights_are_those_of_fifty_digits(way, correlation, doubted):
     """Random neighbourhoods, from well conditioned to nearly singular: each is solved again with mpmath."""
     import mpmath
 
@@ -644,7 +692,7 @@ def test_weights_are_those_of_fifty_digits(correlation, doubted):
     between = 1.0 - correlation(np.linalg.norm(offset[:, :, None] - offset[:, None], axis=-1))
     to_target = 1.0 - correlation(np.linalg.norm(offset, axis=-1))
     first, second = np.triu_indices(9, 1)
-    *_, sound = kriging._solve_schur(between[:, second, first].T, to_target.T)
+    *_, sound = kriging.solve_schur(between[:, second, first].T, to_target.T)
     assert doubted[0] <= (~sound).sum() <= doubted[1], "the case is not as hard as it should be"
     for t in range(40):
         with mpmath.workdps(50):

@@ -446,7 +446,7 @@ def test_compiled_code_has_to_be_quicker_than_numpy_its_compilation_included(mon
     monkeypatch.setattr(compiled, "load", lambda _: compiled.State(types.ModuleType("kernels"), ""))
     monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(compiled, "find_spec", lambda _: True)
-    monkeypatch.delitem(sys.modules, "aerpaw_cmp.propagation.field.kernels", raising=False)
+    monkeypatch.delitem(sys.modules, f"aerpaw_cmp.{compiled.FIELD}", raising=False)
 
     def least_pairs():
         monkeypatch.setitem(compiled._in_numpy_s, compiled.FIELD, 0.0)
@@ -459,7 +459,7 @@ def test_compiled_code_has_to_be_quicker_than_numpy_its_compilation_included(mon
     never_compiled = least_pairs()
     (tmp_path / f"{compiled.FIELD}.compiled").touch()
     on_disk = least_pairs()
-    monkeypatch.setitem(sys.modules, "aerpaw_cmp.propagation.field.kernels", types.ModuleType("kernels"))
+    monkeypatch.setitem(sys.modules, f"aerpaw_cmp.{compiled.FIELD}", types.ModuleType("kernels"))
     loaded = least_pairs()
     assert loaded <= on_disk < never_compiled
     assert never_compiled * compiled.FIELD_S >= compiled.COMPILE_S[compiled.FIELD]
@@ -472,7 +472,7 @@ def test_many_jobs_of_one_process_pay_for_a_compiler(monkeypatch, tmp_path):
     monkeypatch.setattr(compiled, "load", lambda _: compiled.State(types.ModuleType("kernels"), ""))
     monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path)
     monkeypatch.setitem(compiled._in_numpy_s, compiled.FIELD, 0.0)
-    monkeypatch.delitem(sys.modules, "aerpaw_cmp.propagation.field.kernels", raising=False)
+    monkeypatch.delitem(sys.modules, f"aerpaw_cmp.{compiled.FIELD}", raising=False)
     pairs = int(1.0 / compiled.FIELD_S)  # a second of NumPy
     before = [compiled.kernels_for(pairs) is not None for _ in range(30)]
     assert before == sorted(before)

@@ -30,28 +30,9 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 HISTORY = ROOT / "benchmarks" / "history.jsonl"
-PEERS = """
-import json
-from aerpaw_cmp.jobs import bench as p
-search = p.path_search_ratios(samples=(1_000, 10_000, 100_000))
-found = {
-    "path search, image engine / PathSolver at equal error": search["equal_error"]["ratio"],
-    "path search, image engine / PathSolver with 1e5 samples": search["at"]["1e+05"]["ratio"],
-    "ingest / pandas (C engine), 1 000 000 lines": p.ingest_vs_pandas(1_000_000, 1)["ratio"],
-}
-kriging = p.kriging_shared_weights()
-if kriging is not None:
-    found |= {
-        "Kriging / PyKrige's C back end, one field": kriging["ratio_one_field"],
-        "Kriging / PyKrige's C back end, 27 fields": kriging["ratio"],
-    }
-print(json.dumps(found))
-"""
-"""How many times faster than its peer each part is, both sides in one process, by processor time."""
-
 COMMANDS: dict[str, list[str]] = {
     "scaling": ["benchmarks/scaling.py", "--json", "--axes"],
-    "peers": ["-c", PEERS],
+    "peers": ["benchmarks/peers.py"],
     "report": ["benchmarks/report.py", "--quick", "--json"],
     "replay": ["benchmarks/replay.py", "--quick", "--no-sionna", "--json"],
     "kriging": ["benchmarks/kriging.py", "--pairs", "60", "--json"],
@@ -82,6 +63,7 @@ SMALLEST: dict[str, list[str]] = {
     "outside_faults": ["--only", "take-off ground not added to the track", "--no-tests"],
     "output_faults": ["--kills", "5"],
     "pages": ["--only", "long", "--repeats", "1"],
+    "peers": ["--quick"],
     "performance": ["--docs", "{folder}/performance.md"],
     "route_ahead": ["--minutes", "1"],
     "planted_causes": ["--flights", "16"],
@@ -228,8 +210,9 @@ def main() -> int:
     for name, one in entry["benchmarks"].items():
         print(f"{name:<12} {one['seconds']:6.1f} s  load before {one['load_before']:.1f}  {one.get('failed', 'done')}")
     print(f"{'all':<12} {entry['seconds']:6.1f} s on {entry['machine']['processor']}, {entry['machine']['cpus']} cpus")
-    for name, ratio in entry["benchmarks"].get("peers", {}).get("result", {}).items():
-        print(f"{ratio:10.2f} x  {name}")
+    from performance import lines  # beside this file
+
+    print("\n", *lines([entry]), sep="\n")
     if not arguments.no_history:
         with arguments.history.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry, separators=(",", ":")) + "\n")

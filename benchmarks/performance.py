@@ -156,10 +156,13 @@ def long_flight(scaling: dict[str, Any]) -> list[str]:
 
 def peers(found: list[dict[str, Any]]) -> list[str]:
     """Ratios to the peers in every run of the history that has them."""
-    having = [run for run in found if run["benchmarks"].get("peers", {}).get("result")][-8:]
+    results = {run["date"]: run["benchmarks"].get("peers", {}).get("result") for run in found}
+    having = [run for run in found if results[run["date"]]][-8:]
     if not having:
         return []
-    names = list(dict.fromkeys(name for run in having for name in run["benchmarks"]["peers"]["result"]))
+    # until 2026-11-23 the ratios stood alone
+    ratios = [results[run["date"]].get("ratios", results[run["date"]]) for run in having]
+    names = list(dict.fromkeys(name for some in ratios for name in some))
     head = "| times faster than | " + " | ".join(f"{r['date'][:10]}, {r['version']}" for r in having) + " |"
     out = [
         "## Against peers",
@@ -171,8 +174,15 @@ def peers(found: list[dict[str, Any]]) -> list[str]:
     ]
     out.append("| --- |" + " ---: |" * len(having))
     for name in names:
-        values = [run["benchmarks"]["peers"]["result"].get(name) for run in having]
+        values = [some.get(name) for some in ratios]
         out.append(f"| {name} | " + " | ".join("-" if v is None else number(v) for v in values) + " |")
+    last = results[having[-1]["date"]]
+    if ranks := last.get("ranks"):
+        out += [
+            "",
+            f"Ranks of {number(ranks['links'])} links of 4 x 4 elements: {ranks['seconds_ours']:.3f} processor "
+            f"seconds, {ranks['differ']} differ from those of the SVD.",
+        ]
     return [*out, ""]
 
 
@@ -195,14 +205,16 @@ def town(found: list[dict[str, Any]]) -> list[str]:
     out = [
         f"Munich of Sionna RT ({number(rows[0]['faces'])} faces, {rows[0]['receivers']} receivers, one tower; {when}); "
         "PathSolver's time holds what its kernel cache lacks:", "",
-        "| search | depth | processor s | times ours | paths that it lacks |", "| --- | ---: | ---: | ---: | ---: |",
+        "| search | depth | processor s | estimated s | times ours | paths that it lacks |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
     for row in rows:
         cpu = row["search_s"][1]
         name = "image engine" if row["kind"] == "image" else f"PathSolver, {number(row['samples'])} rays"
         ratio = "1" if row["kind"] == "image" else number(cpu / ours[row["depth"]])
         lacks = "none known" if row["kind"] == "image" else f"{row['extra']} of {sum(row['exact'])}"
-        out.append(f"| {name} | {row['depth']} | {number(cpu)} | {ratio} | {lacks} |")
+        guess = number(row["estimated_s"]) if "estimated_s" in row else "-"
+        out.append(f"| {name} | {row['depth']} | {number(cpu)} | {guess} | {ratio} | {lacks} |")
     return [*out, ""]
 
 
@@ -260,6 +272,11 @@ def reports(run: dict[str, Any]) -> list[str]:
             for name, row in (("as it comes", sample), ("with `--audit none`", later))
         ), "",
     ]  # fmt: skip
+
+
+def lines(found: list[dict[str, Any]]) -> list[str]:
+    """What users run, and peers: all but the scaling."""
+    return [*reports(found[-1]), *peers(found), *town(found), *kriging(found)]
 
 
 def page(found: list[dict[str, Any]]) -> str:

@@ -35,6 +35,7 @@ from shapely.geometry import box
 
 from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.beams import grow_paths
+from aerpaw_cmp.propagation.search.effort import SearchRun
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.mitsuba import TriangleScene, read_scene
 
@@ -111,8 +112,9 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
     sources, targets = ends(task["scene"], task["receivers"])
     surfaces = merged(scene)
     setup = clock.since()
-    clock = Clock()
-    paths = grow_paths(surfaces, Links(sources, targets), max_depth=task["depth"])
+    clock, estimates = Clock(), []
+    run = SearchRun(on_estimate=estimates.append)
+    paths = grow_paths(surfaces, Links(sources, targets), run, max_depth=task["depth"])
     search = clock.since()
     row = {
         **task,
@@ -122,6 +124,7 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
         "compile_s": compile_s,
         "setup_s": setup,
         "search_s": search,
+        "estimated_s": estimates[0].seconds,
         "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "paths": np.bincount(paths.depth, minlength=task["depth"] + 1).tolist(),
         "duplicates": len(paths) - len(plane_keys(paths, surfaces.plane)),

@@ -210,9 +210,6 @@ def main() -> int:
     for name, one in entry["benchmarks"].items():
         print(f"{name:<12} {one['seconds']:6.1f} s  load before {one['load_before']:.1f}  {one.get('failed', 'done')}")
     print(f"{'all':<12} {entry['seconds']:6.1f} s on {entry['machine']['processor']}, {entry['machine']['cpus']} cpus")
-    from performance import lines  # beside this file
-
-    print("\n", *lines([entry]), sep="\n")
     if not arguments.no_history:
         with arguments.history.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry, separators=(",", ":")) + "\n")

@@ -274,11 +274,6 @@ def reports(run: dict[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
-def lines(found: list[dict[str, Any]]) -> list[str]:
-    """What users run, and peers: all but the scaling."""
-    return [*reports(found[-1]), *peers(found), *town(found), *kriging(found)]
-
-
 def page(found: list[dict[str, Any]]) -> str:
     """The text of docs/performance.md."""
     run = last_whole(found)
@@ -344,6 +339,7 @@ def main() -> None:
     (arguments.docs / "images").mkdir(parents=True, exist_ok=True)
     draw(last_whole(found)["benchmarks"]["scaling"]["result"], arguments.docs / "images" / FIGURE)
     (arguments.docs / "performance.md").write_text(text, encoding="utf-8")
+    print(*reports(last_whole(found)), *peers(found), *town(found), *kriging(found), sep="\n")
     print(arguments.docs / "performance.md")
 
 

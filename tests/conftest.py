@@ -82,7 +82,6 @@ DEAREST = (
     "jobs/test_plan.py",
     "maps/test_kriging.py",
     "compare/test_calibration.py",
-    "compare/test_gain_choice.py",
     "test_project.py",
 )
 """Files that take 3 s and more, the longest first by and large."""

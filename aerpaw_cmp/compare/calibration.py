@@ -13,8 +13,7 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.units import BoolArray, FloatArray, IntArray
 from .detection import floored_fit
-from .direction_gain import GainFit, GainModel, LinkSamples, Pairs, Term, fit_gain, shared_knots
-from .gain_choice import Choice, choose_and_fit
+from .direction_gain import GainFit, GainModel, LinkSamples, Term, chosen_fit, fit_gain
 from .ladder import log_distance_level_db
 from .mount import GainOf, MountFit, fit_mounts
 from .result import BASELINE_TITLE
@@ -79,8 +78,6 @@ class Recipe:
         ``(yaw, pitch, roll)`` [deg] to a mount (3, 3).
     mount, tilt : bool
         Fit the azimuth, and pitch and roll, of antennas with a pattern.
-    pairs : mapping of str to (k, 6), optional
-        Knots of the term over both directions that serve all fits; they hold directions alone, no level.
     """
 
     model: GainModel
@@ -88,11 +85,6 @@ class Recipe:
     patterns: Mapping[str, GainOf] = field(default_factory=dict)
     mount: bool = True
     tilt: bool = False
-    pairs: Pairs | None = None
-
-    def sharing(self, series: Sequence[LinkSamples]) -> Recipe:
-        """The recipe with knots that serve every fit to some of the series."""
-        return dataclasses.replace(self, pairs=shared_knots(series, self.model))
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +92,7 @@ class Learned:
     """The outcome of :func:`learn`."""
 
     recipe: Recipe
-    choice: Choice
+    model: GainModel
     mounts: Mapping[str, MountFit]
     fit: GainFit | None
     fading: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -108,7 +100,7 @@ class Learned:
 
     def spread(self, antenna: str) -> Spread:
         """Spread of a level at an antenna besides the standard deviation of the gain."""
-        model = self.choice.model
+        model = self.model
         sd_db, kurtosis = self.fading.get(antenna, (0.0, 0.0))
         return Spread(
             own_sd_db=model.own_sd_db,
@@ -136,22 +128,32 @@ class Learned:
         return known + gain, sd
 
     def mean_error(self, samples: LinkSamples) -> float:
-        """Mean of measured minus :meth:`mean` [dB], as cheap as one row; NaN without a sample that has both."""
-        ends = np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1)
-        good = np.isfinite(samples.residual_db) & np.isfinite(ends).all(axis=1)
-        if not good.any():
-            return math.nan
-        part = samples.part(good)
-        known = self.pattern_db("uav", part.at_uav) + self.pattern_db(part.antenna, part.at_tower)
-        return float((part.residual_db - known).mean()) - (0.0 if self.fit is None else self.fit.average(part))
+        """Mean of measured minus :meth:`mean` [dB]; NaN without a sample that has both."""
+        left = samples.residual_db - self.mean(samples)
+        return float(np.nanmean(left)) if np.isfinite(left).any() else math.nan
 
     def mean(self, samples: LinkSamples) -> FloatArray:
-        """The gain of :meth:`predict` alone, at a hundredth of the cost."""
+        """The gain of :meth:`predict` alone, along a flight in the order of time."""
         known = self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
-        return known if self.fit is None else known + self.fit.mean(samples)
+        if self.fit is None:
+            return known
+        return known + _mean_along(self.fit, samples)
 
 
-def learn(series: Sequence[LinkSamples], recipe: Recipe, choice: Choice | None = None) -> Learned:
+FINE_S = 0.5
+"""A UAV hardly turns within this time [s]."""
+
+
+def _mean_along(fit: GainFit, samples: LinkSamples) -> FloatArray:
+    """Gain (n,) along a flight [dB]: at means over :data:`FINE_S`, and linear between them."""
+    at = dataclasses.replace(samples, residual_db=np.zeros(len(samples))).binned(FINE_S)
+    if not len(at):
+        return np.full(len(samples), np.nan)
+    gain = np.interp(samples.time_s, at.time_s, fit.mean(at))
+    return np.where(np.isfinite(samples.at_uav).all(axis=1), gain, np.nan)
+
+
+def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None = None) -> Learned:
     """Mounts, then the gain over direction on top of the patterns.
 
     Parameters
@@ -159,25 +161,22 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, choice: Choice | None =
     series : sequence of LinkSamples
         Residuals against free space of the flights to learn from, and no other.
     recipe : Recipe
-    choice : Choice, optional
+    model : GainModel, optional
         Strengths that were chosen on the same flights; chosen anew without.
     """
     names = ["uav", *dict.fromkeys(s.antenna for s in series)]
     patterns = {name: recipe.patterns[name] for name in names if name in recipe.patterns}
     mounts = fit_mounts(series, patterns, recipe.rotation, tilt=recipe.tilt) if patterns and recipe.mount else {}
-    bare = Learned(recipe, Choice(recipe.model, 1.0, {}, 1.0), mounts, None)
+    bare = Learned(recipe, recipe.model, mounts, None)
     if not recipe.model.terms:
         return bare
     left = [dataclasses.replace(s, residual_db=s.residual_db - bare.mean(s)) for s in series]
-    if choice is None:
-        choice, fit = choose_and_fit(left, recipe.model, pairs=recipe.pairs)
-    else:
-        fit = fit_gain(left, choice.model, recipe.pairs)
+    fit = chosen_fit(left, recipe.model) if model is None else fit_gain(left, model)
     if any(s.floor_db is not None for s in series):  # once more; another time changes nothing on flights left out
-        fit = fit_gain([_at_floor(s, bare.mean(s), fit) for s in series], choice.model, recipe.pairs)
+        fit = fit_gain([_at_floor(s, bare.mean(s), fit) for s in series], fit.model)
     antennas = dict.fromkeys(s.antenna for s in series)
-    fading = {name: fading_of([s for s in series if s.antenna == name], choice.model.bin_s) for name in antennas}
-    return Learned(recipe, choice, mounts, fit, fading)
+    fading = {name: fading_of([s for s in series if s.antenna == name], fit.model.bin_s) for name in antennas}
+    return Learned(recipe, fit.model, mounts, fit, fading)
 
 
 def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkSamples:
@@ -185,7 +184,7 @@ def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkS
     left = samples.residual_db - known_db
     if samples.floor_db is None:
         return dataclasses.replace(samples, residual_db=left)
-    floor, gain = samples.floor_db - known_db, fit.mean(samples)
+    floor, gain = samples.floor_db - known_db, _mean_along(fit, samples)
     offset_db = floored_fit(left - floor, gain - floor, 0.0).offset_db
     lost = np.minimum(gain - offset_db, floor)
     return dataclasses.replace(samples, residual_db=np.where(left < floor, lost, left))
@@ -419,7 +418,7 @@ def parts_left_out(
             if not train or not any(parts(o, o)[k][0].any() for o in mine):
                 continue
             try:
-                learned = learn(train, recipe, kept[flight].choice)
+                learned = learn(train, recipe, kept[flight].model)
             except InputError:
                 continue
             known = {s.antenna for s in train}

@@ -3,27 +3,24 @@
 ``residual = offset + g_uav(body) + g_tower(mast) + g_pair(body, mast) [+ place] + own + noise``
 
 ``offset`` is free per flight, tower and channel. ``own`` is a nuisance of each flight and channel, correlated over
-place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes over directions
-(:mod:`.sphere`): of the tower in the body, of the UAV at the mast, and of both together per channel (what the gain at
-one end does not explain without the other). A place field, if asked for, is one over positions and stays apart.
+place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes over directions:
+of the tower in the body, of the UAV at the mast, and of both together per channel (what the gain at one end does not
+explain without the other). A place field, if asked for, is one over positions and stays apart.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import math
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 
 from ..common.errors import InputError, UsageError
-from ..common.gaussian import determining, gaussian_kernel
+from ..common.gaussian import gaussian_kernel
 from ..common.units import BoolArray, FloatArray, IntArray
-from .sphere import gaussian_features
 
 Frame = Literal["body", "mast", "pair", "world", "place"]
 Sharing = Literal["all", "antenna"]
@@ -31,8 +28,12 @@ Sharing = Literal["all", "antenna"]
 OFFSET_SD = 100.0
 """Prior of each offset in standard deviations of the noise: free in effect, and still a proper covariance."""
 
-MOST_COLUMNS = 6000
-"""Square matrices of this order are held (290 MB)."""
+MOST_ROWS = 3000
+"""Means that a fit rests on (a matrix of 72 MB); of more flights they are over longer times."""
+
+TOWER_FACTORS = (1.0, 0.5)
+"""Of the tower's gains against the UAV's: the likelier one is taken. Nothing else is chosen on flights: a length of the
+nuisance by likelihood and its strength by flights left out, of 0.5 to 4, left 0.06 dB more on dataset 12."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +111,7 @@ def _bin_means(values: FloatArray, member: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One Gaussian process.
+    """One Gaussian process: its covariance falls exponentially, or, of the pair, as a Gaussian.
 
     Parameters
     ----------
@@ -131,16 +132,11 @@ class Term:
     sd_db: float
 
 
-UAV_TERMS = (
-    Term("body", "all", 0.2, 1.5),
-    Term("body", "all", 0.45, 2.0),
-    Term("body", "all", 0.9, 2.0),
-    Term("body", "antenna", 0.35, 0.8),
-)
-TOWER_TERMS = (Term("mast", "antenna", 0.2, 3.0), Term("mast", "antenna", 0.7, 2.0))
+UAV_TERMS = (Term("body", "all", 1.0, 3.2),)
+TOWER_TERMS = (Term("mast", "antenna", 0.5, 3.4),)
 PAIR_TERMS = (Term("pair", "antenna", 0.35, 1.5),)
 ANTENNA_TERMS = UAV_TERMS + TOWER_TERMS + PAIR_TERMS
-PLACE_TERM = Term("place", "antenna", 30.0, 2.0)
+PLACE_TERM = Term("place", "antenna", 60.0, 2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,44 +156,19 @@ class GainModel:
     """
 
     terms: tuple[Term, ...] = ANTENNA_TERMS
-    own_sd_db: float = 2.0
+    own_sd_db: float = 1.2
     own_length_m: float = 20.0
     noise_sd_db: float = 1.5
     bin_s: float = 4.0
 
-
-def scaled_model(model: GainModel, factor: float) -> GainModel:
-    """All standard deviations times a factor."""
-    return dataclasses.replace(
-        model,
-        terms=tuple(dataclasses.replace(t, sd_db=t.sd_db * factor) for t in model.terms),
-        own_sd_db=model.own_sd_db * factor,
-        noise_sd_db=model.noise_sd_db * factor,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class _Block:
-    """Columns of one term for one antenna (or all)."""
-
-    term: Term
-    antenna: str | None
-    start: int
-    stop: int
-    knots: FloatArray | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _System:
-    """Normal equations of the whitened rows, before the terms' standard deviations are put in.
-
-    ``gram`` (p, p) and ``right`` (p,); ``square`` is the whitened target's square; ``log_det`` that of the whitening.
-    """
-
-    gram: FloatArray
-    right: FloatArray
-    square: float
-    log_det: float
+    def scaled(self, factor: float) -> GainModel:
+        """All standard deviations times a factor."""
+        return dataclasses.replace(
+            self,
+            terms=tuple(dataclasses.replace(t, sd_db=t.sd_db * factor) for t in self.terms),
+            own_sd_db=self.own_sd_db * factor,
+            noise_sd_db=self.noise_sd_db * factor,
+        )
 
 
 def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
@@ -211,369 +182,43 @@ def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
     return -samples.at_tower if frame == "world" else samples.position_m
 
 
-def _knots(points_m: FloatArray, spacing_m: float) -> FloatArray:
-    """One point per visited cell of a grid: (knots, 3)."""
-    _, first = np.unique(np.round(points_m / spacing_m).astype(np.int64), axis=0, return_index=True)
-    return points_m[np.sort(first)]
+def _kernel(term: Term, one: FloatArray, other: FloatArray) -> FloatArray:
+    """Covariance (n, m) of a term between arguments [dB^2].
 
-
-UNEXPLAINED = 1e-3
-"""Largest share of the variance of a term over both directions that its knots leave at the bins of the fit."""
-
-
-MOST_KNOTS = 400
-"""Of one antenna; flights with every heading at every place would take thousands for a term of 1.5 dB."""
-
-
-def pair_knots(points: FloatArray, length: float, share: float = UNEXPLAINED, most: int = MOST_KNOTS) -> FloatArray:
-    """Those of some points (n, 6) that determine a Gaussian process at all of them: (knots, 6).
-
-    Parameters
-    ----------
-    points : (n, 6)
-        Directions at both ends.
-    length : float
-        Of the kernel [chord].
-    share : float
-        Share of the variance that may be left at any point.
-    most : int
-        Largest number of knots; where they do not suffice, more than the share is left.
-
-    Returns
-    -------
-    (knots, 6)
-        In the order in which they were taken.
+    Gains of airframes have details of every size: an exponential leaves 0.1 dB less than sums of Gaussians.
     """
-    return points[determining(points, lambda one, other: gaussian_kernel(one, other, length), share, most)]
-
-
-def _features(block: _Block, argument: FloatArray, *, keep: bool = False) -> FloatArray:
-    """Unit-variance features (n, columns of the block); ``keep`` those that the next fit asks for again."""
-    if block.knots is None:
-        return (_direction_features if keep else gaussian_features)(argument, block.term.length)
-    from scipy.linalg import solve_triangular
-
-    lower = _knot_factor(block.knots, block.term.length)
-    return np.asarray(solve_triangular(lower, gaussian_kernel(block.knots, argument, block.term.length), lower=True).T)
-
-
-T = TypeVar("T")
-
-
-class Store(OrderedDict[bytes, T]):
-    """Values by their content; those used longest ago go first.
-
-    Parameters
-    ----------
-    most : float
-        Sum of the sizes that is held, one value at least.
-    size : callable
-        Of a value.
-    """
-
-    def __init__(self, most: float, size: Callable[[T], float] = lambda _: 1.0) -> None:
-        super().__init__()
-        self.most, self.size = most, size
-
-    def made(self, key: bytes, make: Callable[[], T]) -> T:
-        """The value of a key, made where it is not held."""
-        if key not in self:
-            self[key] = make()
-            while len(self) > 1 and sum(map(self.size, self.values())) > self.most:
-                self.popitem(last=False)
-        self.move_to_end(key)
-        return self[key]
-
-
-def _digest(about: object, *arrays: FloatArray) -> bytes:
-    """Key of some arrays and what else decides."""
-    digest = hashlib.blake2b(repr((about, *(array.shape for array in arrays))).encode())
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.digest()
-
-
-NUGGET = 1e-6
-"""Share of the variance that keeps the kernel between knots positive definite."""
-
-_knot_factors: Store[FloatArray] = Store(8)
-"""Of the last eight terms."""
-
-
-def _knot_factor(knots: FloatArray, length: float) -> FloatArray:
-    """Cholesky factor of the kernel between the knots of a term."""
-
-    def make() -> FloatArray:
-        return factor_of(gaussian_kernel(knots, knots, length) + NUGGET * np.eye(len(knots)))
-
-    return _knot_factors.made(_digest(length, knots), make)
-
-
-def _block_values(block: _Block, argument: FloatArray, weights: FloatArray) -> FloatArray:
-    """:func:`_features` times weights (n,); of a term with knots the kernel is enough."""
-    if block.knots is None:
-        return np.asarray(_features(block, argument, keep=True) @ weights)
-    from scipy.linalg import solve_triangular
-
-    lower = _knot_factor(block.knots, block.term.length)
-    at_knots = solve_triangular(lower, weights, lower=True, trans="T")
-    return np.asarray(gaussian_kernel(argument, block.knots, block.term.length) @ at_knots)
-
-
-FEATURES_MIB = 320
-"""Features of directions that are kept at most: the same samples are predicted by one fit after the other."""
-
-_features_of_directions: Store[FloatArray] = Store(FEATURES_MIB << 20, lambda features: features.nbytes)
-
-
-def _direction_features(direction: FloatArray, length: float) -> FloatArray:
-    """:func:`.sphere.gaussian_features`, kept."""
-    return _features_of_directions.made(_digest(length, direction), lambda: gaussian_features(direction, length))
-
-
-MEANS = 4096
-"""Mean features that are kept at most, some kilobytes each."""
-
-_mean_features_of_directions: Store[FloatArray] = Store(MEANS)
-
-
-def _mean_features(block: _Block, argument: FloatArray) -> FloatArray:
-    """Mean of :func:`_features` over the samples (columns of the block,); of directions it is kept."""
-    if block.knots is not None:
-        from scipy.linalg import solve_triangular
-
-        at_knots = gaussian_kernel(block.knots, argument, block.term.length).mean(axis=1)
-        return np.asarray(solve_triangular(_knot_factor(block.knots, block.term.length), at_knots, lower=True))
-    key = _digest(block.term.length, argument)
-    return _mean_features_of_directions.made(key, lambda: _features(block, argument).mean(axis=0))
-
-
-Pairs = Mapping[str, FloatArray]
-"""Knots (k, 6) of each antenna's term over both directions that serve several fits."""
-
-
-def _pair_knots_of(own: Sequence[LinkSamples], length: float, pairs: Pairs) -> FloatArray:
-    """Knots given for an antenna, or those of its bins."""
-    given = pairs.get(own[0].antenna)
-    return pair_knots(np.concatenate([argument_of(s, "pair") for s in own]), length) if given is None else given
-
-
-def shared_knots(series: Sequence[LinkSamples], model: GainModel) -> dict[str, FloatArray]:
-    """Knots per antenna that suit fits of any of the series: equations of one fit are then those of the next."""
-    out: dict[str, FloatArray] = {}
-    for term in (t for t in model.terms if t.frame == "pair"):
-        for antenna in dict.fromkeys(s.antenna for s in series):
-            own = binned_series([s for s in series if s.antenna == antenna], model.bin_s)
-            out[antenna] = _pair_knots_of(own, term.length, {})
-    return out
-
-
-def _knots_of(term: Term, own: Sequence[LinkSamples], pairs: Pairs) -> FloatArray | None:
-    """Knots of a term over places, or over both directions; None of one over a single direction."""
-    if term.frame == "place":
-        return _knots(np.concatenate([s.position_m for s in own]), 0.7 * term.length)
-    return _pair_knots_of(own, term.length, pairs) if term.frame == "pair" else None
-
-
-def _layout(model: GainModel, binned: Sequence[LinkSamples], pairs: Pairs) -> tuple[_Block, ...]:
-    """Columns of every term."""
-    antennas: list[str | None] = list(dict.fromkeys(s.antenna for s in binned))
-    blocks: list[_Block] = []
-    start = 0
-    for term in model.terms:
-        for antenna in antennas if term.per == "antenna" else [None]:
-            knots = _knots_of(term, [s for s in binned if antenna is None or s.antenna == antenna], pairs)
-            width = len(knots) if knots is not None else gaussian_features(np.eye(3)[:1], term.length).shape[1]
-            blocks.append(_Block(term, antenna, start, start + width, knots))
-            start += width
-    if start > MOST_COLUMNS:
-        raise UsageError(
-            f"{start} unknowns for {len(antennas)} antennas and {len(model.terms)} terms",
-            expected=f"at most {MOST_COLUMNS}",
-            cause="many towers at once, or very short lengths: calibrate one tower at a time",
-        )
-    return tuple(blocks)
-
-
-def _design(blocks: Sequence[_Block], samples: LinkSamples) -> FloatArray:
-    """Features (n, p) of all terms, without their standard deviations; zero for other antennas."""
-    out = np.zeros((len(samples), blocks[-1].stop if blocks else 0))
-    for block in blocks:
-        if block.antenna is None or block.antenna == samples.antenna:
-            out[:, block.start : block.stop] = _features(block, argument_of(samples, block.term.frame))
-    return out
-
-
-def whitener(model: GainModel, samples: LinkSamples) -> FloatArray:
-    """Cholesky factor of a series' own covariance: offset, nuisance, noise."""
-    from scipy.linalg import cholesky
     from scipy.spatial.distance import cdist
 
-    distance = cdist(samples.position_m, samples.position_m)
-    own = model.own_sd_db**2 * np.exp(-distance / model.own_length_m) + (OFFSET_SD * model.noise_sd_db) ** 2
-    own[np.diag_indices(len(own))] += model.noise_sd_db**2
-    return np.asarray(cholesky(own, lower=True))
+    if term.frame == "pair":
+        return term.sd_db**2 * gaussian_kernel(one, other, term.length)
+    return np.asarray(term.sd_db**2 * np.exp(cdist(one, other) / -term.length))
 
 
-@dataclass(frozen=True, slots=True)
-class _SeriesEquations:
-    """Normal equations of one series in its own columns, whitened with the noise as the unit.
-
-    ``gram`` (q, q), ``right`` (q,), ``square`` and ``log_det`` as in :class:`_System`; ``mean`` (q,) of the features
-    over the ``rows``.
-    """
-
-    gram: FloatArray
-    right: FloatArray
-    square: float
-    log_det: float
-    mean: FloatArray
-    rows: int
+def _covariance(terms: Sequence[Term], one: Sequence[LinkSamples], other: Sequence[LinkSamples]) -> FloatArray:
+    """Covariance (n, m) of the gains between samples of some series and of others [dB^2]."""
+    names = [[s.antenna for s in series for _ in range(len(s))] for series in (one, other)]
+    codes = np.unique(names[0] + names[1], return_inverse=True)[1]
+    same = codes[: len(names[0]), None] == codes[None, len(names[0]) :]
+    out = np.zeros(same.shape)
+    for term in terms:
+        at, to = (np.concatenate([argument_of(s, term.frame) for s in series]) for series in (one, other))
+        out += _kernel(term, at, to) * (same if term.per == "antenna" else 1.0)
+    return out
 
 
-KEPT_MIB = 512
-"""Equations that are kept at most; those that were used longest ago go first."""
+def _whole(model: GainModel, rows: Sequence[LinkSamples]) -> FloatArray:
+    """Covariance (n, n) of the levels of all rows: gains, and each series' offset, nuisance and noise [dB^2]."""
+    from scipy.spatial.distance import cdist
 
-_equations: Store[_SeriesEquations] = Store(KEPT_MIB << 20, lambda equations: equations.gram.nbytes)
-"""Of series by their content. A flight left out, a factor of the spread, a common scale: each is another sum of the
-same equations, since nuisance and noise keep their ratio and whitening is linear in their scale."""
-
-
-def _runs(own: Sequence[_Block]) -> list[tuple[slice, slice]]:
-    """Columns of each block in the whole, and among those of its series."""
-    ends = np.cumsum([0, *(b.stop - b.start for b in own)]).tolist()
-    return [(slice(b.start, b.stop), slice(ends[i], ends[i + 1])) for i, b in enumerate(own)]
-
-
-def _ratio(model: GainModel) -> float:
-    """Of nuisance and noise; scaled models share it but for the last digits."""
-    return float(f"{model.own_sd_db / model.noise_sd_db:.12g}")
-
-
-def _key(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> bytes:
-    """Digest of everything that the equations of a series depend on."""
-    terms = [(block.term.frame, block.term.length, block.knots is None) for block in own]
-    knots = [block.knots for block in own if block.knots is not None]
-    return _digest((_ratio(model), model.own_length_m, terms), *(getattr(samples, n) for n in _ARRAYS), *knots)
-
-
-def _series_equations(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> _SeriesEquations:
-    """Equations of one series, kept or made."""
-    unit = dataclasses.replace(model, own_sd_db=_ratio(model), noise_sd_db=1.0)
-    return _equations.made(_key(model, own, samples), lambda: _made_equations(unit, own, samples))
-
-
-def _made_equations(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> _SeriesEquations:
-    from scipy.linalg import solve_triangular
-    from scipy.linalg.blas import dsyrk
-
-    made: dict[Any, FloatArray] = {}  # a length that two terms share is made once
-    parts = []
-    for block in own:
-        same = (block.term.frame, block.term.length, None if block.knots is None else block.start)
-        if same not in made:
-            made[same] = _features(block, argument_of(samples, block.term.frame))
-        parts.append(made[same])
-    design = np.concatenate([np.zeros((len(samples), 0)), *parts], axis=1)
-    lower = whitener(model, samples)
-    rows = np.asfortranarray(solve_triangular(lower, design, lower=True))
-    target = solve_triangular(lower, samples.residual_db - samples.residual_db.mean(), lower=True)
-    gram = dsyrk(1.0, rows, trans=1, lower=1) if rows.shape[1] else np.zeros((0, 0))
-    return _SeriesEquations(
-        gram=np.asarray(gram + np.tril(gram, -1).T),
-        right=np.asarray(rows.T @ target),
-        square=float(target @ target),
-        log_det=float(np.log(np.diag(lower)).sum()),
-        mean=design.mean(axis=0),
-        rows=len(samples),
-    )
-
-
-@dataclass(slots=True)
-class _Sum:
-    """Running sum of the equations of several series, with the noise as the unit; ``members`` by key.
-
-    ``steps``: series added to it and taken from it since it was made.
-    """
-
-    gram: FloatArray
-    right: FloatArray
-    square: float = 0.0
-    log_det: float = 0.0
-    total: dict[str, FloatArray] = field(default_factory=dict)
-    count: dict[str, int] = field(default_factory=dict)
-    members: dict[bytes, _Member] = field(default_factory=dict)
-    steps: int = 0
-
-    def add(self, member: _Member, sign: int) -> None:
-        """Add a series, or take it away again."""
-        one, runs = member.equations, member.runs
-        for rows, from_row in runs:
-            for columns, from_column in runs:
-                into = self.gram[rows, columns]
-                (np.add if sign > 0 else np.subtract)(into, one.gram[from_row, from_column], out=into)
-            self.right[rows] += sign * one.right[from_row]
-            self.total[member.antenna][rows] += sign * one.rows * one.mean[from_row]
-        self.square += sign * one.square
-        self.log_det += sign * one.log_det
-        self.count[member.antenna] += sign * one.rows
-
-
-@dataclass(frozen=True, slots=True)
-class _Member:
-    """Equations of one series, and where its columns stand in the whole."""
-
-    antenna: str
-    equations: _SeriesEquations
-    runs: list[tuple[slice, slice]]
-
-
-_last_sum: list[_Sum] = []
-"""The last sum: most fits have some series more or fewer than the one before, or only another scale."""
-
-LONGEST_CHAIN = 64
-"""Series that are added to and taken from one sum before it is made anew: rounding adds up."""
-
-
-def _summed(
-    model: GainModel, series: Sequence[LinkSamples], blocks: Sequence[_Block]
-) -> tuple[_System, dict[str, FloatArray]]:
-    """Sum of the equations of all series, with the noise as the unit, and the mean of the features (p,) per antenna."""
-    width = blocks[-1].stop if blocks else 0
-    own = [[b for b in blocks if b.antenna in (None, s.antenna)] for s in series]
-    keys = [
-        _key(model, mine, s) + repr((width, s.antenna, [b.start for b in mine])).encode()
-        for mine, s in zip(own, series, strict=True)
-    ]
-    antennas = dict.fromkeys(s.antenna for s in series)
-    last = _last_sum[0] if _last_sum else None
-    wanted = set(keys)
-    gone = [] if last is None else [key for key in last.members if key not in wanted]
-    new = [i for i, key in enumerate(keys) if last is None or key not in last.members]
-    steps = len(gone) + len(new)
-    if last is None or len(wanted) < len(keys) or steps >= len(keys) or last.steps + steps > LONGEST_CHAIN:
-        last = _Sum(gram=np.zeros((width, width)), right=np.zeros(width))
-        gone, new = [], list(range(len(keys)))
-    else:
-        last.steps += steps
-    for antenna in antennas:
-        last.total.setdefault(antenna, np.zeros(width))
-        last.count.setdefault(antenna, 0)
-    for key in gone:
-        last.add(last.members.pop(key), -1)
-    for i in new:
-        member = _Member(series[i].antenna, _series_equations(model, own[i], series[i]), _runs(own[i]))
-        last.add(member, 1)
-        last.members[keys[i]] = member
-    _last_sum[:] = [last]
-    centre = {antenna: last.total[antenna] / last.count[antenna] for antenna in antennas}
-    return _System(last.gram, last.right, last.square, last.log_det), centre
-
-
-def _scale(blocks: Sequence[_Block], model: GainModel) -> FloatArray:
-    """Standard deviation per column [dB]."""
-    each = {(t.frame, t.per, t.length): t.sd_db for t in model.terms}
-    return np.concatenate([np.full(b.stop - b.start, each[b.term.frame, b.term.per, b.term.length]) for b in blocks])
+    out, start = _covariance(model.terms, rows, rows), 0
+    for samples in rows:
+        own = slice(start, start + len(samples))
+        distance = cdist(samples.position_m, samples.position_m)
+        out[own, own] += model.own_sd_db**2 * np.exp(-distance / model.own_length_m)
+        out[own, own] += (OFFSET_SD * model.noise_sd_db) ** 2
+        start = own.stop
+    out[np.diag_indices(len(out))] += model.noise_sd_db**2
+    return out
 
 
 def factor_of(matrix: FloatArray) -> FloatArray:
@@ -599,39 +244,6 @@ def factor_of(matrix: FloatArray) -> FloatArray:
         ) from None
 
 
-def _apart(blocks: Sequence[_Block]) -> list[IntArray]:
-    """Columns that no series couples: all in one, or those of each antenna where antennas share no term."""
-    if any(b.antenna is None for b in blocks):
-        return [np.arange(blocks[-1].stop)]
-    names = dict.fromkeys(b.antenna for b in blocks)
-    return [np.concatenate([np.arange(b.start, b.stop) for b in blocks if b.antenna == name]) for name in names]
-
-
-def _posterior(
-    system: _System, scale: FloatArray, groups: Sequence[IntArray]
-) -> tuple[FloatArray, FloatArray, float, float]:
-    """Weights (p,), Cholesky factor of the posterior precision of the unit-variance weights, log evidence, misfit.
-
-    All with the noise as the unit.
-    """
-    from scipy.linalg import cho_solve
-
-    lower = np.zeros_like(system.gram) if len(groups) > 1 else np.zeros((0, 0))
-    for group in groups:
-        whole = len(groups) == 1
-        matrix = (system.gram if whole else system.gram[np.ix_(group, group)]) * scale[group, None]
-        matrix *= scale[group]
-        matrix[np.diag_indices(len(matrix))] += 1.0
-        if whole:
-            lower = factor_of(matrix)
-        else:
-            lower[np.ix_(group, group)] = factor_of(matrix)
-    right = scale * system.right
-    weights = cho_solve((lower, True), right, check_finite=False)
-    misfit = system.square - float(right @ weights)
-    return scale * weights, lower, -0.5 * misfit - float(np.log(np.diag(lower)).sum()) - system.log_det, misfit
-
-
 @dataclass(frozen=True, slots=True)
 class GainFit:
     """Gain over direction with its uncertainty.
@@ -639,40 +251,38 @@ class GainFit:
     Parameters
     ----------
     model : GainModel
-        With the standard deviations that were used.
-    antennas : tuple of str
-        ``tower.channel``, of those that were fitted.
+        With the standard deviations and the bins that were used.
+    rows : tuple of LinkSamples
+        Means over bins that were learned from.
     log_evidence : float
         Log marginal likelihood, but for a constant of the data.
-    rows : int
-        Bins.
     common_scale : float
         Factor on all standard deviations that makes them fit the data: ``s^2 = y' C^-1 y / rows``.
     """
 
     model: GainModel
-    antennas: tuple[str, ...]
+    rows: tuple[LinkSamples, ...]
     log_evidence: float
-    rows: int
     common_scale: float
-    _series: int = field(repr=False)
-    _blocks: tuple[_Block, ...] = field(repr=False)
     _weights: FloatArray = field(repr=False)
     _lower: FloatArray = field(repr=False)
-    _scale: FloatArray = field(repr=False)
-    _centre: Mapping[str, FloatArray] = field(repr=False)
-    _seen: Mapping[str, FloatArray] = field(repr=False)
+
+    @property
+    def antennas(self) -> tuple[str, ...]:
+        """``tower.channel`` of those that were fitted."""
+        return tuple(dict.fromkeys(s.antenna for s in self.rows))
 
     def scaled(self) -> GainFit:
         """The fit with all standard deviations times :attr:`common_scale`: the same gains, other uncertainties."""
-        s = self.common_scale
-        misfit = s**2 * (self.rows - self._series)
+        s, count = self.common_scale, len(self._weights)
+        misfit = s**2 * max(count - len(self.rows), 1)
         return dataclasses.replace(
             self,
-            model=scaled_model(self.model, s),
-            log_evidence=self.log_evidence + 0.5 * misfit * (1.0 - s**-2) - self.rows * math.log(s),
+            model=self.model.scaled(s),
+            log_evidence=self.log_evidence + 0.5 * misfit * (1.0 - s**-2) - count * math.log(s),
             common_scale=1.0,
-            _scale=self._scale * s,
+            _weights=self._weights / s**2,
+            _lower=self._lower * s,
         )
 
     def predict(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> tuple[FloatArray, FloatArray]:
@@ -696,101 +306,94 @@ class GainFit:
             If no flight of the fit had this tower and channel.
         """
         gain, sd = np.full(len(samples), np.nan), np.full(len(samples), np.nan)
-        blocks, good = self._chosen(samples, frames), self._known_rows(samples)
-        for start in range(0, len(good), 2000):
-            rows = good[start : start + 2000]
-            gain[rows], sd[rows] = self._moments(samples.antenna, blocks, samples.part(rows))
+        terms, good = self._terms(frames), self._known_rows(samples)
+        for start in range(0, len(good), AT_ONCE):
+            part = good[start : start + AT_ONCE]
+            gain[part], sd[part] = self._moments(terms, samples.part(part), self._own(samples.antenna))
         return gain, sd
 
     def mean(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> FloatArray:
-        """The gain of :meth:`predict` alone (n,) [dB]: the standard deviation costs a hundred times as much."""
+        """The gain of :meth:`predict` alone (n,) [dB]."""
         gain = np.full(len(samples), np.nan)
-        blocks, rows = self._chosen(samples, frames), self._known_rows(samples)
-        known = samples if len(rows) == len(samples) else samples.part(rows)
-        centre = self._centre[samples.antenna]
-        total = np.zeros(len(rows))
-        for block in blocks:
-            columns = slice(block.start, block.stop)
-            values = _block_values(block, argument_of(known, block.term.frame), self._weights[columns])
-            total += values - centre[columns] @ self._weights[columns]
-        gain[rows] = total
+        terms, good, own = self._terms(frames), self._known_rows(samples), self._own(samples.antenna)
+        zero = float((_covariance(terms, own, self.rows) @ self._weights).mean())
+        for start in range(0, len(good), AT_ONCE):
+            part = good[start : start + AT_ONCE]
+            gain[part] = _covariance(terms, [samples.part(part)], self.rows) @ self._weights - zero
         return gain
-
-    def average(self, samples: LinkSamples) -> float:
-        """Mean of :meth:`mean` over the samples [dB]; their mean features are kept for other fits."""
-        blocks, rows = self._chosen(samples, None), self._known_rows(samples)
-        known = samples if len(rows) == len(samples) else samples.part(rows)
-        centre = self._centre[samples.antenna]
-        total = 0.0
-        for block in blocks:
-            columns = slice(block.start, block.stop)
-            mean = _mean_features(block, argument_of(known, block.term.frame))
-            total += float((mean - centre[columns]) @ self._weights[columns])
-        return total
-
-    def _chosen(self, samples: LinkSamples, frames: Iterable[Frame] | None) -> list[_Block]:
-        """Blocks of some frames that an antenna has."""
-        if samples.antenna not in self.antennas:
-            raise UsageError(
-                f"tower and channel {samples.antenna!r} were not fitted", expected="one of " + ", ".join(self.antennas)
-            )
-        own = [b for b in self._blocks if b.antenna in (None, samples.antenna)]
-        return own if frames is None else [b for b in own if b.term.frame in set(frames)]
-
-    @staticmethod
-    def _known_rows(samples: LinkSamples) -> IntArray:
-        finite = np.isfinite(np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1))
-        return np.flatnonzero(finite.all(axis=1))
 
     def gain(self, frame: Frame, antenna: str, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gain at one end over directions (n, 3), or of the pair of ends (n, 6): posterior mean and SD (n,) [dB].
 
         Zero is the mean over the bins of the flights: the level itself is in the offsets.
         """
-        direction = np.asarray(direction, dtype=np.float64)
-        blocks = [b for b in self._blocks if b.term.frame == frame and b.antenna in (None, antenna)]
-        return self._moments(antenna, blocks, direction)
+        return self.predict(directed(antenna, np.asarray(direction, dtype=np.float64)), (frame,))
 
     def seen(self, frame: Frame, antenna: str) -> FloatArray:
         """Directions (m, 3) of the bins of the fit at one end, the UAV's of all antennas together; (m, 6) of pairs."""
-        if frame == "body":
-            return np.concatenate([self._seen[f"body.{a}"] for a in self.antennas])
-        return self._seen[f"{frame}.{antenna}"]
+        return np.concatenate([argument_of(s, frame) for s in (self.rows if frame == "body" else self._own(antenna))])
 
     def sd_about_mean(self, samples: LinkSamples) -> FloatArray:
         """Standard deviation (n,) of the gain along samples about its mean over them, as an own offset leaves it [dB].
 
         Every sample must have both directions.
         """
-        blocks, centre = self._chosen(samples, None), np.zeros(len(self._weights))
-        for block in blocks:
-            centre[block.start : block.stop] = _mean_features(block, argument_of(samples, block.term.frame))
-        return self._moments(samples.antenna, blocks, samples, centre)[1]
+        self._own(samples.antenna)
+        return self._moments(self.model.terms, samples, [samples])[1]
+
+    def _terms(self, frames: Iterable[Frame] | None) -> tuple[Term, ...]:
+        chosen = None if frames is None else set(frames)
+        return tuple(t for t in self.model.terms if chosen is None or t.frame in chosen)
+
+    def _own(self, antenna: str) -> list[LinkSamples]:
+        """Rows of an antenna."""
+        own = [s for s in self.rows if s.antenna == antenna]
+        if not own:
+            raise UsageError(
+                f"tower and channel {antenna!r} were not fitted", expected="one of " + ", ".join(self.antennas)
+            )
+        return own
+
+    @staticmethod
+    def _known_rows(samples: LinkSamples) -> IntArray:
+        finite = np.isfinite(np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1))
+        return np.flatnonzero(finite.all(axis=1))
 
     def _moments(
-        self, antenna: str, blocks: Sequence[_Block], at: LinkSamples | FloatArray, about: FloatArray | None = None
+        self, terms: Sequence[Term], at: LinkSamples, about: Sequence[LinkSamples]
     ) -> tuple[FloatArray, FloatArray]:
-        """Sum of some terms along samples, or at arguments of their one frame: mean and standard deviation (n,).
-
-        ``about``: features (columns,) whose gain counts as zero; the mean over the bins of the fit without.
-        """
+        """Sum of some terms along samples about its mean over others: mean and standard deviation (n,)."""
         from scipy.linalg import solve_triangular
 
-        design, beyond = np.zeros((len(at), len(self._weights))), np.zeros(len(at))
-        centre = self._centre[antenna] if about is None else about
-        for block in blocks:
-            columns = slice(block.start, block.stop)
-            features = _features(block, argument_of(at, block.term.frame) if isinstance(at, LinkSamples) else at)
-            design[:, columns] = features - centre[columns]
-            if block.knots is not None:  # what the knots say nothing about is as the prior has it
-                beyond += self._scale[block.start] ** 2 * np.maximum(1.0 - (features**2).sum(axis=1), 0.0)
-        if not blocks:
-            return np.zeros(len(at)), beyond
-        spread = solve_triangular(self._lower, (design * self._scale).T, lower=True)
-        return design @ self._weights, np.sqrt((spread**2).sum(axis=0) + beyond)
+        centre = _covariance(terms, about, [at, *self.rows]).mean(axis=0)
+        across = _covariance(terms, [at], self.rows) - centre[len(at) :]
+        # between samples of one antenna every term counts
+        prior = sum(t.sd_db**2 for t in terms) - 2.0 * centre[: len(at)] + _covariance(terms, about, about).mean()
+        spread = solve_triangular(self._lower, across.T, lower=True, check_finite=False)
+        return across @ self._weights, np.sqrt(np.maximum(prior - (spread**2).sum(axis=0), 0.0))
 
 
-def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None, pairs: Pairs | None = None) -> GainFit:
+AT_ONCE = 2000
+"""Samples that are predicted at a time; bounds the memory."""
+
+
+def directed(antenna: str, direction: FloatArray) -> LinkSamples:
+    """Samples (n,) of an antenna towards directions (n, 3), the same at both ends, or pairs of them (n, 6)."""
+    count = len(direction)
+    tower, _, channel = antenna.partition(".")
+    return LinkSamples(
+        flight="",
+        tower=tower,
+        channel=channel,
+        time_s=np.arange(float(count)),
+        position_m=np.zeros((count, 3)),
+        at_uav=direction[:, :3],
+        at_tower=direction[:, -3:],
+        residual_db=np.full(count, np.nan),
+    )
+
+
+def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> GainFit:
     """Learn the gain over direction.
 
     Parameters
@@ -798,9 +401,7 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None, pair
     series : sequence of LinkSamples
         Of all flights.
     model : GainModel, optional
-        Terms and their strength; see :func:`.gain_choice.choose_and_fit`.
-    pairs : mapping of str to (k, 6), optional
-        Knots of :func:`shared_knots`; without, those of these series.
+        Terms and their strength; see :func:`chosen_fit`.
 
     Returns
     -------
@@ -810,64 +411,65 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None, pair
     ------
     InputError
         If no sample counts, or the equations cannot be solved.
-    UsageError
-        If there are more unknowns than memory is allowed for.
 
     Notes
     -----
-    ``w ~ N(0, I)``, ``y = offset + A S w + own + noise``: with the series' own covariance ``C`` the posterior precision
-    is ``I + S A' C^-1 A S`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, eq. 2.11). The solution
-    is exact but for the harmonics left out (:func:`.sphere.gaussian_spectrum`) and the share of the variance over both
-    directions that :func:`pair_knots` leaves (0.1 % each, where they suffice), and the average over ``bin_s``.
+    ``y = offset + gains + own + noise``, all normal: with the covariance ``C`` of the rows the gain at directions of
+    covariance ``k`` with them is ``k' C^-1 y`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, eq.
+    2.25). The solution is exact but for the average over ``bin_s``.
     """
-    model = model or GainModel()
-    binned = binned_series(series, model.bin_s)
-    blocks = _layout(model, binned, pairs or {})
-    system, centre = _summed(model, binned, blocks)
-    scale, noise = _scale(blocks, model), model.noise_sd_db
-    weights, lower, evidence, misfit = _posterior(system, scale / noise, _apart(blocks))
-    rows = sum(map(len, binned))
+    from scipy.linalg import cho_solve
+
+    model, rows = binned_series(series, model or GainModel())
+    lower = factor_of(_whole(model, rows))
+    target = np.concatenate([s.residual_db - s.residual_db.mean() for s in rows])
+    weights = cho_solve((lower, True), target, check_finite=False)
+    misfit = float(target @ weights)
     return GainFit(
         model=model,
-        antennas=tuple(dict.fromkeys(s.antenna for s in binned)),
-        log_evidence=evidence + 0.5 * misfit * (1.0 - noise**-2) - rows * math.log(noise),
-        rows=rows,
-        common_scale=math.sqrt(max(misfit / noise**2 / max(rows - len(binned), 1), 1e-6)),
-        _series=min(len(binned), rows - 1),
-        _blocks=blocks,
+        rows=tuple(rows),
+        log_evidence=-0.5 * misfit - float(np.log(np.diag(lower)).sum()),
+        common_scale=math.sqrt(max(misfit / max(len(target) - len(rows), 1), 1e-6)),
         _weights=weights,
         _lower=lower,
-        _scale=scale,
-        _centre=centre,
-        _seen=_seen(binned),
     )
 
 
-def binned_series(series: Sequence[LinkSamples], bin_s: float) -> list[LinkSamples]:
-    """Means over bins of each series that has any; InputError if none has."""
-    binned = [s.binned(bin_s) for s in series]
+def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) -> GainFit:
+    """:func:`fit_gain` with the likelier strength of the tower's gains and the common scale of all.
+
+    The scale, which changes no mean, makes the standard deviations fit the data: ``s^2 = y' C^-1 y / rows``.
+    """
+    model = model or GainModel()
+    mast = [t.frame == "mast" for t in model.terms]
+    fits = [
+        fit_gain(series, dataclasses.replace(model, terms=tuple(
+            dataclasses.replace(t, sd_db=t.sd_db * factor) if t.frame == "mast" else t for t in model.terms
+        ))).scaled()
+        for factor in (TOWER_FACTORS if any(mast) and not all(mast) else (1.0,))
+    ]  # fmt: skip
+    return max(fits, key=lambda fit: fit.log_evidence)
+
+
+def binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[GainModel, list[LinkSamples]]:
+    """Means over bins of each series that has any, and the model with the bins used; InputError if none has."""
+    binned = [s.binned(model.bin_s) for s in series]
+    longer = math.ceil(sum(map(len, binned)) / MOST_ROWS)
+    if longer > 1:
+        model = dataclasses.replace(model, bin_s=model.bin_s * longer)
+        binned = [s.binned(model.bin_s) for s in series]
     binned = [s for s in binned if len(s)]
     if not binned:
         raise InputError("no sample has a level and a direction", expected="RSS with positions and attitude")
-    return binned
-
-
-def _seen(binned: Sequence[LinkSamples]) -> dict[str, FloatArray]:
-    directions = {}
-    for antenna in dict.fromkeys(s.antenna for s in binned):
-        own = [s for s in binned if s.antenna == antenna]
-        directions[f"body.{antenna}"] = np.concatenate([s.at_uav for s in own])
-        directions[f"mast.{antenna}"] = np.concatenate([s.at_tower for s in own])
-        directions[f"pair.{antenna}"] = np.concatenate([argument_of(s, "pair") for s in own])
-    return directions
+    return model, binned
 
 
 def column_forms(
-    series: Sequence[LinkSamples], model: GainModel, columns: Callable[[LinkSamples], FloatArray], width: int
+    series: Sequence[LinkSamples],
+    model: GainModel,
+    columns: Callable[[LinkSamples, float], FloatArray],
 ) -> FloatArray:
     """``X' Sigma^-1 X`` (width, width), Sigma the covariance of a model with the gains integrated out.
-
-    ``columns(series) -> (bins, width)`` must keep the bins of :meth:`LinkSamples.binned`.
 
     Parameters
     ----------
@@ -875,36 +477,16 @@ def column_forms(
     model : GainModel
         Its priors and noise make Sigma.
     columns : callable
-        The columns X of one series, (bins, width).
-    width : int
-        Number of columns.
+        ``columns(series, bin_s)`` gives the columns X of one series (bins, width), of :meth:`LinkSamples.binned`.
 
     Returns
     -------
     (width, width)
         Symmetric, positive semidefinite [squared unit of the columns per dB^2].
-
-    Notes
-    -----
-    ``Sigma = N + D S S D'``: N has a block per series (offset, nuisance over distance, noise), D is the design of the
-    gains and S the standard deviation of their prior. It is inverted by Woodbury's identity: no matrix is larger than
-    a series or than the number of gains.
     """
-    from scipy.linalg import cholesky, solve_triangular
+    from scipy.linalg import solve_triangular
 
-    kept = [s for s in series if len(s.binned(model.bin_s))]
-    binned = binned_series(kept, model.bin_s)
-    blocks = _layout(model, binned, {})
-    scale = _scale(blocks, model)
-    form, cross = np.zeros((width, width)), np.zeros((len(scale), width))
-    gram = np.zeros((len(scale), len(scale)))
-    for raw, samples in zip(kept, binned, strict=True):
-        lower = whitener(model, samples)
-        rows = solve_triangular(lower, _design(blocks, samples) * scale, lower=True)
-        values = solve_triangular(lower, columns(raw), lower=True)
-        form += values.T @ values
-        cross += rows.T @ values
-        gram += rows.T @ rows
-    gram[np.diag_indices(len(gram))] += 1.0
-    inside = solve_triangular(cholesky(gram, lower=True), cross, lower=True)
-    return np.asarray(form - inside.T @ inside)
+    model, rows = binned_series(series, model)
+    values = np.concatenate([columns(s, model.bin_s) for s in series if len(s.binned(model.bin_s))])
+    inside = solve_triangular(factor_of(_whole(model, rows)), values, lower=True)
+    return np.asarray(inside.T @ inside)

@@ -8,20 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.units import FloatArray
-from .direction_gain import GainModel, LinkSamples, Term, column_forms
+from .direction_gain import LinkSamples
 
 STEP_DEG = 10.0
 """Between the azimuths that are tried."""
 
 MOUNT_NOISE_DB = 10.0
-"""Standard deviation of a bin about the patterns: 4 dB of residual that stays alike over some six bins."""
+"""Standard deviation of a bin about the patterns: 4 dB of residual that stays alike over some six bins.
 
-MOUNT_MODEL = GainModel(
-    terms=(Term("body", "all", 0.9, 0.5),), own_sd_db=0.01, own_length_m=20.0, noise_sd_db=MOUNT_NOISE_DB
-)
-"""Least squares in effect. A covariance with learned gains, or with shadowing correlated over place, takes for itself
-the broad shape over azimuth that tells a mount: on dataset 12 the azimuth at the UAV then jumps between flights
-(320 and 120 deg, in place of 270 and 270)."""
+Least squares: a covariance with learned gains, or with shadowing correlated over place, takes for itself the broad
+shape over azimuth that tells a mount. On dataset 12 the azimuth at the UAV then jumps between flights (320 and 120 deg,
+in place of 270 and 270)."""
+
+BIN_S = 4.0
+"""Samples are averaged over this time [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,7 @@ def fit_mounts(
 
     Notes
     -----
-    ``log p = -(y - u - t)' Sigma^-1 (y - u - t) / 2`` is a quadratic form of columns computed once. Azimuths of
+    ``log p = -|y - u - t|^2 / (2 s^2)`` is a quadratic form of columns computed once. Azimuths of
     tower antennas are optimised for each azimuth of the UAV; tilts follow at the best azimuths, within 20 degrees.
     """
     grid = np.arange(0.0, 360.0, STEP_DEG)
@@ -139,7 +139,7 @@ def _quadratic_forms(
     def candidates(samples: LinkSamples) -> FloatArray:
         """Target and candidates (bins, q) of a series."""
         good = samples.part(np.isfinite(samples.residual_db) & np.isfinite(samples.at_uav).all(axis=1))
-        bins = good.binned(MOUNT_MODEL.bin_s)
+        bins = good.binned(BIN_S)
         out = np.zeros((len(bins), start))
         out[:, 0] = bins.residual_db
         for name, pattern in patterns.items():
@@ -150,7 +150,8 @@ def _quadratic_forms(
                 out[:, column] = pattern(direction @ rotation(*angles))
         return np.asarray(out - out.mean(axis=0), dtype=np.float64)
 
-    return _Forms(column_forms(series, MOUNT_MODEL, candidates, start), columns)
+    rows = np.concatenate([candidates(s) for s in series])
+    return _Forms(rows.T @ rows / MOUNT_NOISE_DB**2, columns)
 
 
 def _best_together(forms: _Forms) -> tuple[dict[str, int], dict[str, FloatArray]]:

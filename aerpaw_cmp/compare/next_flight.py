@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.units import FloatArray
-from .direction_gain import GainFit, GainModel, LinkSamples, Pairs, fit_gain
+from .direction_gain import GainFit, GainModel, LinkSamples, fit_gain
 from .field_gp import NEW_FLIGHT, FieldFit, FieldModel, Part, Rows
 
 PLANNED = "planned"
@@ -33,14 +33,11 @@ class Known:
         Terms and strengths of the antennas, own nuisance, noise.
     field : FieldModel, optional
         Of what the antennas leave; None: nothing is added.
-    pairs : mapping of str to (k, 6), optional
-        Knots that serve every route (:func:`.direction_gain.shared_knots`).
     """
 
     series: Sequence[LinkSamples]
     model: GainModel
     field: FieldModel | None = None
-    pairs: Pairs | None = None
 
     def sd_db(self, route: Sequence[LinkSamples], targets: Mapping[str, LinkSamples]) -> dict[str, FloatArray]:
         """Standard deviation (targets,) of the level per antenna, about its mean over the targets [dB].
@@ -59,7 +56,7 @@ class Known:
         """
         planned = [dataclasses.replace(s, flight=PLANNED, residual_db=np.zeros(len(s))) for s in route]
         rows = [*self.series, *planned]
-        fit = fit_gain(rows, self.model, self.pairs) if rows else None
+        fit = fit_gain(rows, self.model) if rows else None
         return {antenna: self._one(antenna, target, rows, fit) for antenna, target in targets.items()}
 
     def _one(self, antenna: str, target: LinkSamples, rows: Sequence[LinkSamples], fit: GainFit | None) -> FloatArray:

@@ -8,13 +8,14 @@ import pytest
 from aerpaw_cmp.compare.calibration import Observed, Recipe, learn
 from aerpaw_cmp.compare.direction_gain import GainModel, Term
 from aerpaw_cmp.compare.learning_curve import CurvePoint, learning_curve, with_one_more
-from tests.compare.test_gain_choice import campaign
+from tests.compare.test_direction_gain import GAINS, planted
 
 RECIPE = Recipe(GainModel((Term("body", "all", 0.5, 2.5), Term("mast", "antenna", 0.4, 3.0))), lambda *_: np.eye(3))
 
 
 def observed(flights: int) -> list[Observed]:
-    return [Observed(s, np.zeros(len(s)), np.zeros(len(s))) for s in campaign(6, flights=flights, n=120)]
+    series = [s for k in range(flights) for s in planted(f"f{k}", 60 + k, GAINS, n=120)]
+    return [Observed(s, np.zeros(len(s)), np.zeros(len(s))) for s in series]
 
 
 def test_points_are_means_of_explicit_fits_over_all_subsets():

@@ -9,7 +9,7 @@ from scipy.stats import spearmanr
 from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term, fit_gain
 from aerpaw_cmp.compare.field_gp import FieldModel
 from aerpaw_cmp.compare.next_flight import Known, rms_db
-from aerpaw_cmp.compare.sphere import gaussian_features
+from tests.compare.test_direction_gain import drawn
 
 TERMS = (Term("body", "all", 0.6, 2.5), Term("mast", "antenna", 0.5, 3.0))
 MODEL = GainModel(TERMS, own_sd_db=1.0, own_length_m=20.0, noise_sd_db=1.0, bin_s=1.0)
@@ -38,8 +38,8 @@ TARGET = joined([flight("t", 70 + k, 90.0 * k, n=40) for k in range(4)])
 
 
 def gains(one, other):
-    body, mast = (cdist(getattr(one, k), getattr(other, k), "sqeuclidean") for k in ("at_uav", "at_tower"))
-    return 2.5**2 * np.exp(-body / 0.72) + 3.0**2 * np.exp(-mast / 0.5)
+    body, mast = (cdist(getattr(one, k), getattr(other, k)) for k in ("at_uav", "at_tower"))
+    return 2.5**2 * np.exp(-body / 0.6) + 3.0**2 * np.exp(-mast / 0.5)
 
 
 def test_expected_deviation_is_the_dense_posterior_of_both_flights():
@@ -96,10 +96,10 @@ def test_ranking_follows_the_true_error_on_fields_of_known_covariance():
     squares = np.zeros(len(routes))
     rng = np.random.default_rng(5)
     for _ in range(40):
-        uav, mast = (rng.normal(size=gaussian_features(np.eye(3)[:1], t.length).shape[1]) for t in TERMS)
+        uav, mast = (drawn(t.length, t.sd_db, int(rng.integers(1 << 30))) for t in TERMS)
 
         def level(s, uav=uav, mast=mast):
-            return 2.5 * gaussian_features(s.at_uav, 0.6) @ uav + 3.0 * gaussian_features(s.at_tower, 0.5) @ mast
+            return uav(s.at_uav) + mast(s.at_tower)
 
         def measured(s, level=level):
             root = np.linalg.cholesky(np.exp(-cdist(s.position_m, s.position_m) / 20.0) + 1e-9 * np.eye(len(s)))

@@ -381,7 +381,7 @@ def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: P
         patterns=patterns,
         mount=settings.fit.mount != "none",
         tilt=settings.fit.mount == "tilt",
-    ).sharing([o.samples for o in observed])
+    )
 
 
 def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
@@ -402,13 +402,13 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
     by_name = {data.settings.flight.name: data for data in flights}
     kept = {(o.samples.flight, o.samples.antenna): o for o in observed}
 
-    def columns(samples: LinkSamples) -> FloatArray:
+    def columns(samples: LinkSamples, bin_s: float) -> FloatArray:
         data = by_name[samples.flight]
         o = kept[samples.flight, samples.antenna]
         link = next(s.link for s in data.rss if f"{s.tower}.{s.channel}" == samples.antenna)
         tower = data.site.towers[samples.tower]
         place = tower.position_m[None, :] if o.tower_m is None else o.tower_m[:, None, :]
-        out = [samples.binned(model.bin_s).residual_db]
+        out = [samples.binned(bin_s).residual_db]
         for sigma in ROUGHNESS_M:
             level = two_ray_dbm(
                 place,
@@ -420,11 +420,10 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
                 roughness_m=sigma,
             )[:, 0]
             ripple = np.where(np.isfinite(samples.residual_db), level - o.free_space_db, np.nan)
-            out.append(dataclasses.replace(samples, residual_db=ripple).binned(model.bin_s).residual_db)
+            out.append(dataclasses.replace(samples, residual_db=ripple).binned(bin_s).residual_db)
         whole = np.stack(out, axis=1)
         return np.asarray(whole - whole.mean(axis=0))
 
-    model = learned.choice.model
     left = [
         dataclasses.replace(
             o.samples,
@@ -434,7 +433,7 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
         )
         for o in observed
     ]
-    form = column_forms(left, model, columns, 1 + len(ROUGHNESS_M))
+    form = column_forms(left, learned.model, columns)
     value = np.diag(form)[1:] - 2.0 * form[0, 1:]
     likelihood = -0.5 * (value - value[-1])
     return GroundFit(roughness_m=ROUGHNESS_M, log_likelihood=tuple(map(float, likelihood)))
@@ -481,10 +480,9 @@ def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple
         return {}
     left_out, only = calibration.flight_left_out, calibration.only_terms
     bare = dataclasses.replace(recipe, patterns={})
-    turned = dataclasses.replace(bare, pairs=None)  # their directions are others
     scores = {
-        "world frame at the UAV": left_out(calibration.world_frame(observed), turned),
-        "heading turned the wrong way": left_out(calibration.wrong_way(observed), turned),
+        "world frame at the UAV": left_out(calibration.world_frame(observed), bare),
+        "heading turned the wrong way": left_out(calibration.wrong_way(observed), bare),
         "body frame, no patterns": left_out(observed, bare),
         "UAV end only": left_out(observed, only(bare, UAV_TERMS)),
         "tower end only": left_out(observed, only(bare, TOWER_TERMS)),

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import UsageError
+from ...common.gaussian import determining, gaussian_kernel
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, IntArray
 from ...common.versions import versions
 from ...compare.calibration import Learned, mean_rmse
-from ...compare.direction_gain import LinkSamples, pair_knots
+from ...compare.direction_gain import directed
 from ...compare.learning_curve import with_one_more
 from ...flight.data import FlightData, RankSeries, RssSeries
 from ...flight.training import flight_logs
@@ -36,8 +37,8 @@ from .calibrate_rank import RankCalibration
 MARK = "# aerpaw-cmp calibrate"
 """First words of calibrated.yaml, by which an own earlier output is known."""
 
-PAIR_SHARE = 0.01
-"""Share of the variance over both directions that the stored directions leave."""
+PAIR_SHARE, MOST_PAIRS = 0.01, 400
+"""Share of the variance over both directions that the stored directions leave, and their largest number."""
 
 
 def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
@@ -121,21 +122,12 @@ def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str
     term = next((t for t in fit.model.terms if t.frame == "pair"), None) if fit else None
     if fit is None or term is None or end == "uav":
         return ()
-    at = pair_knots(fit.seen("pair", antenna), term.length, PAIR_SHARE)
-    samples = LinkSamples(
-        flight="",
-        tower=antenna.partition(".")[0],
-        channel=antenna.partition(".")[2],
-        time_s=np.arange(float(len(at))),
-        position_m=np.zeros((len(at), 3)),
-        at_uav=at[:, :3],
-        at_tower=at[:, 3:],
-        residual_db=np.full(len(at), np.nan),
-    )
+    seen, length = fit.seen("pair", antenna), term.length
+    at = seen[determining(seen, lambda one, other: gaussian_kernel(one, other, length), PAIR_SHARE, MOST_PAIRS)]
     return PairGain(
         directions=at,
         gain_db=fit.gain("pair", antenna, at)[0],
-        sd_db=fit.predict(samples, ("body", "mast", "pair"))[1],
+        sd_db=fit.predict(directed(antenna, at), ("body", "mast", "pair"))[1],
         length=term.length,
         prior_sd_db=term.sd_db,
     ).notes()
@@ -197,7 +189,6 @@ def record_of(
     CalibrationData
         As :func:`aerpaw_cmp.report.calibration_html.write_calibration` takes it.
     """
-    model = calibration.learned.choice.model
     mounts = {
         name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}
         | {"probability": dict(zip([f"{g:g}" for g in m.grid_deg], map(float, m.probability), strict=True))}
@@ -220,12 +211,7 @@ def record_of(
         scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
         controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
         mounts=mounts,
-        strengths={
-            "spread": calibration.learned.choice.spread,
-            "scale": calibration.learned.choice.scale,
-            "left_out_rmse_db": {f"{k:g}": v for k, v in calibration.learned.choice.left_out_rmse_db.items()},
-            "model": dataclasses.asdict(model),
-        },
+        strengths={"model": dataclasses.asdict(calibration.learned.model)},
         ground=ground,
         curve=[dataclasses.asdict(point) for point in calibration.curve],
         one_more_rmse_db=with_one_more(calibration.curve),

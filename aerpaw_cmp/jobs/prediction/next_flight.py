@@ -18,9 +18,8 @@ from ...common.units import FloatArray
 from ...compare import calibration
 from ...compare.calibration import Recipe
 from ...compare.correction import choose
-from ...compare.direction_gain import GainModel, LinkSamples, shared_knots
+from ...compare.direction_gain import GainModel, LinkSamples
 from ...compare.next_flight import Known, rms_db
-from ...compare.sphere import even_directions
 from ...flight.data import FlightData, load_data
 from ...flight.patterns import NOSES, Pattern, Route, Waypoint, allowed_area, cut, flown, route_of
 from ...flight.settings import load_flight
@@ -189,7 +188,7 @@ def plan_flight(
             )
         wanted = _targets(target, site, asked, ends, area)
     with stages("learn"):
-        known = _known(series, [s for route, _, _ in candidates for s in _samples(route, ends, site)])
+        known = _known(series)
     thin = {a: _thinned(s, MOST_TARGETS) for a, s in wanted.items()}
 
     def leaves_db(route: Route) -> float:
@@ -352,7 +351,7 @@ def _targets(
     for antenna, end in ends.items():
         tower = np.asarray(site.towers[end[0]].position_m)
         if points is None:
-            direction = even_directions(800)
+            direction = _even_directions(800)
             direction = direction[(direction[:, 2] > 0.03) & (direction[:, 2] < 0.98)]
             place, yaw = tower + SPHERE_AWAY_M * direction, 137.508 * np.arange(len(direction)) % 360.0
         else:
@@ -387,15 +386,24 @@ def _samples(route: Route, ends: Mapping[str, tuple[str, str]], site: Site) -> l
     ]
 
 
-def _known(series: Sequence[LinkSamples], ahead: Sequence[LinkSamples]) -> Known:
+def _even_directions(count: int) -> FloatArray:
+    """Unit vectors (count, 3) that share the sphere evenly (Fibonacci lattice)."""
+    k = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * k / count
+    azimuth = np.pi * (1.0 + math.sqrt(5.0)) * k
+    across = np.sqrt(1.0 - z * z)
+    return np.asarray(np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1), dtype=np.float64)
+
+
+def _known(series: Sequence[LinkSamples]) -> Known:
     """Strengths and residual field by the flights that were flown; the model's own without any."""
     model, left = GainModel(), None
     if series:
         learned = calibration.learn(series, Recipe(model=model, rotation=rotation))
-        model = learned.choice.model
+        model = learned.model
         correction = choose(series, {"learned": learned_base})
         left = correction.model if correction.on else None
-    return Known(series=series, model=model, field=left, pairs=shared_knots([*series, *ahead], model))
+    return Known(series=series, model=model, field=left)
 
 
 def _thinned(samples: LinkSamples, most: int) -> LinkSamples:

@@ -1,11 +1,13 @@
 """Position estimate of a transmitter of unknown place, from the levels of one flight.
 
-The model: a level falls with the logarithm of the distance, by a free slope; both antennas add a gain over the
-elevation, shadowing is remembered for half a minute, and what lies below the receiver's floor says only that.
+The model: a level falls with the logarithm of the distance, by a free slope; the airframe adds its gain where flights
+taught it, both antennas one over the elevation, shadowing is remembered for half a minute, and what lies below the
+receiver's floor says only that.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,12 +74,15 @@ class LevelTrack:
         Medians; no lower than the floor.
     floor_db : float
         Level below which the receiver measures nothing; -inf where none shows.
+    airframe_db : callable, optional
+        Gain (m, n) of the airframe at each of the levels towards unit vectors (m, n, 3) from the UAV, where known.
     """
 
     time_s: FloatArray
     position_m: FloatArray
     level_db: FloatArray
     floor_db: float = -np.inf
+    airframe_db: Callable[[FloatArray], FloatArray] | None = None
 
     @property
     def below(self) -> BoolArray:
@@ -175,7 +180,10 @@ def _features(track: LevelTrack, places: FloatArray) -> tuple[FloatArray, FloatA
         ELEVATION_SD_DB * np.sin(elevation) ** 2,
         0.5 * ELEVATION_SD_DB * np.cos(4.0 * elevation),
     ]
-    return _middle(track) - 10.0 * SLOPE * decades, np.stack(columns, axis=-1)
+    mean = _middle(track) - 10.0 * SLOPE * decades
+    if track.airframe_db is not None:
+        mean = mean + track.airframe_db(-away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9))
+    return mean, np.stack(columns, axis=-1)
 
 
 def _middle(track: LevelTrack) -> float:

@@ -26,7 +26,7 @@ from .grouping import Span, flights, stream_span
 from .heights import height_in_name, lacks_height
 from .lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
 from .node import CARRIER_HZ, POWER_DBM, Placer, listed_places
-from .remembered import Nodes, Proposal, propose
+from .remembered import Nodes, Proposal, propose, searching_airframe
 from .settings import FlightFile, LogSettings, RssSettings, with_learned
 from .time_origin import Origin, origin_of
 
@@ -94,6 +94,7 @@ def draft(
         timezone=timezone,
         positioned=any(_has_positions(stream) for stream in every),
         placer=_placer(files, flown, site_place(site, folder)),
+        memory=site_place(site, folder),
         locks=any(may_lose_lock(stream) for stream in every),
     )
     for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest
@@ -364,6 +365,8 @@ class _Entries:
     positioned: bool = False
     """Some log to compare has positions of its own."""
     placer: Placer | None = None
+    memory: str | Path = SITE
+    """Site whose memory is used."""
     locks: bool = False
     """The receiver is a sounder that loses its lock."""
     towers: dict[str, tuple[Mapping[str, Any], str]] = field(default_factory=dict)
@@ -411,7 +414,10 @@ class _Entries:
         origin = None if self.time_origin else self._origin(streams)
         if self.placer is not None:
             levels = [s for s in streams if s.kind == "rss" and not is_ratio(s)]
-            asked = self._place(entry, asked, levels, self.placer) if asked else self._doubt(entry, levels, self.placer)
+            if asked:
+                asked = self._place(file, entry, asked, levels, self.placer)
+            else:
+                asked = self._doubt(entry, levels, self.placer)
         refused = self._refused(streams, entry, shown, dated=origin is not None)
         kept = [s for s in streams if s.name not in refused]
         reasons = list(dict.fromkeys(refused.values()))
@@ -462,13 +468,33 @@ class _Entries:
         self.series += [(*_key(s, entry), file.result.reader) for s in kept if s.kind in ("rss", "rank")]
         self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
 
-    def _place(self, entry: dict[str, Any], asked: str, levels: Sequence[Stream], placer: Placer) -> str:
-        """Fill in the nodes that the levels fit; gives what is left to ask."""
+    def _place(
+        self, file: IngestedFile, entry: dict[str, Any], asked: str, levels: Sequence[Stream], placer: Placer
+    ) -> str:
+        """Fill in the nodes that the levels fit; gives what is left to ask.
+
+        Parameters
+        ----------
+        file : IngestedFile
+        entry : dict
+            Of the file in ``logs:``; receives the nodes.
+        asked : str
+            The question where no level fits.
+        levels : sequence of Stream
+            Of the file.
+        placer : Placer
+
+        Returns
+        -------
+        str
+        """
         places = {}
         for pci in entry.get("cells", [None]):
             level = next((s for s in levels if s.attributes.get("pci") == pci), None)
             if level is not None:
-                places[pci] = placer.propose(placer.levels(level, self._floor_db(level)))
+                series = _key(level, entry)[1], file.result.reader
+                airframe = searching_airframe(self.memory, placer.site.towers, series, file.sha256)
+                places[pci] = placer.propose(placer.levels(level, self._floor_db(level), airframe))
         for pci, place in places.items():
             if place is None:
                 continue

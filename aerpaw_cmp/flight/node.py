@@ -14,6 +14,7 @@ from ..common.units import FloatArray
 from ..compare.locate import FEWEST, LevelTrack, fit_places, level_track, locate
 from ..logs.records import Stream
 from ..propagation.field.baselines import free_space_dbm
+from ..site.antennas import MeasuredPattern
 from ..site.site import Site
 from .scored import unscored
 from .track import Track
@@ -104,8 +105,8 @@ class Placer:
         """True if the flight was flown near a tower of the site."""
         return any(self._near(tower.latitude_deg, tower.longitude_deg) for tower in self.site.towers.values())
 
-    def levels(self, stream: Stream, floor_db: float = -np.inf) -> LevelTrack:
-        """Levels of a log where the UAV flew."""
+    def levels(self, stream: Stream, floor_db: float = -np.inf, airframe: MeasuredPattern | None = None) -> LevelTrack:
+        """Levels of a log where the UAV flew, with the gain of its airframe where it is known."""
         frame = stream.frame[~unscored(stream.frame)]
         poses = self.track.pose_at(frame["time"])
         place = np.where((poses.position_m[:, 2] > self.track.ground_m + LOW_M)[:, None], poses.position_m, np.nan)
@@ -113,7 +114,17 @@ class Placer:
         level = frame["rss_db"].to_numpy(np.float64)
         heard = frame["flag"].astype(str).str.contains("out_of_coverage").to_numpy()
         level = np.where(np.isnan(level) & heard & np.isfinite(floor_db), floor_db, level)
-        return level_track(time, place, level, floor_db=floor_db)
+        track = level_track(time, place, level, floor_db=floor_db)
+        if airframe is None or not len(track.time_s):
+            return track
+        rotation = self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation
+
+        def gain_db(towards: FloatArray) -> FloatArray:
+            own = np.einsum("nji,mnj->mni", rotation, towards)
+            theta = np.arctan2(np.hypot(own[..., 0], own[..., 1]), own[..., 2])
+            return airframe.gain_dbi(theta, np.arctan2(own[..., 1], own[..., 0]))
+
+        return replace(track, airframe_db=gain_db)
 
     def propose(self, track: LevelTrack) -> Placement | None:
         """Tower, listed place or estimated place that the levels fit; None where they are too few."""

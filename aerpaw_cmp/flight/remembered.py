@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..common.errors import InputError, UsageError
-from ..site.learned import Entry, Errors, Learned, LearnedLock, find_named, read_learned
+from ..site.learned import Entry, Errors, Learned, LearnedLock, find_named, folder_of, read_learned
+from ..site.sphere_pattern import SpherePattern, read_sphere_csv
 from .data import FlightData, RssSeries, site_place
 from .settings import FlightFile, with_learned
 
@@ -87,6 +89,33 @@ def propose(known: Learned, site: str, series: Sequence[SeriesKey], nodes: Nodes
         receiver=f"{site}/{receivers[0][0]}" if receivers else None,
         receiver_about=receivers[0][1].about() if receivers else "",
     )
+
+
+def searching_airframe(
+    site: str | Path, towers: Collection[str], series: tuple[str, str], log: str
+) -> SpherePattern | None:
+    """The airframe that flights taught with a node of theirs, for the search of a node; None where none fits.
+
+    Parameters
+    ----------
+    site : str or Path
+        As :func:`.read_learned` takes it.
+    towers : collection of str
+        Of the site: what was learned with one of them says little about a search.
+    series : (channel, reader)
+    log : str
+        SHA-256 of the log, which must not have been learned from.
+
+    Returns
+    -------
+    SpherePattern or None
+    """
+    with suppress(InputError, UsageError):
+        for entry in read_learned(site).entries.values():
+            for s in entry.series:
+                if (s.channel, s.reader) == series and s.tower not in towers and log not in entry.trained_on:
+                    return read_sphere_csv(folder_of(site) / s.uav_file)
+    return None
 
 
 def offered(data: FlightData) -> FlightFile | None:

@@ -71,7 +71,9 @@ def test_fit_equals_the_exact_gaussian_process(own_sd, noise_sd):
         k = 2.5**2 * np.exp(-cdist(b1, b2) / 0.5)
         return k + 3.0**2 * np.exp(-cdist(m1, m2) / 0.4) * (s1[:, None] == s2[None])
 
-    own = (own_sd**2 * np.exp(-cdist(where, where) / 20.0) + 1e4 * noise_sd**2) * same + noise_sd**2 * np.eye(len(where))
+    own = (own_sd**2 * np.exp(-cdist(where, where) / 20.0) + 1e4 * noise_sd**2) * same + noise_sd**2 * np.eye(
+        len(where)
+    )
     y = np.concatenate([s.residual_db - s.residual_db.mean() for s in train])
     weights = np.linalg.solve(kernel(body, mast, series, body, mast, series) + own, y)
     for i, test in enumerate(TEST):

@@ -115,6 +115,22 @@ def test_a_flight_without_shadowing_finds_its_node() -> None:
     assert estimate.slope == pytest.approx(3.0, abs=2.0 * estimate.slope_sd)
 
 
+def test_the_gain_of_the_airframe_keeps_the_node_from_moving_to_where_the_nose_points() -> None:
+    """Twelve dB more ahead than behind on a flight that looks north: without it the level says the node is south."""
+    time, position = _lawnmower(75)
+    node = np.array([40.0, -70.0, 1.5])
+    away = node - position
+    distance = np.linalg.norm(away, axis=1)
+
+    def ahead(towards: FloatArray) -> FloatArray:
+        return 6.0 * towards[..., 1]
+
+    level = -30.0 * np.log10(distance) + ahead(away / distance[:, None])
+    plain, known = locate(LevelTrack(time, position, level)), locate(LevelTrack(time, position, level, -np.inf, ahead))
+    assert np.hypot(*(plain.place_m - node)[:2]) > 40.0
+    assert np.hypot(*(known.place_m - node)[:2]) < 15.0
+
+
 def test_odds_tell_the_right_place_from_wrong_ones() -> None:
     wrong = np.array([[600.0, 0.0, 10.0], [0.0, -700.0, 10.0]])
     odds = [locate(track, [[*truth, 1.5], *wrong]).log_odds for track, truth in _flights(8, -np.inf)]

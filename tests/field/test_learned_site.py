@@ -90,6 +90,12 @@ def test_an_unseen_flight_of_the_sounder_is_told_its_lock_by_other_flights(tmp_p
     assert numbers["P(detected) brier"] < 0.75 * numbers["P(detected) constant_brier"]
     assert numbers["P(detected) log_score"] < 0.75 * numbers["P(detected) constant_log_score"]
     assert numbers["floor"] < min(9.0, numbers["floor, free space"])
+    drafted = yaml.safe_load((tmp_path / "flight.yaml").read_text(encoding="utf-8"))["towers"]["NODE"]
+    surveyed = yaml.safe_load((HERE / "../calibrations/afar300_loc_2.yaml").read_text(encoding="utf-8"))["towers"][
+        "ROVER"
+    ]
+    north, east = (drafted[key] - surveyed[key] for key in ("latitude_deg", "longitude_deg"))
+    assert np.hypot(111_000.0 * north, 90_400.0 * east) < 40.0
 
 
 @pytest.mark.parametrize("name", ["dataset12", "lte", "nr_rank", pytest.param("afar", marks=pytest.mark.skipif(

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.flight.remembered import Nodes, propose
+from aerpaw_cmp.flight.remembered import Nodes, propose, searching_airframe
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.site.learned import (
     Entry,
@@ -55,6 +55,22 @@ def flight(folder: Path, antennas: dict[str, str], carrier_hz: float = CARRIER_H
     path = folder / "flight.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path
+
+
+@pytest.mark.parametrize(
+    ("site", "towers", "series", "log", "fits"),
+    [
+        ("mine.yaml", [], ("A", "flight_mat"), "b" * 64, True),
+        ("mine.yaml", ["LW1"], ("A", "flight_mat"), "b" * 64, False),  # learned with a tower that needs no search
+        ("mine.yaml", [], ("A", "flight_mat"), "a" * 64, False),  # learned from this very log
+        ("mine.yaml", [], ("B", "flight_mat"), "b" * 64, False),
+        ("none.yaml", [], ("A", "flight_mat"), "b" * 64, False),
+    ],
+)
+def test_a_search_takes_the_airframe_of_other_flights_alone(folder, site, towers, series, log, fits) -> None:
+    found = searching_airframe(folder / site, towers, series, log)
+    assert (found is not None) == fits
+    assert found is None or found.gain_dbi(0.3, 0.4) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:

@@ -24,7 +24,7 @@ ELEVATION_SD_DB = 5.0
 SHADOW_SD_DB, SHADOW_S, SCATTER_SD_DB = 8.0, 30.0, 4.0
 """Shadowing, how long it is remembered, and scatter of medians over some seconds.
 
-With them the regions hold the surveyed rover on the six AFAR and sounder flights that docs/research/locate.md names.
+With them the regions hold the surveyed rover on the six AFAR and sounder flights that docs/formats.md names.
 """
 
 SYSTEMATIC_M = 20.0

@@ -97,6 +97,16 @@ class AntennaSettings(Settings):
     polarised: bool = True
     """Use both field components of a text pattern; false: its total gain on the element's slant."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _gone(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("installed_db"):
+            raise ValueError(
+                "installed_db is gone: 'aerpaw-cmp calibrate' writes the gain of mast and airframe as an antenna file "
+                "(model: sphere, file: ...)"
+            )
+        return {key: value for key, value in data.items() if key != "installed_db"} if isinstance(data, dict) else data
+
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
         if (self.file is None) != (self.model not in ("file", "gain_grid", "sphere")):

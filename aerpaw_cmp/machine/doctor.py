@@ -216,24 +216,30 @@ def readers_check() -> Check:
 
 def holders(device: str) -> list[str]:
     """Processes that have a device open, as ``name (pid)``; those of other users are visible to root only."""
-    from ..live import ports
-
+    try:
+        from ..live import ports
+    except ImportError:  # no termios: not a system that the tap runs on
+        return []
     return [f"{holder.name} ({holder.pid})" for holder in ports.holders(Path(device), others_only=False)]
 
 
 def serial_checks() -> Iterator[Check]:
-    """AT ports of Quectel modems, whether this user may open them and who holds them; no port is opened."""
+    """Serial ports, whether this user may open them and who holds them; no port is opened."""
     if missing := [name for name in ("fcntl", "termios") if not _importable(name)]:
         found = f"this system has no {' and no '.join(missing)}: 'tap' and 'modem-sim' need Linux, all else works"
         yield Check("Serial", "warn", found, "run the tap on Linux")
         return
-    from ..live.ports import find_candidates
-
-    ports = find_candidates()
+    try:
+        from serial.tools import list_ports
+    except ImportError as error:
+        what = "pyserial is not installed" if not _importable("serial") else f"pyserial cannot be loaded ({error})"
+        yield Check("Serial", "fail", what, "make setup")
+        return
+    ports = sorted(port for port in list_ports.comports() if port.vid is not None or "ttyS" not in port.device)
     if not ports:
-        yield Check("Serial", "ok", "no AT port of a Quectel modem: plug it in to use 'aerpaw-cmp tap'")
+        yield Check("Serial", "ok", "no USB serial port: plug the modem in to use 'aerpaw-cmp tap'")
     for port in ports:
-        yield serial_check(str(port.path), port.product or "")
+        yield serial_check(port.device, port.description or "")
 
 
 def _importable(name: str) -> bool:

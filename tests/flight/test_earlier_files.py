@@ -65,3 +65,10 @@ def test_interactions_of_sionna_are_refused_with_what_to_write_instead(tmp_path:
     assert "rt.interactions" in written(tmp_path, "rt: {interactions: [reflection]}\n").flight.notes[0]
     with pytest.raises(UsageError, match=r"flight\.yaml, line 3: rt: .*use diffraction: edges and refraction: true"):
         written(tmp_path, "rt: {engine: sionna, interactions: [reflection, diffraction]}\n")
+
+
+def test_a_gain_written_by_hand_is_refused_with_what_to_write_instead(tmp_path: Path) -> None:
+    antenna = "link: {rss: {carrier_hz: 3.3e9, uav: {antenna: {model: dipole, installed_db: %s}}}}\n"
+    assert written(tmp_path, antenna % "[]").link.rss.uav.antenna.model == "dipole"
+    with pytest.raises(UsageError, match=r"flight\.yaml, line 3: .*installed_db is gone.*model: sphere"):
+        written(tmp_path, antenna % "[1.0, 2.0]")

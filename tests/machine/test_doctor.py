@@ -159,8 +159,16 @@ def test_a_port_that_is_not_ours_names_the_group(monkeypatch: pytest.MonkeyPatch
     assert check.remedy == "sudo usermod -aG dialout $USER, then log in anew"
 
 
-def test_a_system_without_fcntl_has_no_tap(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_fcntl_nothing_is_said_about_pyserial(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fcntl", None)
     (check,) = doctor.serial_checks()
     assert check.status == "warn"
     assert "no fcntl: 'tap' and 'modem-sim' need Linux" in check.found
+    assert "pyserial" not in check.found
+
+
+def test_a_missing_pyserial_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("serial", "serial.tools", "serial.tools.list_ports"):
+        monkeypatch.setitem(sys.modules, name, None)
+    (check,) = doctor.serial_checks()
+    assert (check.status, check.found) == ("fail", "pyserial is not installed")

@@ -52,6 +52,8 @@ RULES = (
 
 TESTS = (
     *(f"{base}/{room}" for base in ("tests", "aerpaw_cmp") for room in (*ROOMS, "jobs")),
+    "tests/site",
+    "tests/report/test_diff.py",
     "tests/test_round_trip.py",
     "tests/test_equations.py",
     "tests/test_public_face.py",

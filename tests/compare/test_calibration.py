@@ -214,3 +214,38 @@ def test_a_line_over_distance_is_the_one_that_least_squares_finds_outside() -> N
                 free[~outside] + (measured - free)[outside].mean()
             )
             assert np.isnan(simple.line_db[outside]).all()
+
+
+def test_a_stretch_left_out_is_learned_from_the_flight_twenty_seconds_away_and_from_others_whole() -> None:
+    one, same, other = observed("a"), observed("a").part(np.arange(3, 190)), observed("b")
+    parts = calibration.route_parts(one, same)
+    counted = np.zeros(len(one.samples), dtype=int)
+    for k, (inside, outside) in enumerate(parts):
+        counted += inside
+        time, there = one.samples.time_s[inside], same.samples.time_s
+        assert np.ptp(time) == pytest.approx(398.0 / 8, abs=2.1)
+        apart = np.maximum(time.min() - there, there - time.max())
+        assert (apart[outside] >= calibration.GUARD_S - 2.0).all()  # a stretch ends between two samples of 2 s
+        assert (apart[~outside] <= calibration.GUARD_S + 2.0).all()
+        assert time.min() == pytest.approx(k * 398.0 / 8, abs=2.0)
+    assert (counted == 1).all()
+    for (inside, whole), (mine, _) in zip(calibration.route_parts(one, other), parts, strict=True):
+        assert whole.all()
+        assert np.array_equal(inside, mine)
+
+
+def test_controls_turn_the_uav_as_an_aircraft_of_the_opposite_heading_or_none_sees_the_tower() -> None:
+    heading = np.radians(np.random.default_rng(1).uniform(-180.0, 180.0, 200))
+
+    def seen(turn: np.ndarray, world: np.ndarray) -> np.ndarray:
+        c, s, z = np.cos(turn), np.sin(turn), np.zeros(len(turn))
+        back = np.stack([np.stack([c, s, z], -1), np.stack([-s, c, z], -1), np.stack([z, z, z + 1.0], -1)], axis=1)
+        return np.einsum("nij,nj->ni", back, world)
+
+    plain = observed("a")
+    world = -plain.samples.at_tower
+    flown = calibration._with_uav(plain, seen(heading, world))
+    (wrong,), (none,) = calibration.wrong_way([flown]), calibration.world_frame([flown])
+    np.testing.assert_allclose(wrong.samples.at_uav, seen(-heading, world), atol=1e-12)
+    np.testing.assert_allclose(none.samples.at_uav, world, atol=1e-12)
+    assert np.array_equal(wrong.samples.at_tower, plain.samples.at_tower)

@@ -261,6 +261,8 @@ def test_directions_that_are_not_known_are_not_predicted():
     assert np.isnan(gain[:7]).all()
     assert np.isnan(sd[:7]).all()
     assert np.isfinite(gain[7:]).all()
+    part = dataclasses.replace(TEST[0], at_uav=lost)
+    np.testing.assert_allclose(fit.mean(part), gain, atol=1e-9)
 
 
 def test_the_evidence_is_that_of_the_dense_covariance_at_any_noise():

@@ -1,6 +1,7 @@
 """The residual field: closed forms, a second way in plain loops, planted fields whose intervals hold."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -234,3 +235,23 @@ def test_levels_of_flights_need_no_neighbours():
     near, every = (fit.predict(rows.part(slice(0, 80, 20)), ("mean", "offset"), exact=exact) for exact in (False, True))
     np.testing.assert_allclose(near[0], every[0], atol=1e-6)
     np.testing.assert_allclose(near[1], every[1], atol=1e-6)
+
+
+def test_long_flights_are_thinned_to_whole_stretches_from_end_to_end():
+    rows = rows_at(np.arange(6000.0).reshape(2000, 3), time=np.arange(2000.0))
+    some, value = field_gp._evenly(rows, np.arange(2000.0))
+    assert np.array_equal(some.time_s, value)
+    runs = np.split(value, np.flatnonzero(np.diff(value) > 1) + 1)
+    assert [len(run) for run in runs] == [field_gp.FIT_ROWS // 7] * 7
+    assert (value[0], value[-1]) == (0.0, 1999.0)
+    gaps = [b[0] - a[-1] for a, b in itertools.pairwise(runs)]
+    assert max(gaps) - min(gaps) <= 1.0
+    assert field_gp._evenly(some, value)[0] is some
+
+
+def test_all_strengths_are_scaled_together():
+    twice = MOVING.scaled(2.0)
+    rows = flights(np.random.default_rng(1), each=5)
+    np.testing.assert_allclose(field_gp.covariance(twice, rows, rows), 4.0 * field_gp.covariance(MOVING, rows, rows)
+                               - 3.0 * field_gp.MEAN_SD_DB**2)  # fmt: skip
+    assert twice.noise_sd_db == 2.0 * MOVING.noise_sd_db

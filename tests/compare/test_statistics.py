@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 
 from aerpaw_cmp.compare import statistics
+from aerpaw_cmp.compare.memory import power_draws
 from aerpaw_cmp.compare.passes import Visit, repeatability, same_places
 from aerpaw_cmp.compare.statistics import (
     Autocorrelation,
@@ -219,6 +220,16 @@ def test_a_paired_difference_sees_what_two_intervals_of_their_own_hide():
     assert back.verdict == "better"
     assert back.difference_ci95_db == pytest.approx((-found.difference_ci95_db[1], -found.difference_ci95_db[0]))
     assert back.in_words("b").startswith("better than b by 0.3 dB")
+
+
+def test_beside_a_model_without_error_the_whole_error_of_the_other_is_the_difference():
+    error = shadowing(np.random.default_rng(14), 300, 5, 4.0)
+    low, high = np.quantile(power_draws(error - error.mean()), [0.025, 0.975])
+    found, back = paired_difference(error, np.zeros(300)), paired_difference(np.zeros(300), error)
+    assert (found.verdict, back.verdict) == ("worse", "better")
+    assert found.mean_square_ci95_db2 == pytest.approx((low, high))
+    assert back.mean_square_ci95_db2 == pytest.approx((-high, -low))
+    assert paired_difference(np.zeros(300), np.zeros(300)).difference_ci95_db == (0.0, 0.0)
 
 
 def test_models_of_equal_error_are_called_different_at_most_as_often_as_stated():

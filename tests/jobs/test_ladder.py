@@ -219,3 +219,12 @@ def test_a_rung_with_diffraction_states_its_key() -> None:
     assert recommended_settings({"rt": {"max_depth": 1}}, model)["rt"]["diffraction"] == "edges"
     plain = Model(ground="power sum", buildings=True)
     assert "diffraction" not in recommended_settings({"rt": {"max_depth": 1, "diffraction": "all"}}, plain)["rt"]
+
+
+def test_channels_that_share_a_replay_cost_its_seconds_once() -> None:
+    """Ten channels of one replay of 5 s, and one of another tower of 2 s: 7 s, not 52 s."""
+    rss = [SimpleNamespace(tower="LW1", settings_key="{}")] * 10 + [SimpleNamespace(tower="LW2", settings_key="{}")]
+    climber = SimpleNamespace(_data=SimpleNamespace(rss=rss))
+    assert _Climber._of_flight(climber, [5.0] * 10 + [2.0]) == 7.0  # type: ignore[arg-type]
+    other = [*rss[:2], SimpleNamespace(tower="LW1", settings_key='{"carrier_hz": 1}')]
+    assert _Climber._of_flight(SimpleNamespace(_data=SimpleNamespace(rss=other)), [5.0, 4.0, 3.0]) == 8.0  # type: ignore[arg-type]

@@ -314,5 +314,9 @@ def test_few_points():
     assert fit.degenerate
     assert "cannot tell" in fit.message
     assert fit([0.0, 30.0]) == pytest.approx([1.0, 0.5], abs=1e-6)
+    two = fit_biexponential([0.0, 30.0, 30.0], [1.0, 0.5, 0.7])  # one curve cannot meet both
+    assert two.degenerate
+    assert two([0.0, 30.0]) == pytest.approx([1.0, 0.6], abs=1e-6)
+    assert two.rmse == pytest.approx(0.1 * np.sqrt(2 / 3))
     with pytest.raises(UsageError, match="usable points"):
         fit_biexponential([0.0], [1.0])

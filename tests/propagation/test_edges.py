@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shapely.geometry import LineString, box
+from shapely.geometry import LineString, Point, Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
@@ -21,6 +21,7 @@ from aerpaw_cmp.propagation.faces import site_faces, triangles
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.search.edges import _below
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.site.mitsuba import TriangleScene
@@ -260,8 +261,6 @@ def test_silent_places_are_reached() -> None:
 
 
 def _points(spots: np.ndarray) -> list:
-    from shapely.geometry import Point
-
     return [Point(p[:2]) for p in spots]
 
 
@@ -355,6 +354,30 @@ def test_a_box_of_triangles_diffracts_as_a_prism() -> None:
         one, two = (trace(site, LINK, where, diffraction=mode) for site in (prism, mesh))
         assert len(one.edge_paths or ()) == len(two.edge_paths or ()) > 8
         assert np.abs(one.h - two.h).max() < 1e-6 * np.abs(one.h).max()
+
+
+def test_the_face_below_a_point_is_the_highest_beneath_it() -> None:
+    """Tilted, overlapping and upright triangles: heights by shapely's interpolation on their corners."""
+    pytest.importorskip("numba")
+    generator = np.random.default_rng(4)
+    corners = generator.uniform([-9, -9, 0], [9, 9, 6], (25, 3, 3))
+    corners[0, :, 0] = 3.0  # upright
+    scene = TriangleScene(
+        corners.reshape(-1, 3), np.arange(75).reshape(-1, 3), np.arange(25), tuple(map(str, range(25))), ("metal",) * 25
+    )
+    surfaces = merged(scene)
+    points = generator.uniform([-9, -9, 1], [9, 9, 8], (60, 3))
+    points[7] = np.nan
+    expected = []
+    for point in points:
+        best = (-np.inf, -1)
+        for triangle, face in zip(surfaces.corners_m, surfaces.face.tolist(), strict=True):
+            if np.isfinite(point).all() and Polygon(triangle[:, :2]).contains(Point(point[:2])):
+                height = triangle[:, 2] @ np.linalg.solve(np.vstack([triangle[:, :2].T, np.ones(3)]), [*point[:2], 1.0])
+                best = max(best, (height, face)) if height < point[2] else best
+        expected.append(best[1])
+    assert _below(surfaces, points).tolist() == expected
+    assert min(expected.count(-1), len(set(expected))) > 5
 
 
 def test_the_border_of_a_sheet_is_a_half_plane() -> None:

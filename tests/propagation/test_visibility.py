@@ -1,17 +1,22 @@
 """Each element pair with its own paths."""
 
+import itertools
+
 import numpy as np
 import pytest
 from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation.arrays import Array, linear_array, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.check import field_audit
 from aerpaw_cmp.propagation.check.field_audit import per_pair
 from aerpaw_cmp.propagation.drivers.pairs import replay_pairs
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.search import sionna
 from aerpaw_cmp.site.site import Building
 
 
@@ -71,6 +76,71 @@ def test_few_links_of_the_bench_scene_differ():
     differs = change > 1e-6
     assert 0 < differs.mean() < 0.1
     assert change[~differs].max() < 1e-9
+
+
+def shadowed(scenes):
+    """A wall that ends beside the straight way to some poses; the elements of the UAV lie a metre apart."""
+    site = scenes.site([Building("wall", box(20, 0, 20.5, 30), 30.0)], ((0.0, 0.0, 10.0), (5.0, -3.0, 12.0)))
+    two = Array(np.array([[0.0, 0.5, 0.0], [0.0, -0.5, 0.0]]), np.zeros(2))
+    spots = np.column_stack([np.linspace(30, 160, 14), np.linspace(-1.4, 1.6, 14), np.linspace(10, 14, 14)])
+    return site, scenes.link(site, uav_array=two, uav_transmits=False), scenes.poses(spots)
+
+
+def by_pairs(scenes):
+    site, link, poses = shadowed(scenes)
+    search = Search(max_depth=1)
+    return per_pair(site, link, poses, replay(site, link, poses, search), np.arange(1, 14), search, ks=(2.0, 10.0))
+
+
+def test_what_the_centre_alone_decides_is_counted(scenes, monkeypatch):
+    """Links that differ, the largest change of a level and ranks that change, one link at a time."""
+    monkeypatch.setattr(sionna, "own_channels", lambda _, links, *__, **___: np.zeros((len(links.targets_m), 2, 2, 1)))
+    site, link, poses = shadowed(scenes)
+    differ = ranks = 0
+    change = [0.0]
+    for k, tower in itertools.product(range(1, 14), range(2)):
+        spot = scenes.poses(poses.position_m[k : k + 1])
+        one, other = (each(site, link, spot, Search(max_depth=1)) for each in (replay, replay_pairs))
+        a, b = one.h[0, tower], other.h[0, tower]
+        differ += not np.allclose(a, b, rtol=1e-8, atol=0)
+        ranks += any(channel_rank(a, x) != channel_rank(b, x) for x in (2.0, 10.0))
+        level = abs(other.rss_dbm[0, tower] - one.rss_dbm[0, tower])
+        change += [level] if np.isfinite(level) else []
+    found = by_pairs(scenes)
+    assert (found.pairs_links, found.pairs_differ) == (26, differ)
+    assert (found.pairs_rank_differs, found.pairs_rss_max_db) == (ranks, pytest.approx(max(change)))
+    assert 0 < differ < 26
+    assert max(change) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("third", "rest", "wrong"), [(0.5, 0.001, False), (0.001, 0.5, True), (0.009, 0.009, False), (0.011, 0.011, True)]
+)
+def test_explicit_arrays_are_judged_by_the_better_half_of_the_nearest_links(scenes, monkeypatch, third, rest, wrong):
+    """Planted: matrices that are wrong by one share on every third link, and by another on the rest."""
+    asked, shares = [], []
+
+    def own(faces, links, rotation, link, rays, *, explicit, surfaces=None):
+        asked.append(links.targets_m)
+        site, _, _ = shadowed(scenes)
+        h = replay_pairs(site, link, scenes.poses(links.targets_m, rotation), Search(max_depth=rays.max_depth)).h
+        assert explicit
+        share = np.where(np.arange(len(h) * 2) % 3 == 0, third, rest).reshape(len(h), 2)
+        largest = np.abs(h).max(axis=(2, 3), keepdims=True)
+        shares.extend(share[largest[..., 0, 0] > 0])
+        return h + share[..., None, None] * largest
+
+    monkeypatch.setattr(sionna, "own_channels", own)
+    found = by_pairs(scenes)
+    site, _, poses = shadowed(scenes)
+    away = np.min([np.linalg.norm(poses.position_m[1:] - t.position_m, axis=1) for t in site.towers.values()], axis=0)
+    nearest = np.sort(away)[: field_audit.EXPLICIT_POSES]
+    assert sorted(np.min([np.linalg.norm(asked[0] - t.position_m, axis=1) for t in site.towers.values()], axis=0)) == (
+        pytest.approx(nearest[nearest < field_audit.EXPLICIT_RANGE_M])
+    )
+    assert found.explicit_links == len(shares) < 2 * len(asked[0])
+    assert found.explicit_max_error == pytest.approx(sorted(shares)[: (len(shares) + 1) // 2][-1], rel=1e-6, abs=1e-9)
+    assert bool(found.failures) == wrong
 
 
 def test_pairs_need_the_image_engine(scenes):

@@ -1,0 +1,68 @@
+"""Dotted keys that change checked settings: copies that are begun from others, elements of lists, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.flight.overrides import overridden
+from aerpaw_cmp.flight.settings import FlightFile, load_flight
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
+
+
+@pytest.fixture(scope="module")
+def settings() -> FlightFile:
+    return load_flight(SAMPLE)
+
+
+def test_a_key_changes_itself_alone(settings: FlightFile) -> None:
+    changed = overridden(settings, {"rt.max_depth": 1})
+    before, after = settings.model_dump(), changed.model_dump()
+    assert after["rt"].pop("max_depth") == 1 != before["rt"].pop("max_depth")
+    assert before == after
+    assert overridden(settings, {}) is settings
+    assert overridden(settings, {"rt.maximum_gap_s": 7.0}).rt.advanced.maximum_gap_s == 7.0  # as 0.3 named it
+    log = overridden(settings, {"logs.1.channel": "Z"})
+    assert [one.channel for one in log.logs] == ["Z" if k == 1 else one.channel for k, one in enumerate(settings.logs)]
+
+
+def test_new_channels_and_towers_begin_as_copies_whatever_the_order(settings: FlightFile) -> None:
+    keys = {
+        "link.channels.NEW.towers.LW1.yaw_deg": 12.0,
+        "link.rss.tower.yaw_deg": 33.0,
+        "link.rss.towers.LW2.roll_deg": 5.0,
+    }
+    for order in (list(keys), list(keys)[::-1]):
+        changed = overridden(settings, {key: keys[key] for key in order}).link
+        assert (changed.rss.tower.yaw_deg, changed.rss.towers["LW2"].yaw_deg) == (33.0, 33.0)
+        assert changed.rss.towers["LW2"].roll_deg == 5.0
+        new = changed.channels["NEW"]
+        assert new.towers["LW1"].yaw_deg == 12.0
+        assert (new.tower.yaw_deg, new.carrier_hz) == (33.0, settings.link.rss.carrier_hz)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("rt.max_deph", 1, "no key 'max_deph' below 'rt'.*max_depth"),
+        ("rtt", 1, "no key 'rtt'.*'rt'"),
+        ("rt.engine.kind", 1, "goes below 'rt.engine', which is a value"),
+        ("rt.max_depth.more.still", 1, "goes below 'rt.max_depth', which is a value"),
+        ("logs.99.node", "LW1", "no element '99'.*0 to"),
+        ("logs.-1.node", "LW1", "no element '-1'"),
+        ("rt.max_depth", "deep", "'rt.max_depth': found 'deep'"),
+    ],
+)
+def test_a_mistake_is_named_with_what_was_meant(settings: FlightFile, key: str, value: object, words: str) -> None:
+    with pytest.raises(UsageError, match="(?s)" + words):
+        overridden(settings, {key: value})
+
+
+def test_the_last_element_of_a_list_is_one_and_the_next_is_none(settings: FlightFile) -> None:
+    count = len(settings.logs)
+    assert overridden(settings, {f"logs.{count - 1}.channel": "Q"}).logs[-1].channel == "Q"
+    with pytest.raises(UsageError, match=f"0 to {count - 1}"):
+        overridden(settings, {f"logs.{count}.channel": "Q"})

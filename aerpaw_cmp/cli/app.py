@@ -55,7 +55,11 @@ Scheduler = Annotated[
 ]
 Flights = Annotated[
     list[Path] | None,
-    typer.Option("--with", metavar="FLIGHT", help="Flown flight.yaml to learn from; repeatable."),
+    typer.Option(
+        "--with",
+        metavar="FLIGHT",
+        help="Flown flight.yaml to learn from, or calibration.yaml: its flights; repeatable.",
+    ),
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print stages and time estimate; write nothing.")]
 Quiet = Annotated[

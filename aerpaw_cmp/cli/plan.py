@@ -67,9 +67,8 @@ def plan(
         fence=geofence,
         avoid=tuple(avoid or ()),
         routes=tuple(routes or ()),
-        site=site,
         towers=tuple(tower or ()),
-        target=Asked(heights_m=tuple(target_height or (40.0,)), spacing_m=60.0),
+        target=Asked(heights_m=tuple(target_height or (40.0,)), spacing_m=60.0, site=site),
     )
     outcome = run_plan(
         target, flights or (), asked, RunOptions(out=out, logs_root=logs_root, force=force, progress=say)

@@ -16,6 +16,7 @@ from .shown import number, print_json, say, table
     "predict",
     examples=[
         "aerpaw-cmp predict plan.kml --with flight1.yaml --with flight2.yaml -o prediction",
+        "aerpaw-cmp predict plan.kml --site lake_wheeler -o prediction",
         "aerpaw-cmp predict next_flight.yaml --with flight1.yaml --threshold -95",
         "aerpaw-cmp predict lake_wheeler --with flight1.yaml --height 40 --height 80 --spacing 30",
     ],
@@ -30,6 +31,7 @@ def predict(
         ),
     ],
     flights: Flights = None,
+    site: Annotated[str | None, typer.Option(help="Site of a route or of points, without --with.")] = None,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/prediction-<WHERE>]"),
@@ -56,7 +58,7 @@ def predict(
     outcome = run_predict(
         where,
         flights or (),
-        Asked(heights_m=tuple(height or (40.0,)), spacing_m=spacing, heading_deg=heading),
+        Asked(heights_m=tuple(height or (40.0,)), spacing_m=spacing, heading_deg=heading, site=site),
         RunOptions(out=out, logs_root=logs_root, force=force, progress=say),
         threshold_db=threshold,
     )

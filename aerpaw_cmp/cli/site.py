@@ -180,6 +180,9 @@ def map_(
         Path | None, typer.Option(help="flight.yaml whose track is the training set of the test 'along a flight'.")
     ] = None,
     flights: Flights = None,
+    remembered: Annotated[
+        bool, typer.Option("--remembered", help="Correct by what the site remembers, without --with.")
+    ] = False,
     logs_root: LogsRoot = None,
     threshold_dbm: Annotated[
         float | None, typer.Option(help="Lowest level in coverage [dBm]  [default: any path is coverage]")
@@ -217,7 +220,7 @@ def map_(
     if dry_run:
         print_plan(run.plan_map(site, settings, options, flight=flight), as_json)
         return
-    outcome = run.run_map(site, settings, options, flight=flight, flights=flights or ())
+    outcome = run.run_map(site, settings, options, flight=flight, flights=flights or (), remembered=remembered)
     if as_json:
         print_json(outcome.metrics)
         return

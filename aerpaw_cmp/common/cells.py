@@ -17,7 +17,8 @@ def guarded(table: Any) -> Any:
         if table[name].dtype.kind == "O" or str(table[name].dtype).startswith("str"):
             words = [word for word in table[name].unique() if isinstance(word, str) and word.startswith(_FORMULA)]
             if words:
-                guarded_columns[name] = table[name].replace({word: f"'{word}" for word in words})
+                texts = table[name].astype(object)
+                guarded_columns[name] = texts.replace({word: f"'{word}" for word in words})
     return table.assign(**guarded_columns) if guarded_columns else table
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.units import FloatArray, IntArray
-from .calibration import groups_of
+from .calibration import MOST_GROUPS, groups_of
 from .direction_gain import LinkSamples
 from .entries import crps_normal
 from .field_gp import NEW_FLIGHT, PARTS, FieldFit, FieldModel, Part, Rows, fit_field
@@ -34,6 +34,10 @@ BIN_S = 4.0
 
 BLOCK_M = 300.0
 """Side of the blocks of a single flight that are left out."""
+
+SCORED_GROUPS = 3
+"""Of more flights than :data:`~.calibration.MOST_GROUPS`, so many groups are left out in turn, and the strengths of a
+residual field that are learned without the first serve for all: one flight among many hardly moves them."""
 
 OFF = "no correction"
 
@@ -203,12 +207,12 @@ class _Fold:
 
 
 def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
-    """Each flight left out (or each of six groups); of a single flight, blocks of :data:`BLOCK_M`."""
+    """Each flight left out (or three of six groups); of a single flight, blocks of :data:`BLOCK_M`."""
     names = list(dict.fromkeys(s.flight for s in series))
     if len(names) > 1:
         return [
             _Fold([s for s in series if s.flight not in group], [s for s in series if s.flight in group])
-            for group in groups_of(names)
+            for group in groups_of(names)[: None if len(names) <= MOST_GROUPS else SCORED_GROUPS]
         ]
     cells = [np.floor(s.position_m[:, :2] / BLOCK_M).astype(np.int64) for s in series]
     every, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
@@ -221,8 +225,26 @@ def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
     return out
 
 
-def _score_fold(fold: _Fold, base: Base, titles: Sequence[str], tallies: Mapping[str, list[HeldOut]]) -> None:
-    """Add the errors of every residual field of a base; new flights count about their own mean."""
+def _score_fold(
+    fold: _Fold, base: Base, models: dict[str, FieldModel | None], tallies: Mapping[str, list[HeldOut]], *, keep: bool
+) -> None:
+    """Add the errors of every residual field of a base; new flights count about their own mean.
+
+    Parameters
+    ----------
+    fold : _Fold
+    base : callable
+    models : dict of str to FieldModel or None
+        By title; None: its strengths are learned here.
+    tallies : mapping of str to list
+        Receives the errors.
+    keep : bool
+        Put what is learned into ``models``.
+
+    Returns
+    -------
+    None
+    """
     flights = list(dict.fromkeys(s.flight for s in fold.known))
     predictor = base(fold.known)
     channels = _channels(fold.known, predictor, flights)
@@ -230,8 +252,10 @@ def _score_fold(fold: _Fold, base: Base, titles: Sequence[str], tallies: Mapping
     own = bool(asked) and asked[0].flight not in flights
     binned = [s.binned(BIN_S) for s in asked]
     known = [predictor(s) if s.antenna in channels else None for s in binned]
-    for title in titles:
-        model = _model(title, channels)
+    for title, known_model in models.items():
+        model = known_model or _model(title, channels)
+        if keep:
+            models[title] = model
         parts: tuple[Part, ...] = ("place", "drift") if own else PARTS
         for samples, gains in zip(binned, known, strict=True):
             if gains is None:
@@ -274,9 +298,11 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, beyond: 
     folds = _folds(series)
     tallies: dict[tuple[str, str], list[HeldOut]] = {(base, title): [] for base in bases for title in titles}
     for name, base in bases.items():
+        models: dict[str, FieldModel | None] = dict.fromkeys(titles)
         for fold in folds:
             if fold.known and fold.asked:
-                _score_fold(fold, base, titles, {t: tallies[name, t] for t in titles})
+                many = len({s.flight for s in series}) > MOST_GROUPS
+                _score_fold(fold, base, models, {t: tallies[name, t] for t in titles}, keep=many)
     held_out = {key: _joined(parts) for key, parts in tallies.items() if parts}
     crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*one)) for key, one in held_out.items()}
     best = min(crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
@@ -318,3 +344,34 @@ def fixed_base(gain: Callable[[LinkSamples], FloatArray]) -> Base:
         return lambda samples: (gain(samples), np.zeros(len(samples)))
 
     return learn
+
+
+MOST_DIRECTIONS = 5_000
+"""Of more samples at a time, a model of directions is evaluated once per degree of direction."""
+
+
+def by_degree(predictor: Predictor) -> Predictor:
+    """A model of directions that takes many samples a degree at a time (gains have lengths of 11 degrees and more).
+
+    What a degree has is kept: later parts of a run, and other headings, ask for much the same directions.
+    """
+    known: dict[str, tuple[IntArray, FloatArray]] = {}
+
+    def predict(samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        if len(samples) <= MOST_DIRECTIONS:
+            return predictor(samples)
+        cells = np.zeros(len(samples), dtype=np.int64)
+        for ray in (samples.at_tower, samples.at_uav):
+            for angle in (np.arctan2(ray[:, 1], ray[:, 0]), np.arcsin(np.clip(ray[:, 2], -1.0, 1.0))):
+                cells = 361 * cells + np.round(np.degrees(angle)).astype(np.int64) + 180
+        asked, first, member = np.unique(cells, return_index=True, return_inverse=True)
+        keys, values = known.get(samples.antenna, (np.zeros(0, dtype=np.int64), np.zeros((2, 0))))
+        new = ~np.isin(asked, keys)
+        if new.any():
+            keys, values = np.append(keys, asked[new]), np.hstack([values, predictor(samples.part(first[new]))])
+            order = np.argsort(keys)
+            keys, values = known[samples.antenna] = keys[order], values[:, order]
+        gain, sd = values[:, np.searchsorted(keys, asked)[member.ravel()]]
+        return gain, sd
+
+    return predict

@@ -33,11 +33,14 @@ MEAN_SD_DB = 100.0
 EXACT_ROWS = 3000
 """Rows of the exact solution: one matrix of 72 MB."""
 
-EXACT_WORK = 2.0e12
-"""Rows squared times targets: beyond it (some two minutes) only the nearest rows of a target are used."""
+EXACT_WORK = 2.0e11
+"""Rows squared times targets: beyond it (some ten seconds) only the nearest rows of a target are used."""
 
-NEAREST = 40
-"""Rows per target of the approximation."""
+NEAREST, MOST_NEAREST = 40, 160
+"""Rows of the approximation for a single target, and at most for targets that share them."""
+
+TOGETHER = 0.25
+"""Side of the cells in scaled space whose targets share their rows."""
 
 FIT_ROWS = 700
 """Rows of one channel from which scales are learned."""
@@ -251,7 +254,8 @@ class FieldFit:
         -----
         Beyond the exact solution the common mean and each flight's offset come from evenly thinned rows, and each
         target from its :data:`NEAREST` rows in the scaled space (Vecchia's conditioning; Datta et al. 2016,
-        doi 10.1080/01621459.2015.1044091).
+        doi 10.1080/01621459.2015.1044091). Targets of one cell share the rows nearest to their middle, the more of
+        them the more targets there are (Guinness 2018, doi 10.1080/00401706.2018.1437476).
         """
         mean, sd = np.full((2, len(targets)), np.nan)
         ends = targets.direction.reshape(len(targets), -1)
@@ -259,9 +263,7 @@ class FieldFit:
         exact = self.fits(int(known.sum())) if exact is None else exact
         good, some = np.flatnonzero(known), targets.part(known)
         step = max(AT_ONCE * 3 // max(ends.shape[1], 3), 1)
-        blocks = [slice(start, start + step) for start in range(0, len(good), step)]
-        moments = (self._exact if exact else self._nearest)(some, blocks, parts)
-        for block, (one, two) in zip(blocks, moments, strict=True):
+        for block, one, two in (self._exact if exact else self._nearest)(some, step, parts):
             mean[good[block]], sd[good[block]] = one, two
         return mean, sd
 
@@ -279,20 +281,21 @@ class FieldFit:
         return lower, np.asarray(solve_triangular(lower, value, lower=True, check_finite=False))
 
     def _exact(
-        self, targets: Rows, blocks: Sequence[slice], parts: Collection[Part]
-    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+        self, targets: Rows, step: int, parts: Collection[Part]
+    ) -> Iterator[tuple[slice | IntArray, FloatArray, FloatArray]]:
         from scipy.linalg import solve_triangular
 
         lower, white = self._whitened
         prior = prior_sd_db(self.model, parts) ** 2
-        for block in blocks:
+        for start in range(0, len(targets), step):
+            block = slice(start, start + step)
             across = covariance(self.model, targets.part(block), self.rows, parts)
             half = solve_triangular(lower, across.T, lower=True, overwrite_b=True, check_finite=False)
-            yield half.T @ white, np.sqrt(np.maximum(prior - np.einsum("nm,nm->m", half, half), 0.0))
+            yield block, half.T @ white, np.sqrt(np.maximum(prior - np.einsum("nm,nm->m", half, half), 0.0))
 
     def _nearest(
-        self, targets: Rows, blocks: Sequence[slice], parts: Collection[Part]
-    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+        self, targets: Rows, step: int, parts: Collection[Part]
+    ) -> Iterator[tuple[slice | IntArray, FloatArray, FloatArray]]:
         from scipy.spatial import cKDTree
 
         levels, level_sd = self._levels(targets, parts)
@@ -302,17 +305,23 @@ class FieldFit:
         asked = [part for part in near if part in parts]
         prior = prior_sd_db(self.model, asked) ** 2 if asked else 0.0
         turned = math.isfinite(self.model.turn) and targets.direction.ndim == 2
-        tree, count = cKDTree(self._scaled(self.rows, turned)), min(NEAREST, len(self.rows))
-        for part in blocks:
-            some = targets.part(part)
-            index = tree.query(self._scaled(some, turned), k=np.arange(1, count + 1))[1]
-            rows = self.rows.part(index)
-            across = covariance(self.model, some.part((slice(None), None)), rows, asked)[:, 0, :, None]
-            matrix = _noisy(self.model, covariance(self.model, rows, rows, near))
-            weight = np.linalg.solve(matrix, across)[..., 0]
-            left = prior - np.einsum("tm,tm->t", weight, across[..., 0])
-            mean = levels[part] + np.einsum("tm,tm->t", weight, value[index])
-            yield mean, np.sqrt(np.maximum(left, 0.0) + level_sd[part] ** 2)
+        tree, places = cKDTree(self._scaled(self.rows, turned)), self._scaled(targets, turned)
+        for part, shared in _cells(places, step):
+            most = min(NEAREST * len(part) ** (1 / 3), MOST_NEAREST) if shared else NEAREST
+            count = np.arange(1, min(round(most), len(self.rows)) + 1)
+            index = tree.query(places[part].mean(axis=0) if shared else places[part], k=count)[1]
+            rows, some = self.rows.part(index), targets.part(part)
+            if shared:  # (targets, rows) of one set of rows
+                across = covariance(self.model, some, rows, asked)
+                matrix = _noisy(self.model, covariance(self.model, rows, rows, near))
+                weight = np.linalg.solve(matrix, across.T).T
+            else:  # a set of rows per target
+                across = covariance(self.model, some.part((slice(None), None)), rows, asked)[:, 0, :]
+                matrix = _noisy(self.model, covariance(self.model, rows, rows, near))
+                weight = np.linalg.solve(matrix, across[..., None])[..., 0]
+            left = prior - np.einsum("tm,tm->t", weight, across)
+            mean = levels[part] + np.einsum("tm,tm->t", weight, np.broadcast_to(value[index], weight.shape))
+            yield part, mean, np.sqrt(np.maximum(left, 0.0) + level_sd[part] ** 2)
 
     def _scaled(self, rows: Rows, turned: bool) -> FloatArray:
         """Coordinates in which the place part falls off evenly, with or without the direction."""
@@ -331,6 +340,25 @@ class FieldFit:
         _, first, member = np.unique(targets.flight, return_index=True, return_inverse=True)
         mean_of, sd_of = fit.predict(targets.part(first), asked, exact=True)
         return mean_of[member], sd_of[member]
+
+
+FEWEST_TOGETHER = 8
+"""Targets of smaller cells have their own rows: many at a time are as cheap."""
+
+
+def _cells(places: FloatArray, step: int) -> Iterator[tuple[IntArray, bool]]:
+    """At most ``step`` targets (n, k) at a time: those of one cell, and then all others; True for those of one cell."""
+    cell = np.floor(places / TOGETHER).astype(np.int64)
+    _, member, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    member = member.ravel()
+    many = count[member] >= FEWEST_TOGETHER
+    order = np.flatnonzero(many)[np.argsort(member[many], kind="stable")]
+    for part in np.split(order, np.cumsum(count[count >= FEWEST_TOGETHER])[:-1]) if len(order) else ():
+        for start in range(0, len(part), step):
+            yield part[start : start + step], True
+    alone = np.flatnonzero(~many)
+    for start in range(0, len(alone), step):
+        yield alone[start : start + step], False
 
 
 def _noisy(model: FieldModel, matrix: FloatArray) -> FloatArray:

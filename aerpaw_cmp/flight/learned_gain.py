@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,16 +57,28 @@ def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain 
             ends[end] = pattern, _own(array, towards[end])
     if not ends:
         return None
-    square = np.zeros(len(ray))
-    for pattern, own in ends.values():
-        theta = np.arctan2(np.hypot(own[:, 0], own[:, 1]), own[:, 2])
-        square += pattern.gain_sd_db(theta, np.arctan2(own[:, 1], own[:, 0])) ** 2
-    pair_db, sd_db = np.zeros(len(ray)), np.sqrt(square)
+    pair_db, sd_db = pair_and_sd_db(ends)
+    return LearnedGain(pair_db=pair_db, sd_db=sd_db, notes=tuple(p.notes for p, _ in reversed(ends.values())))
+
+
+def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """Gain towards both ends at once (n,) and standard deviation (n,) of all learned gain together [dB].
+
+    ``ends``: pattern and directions (n, 3) in its frame, of ``uav`` and ``tower``, or one of them.
+    """
+    square = sum(pattern.gain_sd_db(*sphere_angles(own)) ** 2 for pattern, own in ends.values())
+    sd_db = np.sqrt(square)
     if len(ends) == 2:
         (uav, at_uav), (tower, at_tower) = ends["uav"], ends["tower"]
         if tower.pair is not None and uav.trained_on == tower.trained_on:  # of one and the same calibration
-            pair_db, sd_db = tower.pair.at(np.concatenate([at_uav, at_tower], axis=1), sd_db)
-    return LearnedGain(pair_db=pair_db, sd_db=sd_db, notes=tuple(p.notes for p, _ in reversed(ends.values())))
+            return tower.pair.at(np.concatenate([at_uav, at_tower], axis=1), sd_db)
+    return np.zeros(len(sd_db)), sd_db
+
+
+def sphere_angles(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Zenith angle and azimuth (n,) [rad] of directions (n, 3)."""
+    theta = np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
+    return np.asarray(theta), np.asarray(np.arctan2(direction[:, 1], direction[:, 0]))
 
 
 def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | float:

@@ -10,10 +10,64 @@ from pathlib import Path
 import numpy as np
 
 from ..common.errors import InputError, UsageError
-from ..site.learned import Entry, Errors, Learned, LearnedLock, find_named, folder_of, read_learned
+from ..common.units import FloatArray
+from ..compare.direction_gain import LinkSamples
+from ..site.learned import (
+    Entry,
+    Errors,
+    Learned,
+    LearnedLock,
+    LearnedSeries,
+    Named,
+    find_named,
+    folder_of,
+    read_learned,
+)
 from ..site.sphere_pattern import SpherePattern, read_sphere_csv
 from .data import FlightData, RssSeries, site_place
-from .settings import FlightFile, with_learned
+from .learned_gain import pair_and_sd_db, sphere_angles
+from .settings import FlightFile, check_logs, with_learned
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Remembered:
+    """Antennas of one tower and channel that a site remembers."""
+
+    entry: Entry
+    series: LearnedSeries
+    tower: SpherePattern
+    uav: SpherePattern
+
+    @property
+    def prior_variance_db2(self) -> float:
+        """Variance of the gains of both ends in directions that nobody has flown."""
+        return self.tower.largest_sd_db**2 + self.uav.largest_sd_db**2
+
+    def gain_db(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        """Gain of both ends (n,) and its standard deviation (n,) [dB]."""
+        ends = {"uav": (self.uav, samples.at_uav), "tower": (self.tower, samples.at_tower)}
+        pair_db, sd_db = pair_and_sd_db(ends)
+        return pair_db + sum(pattern.gain_dbi(*sphere_angles(own)) for pattern, own in ends.values()), sd_db
+
+
+def remembered(site: str | Path) -> dict[str, Remembered]:
+    """Antennas of the towers of a site that its memory holds, by ``tower.channel``; the latest made of each.
+
+    Raises
+    ------
+    UsageError, InputError
+        A memory or a table that is damaged.
+    """
+    folder, out = folder_of(site), {}
+    for entry in sorted(read_learned(site).entries.values(), key=lambda entry: entry.made):
+        for series in entry.series:
+            tower, uav = (read_sphere_csv(folder / file) for file in (series.tower_file, series.uav_file))
+            named = Named(entry=entry, part="", folder=folder)
+            for pattern, file in ((tower, series.tower_file), (uav, series.uav_file)):
+                check_logs(pattern.trained_on, named, folder / file)
+            out[f"{series.tower}.{series.channel}"] = Remembered(entry=entry, series=series, tower=tower, uav=uav)
+    return out
+
 
 SeriesKey = tuple[str, str, str]
 """Tower, channel (``rank`` of rank) and reader of a series of the draft."""

@@ -709,11 +709,11 @@ def _receiver_file(named: Named) -> str:
         content = json.loads(read_table(path, "a rank receiver"))
     except (OSError, ValueError) as error:
         raise InputError(f"cannot be read ({error})", expected="a rank receiver", path=path) from None
-    _check_logs(content.get("trained_on", []) if isinstance(content, dict) else [], named, path)
+    check_logs(content.get("trained_on", []) if isinstance(content, dict) else [], named, path)
     return str(path)
 
 
-def _check_logs(trained_on: Sequence[str], named: Named, path: Path) -> None:
+def check_logs(trained_on: Sequence[str], named: Named, path: Path) -> None:
     """Refuse a table that was learned from logs which its entry does not name: scores would trust the wrong ones."""
     strange = set(trained_on) - set(named.entry.trained_on)
     if strange:
@@ -752,7 +752,7 @@ def _with_antenna(
                 expected="an antenna of the same band",
             )
         path = named.folder / (series.uav_file if end == "uav" else series.tower_file)
-        _check_logs(read_sphere_csv(path).trained_on, named, path)
+        check_logs(read_sphere_csv(path).trained_on, named, path)
         antenna = AntennaSettings(model="sphere", file=str(path))
         if end == "uav":
             out[name] = link.model_copy(update={"uav": ArraySettings(antenna=antenna)})

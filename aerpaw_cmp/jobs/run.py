@@ -445,6 +445,7 @@ def run_map(
     *,
     flight: Path | None = None,
     flights: Sequence[Path] = (),
+    remembered: bool = False,
 ) -> JobOutcome:
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -457,7 +458,9 @@ def run_map(
     flight : Path, optional
         flight.yaml whose track trains the test "along a flight".
     flights : sequence of Path
-        Flight files that correct the levels (:mod:`.predict`).
+        Flight files that correct the levels and ranks (:mod:`.predict`).
+    remembered : bool
+        Correct by what the site remembers, where no flight is named.
 
     Returns
     -------
@@ -473,20 +476,22 @@ def run_map(
     from ..site.siteyaml import load_site
     from .mapping import coverage_map as mapping
     from .mapping.paper_table import paper_markdown, paper_rows
+    from .prediction.sources import files_of, named_flights
     from .tasks.workers import open_workers
 
+    known = named_flights(flights)
     place, progress, stages = load_site(site), options.progress, Stages(options.progress)
     folder = options.out or _map_folder(site)
-    inputs = [Path(site), *([] if flight is None else [flight]), *flights]
+    inputs = [Path(site), *([] if flight is None else [flight]), *files_of(known, options.logs_root)]
     with OutputFolder(folder, job="map", inputs=inputs, force=options.force) as output:
         file = [Path(site).absolute()] if Path(site).is_file() else []
         with open_workers(options.workers, options.scheduler, paths=file, progress=progress) as crew:
             outcome = mapping.make_maps(place, settings, stages, workers=crew, name=str(file[0] if file else site))
-        if flights:
+        if flights or remembered:
             from .prediction.corrected_map import corrected_maps
 
-            heights = settings.rss_altitudes_m
-            outcome.corrected = corrected_maps(site, settings.spacing_m, heights, flights, options.logs_root, stages)
+            heights = settings.rss_altitudes_m, settings.rank_altitudes_m
+            outcome.corrected = corrected_maps(site, settings.spacing_m, heights, known, options.logs_root, stages)
         if settings.study:
             if flight is not None:
                 outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, options.logs_root)

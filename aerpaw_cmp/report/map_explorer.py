@@ -52,12 +52,23 @@ def page_layers(data: MapsData) -> list[MapLayer]:
         MapLayer(
             quantity="Rank",
             unit="",
-            axes={"Tower": item.tower, "K": k_key(item.k), **_foliage(item.foliage), **_height(item.altitude_m)},
+            axes={"Tower": item.tower, "K": k_key(item.k or 0.0), **_foliage(item.foliage), **_height(item.altitude_m)},
             values=np.where(item.rank > 0, item.rank, np.nan),
             classes=RANK_CLASSES,
         )
         for item in (*data.rank, *data.rank_by_tower)
     ]
+    layers += [
+        MapLayer(
+            quantity="Rank, raw and corrected",
+            unit="",
+            axes={"Version": f"{'corrected' if item.k is None else 'raw'}, {item.source}", "Tower": item.tower,
+                  **_height(item.altitude_m)},
+            values=np.where(item.rank > 0, item.rank, np.nan),
+            classes=RANK_CLASSES,
+        )
+        for item in data.corrected_rank
+    ]  # fmt: skip
     layers += [
         MapLayer(
             quantity=item.name, unit=_unit(item.label), axes=_height(item.altitude_m), values=item.values,

@@ -91,7 +91,7 @@ def warnings(data: MapsData) -> list[str]:
             "the method, not the place."
         )
     if data.corrected_words:
-        out.append(f"Corrected by flights: {data.corrected_words}")
+        out.append(f"Corrected: {data.corrected_words}")
     for key, fit in data.metrics.get("correlation", {}).items():
         if fit["degenerate"]:
             out.append(f"Correlation fit ({key.replace('z_', 'Z ')}): {fit['message']}")

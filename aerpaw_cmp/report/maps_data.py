@@ -13,6 +13,7 @@ from typing import Any
 from ..common.units import FloatArray, IntArray
 from ..compare.statistics import Interval
 from ..site.site import Site
+from .names import k_key
 
 JOINT = "joint"
 """Name of the map in which the nearest tower serves."""
@@ -35,14 +36,22 @@ class RssMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankMap:
-    """Rank (rows, columns) for one K at one height, 0 for Z; ``share`` (5,) of Z and rank 1 to 4."""
+    """Rank (rows, columns) for one K at one height, 0 for Z; ``share`` (5,) of Z and rank 1 to 4.
 
-    k: float
+    Without K the rank is the most probable one of a learned receiver, and ``share`` its mean probabilities.
+    """
+
+    k: float | None
     altitude_m: float
     rank: IntArray
     share: FloatArray
     foliage: str = ""
     tower: str = JOINT
+
+    @property
+    def source(self) -> str:
+        """K, or the learned receiver."""
+        return "learned receiver" if self.k is None else f"K = {k_key(self.k)}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,6 +159,8 @@ class MapsData:
         The nearest tower serving; ``rank_by_tower`` each alone, for the linked map.
     corrected : tuple of RssMap
         Of each link, raw and corrected by flights (``antennas``): for figures; the linked map has them in ``further``.
+    corrected_rank : tuple of RankMap
+        Of each tower with a learned receiver: the traced ranks of every K and those of the receiver.
     flown_m : tuple of (n, 2)
         Tracks of those flights, east and north [m].
     outside_flown : float
@@ -171,6 +182,7 @@ class MapsData:
     borders_m: tuple[FloatArray, ...] = ()
     rss: tuple[RssMap, ...] = ()
     corrected: tuple[RssMap, ...] = ()
+    corrected_rank: tuple[RankMap, ...] = ()
     flown_m: tuple[FloatArray, ...] = ()
     outside_flown: float = 0.0
     corrected_words: str = ""

@@ -227,11 +227,11 @@ def cdfs(maps: Sequence[RssMap]) -> Figure:
 
 
 def rank_shares(maps: Sequence[RankMap]) -> Figure:
-    """Shares of Z and rank 1 to 4 against height, a panel per K."""
-    panels = grouped(maps, lambda one: one.k)
+    """Shares of Z and rank 1 to 4 against height, a panel per K and learned receiver."""
+    panels = grouped(maps, lambda one: one.source)
     fig = figure((9.2, 3.4))
     axes = fig.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for ax, (k, members) in zip(axes, panels.items(), strict=True):
+    for ax, (source, members) in zip(axes, panels.items(), strict=True):
         at = np.arange(len(members))
         share = 100 * np.array([member.share for member in members])
         below = np.zeros(len(members))
@@ -245,7 +245,7 @@ def rank_shares(maps: Sequence[RankMap]) -> Figure:
             )  # fmt: skip
             below = below + share[:, column]
         ax.set_xticks(at, [f"{member.altitude_m:g}" for member in members], fontsize=7)
-        ax.set_title(f"K = {k_key(k)}")
+        ax.set_title(source)
         ax.set_xlabel("Height [m]")
         ax.grid(visible=False)
     axes[0].set_ylabel("Share of positions [%]")
@@ -356,7 +356,7 @@ def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
 
 
 def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
-    for words, maps in grouped(data.rank, lambda one: f"K = {k_key(one.k)}{_under(one.foliage)}").items():
+    for words, maps in grouped(data.rank, lambda one: f"{one.source}{_under(one.foliage)}").items():
         yield FigureSpec(
             f"rank_map_{safe_name(words)}", "rank", f"Rank, {words}", "The nearest tower serves. Hatched: no path.",
             partial(rank_grid, data, maps),
@@ -365,6 +365,18 @@ def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
         yield FigureSpec(
             "_".join(["rank_share", *([safe_name(words)] if words else [])]), "rank", f"Rank against height{words}",
             "Share of positions with each rank; Z is out of coverage.",
+            partial(rank_shares, maps),
+        )  # fmt: skip
+    for tower, maps in grouped(data.corrected_rank, lambda one: one.tower).items():
+        yield FigureSpec(
+            f"rank_map_learned_{safe_name(tower)}", "rank", f"Rank of {tower}, corrected",
+            "Most probable rank by the receiver that flights taught; all headings count alike.",
+            partial(rank_grid, data, [one for one in maps if one.k is None]),
+        )  # fmt: skip
+        yield FigureSpec(
+            f"rank_share_learned_{safe_name(tower)}", "rank", f"Rank of {tower} against height, raw and corrected",
+            "Raw: share of positions with each rank of the traced channel, by K; Z is out of coverage. Learned "
+            "receiver: mean probability of each rank.",
             partial(rank_shares, maps),
         )  # fmt: skip
     for name, layers in grouped(data.layers, lambda one: one.name).items():

@@ -50,10 +50,21 @@ class PredictionPage:
     stages_s: Mapping[str, float]
 
     @property
+    def outside_flown(self) -> float:
+        """Share of the points where the model is a guess."""
+        return outside_share(self.table)
+
+    @property
     def series(self) -> list[tuple[str, pd.DataFrame]]:
         """Rows of each tower and channel that has levels."""
         levels = self.table[self.table["channel"] != "rank"]
-        return [(f"{t} {c}", part) for (t, c), part in levels.groupby(["tower", "channel"], sort=False)]
+        each = levels.groupby(["tower", "channel"], sort=False, observed=True)
+        return [(f"{t} {c}", part) for (t, c), part in each]
+
+
+def outside_share(table: pd.DataFrame) -> float:
+    """Share of the levels of a table that are flagged as outside the flown places."""
+    return float((table["flag"][table["channel"] != "rank"] == "outside_flown").mean())
 
 
 def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
@@ -81,7 +92,10 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
         candidates=data.candidates,
         field=data.model,
         series=series,
-        ranks={tower: {k: part[f"p_rank{k}"].mean() for k in "1234"} for tower, part in ranks.groupby("tower")},
+        ranks={
+            tower: {k: part[f"p_rank{k}"].mean() for k in "1234"}
+            for tower, part in ranks.groupby("tower", observed=True)
+        },
         warnings=data.warnings,
         **about(data),
     )

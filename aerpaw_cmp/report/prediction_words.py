@@ -12,13 +12,15 @@ from ..compare.entries import crps_normal
 from ..compare.forecast import ForecastScore
 from ..compare.statistics import mean_interval, paired_difference, paired_verdict
 from ..compare.verdicts import Verdict, stated_errors
-from .phrases import said_of
+from ..flight.remembered import Remembered
+from .phrases import filled, said_of
 
 TITLES = {
     "learned": "antennas learned from the named flights",
     "replay": "ray tracing with the flights' own settings",
     "free space": "free space",
     "none": "a constant level",
+    "memory": "antennas that the site remembers",
 }
 
 FLAGS = {
@@ -132,6 +134,40 @@ def first_words(correction: Correction, outside: float) -> str:
             "flight that helps most."
         )
     return " ".join(text for text in texts if text)
+
+
+NO_FLIGHT = (
+    "No flight is named: antennas and levels are those that the site remembers. {learned}. The offset of a new flight "
+    "has a standard deviation of up to {sd:.1f} dB."
+)
+"""A prediction from the memory of the site; ``learned`` by entry."""
+
+UNSEEN = (
+    "{percent:.0f} % of the points lie in directions that the remembered flights hardly saw. Next: `aerpaw-cmp plan` "
+    "names the flight that helps most."
+)
+
+
+def memory_words(known: Sequence[Remembered], outside: float) -> str:
+    """First line of terminal and page without flights: what the site remembers, and the error to expect.
+
+    Parameters
+    ----------
+    known : sequence of Remembered
+    outside : float
+        Share of points in directions that flights hardly saw.
+
+    Returns
+    -------
+    str
+    """
+    each: dict[str, list[str]] = {}
+    for one in known:
+        each.setdefault(one.entry.about(), []).append(f"{one.series.tower} {one.series.channel}")
+    learned = ". ".join(f"{', '.join(names)}: {about}" for about, names in each.items())
+    sd = max(one.series.level.sd_db for one in known if one.series.level is not None)
+    texts = [NO_FLIGHT, *([UNSEEN] if outside > MANY else [])]
+    return " ".join(filled(texts, learned=learned, sd=sd, percent=100.0 * outside))
 
 
 def inside_share(error: FloatArray, sd: FloatArray) -> float:

@@ -71,6 +71,15 @@ class LearnedLock(_Record):
     free_space_floor_rmse_db: float
 
 
+class LearnedLevel(_Record):
+    """Level of a log minus free space of a transmit power and the gains as written [dB]; ``sd_db``: of a new flight."""
+
+    offset_db: float
+    sd_db: Annotated[float, Field(gt=0)]
+    transmit_power_dbm: float
+    unit: str
+
+
 class LearnedSeries(_Record):
     """Antennas of one tower and channel, and what the log of that channel looks like."""
 
@@ -83,6 +92,8 @@ class LearnedSeries(_Record):
     sd_db: float
     """Mean standard deviation of the level over directions that were flown."""
     lock: LearnedLock | None = None
+    level: LearnedLevel | None = None
+    """None of receivers that lose their lock, and of memories before 0.5."""
 
 
 class LearnedReceiver(_Record):

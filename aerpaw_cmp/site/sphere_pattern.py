@@ -54,6 +54,11 @@ class SpherePattern(MeasuredPattern):
         self.pair = PairGain.from_notes(notes)
         self._sd_db = np.asarray(sd_db, dtype=np.float64)
 
+    @property
+    def largest_sd_db(self) -> float:
+        """Standard deviation of the gain in the direction that is known least [dB]."""
+        return float(self._sd_db.max())
+
     def gain_sd_db(self, theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
         """Standard deviation of the gain towards directions [dB], bilinear."""
         from scipy.ndimage import map_coordinates

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.compare import correction
 from aerpaw_cmp.compare.direction_gain import LinkSamples
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
@@ -19,7 +20,8 @@ from aerpaw_cmp.jobs.learning.calibrate_rank import rank_samples
 from aerpaw_cmp.jobs.prediction import corrected_map
 from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.against import score_against
-from aerpaw_cmp.jobs.prediction.predict_run import page_of, write_maps
+from aerpaw_cmp.jobs.prediction.predict_run import write_maps
+from aerpaw_cmp.jobs.prediction.sources import named_flights
 from aerpaw_cmp.jobs.prediction.where import Asked, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
@@ -54,7 +56,7 @@ def small(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def prediction(small):
-    return job.predict(small / "points.csv", [small / "a.yaml", small / "b.yaml"], threshold_db=-60.0)
+    return job.predict(small / "points.csv", named_flights([small / "a.yaml", small / "b.yaml"]), threshold_db=-60.0)
 
 
 def rows(prediction, point):
@@ -63,8 +65,8 @@ def rows(prediction, point):
 
 
 def test_a_copy_of_a_flight_counts_once(prediction):
-    assert prediction.flights == ("sample",)
-    assert any("counted once" in text for text in prediction.warnings)
+    assert prediction.page.flights == ["sample"]
+    assert any("counted once" in text for text in prediction.page.warnings)
 
 
 def test_points_without_a_position_and_outside_are_flagged(prediction):
@@ -81,7 +83,7 @@ def test_columns_are_those_of_the_contract(prediction):
     assert set(contract) <= set(prediction.table.columns)
     levels = prediction.table[prediction.table["level_db"].notna()]
     assert ((levels["q05_db"] < levels["level_db"]) & (levels["level_db"] < levels["q95_db"])).all()
-    by_point = levels.groupby(["point", "channel"])["p_serving"].sum()
+    by_point = levels.groupby(["point", "channel"], observed=True)["p_serving"].sum()
     np.testing.assert_allclose(by_point, 1.0, atol=2e-3)
 
 
@@ -103,8 +105,8 @@ def test_no_flight_that_shares_a_tower_is_one_message(small):
     text = (small / "a.yaml").read_text().replace("node: LW1", "node: LW4").replace("node: LW2", "node: LW5")
     other.write_text(text)
     with pytest.raises(UsageError, match="asks for LW4, LW5"):
-        job.predict(other, [small / "a.yaml"])
-    with pytest.raises(UsageError, match="no flight to learn from"):
+        job.predict(other, named_flights([small / "a.yaml"]))
+    with pytest.raises(UsageError, match="the site is not named"):
         job.predict(small / "points.csv", [])
 
 
@@ -115,13 +117,13 @@ def test_a_file_without_positions_is_refused(tmp_path):
 
 
 def test_files_agree_with_each_other(tmp_path, prediction):
-    files, _ = write_prediction(page_of(prediction, {}), tmp_path)
+    files, _ = write_prediction(prediction.page, tmp_path)
     table = pd.read_csv(tmp_path / "prediction.csv")
     levels = table[table["channel"] != "rank"]
     np.testing.assert_allclose(levels["level_db"], prediction.table["level_db"][: len(levels)], atol=1e-3)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert unlisted("predict", metrics) == []
-    assert metrics["trained_on"] == list(prediction.trained_on)
+    assert metrics["trained_on"] == list(prediction.page.trained_on)
     assert metrics["sentence"].startswith("Expect an RMSE of")
     assert coded(metrics["sentence"]) in files[0].read_text()
     xarray = pytest.importorskip("xarray")
@@ -220,7 +222,8 @@ def test_maps_of_a_grid_hold_levels_and_their_spread_height_by_height(prediction
     level, sd = np.arange(float(n)) - 100.0, np.full(n, 3.0)
     table = pd.DataFrame({"tower": "LW1", "channel": "USRP1", "level_db": level, "sd_db": sd})
     ranked = pd.DataFrame({"tower": ["LW1"], "channel": ["rank"]})
-    one = dataclasses.replace(prediction, targets=targets, table=pd.concat([table, ranked], ignore_index=True))
+    page = dataclasses.replace(prediction.page, table=pd.concat([table, ranked], ignore_index=True))
+    one = dataclasses.replace(prediction, targets=targets, page=page)
     files, said = write_maps(one, targets.grid, tmp_path)
     assert [file.name for file in files] == ["prediction.kmz", "prediction.tif"]
     assert said == []
@@ -249,7 +252,7 @@ def test_corrected_levels_are_brought_to_the_raw_replay_by_the_planted_offset(pr
     np.testing.assert_allclose((one.corrected_dbm - level)[[0, 2, 3]], 12.3, atol=0.7)
     raw = trace("lake_wheeler", Link(3.3e9, {"LW1": single_element()}, single_element()), [[-300.0, 150.0, 45.0]])
     assert one.raw_dbm[0] == pytest.approx(raw.rss_dbm[0, 0], abs=1e-6)
-    maps = corrected_map.CorrectedMaps(levels=(one,), ranks={}, flown_m=(), sentence="", outside=0.0, warnings=())
+    maps = corrected_map.CorrectedMaps(levels=(one,), ranks={}, prediction=prediction.page)
     assert [layer.name for layer in maps.layers()] == [
         f"rss_{kind}_h045m_LW1_USRP1" for kind in ("raw", "corrected", "sd")
     ]
@@ -267,7 +270,7 @@ def test_many_directions_are_those_of_a_degree():
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     zero = np.zeros(len(ray))
     samples = LinkSamples("f", "t", "c", zero, ray, ray, ray, zero)
-    exact = job._by_degree(lambda s: (10.0 * s.at_uav[:, 2], 1.0 + 0.0 * s.time_s))
+    exact = correction.by_degree(lambda s: (10.0 * s.at_uav[:, 2], 1.0 + 0.0 * s.time_s))
     gain, sd = exact(samples)
     assert np.abs(gain - 10.0 * ray[:, 2]).max() < 10.0 * np.radians(1.01)
     assert np.abs(gain - 10.0 * ray[:, 2]).max() > 0.0
@@ -275,7 +278,7 @@ def test_many_directions_are_those_of_a_degree():
 
 
 def test_directions_are_evaluated_once_per_degree_over_all_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(job, "MOST_DIRECTIONS", 10)
+    monkeypatch.setattr(correction, "MOST_DIRECTIONS", 10)
     asked = []
 
     def gain(samples):
@@ -288,7 +291,7 @@ def test_directions_are_evaluated_once_per_degree_over_all_parts(monkeypatch: py
         flight="", tower="T", channel="a", time_s=np.zeros(4000), position_m=100.0 * ray, at_uav=-ray, at_tower=ray,
         residual_db=np.zeros(4000),
     )  # fmt: skip
-    predict = job._by_degree(gain)
+    predict = correction.by_degree(gain)
     whole = predict(samples)
     for part in (slice(0, 2000), slice(2000, 4000)):
         rows = np.arange(4000)[part]

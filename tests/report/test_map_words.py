@@ -85,6 +85,6 @@ def test_warnings_and_notes_stand_only_under_their_condition(maps_data: MapsData
     )
     said = warnings(coarse)
     assert any("spacing of 90 m is coarser" in text for text in said)
-    assert "Corrected by flights: Expect 3 dB." in said
+    assert "Corrected: Expect 3 dB." in said
     assert "Correlation fit (Z zero): one length alone" in said
     assert any("in maps of RSS above -80 dBm" in text for text in notes(coarse))

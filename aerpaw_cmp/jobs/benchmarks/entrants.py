@@ -12,9 +12,9 @@ import pandas as pd
 
 from ...common.units import BoolArray, FloatArray
 from ...compare import calibration
-from ...compare.calibration import Observed, Recipe
+from ...compare.calibration import Observed
 from ...compare.correction import BIN_S, Base, Predictor, choose, fixed_base
-from ...compare.direction_gain import GainModel, LinkSamples
+from ...compare.direction_gain import LinkSamples
 from ...compare.forecast import constant_forecast
 from ...compare.spread import fading_of
 from ...flight.data import FlightData
@@ -22,7 +22,7 @@ from ...flight.replay import attitude_rotation
 from ...propagation.arrays import Poses
 from ...propagation.field.baselines import p1411_loss_db, tr36777_loss_db, two_ray_dbm
 from ...propagation.trace import trace
-from ..learning.calibrate import rotation
+from ..learning.calibrate import learned_antennas
 from ..learning.calibrate_rank import RankFitSettings, Tried
 from .benchmark import KEY, RANKS, Bench, Question, questions, utc_texts
 
@@ -144,8 +144,7 @@ def learned_base(train: Sequence[LinkSamples]) -> Predictor:
     """Antennas learned on these samples, as a base of a correction; each fit is made once."""
     key = tuple(hash(s.residual_db.tobytes()) for s in train)
     if key not in _FITS:
-        recipe = Recipe(model=GainModel(bin_s=BIN_S), rotation=rotation)
-        _FITS[key] = calibration.learn(train, recipe)
+        _FITS[key] = learned_antennas(train)
     return _FITS[key].predict
 
 

@@ -19,6 +19,7 @@ from ...common.units import FloatArray
 from ...common.yamlfile import load_yaml
 from ...compare import calibration
 from ...compare.calibration import Learned, Observed, Recipe, Score
+from ...compare.correction import BIN_S
 from ...compare.direction_gain import (
     ANTENNA_TERMS,
     PLACE_TERM,
@@ -361,6 +362,11 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:
 def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
     """Mount (3, 3) from the angles of flight.yaml."""
     return rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, pitch_deg, roll_deg]))
+
+
+def learned_antennas(train: Sequence[LinkSamples]) -> Learned:
+    """Antennas of both ends from means over the bins of a correction, with the model's own strengths to start from."""
+    return calibration.learn(train, Recipe(model=GainModel(bin_s=BIN_S), rotation=rotation))
 
 
 def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:

@@ -28,7 +28,7 @@ from ...report.calibration_data import AntennaMap, CalibrationData
 from ...report.calibration_html import calibration_metrics, write_calibration
 from ...report.export import write_file
 from ...report.names import safe_name
-from ...site.learned import Entry, Errors, LearnedLock, LearnedReceiver, LearnedSeries
+from ...site.learned import Entry, Errors, LearnedLevel, LearnedLock, LearnedReceiver, LearnedSeries
 from ...site.pair_gain import PairGain
 from ...site.sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid, sphere_netcdf, unit_mean_gain
 from .calibrate import Calibration, CalibrationFile
@@ -336,6 +336,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
                 uav_file=files["uav"],
                 sd_db=round(float(np.nanmean(seen)), 2),
                 lock=_at_unit_gain(calibration.locks.get(antenna), maps[antenna, "uav"], maps[antenna, "tower"]),
+                level=_level(calibration, first[1], maps[antenna, "uav"], maps[antenna, "tower"]),
             )
         )
     return (
@@ -346,6 +347,30 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
             ground_roughness_m=None if calibration.ground is None else calibration.ground.used_m,
         ),
         tables,
+    )
+
+
+OFFSET_SD_DB = 1.5
+"""Between flights, before any was left out: counts as two flights."""
+
+
+def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
+    """Mean level of the flights above the antennas as written; its error is that of flights left out."""
+    mine = [o for o in calibration.observed if (o.samples.tower, o.samples.channel) == (series.tower, series.channel)]
+    if mine[0].samples.antenna in calibration.locks:
+        return None  # the levels below the floor are not logged
+    sent = series.link.transmit_power_dbm
+    offsets = [calibration.learned.mean_error(o.samples) + o.sent_dbm - sent for o in mine]
+    squares = [
+        max(s.rmse_shared_offset_db**2 - s.rmse_db**2, 0.0)
+        for s in calibration.scores["flight_left_out"]
+        if (s.tower, s.channel) == (series.tower, series.channel)
+    ]
+    return LearnedLevel(
+        offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
+        sd_db=round(math.sqrt((2.0 * OFFSET_SD_DB**2 + sum(squares)) / (2 + len(squares))), 2),
+        transmit_power_dbm=sent,
+        unit=series.unit,
     )
 
 

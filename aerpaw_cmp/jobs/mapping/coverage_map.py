@@ -500,9 +500,10 @@ def maps_record(
         borders_m=tuple(border.line_m for border in result.borders),
         rss=rss,
         corrected=() if flown is None else tuple(flown.rss_maps(result.grid)),
-        flown_m=() if flown is None else flown.flown_m,
-        outside_flown=0.0 if flown is None else flown.outside,
-        corrected_words="" if flown is None else flown.sentence,
+        corrected_rank=tuple(_rank_versions(outcome)),
+        flown_m=() if flown is None else tuple(line.T for line in flown.prediction.flown.values()),
+        outside_flown=0.0 if flown is None else flown.prediction.outside_flown,
+        corrected_words="" if flown is None else flown.prediction.verdict,
         rank=rank,
         rank_by_tower=tuple(by_tower),
         layers=tuple(_further_layers(outcome)),
@@ -511,7 +512,7 @@ def maps_record(
         errors=tuple(_errors(outcome)),
         learning=tuple(_learning(outcome)),
         paper=tuple(paper),
-        warnings=() if flown is None else flown.warnings,
+        warnings=() if flown is None else tuple(flown.prediction.warnings),
         notes=_notes(outcome),
         versions=versions,
         settings=asdict(s),
@@ -548,6 +549,14 @@ def _rank_maps(result: MapResult, mode: str, tower: str | None = None) -> Iterat
             foliage=mode,
             **({} if tower is None else {"tower": tower}),
         )
+
+
+def _rank_versions(outcome: MapOutcome) -> Iterator[page.RankMap]:
+    """Traced and learned ranks of every tower whose receiver is learned."""
+    if outcome.corrected is not None:
+        for tower in dict.fromkeys(tower for tower, _ in outcome.corrected.ranks):
+            yield from _rank_maps(outcome.shown, outcome.settings.shown, tower)
+        yield from outcome.corrected.rank_maps(outcome.shown.grid)
 
 
 def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:

@@ -1,6 +1,6 @@
 """Maps corrected by flights: raw replay, what ``predict`` says, its standard deviation, ranks of a learned receiver.
 
-Levels are those of the map, in dBm: the mean offset between the flights' logs and the raw replay is taken off.
+Levels are those of the map, in dBm: the mean offset between the logs and the raw replay is taken off.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from ...common.stages import Stages
 from ...common.units import FloatArray
 from ...maps.grid import Grid, Layer, class_names
 from ...report import maps_data as page
-from .predict import RANKS, Prediction, Source, predict
+from ...report.prediction_html import PredictionPage
+from .predict import RANKS, Prediction, predict
+from .sources import NamedFlight, Source
 from .where import Asked
 
 
@@ -33,15 +35,14 @@ class CorrectedLevel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CorrectedMaps:
-    """All corrected maps of a run; ``ranks`` by (tower, height): the most probable rank (n,), NaN where unknown."""
+    """All corrected maps of a run, and the page of the prediction.
+
+    ``ranks``: probabilities (n, 4) by tower and height, NaN where unknown.
+    """
 
     levels: tuple[CorrectedLevel, ...]
     ranks: dict[tuple[str, float], FloatArray]
-    flown_m: tuple[FloatArray, ...]
-    sentence: str
-    outside: float
-    """Share of positions beyond the flown places."""
-    warnings: tuple[str, ...]
+    prediction: PredictionPage
 
     def layers(self) -> list[Layer]:
         """For the files beside the page."""
@@ -55,14 +56,13 @@ class CorrectedMaps:
             ):
                 text = f"{title}, {item.link}, {item.height_m:g} m"
                 out.append(Layer(f"{name}_{at}", np.round(values, 2), unit, text))
-        for (tower, height), rank in self.ranks.items():
+        for (tower, height), p in self.ranks.items():
             name = f"rank_learned_h{height:03.0f}m_{re.sub(r'[^0-9A-Za-z]', '_', tower)}"
-            codes = np.nan_to_num(rank).astype(np.int64)
-            out.append(Layer(name, codes, "1", f"Rank, learned receiver, {tower}, {height:g} m", class_names(4)))
+            out.append(Layer(name, likeliest(p), "1", f"Rank, learned receiver, {tower}, {height:g} m", class_names(4)))
         return out
 
     def page_layers(self, grid: Grid) -> Iterator[page.MapLayer]:
-        """For the linked map: raw and corrected level, standard deviation, rank."""
+        """For the linked map: raw and corrected level, standard deviation."""
         for item in self.levels:
             axes = {"Link": item.link, "Height": f"{item.height_m:g} m"}
             for version, values in (("corrected", item.corrected_dbm), ("raw", item.raw_dbm)):
@@ -70,14 +70,6 @@ class CorrectedMaps:
                                     values=grid.raster(values))  # fmt: skip
             yield page.MapLayer(
                 quantity="SD of the corrected RSS", unit="dB", axes=axes, values=grid.raster(item.sd_db)
-            )
-        for (tower, height), rank in self.ranks.items():
-            yield page.MapLayer(
-                quantity="Rank, learned receiver",
-                unit="",
-                axes={"Link": tower, "Height": f"{height:g} m"},
-                values=grid.raster(rank),
-                classes=class_names(4),
             )
 
     def rss_maps(self, grid: Grid) -> Iterator[page.RssMap]:
@@ -93,25 +85,38 @@ class CorrectedMaps:
                     coverage=float(np.isfinite(values).mean()),
                 )
 
+    def rank_maps(self, grid: Grid) -> Iterator[page.RankMap]:
+        """For figures and the linked map: the most probable rank, and mean probabilities as shares."""
+        for (tower, height), p in self.ranks.items():
+            share = np.concatenate([[np.isnan(p[:, 0]).mean()], np.nan_to_num(p).mean(axis=0)])
+            rank = grid.raster(likeliest(p)).astype(np.int64)
+            yield page.RankMap(k=None, altitude_m=height, rank=rank, share=share, tower=tower)
+
+
+def likeliest(p: FloatArray) -> FloatArray:
+    """Most probable rank (n,) by probabilities (n, 4); 0 where they are NaN."""
+    return np.where(np.isnan(p[:, 0]), 0, np.nan_to_num(p).argmax(axis=1) + 1)
+
 
 def corrected_maps(
     site: str,
     spacing_m: float,
-    heights_m: Sequence[float],
-    flights: Sequence[Path],
+    heights_m: tuple[Sequence[float], Sequence[float]],
+    flights: Sequence[NamedFlight],
     logs_root: Path | None = None,
     stages: Stages | None = None,
 ) -> CorrectedMaps:
-    """Predict a map's grid from flights, beside the raw replay of the same links.
+    """Predict a map's grid from flights, or from what the site remembers, beside the raw replay of the same links.
 
     Parameters
     ----------
     site : str
         As ``map`` takes it.
     spacing_m : float
-    heights_m : sequence of float
-    flights : sequence of Path
-        Flight files to learn from.
+    heights_m : (sequence of float, sequence of float)
+        Of levels, and of ranks.
+    flights : sequence of NamedFlight
+        To learn from; without any the memory of the site is the source.
     logs_root : Path, optional
     stages : Stages, optional
 
@@ -124,32 +129,24 @@ def corrected_maps(
     UsageError, InputError
         As :func:`.predict.predict`.
     """
-    asked = Asked(heights_m=tuple(heights_m), spacing_m=spacing_m)
+    asked = Asked(heights_m=tuple(sorted({*heights_m[0], *heights_m[1]})), spacing_m=spacing_m)
     said = predict(Path(site), flights, asked, logs_root=logs_root, stages=stages)
     grid = said.targets.grid
     assert grid is not None
+    levels = (one for source in said.sources.values() for one in _levels(said, source, len(grid)))
     return CorrectedMaps(
-        levels=tuple(one for source in said.sources.values() for one in _levels(said, source, len(grid))),
-        ranks=dict(_ranks(said, len(grid))),
-        flown_m=tuple(s.position_m[:: max(1, len(s) // 500), :2] for s in said.samples),
-        sentence=said.sentence,
-        outside=said.outside,
-        warnings=said.warnings,
+        levels=tuple(one for one in levels if one.height_m in heights_m[0]),
+        ranks={key: p for key, p in _ranks(said, len(grid)) if key[1] in heights_m[1]},
+        prediction=said.page,
     )
 
 
 def _levels(said: Prediction, source: Source, n: int) -> Iterator[CorrectedLevel]:
     table = said.table
-    mine = table[(table["tower"] == source.series.tower) & (table["channel"] == source.series.channel)]
+    mine = table[(table["tower"] == source.tower) & (table["channel"] == source.channel)]
     position = said.targets.position_m
-    north = source.samples(position, np.zeros(len(position)))
-    raw = source.replayed_db(north) + source.free_space_db(position)
-    errors = []
-    for s in said.samples:
-        if s.antenna == source.antenna:
-            binned = s.binned(4.0)
-            errors.append(np.nanmean(binned.residual_db - source.replayed_db(binned)))
-    level = mine["level_db"].to_numpy() - float(np.nanmean(errors))
+    raw = source.replayed_db(source.targets(position, np.zeros(len(position)))) + source.free_space_db(position)
+    level = mine["level_db"].to_numpy() - said.model.offset_db(source.antenna)
     for k, height in enumerate(said.targets.heights_m):
         part = slice(k * n, (k + 1) * n)
         yield CorrectedLevel(
@@ -163,8 +160,8 @@ def _levels(said: Prediction, source: Source, n: int) -> Iterator[CorrectedLevel
 
 def _ranks(said: Prediction, n: int) -> Iterator[tuple[tuple[str, float], FloatArray]]:
     ranks = said.table[said.table["channel"] == "rank"]
-    for tower, rows in ranks.groupby("tower", sort=False):
-        best = np.full(len(said.targets), np.nan)
-        best[rows["point"].to_numpy()] = rows[list(RANKS)].to_numpy().argmax(axis=1) + 1.0
+    for tower, rows in ranks.groupby("tower", sort=False, observed=True):
+        p = np.full((len(said.targets), 4), np.nan)
+        p[rows["point"].to_numpy()] = rows[list(RANKS)].to_numpy()
         for k, height in enumerate(said.targets.heights_m):
-            yield (str(tower), height), best[k * n : (k + 1) * n]
+            yield (str(tower), height), p[k * n : (k + 1) * n]

@@ -20,17 +20,14 @@ from ...compare.calibration import Recipe
 from ...compare.correction import choose
 from ...compare.direction_gain import GainModel, LinkSamples
 from ...compare.next_flight import Known, rms_db
-from ...flight.data import FlightData, load_data
 from ...flight.patterns import NOSES, Pattern, Route, Waypoint, allowed_area, cut, flown, route_of
-from ...flight.settings import load_flight
 from ...flight.training import counted_once
 from ...logs.route import read_areas
 from ...site.site import Site
-from ...site.siteyaml import load_site
-from ..benchmarks.entrants import learned_base
-from ..learning.calibrate import observe, rotation
-from .predict import site_of, sources_of
-from .where import Asked, Targets, find_targets, is_settings, level_samples
+from ..learning.calibrate import learned_antennas, observe, rotation
+from .predict import site_of
+from .sources import NamedFlight, sources_of
+from .where import Asked, Targets, find_targets, level_samples
 
 SPHERE = "sphere"
 """Target: all directions of the tower seen from the UAV, at all headings."""
@@ -69,12 +66,10 @@ class PlanAsked:
         KMLs of no-fly areas.
     routes : tuple of Path
         Further candidates.
-    site : str, optional
-        Where no flight names it.
     towers : tuple of str
         Whose antennas count, where no flight names them.
     target : Asked
-        Heights, spacing and heading of a target that is a grid.
+        Heights, spacing and heading of a target that is a grid, and the site where no flight names it.
     """
 
     minutes: float = 15.0
@@ -84,7 +79,6 @@ class PlanAsked:
     fence: Path | None = None
     avoid: tuple[Path, ...] = ()
     routes: tuple[Path, ...] = ()
-    site: str | None = None
     towers: tuple[str, ...] = ()
     target: Asked = field(default_factory=lambda: Asked(spacing_m=60.0))
 
@@ -141,7 +135,7 @@ class FlightPlan:
 
 def plan_flight(
     target: str,
-    flights: Sequence[Path],
+    flights: Sequence[NamedFlight],
     asked: PlanAsked,
     *,
     logs_root: Path | None = None,
@@ -153,8 +147,8 @@ def plan_flight(
     ----------
     target : str
         ``sphere``, or what :func:`.where.find_targets` takes.
-    flights : sequence of Path
-        Flight files that were flown; none: antennas are unknown.
+    flights : sequence of NamedFlight
+        That were flown; none: antennas are unknown.
     asked : PlanAsked
     logs_root : Path, optional
     stages : Stages, optional
@@ -169,14 +163,12 @@ def plan_flight(
         No candidate fits, a target far outside, a route that cannot be read.
     """
     stages = stages or Stages()
-    if Path(target).suffix and not Path(target).exists():
-        raise InputError("there is no such file", expected="sphere, a site, a route or points", path=Path(target))
     with stages("read"):
-        datas, said = counted_once([load_data(load_flight(p), p.parent, logs_root) for p in flights])
+        datas, said = counted_once([flight.load(logs_root) for flight in flights])
         observed = observe(datas)[0] if datas else []
-        site = _site(target, asked.site, datas)
+        site, _ = site_of(None if target == SPHERE else Path(target), flights, datas, asked.target.site)
         sources = sources_of(datas, observed) if datas else {}
-        ends = {a: (s.series.tower, s.series.channel) for a, s in sources.items()} or _open_ends(site, asked)
+        ends = {a: (s.tower, s.channel) for a, s in sources.items()} or _open_ends(site, asked)
         series = [o.samples for o in observed if o.samples.antenna in ends]
         area = _area(site, asked)
     with stages("candidates"):
@@ -232,20 +224,6 @@ def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float]
             expected="a candidate within the geofence, the battery and the distance to towers",
         )
     return ranked
-
-
-def _site(target: str, site_name: str | None, datas: Sequence[FlightData]) -> Site:
-    """By name, else of the target where it is a site, else of the flights."""
-    if site_name is None and target == SPHERE:
-        if not datas:
-            raise UsageError("the site is not named", expected="--site SITE, or --with a flight")
-        return datas[0].site
-    where = Path(site_name or target)
-    if datas:
-        return site_of(where, datas)
-    if site_name is None and where.is_file() and not is_settings(where):
-        raise UsageError("the site is not named", expected="--site SITE, or --with a flight")
-    return load_site(where if where.is_file() else str(where))
 
 
 def _open_ends(site: Site, asked: PlanAsked) -> dict[str, tuple[str, str]]:
@@ -401,7 +379,7 @@ def _known(series: Sequence[LinkSamples]) -> Known:
     if series:
         learned = calibration.learn(series, Recipe(model=model, rotation=rotation))
         model = learned.model
-        correction = choose(series, {"learned": learned_base})
+        correction = choose(series, {"learned": lambda train: learned_antennas(train).predict})
         left = correction.model if correction.on else None
     return Known(series=series, model=model, field=left)
 

@@ -8,16 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ...common.inputs import input_files
 from ...common.outputs import OutputFolder
 from ...common.stages import Stages
 from ...common.versions import versions
 from ...flight.route_files import kml_text, plan_text, waypoints_csv
-from ...flight.settings import load_flight
 from ...report.names import safe_name
 from ...report.plan_html import PlanPage, plan_metrics, write_plan
 from ..options import DEFAULT, JobOutcome, RunOptions
 from .next_flight import FlightPlan, PlanAsked, plan_flight
+from .sources import files_of, named_flights
 
 
 def run_plan(target: str, flights: Sequence[Path], asked: PlanAsked, options: RunOptions = DEFAULT) -> JobOutcome:
@@ -42,12 +41,12 @@ def run_plan(target: str, flights: Sequence[Path], asked: PlanAsked, options: Ru
         With what was found, expected, and the likely cause.
     """
     inputs = [p for p in (Path(target), asked.fence, *asked.avoid, *asked.routes) if p is not None and p.is_file()]
-    for path in flights:
-        inputs += input_files(load_flight(path), path, options.logs_root)
+    known = named_flights(flights)
+    inputs += files_of(known, options.logs_root)
     stages = Stages(options.progress)
     folder = options.out or Path("reports") / f"plan-{safe_name(Path(target).stem)}"
     with OutputFolder(folder, job="plan", inputs=inputs, force=options.force) as output:
-        plan = plan_flight(target, flights, asked, logs_root=options.logs_root, stages=stages)
+        plan = plan_flight(target, known, asked, logs_root=options.logs_root, stages=stages)
         record = page_of(plan, stages.seconds)
         with output.filling() as place:
             options.progress("page")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -14,134 +15,73 @@ import pandas as pd
 from ...common.errors import InputError, UsageError
 from ...common.provenance import union
 from ...common.stages import Progress, Stages
-from ...common.units import BoolArray, FloatArray, IntArray
-from ...compare.calibration import Observed
-from ...compare.correction import BIN_S, Base, Correction, Predictor, between_blocks_db, choose, fixed_base
+from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ...common.versions import versions
+from ...compare.correction import OFF, Base, by_degree, choose, fixed_base
 from ...compare.direction_gain import LinkSamples
-from ...compare.spread import BAND, Spread, fading_of
-from ...flight.data import FlightData, RssSeries, load_data
-from ...flight.learned_gain import pair_db
-from ...flight.replay import replay_poses
-from ...flight.settings import load_flight
+from ...compare.spread import BAND
+from ...flight.data import FlightData, choose_site, site_place
+from ...flight.remembered import remembered
+from ...flight.settings import LinkSettings, LinksSettings
 from ...flight.track import body_rotation
 from ...flight.training import common, counted_once, flight_logs, learned_patterns
 from ...propagation.arrays import Poses
-from ...propagation.field.baselines import free_space_dbm
-from ...report.prediction_words import first_words
+from ...report.prediction_html import PredictionPage, outside_share
+from ...report.prediction_words import FLAGS, TITLES, first_words, memory_words
 from ...site.learned import BAND as CARRIER_BAND
 from ...site.learned import folder_of, read_learned
 from ...site.site import Site
 from ...site.siteyaml import load_site
-from ..benchmarks.entrants import learned_base
-from ..learning.calibrate import observe
+from ..learning.calibrate import learned_antennas, observe
 from ..learning.calibrate_rank import FittedReceiver, RankSamples, read_receiver
-from .where import Asked, Targets, find_targets, flight_of, is_settings, level_samples
+from .sources import Flown, Memory, NamedFlight, Source, memory_of, outside, sources_of, track_m
+from .where import Asked, Targets, find_targets, flight_of, is_settings
 
 HEADINGS = 8
 """Directions of the nose that count alike where it is not known."""
 
-HULL_M = 60.0
-HULL_UP_M = 20.0
-"""Targets further than this from every sample that is known are flagged, horizontally and in height [m]."""
-
 AT_ONCE = 50_000
 """Targets that are predicted together: bounds the memory."""
 
-REPLAYED_AT_ONCE = 20_000
-
-MOST_DIRECTIONS = 5_000
-"""Of more targets at a time, learned antennas are evaluated once per degree of direction."""
-
 RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
 
+TILE_M = 100.0
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Source:
-    """Link of one tower and channel, as the first flight that has it describes it."""
+MOST_RANKED = 50_000
+"""Targets at which the channel matrices of a receiver are evaluated."""
 
-    data: FlightData
-    series: RssSeries
+NOSE_M = 50.0
+"""Distance that counts as much as a turn of 60 degrees, where a target stands for its neighbours."""
 
-    @property
-    def antenna(self) -> str:
-        """``tower.channel``."""
-        return f"{self.series.tower}.{self.series.channel}"
+FLAG_CODES = {name: code for code, name in enumerate(["", *FLAGS])}
 
-    @property
-    def tower_m(self) -> FloatArray:
-        """Place of the array (3,)."""
-        return np.asarray(self.data.site.towers[self.series.tower].position_m)
-
-    def free_space_db(self, position_m: FloatArray) -> FloatArray:
-        """Level (n,) of free space [dBm]."""
-        link = self.series.link
-        place = self.tower_m[None, :]
-        return np.asarray(free_space_dbm(place, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
-
-    def samples(self, position_m: FloatArray, yaw_deg: FloatArray) -> LinkSamples:
-        """Targets (n,) of a level aircraft as samples without a level."""
-        end = self.series.tower, self.series.channel
-        return level_samples(end, self.tower_m, position_m, yaw_deg, np.zeros(len(yaw_deg)))
-
-    def replayed_db(self, samples: LinkSamples) -> FloatArray:
-        """Replayed level above free space (n,) of a level aircraft [dB]; NaN without a path."""
-        data, series = self.data, self.series
-        link = series.link.build([series.tower], data.folder)
-        body, world = samples.at_uav, -samples.at_tower
-        turn = np.arctan2(world[:, 1], world[:, 0]) - np.arctan2(body[:, 1], body[:, 0])
-        flat = np.zeros(len(turn))
-        known = data.settings.rt.attitude != "ignored"
-        rotation = body_rotation(flat, flat, 90.0 - np.degrees(turn) if known else flat + 90.0)
-        level = np.empty(len(samples))
-        for start in range(0, len(samples), REPLAYED_AT_ONCE):
-            part = slice(start, start + REPLAYED_AT_ONCE)
-            poses = Poses(samples.position_m[part], rotation[part])
-            replayed = replay_poses(data.site, data.settings.rt, link, poses)
-            field = replayed.rss_dbm if data.settings.rss.field == "coherent" else replayed.rss_power_dbm
-            level[part] = field[:, 0] + pair_db(link, poses, self.tower_m[None, :])
-        return np.asarray(level - self.free_space_db(samples.position_m))
+Receivers = Mapping[str, tuple[FittedReceiver, LinkSettings, Path]]
+"""Receiver of each tower, the link that says its arrays, and the folder of their files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """All that a run of ``predict`` found; ``table`` has a row per target, tower and channel (and receiver)."""
+    """The record of a page, and what maps need besides."""
 
+    page: PredictionPage
     targets: Targets
-    site: Site
-    table: pd.DataFrame
-    correction: Correction
+    model: Flown | Memory
     sources: Mapping[str, Source]
-    trained_on: tuple[str, ...]
-    flights: tuple[str, ...]
-    threshold_db: float | None
-    warnings: tuple[str, ...]
-    samples: Sequence[LinkSamples]
 
     @property
-    def key(self) -> tuple[str, str]:
-        """Of the base and the residual field that were chosen."""
-        return self.correction.base, self.correction.title
-
-    @property
-    def sentence(self) -> str:
-        """First words of terminal and page."""
-        return first_words(self.correction, self.outside)
+    def table(self) -> pd.DataFrame:
+        """Rows of prediction.csv: one per target, tower and channel, then one per target and receiver."""
+        return self.page.table
 
     def _repr_html_(self) -> str:
         """First words and the first points for notebooks."""
         points = str(self.table.head(10).round(2).to_html(index=False, border=0))
-        return f"<p>{escape(self.sentence)}</p>{points}"
-
-    @property
-    def outside(self) -> float:
-        """Share of the points beyond the flown places."""
-        levels = self.table[self.table["channel"] != "rank"]
-        return float((levels["flag"] == "outside_flown").mean())
+        return f"<p>{escape(self.page.verdict)}</p>{points}"
 
 
 def predict(
     where: Path,
-    flights: Sequence[Path],
+    flights: Sequence[NamedFlight],
     asked: Asked | None = None,
     *,
     threshold_db: float | None = None,
@@ -154,8 +94,8 @@ def predict(
     ----------
     where : Path
         See :func:`.where.find_targets`.
-    flights : sequence of Path
-        Flight files to learn from.
+    flights : sequence of NamedFlight
+        To learn from; without any the memory of the site is the source.
     asked : Asked, optional
     threshold_db : float, optional
         P(level > threshold) is given for it, in the unit of the logs.
@@ -170,61 +110,126 @@ def predict(
     Raises
     ------
     UsageError, InputError
-        No flight that shares a tower and band, no place to predict.
+        No source that shares a tower and band, no place to predict.
     """
-    stages = stages or Stages()
+    stages, asked = stages or Stages(), asked or Asked()
     with stages("read"):
-        planned = flight_of(where)
-        datas = [load_data(load_flight(path), path.parent, logs_root) for path in flights]
-        if not datas:
-            raise UsageError(
-                "no flight to learn from", expected="--with flight.yaml (repeatable), a flight of this site"
-            )
-        known, said = counted_once(datas)
-        observed, warnings = observe(known)
-        site = site_of(where, known)
-        _check_shared(where, planned, known, site)
-        targets = find_targets(where, site, asked or Asked(), logs_root)
-    sources = sources_of(known, observed)
+        known, said = counted_once([flight.load(logs_root) for flight in flights])
+        site, place = site_of(where, flights, known, asked.site)
+        memory = None if known else memory_of(place, site)
+        if memory is not None:
+            sources = memory.sources(site)
+        else:
+            observed, warnings = observe(known)
+            sources = sources_of(known, observed)
+            said += [text for text in warnings if "scored" not in text]
+        _check_shared(where, sources, site, "the flights heard" if known else "the site remembers")
+        targets = find_targets(where, site, asked, logs_root)
     with stages("choose"):
-        samples = [o.samples for o in observed if o.samples.antenna in sources]
-        beyond = bool(np.mean(_outside(targets, samples)[targets.known]) > 0.5)
-        bases = _bases(sources, known, samples)
-        if beyond:
-            said = [*said, "Most points lie outside the flown places: models that remember places are left out."]
-            bases.pop("none")
-        correction = choose(samples, bases, beyond=beyond)
+        model = memory or _chosen(targets, sources, known, place, said)
     with stages("predict"):
-        parts = [
-            _levels(targets, source, correction, samples, threshold_db, stages.progress) for source in sources.values()
-        ]
-        table = pd.concat(parts, ignore_index=True)
-        table["p_serving"] = _serving(table, len(targets), len(parts))
-        receivers = _receivers(known, site)
-        ranks = _ranks(targets, receivers, site)
-        table = pd.concat([table, *ranks], ignore_index=True).reindex(columns=_columns(table, bool(ranks)))
-    notes = [w for w in warnings if "scored" not in w]
-    return Prediction(
-        targets=targets,
+        receivers = _receivers(known, place, site)
+        table = _table(targets, site, (sources, model, receivers), threshold_db, stages.progress)
+    page = PredictionPage(
+        name=targets.name,
+        kind=targets.kind,
         site=site,
         table=table,
-        correction=correction,
-        sources=sources,
-        trained_on=union(*map(flight_logs, known), *(one.trained_on for one, _ in receivers.values())),
-        flights=tuple(data.settings.flight.name for data in known),
+        units={f"{s.tower} {s.channel}": s.unit for s in sources.values()},
+        shape=None if targets.grid is None else targets.grid.shape,
+        heights_m=targets.heights_m,
+        flown={f"{s.flight} {s.antenna}": track_m(s).T for one in sources.values() for s in one.samples},
         threshold_db=threshold_db,
-        warnings=(*said, *notes, *targets.remarks),
-        samples=samples,
+        warnings=(*said, *targets.remarks),
+        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        versions=versions(),
+        stages_s=stages.seconds,
+        **_about(model, known, [receiver.trained_on for receiver, _, _ in receivers.values()], table),
     )
+    return Prediction(page=page, targets=targets, model=model, sources=sources)
 
 
-def site_of(where: Path, known: Sequence[FlightData]) -> Site:
-    """Of WHERE where it is a site, else of the flights; all must share a frame."""
-    site = known[0].site
-    if where.suffix and not where.exists():
+def _about(
+    model: Flown | Memory, known: Sequence[FlightData], used: Iterable[Sequence[str]], table: pd.DataFrame
+) -> dict[str, Any]:
+    """Fields of the page that tell of the model and what it learned from; ``used``: logs of the receivers."""
+    guess = outside_share(table)
+    if isinstance(model, Memory):
+        entries = {one.entry.command: one.entry for one in model.known.values()}.values()
+        return {
+            "verdict": memory_words(list(model.known.values()), guess),
+            "flights": [name for entry in entries for name in entry.flights],
+            "trained_on": union(*(entry.trained_on for entry in entries), *used),
+            "candidates": [],
+            "model": {},
+            "chosen": {"title": TITLES["memory"], "base": "memory", "corrected": False, "field": OFF},
+        }
+    correction = model.correction
+    key = correction.base, correction.title
+    return {
+        "verdict": first_words(correction, guess),
+        "flights": [data.settings.flight.name for data in known],
+        "trained_on": union(*map(flight_logs, known), *used, *model.logs),
+        "candidates": [
+            {"base": TITLES[base], "field": name, "rmse_db": correction.rmse_db[base, name], "crps_db": crps}
+            for (base, name), crps in sorted(correction.crps_db.items(), key=lambda item: item[1])
+        ],
+        "model": asdict(correction.model),
+        "chosen": {
+            "title": f"{TITLES[correction.base]}, {correction.title}",
+            "base": correction.base,
+            "corrected": correction.on,
+            "field": correction.title,
+            "sd_factor": correction.sd_factor,
+            "rmse_db": correction.rmse_db[key],
+            "crps_db": correction.crps_db[key],
+            "left_out": "flights" if len(correction.flights) > 1 else "300 m blocks",
+        },
+    }
+
+
+# --- sources -------------------------------------------------------------------------------------------------------
+
+
+def site_of(
+    where: Path | None, flights: Sequence[NamedFlight], known: Sequence[FlightData], named: str | None = None
+) -> tuple[Site, str | Path]:
+    """Site of a prediction or plan: by name, WHERE where it is a site, that of the flights, that of WHERE.
+
+    Parameters
+    ----------
+    where : Path or None
+    flights : sequence of NamedFlight
+    known : sequence of FlightData
+        Their data; all must share the frame of the site.
+    named : str, optional
+        ``--site``.
+
+    Returns
+    -------
+    site : Site
+    place : str or Path
+        As :func:`~aerpaw_cmp.site.siteyaml.load_site` takes it.
+
+    Raises
+    ------
+    UsageError, InputError
+        No site, two sites, no such file.
+    """
+    if where is not None and where.suffix and not where.exists():
         raise InputError("no such file", expected="a site, a route, points or a flight.yaml", path=where)
-    if (is_settings(where) and flight_of(where) is None) or not where.exists():
-        site = load_site(where if where.is_file() else str(where))
+    planned = None if where is None else flight_of(where)
+    place: str | Path | None = named
+    if place is None and where is not None and planned is None and (is_settings(where) or not where.exists()):
+        place = where if where.is_file() else str(where)
+    if place is not None:
+        site = load_site(place)
+    elif known:
+        site, place = known[0].site, site_place(flights[0].settings.site.file, flights[0].path.parent)
+    elif where is not None and planned is not None:
+        site, place = choose_site(planned.site, where.parent), site_place(planned.site.file, where.parent)
+    else:
+        raise UsageError("the site is not named", expected="--site SITE, or --with a flight")
     for data in known:
         east, north = site.frame.to_local(np.array([data.site.frame.latitude_deg]), [data.site.frame.longitude_deg])
         if np.hypot(east[0], north[0]) > 1.0:
@@ -232,151 +237,190 @@ def site_of(where: Path, known: Sequence[FlightData]) -> Site:
                 f"flight {data.settings.flight.name} has site {data.site.name!r}, the prediction {site.name!r}",
                 expected="flights of one site",
             )
-    return site
+    return site, place
 
 
-def _check_shared(where: Path, planned: Any, known: Sequence[FlightData], site: Site) -> None:
-    """UsageError where the flights share no tower with the site, or none with the planned flight and its band."""
-    towers = {s.tower for data in known for s in data.rss}
-    bands = {s.link.carrier_hz for data in known for s in data.rss}
+def _check_shared(where: Path, sources: Mapping[str, Source], site: Site, who: str) -> None:
+    """UsageError where the sources share no tower with the site, or none with the planned flight and its band."""
+    planned = flight_of(where)
+    towers, bands = {s.tower for s in sources.values()}, {s.link.carrier_hz for s in sources.values()}
     wanted = {log.node for log in planned.logs if log.node} if planned is not None else set(site.towers) | towers
     links = [planned.link.rss, *planned.link.channels.values()] if planned is not None else []
     carriers = {link.carrier_hz for link in links if "carrier_hz" in link.model_fields_set}
     near = not carriers or any(abs(a / b - 1.0) <= CARRIER_BAND for a in carriers for b in bands)
     if (not wanted or wanted & towers) and near:
         return
-    heard = ", ".join(f"{t}" for t in sorted(towers)) or "no tower"
     raise UsageError(
-        f"the flights heard {heard} at {', '.join(f'{b / 1e9:g} GHz' for b in sorted(bands)) or 'no band'}; "
+        f"{who} {', '.join(sorted(towers))} at {', '.join(f'{b / 1e9:g} GHz' for b in sorted(bands))}; "
         f"{where.name} asks for {', '.join(sorted(wanted)) or 'any tower'}"
         + (f" at {', '.join(f'{c / 1e9:g} GHz' for c in sorted(carriers))}" if carriers else ""),
         expected="--with a flight that shares a tower and the band",
     )
 
 
-def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
-    """Towers that stand still and their channels that a flight heard, by antenna."""
-    heard = {o.samples.antenna for o in observed if np.isfinite(o.samples.residual_db).any()}
-    out: dict[str, Source] = {}
-    for data in known:
-        for series in data.rss:
-            source = Source(data=data, series=series)
-            if source.antenna in heard and series.tower not in data.nodes and series.unit != "dB":
-                out.setdefault(source.antenna, source)
-    if not out:
-        raise InputError("no flight has levels of a tower that stands still", expected="RSS logs with positions")
-    return out
+def _chosen(
+    targets: Targets, sources: Mapping[str, Source], known: Sequence[FlightData], place: str | Path, said: list[str]
+) -> Flown:
+    """The model that predicts the named flights best; ``said`` receives a remark on the choice.
+
+    Parameters
+    ----------
+    targets : Targets
+    sources : mapping of str to Source
+    known : sequence of FlightData
+    place : str or Path
+        Of the site.
+    said : list of str
+
+    Returns
+    -------
+    Flown
+    """
+    samples = [s for source in sources.values() for s in source.samples]
+    bases, logs = _bases(sources, known, place)
+    beyond = bool(np.mean(outside(targets.position_m[targets.known], samples)) > 0.5)
+    if beyond:
+        said.append("Most points lie outside the flown places: models that remember places are left out.")
+        bases.pop("none")
+    correction = choose(samples, bases, beyond=beyond)
+    return Flown(correction, sources, logs.get(correction.base, ()))
 
 
 def _bases(
-    sources: Mapping[str, Source], known: Sequence[FlightData], samples: Sequence[LinkSamples]
-) -> dict[str, Base]:
-    """Models that may carry the prediction; those that learned from these very flights elsewhere are left out."""
+    sources: Mapping[str, Source], known: Sequence[FlightData], place: str | Path
+) -> tuple[dict[str, Base], dict[str, list[Sequence[str]]]]:
+    """Models that may carry the prediction, and the logs that they know besides those of the flights.
+
+    Models that learned from these very flights elsewhere are left out.
+    """
 
     def each(gain: Callable[[Source, LinkSamples], FloatArray]) -> Base:
         return fixed_base(lambda s: gain(sources[s.antenna], s))
 
     bases: dict[str, Base] = {
-        "learned": lambda train: _by_degree(learned_base(train)),
+        "learned": lambda train: by_degree(learned_antennas(train).predict),
         "free space": each(lambda _, s: np.zeros(len(s))),
         "none": each(lambda source, s: -source.free_space_db(s.position_m)),
     }
-    logs = union(*map(flight_logs, known))
-    learned = [
-        p.trained_on
-        for source in sources.values()
-        for p in learned_patterns(source.series.link.build([source.series.tower], source.data.folder))
-    ]
-    if not common(logs, [*learned, *(data.settings.trained_on for data in known)]):
+    patterns = [p for s in sources.values() for p in learned_patterns(s.link.build([s.tower], s.folder))]
+    near = {
+        name: one
+        for name, one in remembered(place).items()
+        if name in sources and abs(one.series.carrier_hz / sources[name].link.carrier_hz - 1.0) <= CARRIER_BAND
+    }
+    logs: dict[str, list[Sequence[str]]] = {
+        "replay": [*(p.trained_on for p in patterns), *(data.settings.trained_on for data in known)],
+        "memory": [one.entry.trained_on for one in near.values()],
+    }
+    own = union(*map(flight_logs, known))
+    if not common(own, logs["replay"]):
         bases["replay"] = each(lambda source, s: source.replayed_db(s))
-    if len({s.flight for s in samples}) < 2:
+    if len(near) == len(sources) and not common(own, logs["memory"]):
+        bases["memory"] = lambda _: by_degree(lambda s: near[s.antenna].gain_db(s))
+    if len({s.flight for source in sources.values() for s in source.samples}) < 2:
         bases = {"free space": bases.pop("free space"), **bases}
-    return bases
-
-
-def _by_degree(predictor: Predictor) -> Predictor:
-    """A model of directions that takes many samples a degree at a time (gains have lengths of 11 degrees and more).
-
-    What a degree has is kept: later parts of a run, and other headings, ask for much the same directions.
-    """
-    known: dict[str, tuple[IntArray, FloatArray]] = {}
-
-    def predict(samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
-        if len(samples) <= MOST_DIRECTIONS:
-            return predictor(samples)
-        cells = np.zeros(len(samples), dtype=np.int64)
-        for ray in (samples.at_tower, samples.at_uav):
-            for angle in (np.arctan2(ray[:, 1], ray[:, 0]), np.arcsin(np.clip(ray[:, 2], -1.0, 1.0))):
-                cells = 361 * cells + np.round(np.degrees(angle)).astype(np.int64) + 180
-        asked, first, member = np.unique(cells, return_index=True, return_inverse=True)
-        keys, values = known.get(samples.antenna, (np.zeros(0, dtype=np.int64), np.zeros((2, 0))))
-        new = ~np.isin(asked, keys)
-        if new.any():
-            keys, values = np.append(keys, asked[new]), np.hstack([values, predictor(samples.part(first[new]))])
-            order = np.argsort(keys)
-            keys, values = known[samples.antenna] = keys[order], values[:, order]
-        gain, sd = values[:, np.searchsorted(keys, asked)[member.ravel()]]
-        return gain, sd
-
-    return predict
+    return bases, logs
 
 
 # --- levels --------------------------------------------------------------------------------------------------------
 
 
-def _levels(
+def _table(
     targets: Targets,
-    source: Source,
-    correction: Correction,
-    samples: Sequence[LinkSamples],
+    site: Site,
+    learned: tuple[Mapping[str, Source], Flown | Memory, Receivers],
     threshold_db: float | None,
     progress: Progress,
 ) -> pd.DataFrame:
-    """Rows of one tower and channel."""
-    n, mine = len(targets), [s for s in samples if s.antenna == source.antenna]
-    sd_db, kurtosis = fading_of(mine, BIN_S)
-    fading = Spread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)
-    level, slow = np.full((2, n), np.nan)
-    good = np.flatnonzero(targets.known)
-    for start in range(0, len(good), AT_ONCE):
-        rows = good[start : start + AT_ONCE]
-        level[rows], slow[rows] = _over_headings(targets, rows, source, correction)
-        progress(f"predict {source.antenna}", (start + len(rows)) / len(good))
-    beyond = between_blocks_db(correction.channels[source.antenna])
-    slow = np.where(_outside(targets, mine), np.hypot(slow, beyond), slow)
-    half = fading.half_width_db(slow, BAND)
-    frame: pd.DataFrame = pd.DataFrame(
-        {
-            "point": np.arange(n),
-            "time_s": targets.time_s,
-            **dict(zip(("east_m", "north_m", "height_m"), targets.position_m.T, strict=True)),
-            "yaw_deg": targets.yaw_deg,
-            "tower": source.series.tower,
-            "channel": source.series.channel,
-            "level_db": level,
-            "sd_db": fading.total_db(slow),
-            "slow_sd_db": slow,
-            "q05_db": level - half,
-            "q95_db": level + half,
-        }
-    )
-    if threshold_db is not None:
-        from scipy.special import ndtr
+    """Rows of every tower and channel, then of every receiver; float32, or a million points take gigabytes.
 
-        frame["p_above"] = ndtr((level - threshold_db) / frame["sd_db"].to_numpy())
-    frame["flag"] = _flags(targets, mine, level)
-    return frame
+    Parameters
+    ----------
+    targets : Targets
+    site : Site
+    learned : tuple
+        Sources, model, receivers.
+    threshold_db : float or None
+    progress : callable
+
+    Returns
+    -------
+    DataFrame
+    """
+    from scipy.special import ndtr
+
+    sources, model, receivers = learned
+    level, slow, guess = _levels(targets, sources, model, progress)
+    serving = _serving(level, slow, [source.channel for source in sources.values()])
+    towers = pd.CategoricalDtype(list(dict.fromkeys([*(s.tower for s in sources.values()), *receivers])))
+    channels = pd.CategoricalDtype(list(dict.fromkeys([*(s.channel for s in sources.values()), "rank"])))
+
+    def rows(tower: str, channel: str, flag: IntArray, index: Any, values: Mapping[str, FloatArray]) -> pd.DataFrame:
+        names = {"tower": (tower, towers), "channel": (channel, channels)}
+        kinds = pd.CategoricalDtype(list(FLAG_CODES))
+        frame: pd.DataFrame = pd.DataFrame(
+            {
+                "point": np.arange(len(targets), dtype=np.int32)[index],
+                "time_s": targets.time_s[index],
+                **dict(zip(("east_m", "north_m", "height_m"), targets.position_m[index].T, strict=True)),
+                "yaw_deg": targets.yaw_deg[index],
+                **{
+                    column: pd.Categorical.from_codes(np.full(len(flag), kind.categories.get_loc(one)), dtype=kind)
+                    for column, (one, kind) in names.items()
+                },
+                **{name: np.asarray(value, dtype=np.float32) for name, value in values.items()},
+                "flag": pd.Categorical.from_codes(flag, dtype=kinds),
+            }
+        )
+        return frame
+
+    parts, nothing = [], np.full(len(targets), np.nan, dtype=np.float32)
+    for k, source in enumerate(sources.values()):
+        fading = model.fading(source.antenna)
+        half, sd = fading.half_width_db(slow[k], BAND), fading.total_db(slow[k])
+        values = {"level_db": level[k], "sd_db": sd, "q05_db": level[k] - half, "q95_db": level[k] + half}
+        values |= {} if threshold_db is None else {"p_above": ndtr((level[k] - threshold_db) / sd)}
+        values |= {"p_serving": serving[k], "slow_sd_db": slow[k]} | (
+            dict.fromkeys(RANKS, nothing) if receivers else {}
+        )
+        flag = np.where(guess[k], FLAG_CODES["outside_flown"], 0)
+        flag[~np.isfinite(level[k])] = FLAG_CODES["out_of_coverage"]
+        flag[~targets.known] = FLAG_CODES["no_position"]
+        parts.append(rows(source.tower, source.channel, flag, slice(None), values))
+    for tower, index, p in _ranks(targets, receivers, site, progress):
+        values = dict(zip(RANKS, p.T, strict=True))
+        parts.append(rows(tower, "rank", np.zeros(len(index), dtype=np.int64), index, values))
+    table: pd.DataFrame = pd.concat(parts, ignore_index=True)
+    return table
 
 
-def _over_headings(
-    targets: Targets, rows: Any, source: Source, correction: Correction
-) -> tuple[FloatArray, FloatArray]:
-    """Level and standard deviation of 4 s means (m,); all headings count alike where none is known."""
-    position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
-    free = source.free_space_db(position)
-    each = [source.samples(position, np.where(np.isfinite(yaw), yaw, turn)) for turn in _turns(yaw)]
-    level, sd = correction.over_headings(each, whole=int(targets.known.sum()))
-    return free + level, sd
+def _levels(
+    targets: Targets, sources: Mapping[str, Source], model: Flown | Memory, progress: Progress
+) -> tuple[AnyArray, AnyArray, BoolArray]:
+    """Level, standard deviation of 4 s means (series, n) [dB], and where the model is a guess.
+
+    All headings count alike where none is known.
+    """
+    level, slow = np.full((2, len(sources), len(targets)), np.nan, dtype=np.float32)
+    guess: BoolArray = np.zeros(level.shape, dtype=np.bool_)
+    for k, source in enumerate(sources.values()):
+        for rows, share in _in_parts(targets):
+            position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
+            each = [source.targets(position, np.where(np.isfinite(yaw), yaw, turn)) for turn in _turns(yaw)]
+            level[k, rows], slow[k, rows], guess[k, rows] = model.levels(each, int(targets.known.sum()))
+            level[k, rows] += source.free_space_db(position)
+            progress(f"predict {source.antenna}", share)
+    return level, slow, guess
+
+
+def _in_parts(targets: Targets) -> Iterator[tuple[IntArray, float]]:
+    """Targets that have a position, neighbours at a time, and the share that is then done."""
+    known = np.flatnonzero(targets.known)
+    tile = np.floor(targets.position_m[known, :2] / TILE_M)
+    known = known[np.lexsort(tile.T)]
+    for start in range(0, len(known), AT_ONCE):
+        rows = known[start : start + AT_ONCE]
+        yield rows, (start + len(rows)) / len(known)
 
 
 def _turns(yaw_deg: FloatArray) -> FloatArray:
@@ -385,80 +429,64 @@ def _turns(yaw_deg: FloatArray) -> FloatArray:
     return np.asarray(np.arange(count) * (360.0 / HEADINGS))
 
 
-def _outside(targets: Targets, flown: Sequence[LinkSamples]) -> BoolArray:
-    """Targets (n,) that are further than :data:`HULL_M` or :data:`HULL_UP_M` from every sample."""
-    from scipy.spatial import cKDTree
+def _serving(level: AnyArray, slow: AnyArray, channels: Sequence[str]) -> AnyArray:
+    """Probability (series, n) that each tower is the strongest among those of its channel.
 
-    scaled = np.array([HULL_M, HULL_M, HULL_UP_M])
-    places = np.concatenate([s.position_m for s in flown])
-    out = np.zeros(len(targets), dtype=np.bool_)
-    out[targets.known] = cKDTree(places / scaled).query(targets.position_m[targets.known] / scaled)[0] > 1.0
-    return out
-
-
-def _flags(targets: Targets, mine: Sequence[LinkSamples], level: FloatArray) -> list[str]:
-    """Flag of each target for the reader: empty, or why its level is a guess or missing."""
-    flag = np.where(_outside(targets, mine), "outside_flown", "").astype(object)
-    flag[~targets.known] = "no_position"
-    flag[targets.known & ~np.isfinite(level)] = "out_of_coverage"
-    return list(flag)
-
-
-def _serving(table: pd.DataFrame, n: int, series: int) -> FloatArray:
-    """Probability that each row's tower is the strongest at its target, among the towers of its channel.
-
-    By Gauss-Hermite quadrature over the row's own level; levels of towers are taken as independent.
+    By Gauss-Hermite quadrature over the tower's own level; levels of towers are taken as independent.
     """
     from scipy.special import ndtr
 
     nodes, weight = np.polynomial.hermite_e.hermegauss(24)
-    out = np.ones(len(table))
-    groups = [table["channel"].iloc[k * n] for k in range(series)]
-    level, sd = (np.nan_to_num(table[c].to_numpy().reshape(series, n), nan=f)
-                 for c, f in (("level_db", -1e9), ("slow_sd_db", 1.0)))  # fmt: skip
-    for k in range(series):
-        total = np.zeros(n)
-        others = [j for j in range(series) if groups[j] == groups[k] and j != k]
+    out: AnyArray = np.where(np.isfinite(level), np.float32(1.0), np.float32(np.nan))
+    filled, sd = np.nan_to_num(level, nan=-1e9), np.nan_to_num(slow, nan=1.0)
+    for k, channel in enumerate(channels):
+        others = [j for j, name in enumerate(channels) if name == channel and j != k]
+        if not others:
+            continue
+        total = np.zeros(level.shape[1])
         for node, w in zip(nodes, weight / weight.sum(), strict=True):
-            at = level[k] + node * sd[k]
-            total += w * np.prod([ndtr((at - level[j]) / sd[j]) for j in others], axis=0)
-        out[k * n : (k + 1) * n] = total
-    return np.where(np.isfinite(table["level_db"]), out, np.nan)
+            at = filled[k] + node * sd[k]
+            total += w * np.prod([ndtr((at - filled[j]) / sd[j]) for j in others], axis=0)
+        out[k] *= total
+    return out
 
 
 # --- ranks ---------------------------------------------------------------------------------------------------------
 
 
-def _receivers(known: Sequence[FlightData], site: Site) -> dict[str, tuple[FittedReceiver, FlightData]]:
-    """Receivers that the flights name or the site remembers, by tower, with the flight that says the arrays."""
-    out: dict[str, tuple[FittedReceiver, FlightData]] = {}
+def _receivers(known: Sequence[FlightData], place: str | Path, site: Site) -> Receivers:
+    """Receivers that the flights name or the site remembers, by tower."""
+    out: dict[str, tuple[FittedReceiver, LinkSettings, Path]] = {}
     for data in known:
         if data.settings.rank.receiver is not None:
             for tower, one in read_receiver(data.folder / data.settings.rank.receiver).items():
-                out.setdefault(tower, (one, data))
-    memory = read_learned(known[0].settings.site.file)
-    for entry in memory.entries.values():
-        for remembered in entry.receivers:
-            path = folder_of(known[0].settings.site.file) / remembered.file
-            for tower, one in read_receiver(path).items():
-                out.setdefault(tower, (one, known[0]))
+                out.setdefault(tower, (one, data.settings.link.rank, data.folder))
+    link, folder = LinksSettings().rank, Path()
+    if known:
+        link, folder = known[0].settings.link.rank, known[0].folder
+    for entry in read_learned(place).entries.values():
+        for file in dict.fromkeys(receiver.file for receiver in entry.receivers):
+            for tower, one in read_receiver(folder_of(place) / file).items():
+                out.setdefault(tower, (one, link, folder))
     return {tower: one for tower, one in out.items() if tower in site.towers}
 
 
 def _ranks(
-    targets: Targets, receivers: Mapping[str, tuple[FittedReceiver, FlightData]], site: Site
-) -> list[pd.DataFrame]:
-    """Rows of every tower with a receiver."""
-    out = []
+    targets: Targets, receivers: Receivers, site: Site, progress: Progress
+) -> Iterator[tuple[str, IntArray, FloatArray]]:
+    """Tower, rows (n,) of the targets and probabilities (n, 4) of the ranks by every receiver.
+
+    Of more targets than :data:`MOST_RANKED` the nearest of so many stands for each.
+    """
+    from scipy.spatial import cKDTree
+
     rows = np.flatnonzero(targets.known)
-    for tower, (receiver, data) in receivers.items():
-        if not len(rows):
-            continue
-        position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
-        link = data.settings.link.rank.build([tower], data.folder)
+    some = rows[:: -(-len(rows) // MOST_RANKED)]
+    for tower, (receiver, settings, folder) in receivers.items():
+        link = settings.build([tower], folder)
         if {len(link.uav_array), len(link.tower_arrays[tower])} != {4}:
             continue
-        each = []
+        position, yaw, each = targets.position_m[some], targets.yaw_deg[some], []
         for turn in _turns(yaw):
             heading = np.where(np.isfinite(yaw), yaw, turn)
             samples = RankSamples(
@@ -466,28 +494,19 @@ def _ranks(
                 tower=tower,
                 tower_m=np.asarray(site.towers[tower].position_m),
                 poses=Poses(position, body_rotation(0.0 * heading, 0.0 * heading, heading)),
-                rank=np.full(len(rows), np.nan),
+                rank=np.full(len(some), np.nan),
                 link=link,
-                time_s=targets.time_s[rows] if targets.kind == "route" else 1e4 * np.arange(float(len(rows))),
+                time_s=targets.time_s[some] if targets.kind == "route" else 1e4 * np.arange(float(len(some))),
             )
             each.append(receiver.forecast(samples)[0])
+            progress(f"predict rank {tower}", len(each) / len(_turns(yaw)))
         p = np.mean(each, axis=0)
-        frame: pd.DataFrame = pd.DataFrame(
-            {
-                "point": rows,
-                "time_s": targets.time_s[rows],
-                **dict(zip(("east_m", "north_m", "height_m"), position.T, strict=True)),
-                "yaw_deg": yaw,
-                "tower": tower,
-                "channel": "rank",
-                **dict(zip(RANKS, p.T, strict=True)),
-                "flag": "",
-            }
-        )
-        out.append(frame)
-    return out
+        if len(some) < len(rows):
+            p = p[cKDTree(_seen(targets, some)).query(_seen(targets, rows))[1]]
+        yield tower, rows, p
 
 
-def _columns(table: pd.DataFrame, ranked: bool) -> list[str]:
-    names = [name for name in table.columns if name not in ("flag", "slow_sd_db")]
-    return [*names, "slow_sd_db", *(RANKS if ranked else ()), "flag"]
+def _seen(targets: Targets, rows: IntArray) -> FloatArray:
+    """Place and nose (n, 5) in units [m] in which ranks differ alike."""
+    yaw = np.radians(np.nan_to_num(targets.yaw_deg[rows]))
+    return np.column_stack([targets.position_m[rows], NOSE_M * np.sin(yaw), NOSE_M * np.cos(yaw)])

@@ -79,11 +79,14 @@ class Asked:
         Of a grid.
     heading_deg : float, optional
         Of a grid and of points without yaw; without it all headings count alike.
+    site : str, optional
+        Where neither flights nor the place name it.
     """
 
     heights_m: tuple[float, ...] = (40.0,)
     spacing_m: float = 30.0
     heading_deg: float | None = None
+    site: str | None = None
 
 
 def level_samples(

@@ -1,0 +1,288 @@
+"""Links that can be predicted: of the flights that were named, or of the memory of the site."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ...common.errors import InputError, UsageError
+from ...common.inputs import input_files
+from ...common.units import BoolArray, FloatArray
+from ...compare.calibration import Observed
+from ...compare.correction import BIN_S, Correction, Predictor, between_blocks_db, by_degree
+from ...compare.direction_gain import LinkSamples
+from ...compare.spread import NO_SPREAD, Spread, fading_of
+from ...flight.data import FlightData, RssSeries, load_data
+from ...flight.learned_gain import pair_db
+from ...flight.remembered import Remembered, remembered
+from ...flight.replay import replay_poses
+from ...flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings, load_flight
+from ...flight.track import body_rotation
+from ...propagation.arrays import Poses
+from ...propagation.field.baselines import free_space_dbm
+from ...site.learned import LearnedLevel
+from ...site.site import Site
+from ..learning.calibrate import load_calibration
+from .where import is_settings, level_samples
+
+REPLAYED_AT_ONCE = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class NamedFlight:
+    """A flight file that ``--with`` names."""
+
+    path: Path
+    settings: FlightFile
+
+    def load(self, logs_root: Path | None) -> FlightData:
+        """Its logs and track."""
+        return load_data(self.settings, self.path.parent, logs_root)
+
+
+def named_flights(paths: Sequence[Path]) -> list[NamedFlight]:
+    """Flight files, and those that a calibration.yaml lists.
+
+    Raises
+    ------
+    UsageError, InputError
+        As of any settings file.
+    """
+    out = []
+    for path in paths:
+        text = path.read_text(encoding="utf-8", errors="replace") if is_settings(path) and path.is_file() else ""
+        listed = text.startswith("calibration:") or "\ncalibration:" in text
+        each = [path.parent / name for name in load_calibration(path).flights] if listed else [path]
+        out += [NamedFlight(one, load_flight(one)) for one in each]
+    return out
+
+
+def files_of(flights: Sequence[NamedFlight], logs_root: Path | None) -> list[Path]:
+    """Every file that the flights are read from."""
+    return [file for flight in flights for file in input_files(flight.settings, flight.path, logs_root)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Link of one tower and channel, as the first flight that has it describes it, or the memory of the site.
+
+    Parameters
+    ----------
+    tower, channel, unit : str
+    link : LinkSettings
+    site : Site
+    folder : Path
+        Where antenna files resolve.
+    rt, rss : RtSettings, RssSettings
+        How a replay goes, and which sum of its paths counts.
+    samples : tuple of LinkSamples
+        Of the flights that have it.
+    """
+
+    tower: str
+    channel: str
+    unit: str
+    link: LinkSettings
+    site: Site
+    folder: Path = Path()
+    rt: RtSettings = field(default_factory=RtSettings)
+    rss: RssSettings = field(default_factory=RssSettings)
+    samples: tuple[LinkSamples, ...] = ()
+
+    @classmethod
+    def of(cls, data: FlightData, series: RssSeries, samples: Sequence[LinkSamples]) -> Source:
+        """As a flight has it; ``samples`` are those of all flights."""
+        own = tuple(s for s in samples if (s.tower, s.channel) == (series.tower, series.channel))
+        settings = data.settings
+        return cls(
+            tower=series.tower,
+            channel=series.channel,
+            unit=series.unit,
+            link=series.link,
+            site=data.site,
+            folder=data.folder,
+            rt=settings.rt,
+            rss=settings.rss,
+            samples=own,
+        )
+
+    @property
+    def antenna(self) -> str:
+        """``tower.channel``."""
+        return f"{self.tower}.{self.channel}"
+
+    @property
+    def tower_m(self) -> FloatArray:
+        """Place of the array (3,)."""
+        return np.asarray(self.site.towers[self.tower].position_m)
+
+    def free_space_db(self, position_m: FloatArray) -> FloatArray:
+        """Level (n,) of free space [dBm]."""
+        place, link = self.tower_m[None, :], self.link
+        return np.asarray(free_space_dbm(place, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
+
+    def targets(self, position_m: FloatArray, yaw_deg: FloatArray) -> LinkSamples:
+        """Targets (n,) of a level aircraft as samples without a level."""
+        return level_samples((self.tower, self.channel), self.tower_m, position_m, yaw_deg, np.zeros(len(yaw_deg)))
+
+    def replayed_db(self, samples: LinkSamples) -> FloatArray:
+        """Replayed level above free space (n,) of a level aircraft [dB]; NaN without a path."""
+        link = self.link.build([self.tower], self.folder)
+        body, world = samples.at_uav, -samples.at_tower
+        turn = np.arctan2(world[:, 1], world[:, 0]) - np.arctan2(body[:, 1], body[:, 0])
+        flat = np.zeros(len(turn))
+        known = self.rt.attitude != "ignored"
+        rotation = body_rotation(flat, flat, 90.0 - np.degrees(turn) if known else flat + 90.0)
+        level = np.empty(len(samples))
+        for start in range(0, len(samples), REPLAYED_AT_ONCE):
+            part = slice(start, start + REPLAYED_AT_ONCE)
+            poses = Poses(samples.position_m[part], rotation[part])
+            replayed = replay_poses(self.site, self.rt, link, poses)
+            total = replayed.rss_dbm if self.rss.field == "coherent" else replayed.rss_power_dbm
+            level[part] = total[:, 0] + pair_db(link, poses, self.tower_m[None, :])
+        return np.asarray(level - self.free_space_db(samples.position_m))
+
+
+def track_m(samples: LinkSamples) -> FloatArray:
+    """Some 500 positions (n, 2) of a flight, for drawings."""
+    return np.asarray(samples.position_m[:: max(1, len(samples) // 500), :2])
+
+
+def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
+    """Towers that stand still and their channels that a flight heard, by antenna."""
+    heard = [o.samples for o in observed if np.isfinite(o.samples.residual_db).any()]
+    out: dict[str, Source] = {}
+    for data in known:
+        for series in data.rss:
+            source = Source.of(data, series, heard)
+            if source.samples and series.tower not in data.nodes and series.unit != "dB":
+                out.setdefault(source.antenna, source)
+    if not out:
+        raise InputError("no flight has levels of a tower that stands still", expected="RSS logs with positions")
+    return out
+
+
+# --- models --------------------------------------------------------------------------------------------------------
+
+HULL_M = 60.0
+HULL_UP_M = 20.0
+"""Targets further than this from every sample that is known are flagged, horizontally and in height [m]."""
+
+Levels = tuple[FloatArray, FloatArray, BoolArray]
+"""Level above free space and standard deviation of 4 s means (n,) [dB], and where the model is a guess."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """The model that the named flights taught: a base with or without a residual field."""
+
+    correction: Correction
+    sources: Mapping[str, Source]
+    logs: Sequence[Sequence[str]] = ()
+    """SHA-256 of what its base knows besides the named flights."""
+
+    def levels(self, each: Sequence[LinkSamples], whole: int) -> Levels:
+        """Levels at targets as seen with each of some headings, which count alike; ``whole``: targets of the run."""
+        antenna = each[0].antenna
+        level, slow = self.correction.over_headings(each, whole=whole)
+        guess = outside(each[0].position_m, self.sources[antenna].samples)
+        beyond = between_blocks_db(self.correction.channels[antenna])
+        return level, np.where(guess, np.hypot(slow, beyond), slow), guess
+
+    def fading(self, antenna: str) -> Spread:
+        """Spread of samples about their means over 4 s."""
+        sd_db, kurtosis = fading_of(self.sources[antenna].samples, BIN_S)
+        return dataclasses.replace(NO_SPREAD, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)
+
+    def offset_db(self, antenna: str) -> float:
+        """Mean of logged minus replayed levels [dB]."""
+        source = self.sources[antenna]
+        binned = [samples.binned(BIN_S) for samples in source.samples]
+        return float(np.nanmean([np.nanmean(b.residual_db - source.replayed_db(b)) for b in binned]))
+
+
+class Memory:
+    """The model that the site remembers: antennas and level of each channel, from flights that are not named.
+
+    Parameters
+    ----------
+    known : mapping of str to Remembered
+        By antenna (``tower.channel``), each with a level.
+    """
+
+    def __init__(self, known: Mapping[str, Remembered]) -> None:
+        self.known = known
+        self._gain_db: Predictor = by_degree(lambda samples: known[samples.antenna].gain_db(samples))
+
+    def levels(self, each: Sequence[LinkSamples], whole: int) -> Levels:  # noqa: ARG002
+        """As :meth:`Flown.levels`; a guess where flights taught less than half of the variance of the gains."""
+        antenna = each[0].antenna
+        gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
+        level, spread, gain_variance = self._level(antenna), self._spread(antenna), (sds**2).mean(axis=0)
+        rest = spread.own_sd_db**2 + spread.noise_sd_db**2 + level.sd_db**2
+        guess = gain_variance > 0.5 * self.known[antenna].prior_variance_db2
+        return gains.mean(axis=0) + level.offset_db, np.sqrt(gain_variance + gains.var(axis=0) + rest), guess
+
+    def fading(self, antenna: str) -> Spread:
+        """As :meth:`Flown.fading`."""
+        return dataclasses.replace(self._spread(antenna), own_sd_db=0.0, noise_sd_db=0.0)
+
+    def offset_db(self, antenna: str) -> float:
+        """Mean of logged levels minus those of the antennas [dB]."""
+        return self._level(antenna).offset_db
+
+    def _level(self, antenna: str) -> LearnedLevel:
+        level = self.known[antenna].series.level
+        assert level is not None
+        return level
+
+    def _spread(self, antenna: str) -> Spread:
+        return Spread.from_text(self.known[antenna].tower.notes) or NO_SPREAD
+
+    def sources(self, site: Site) -> dict[str, Source]:
+        """Links by antenna, with isotropic ends."""
+        out = {}
+        for antenna, one in self.known.items():
+            series, level = one.series, self._level(antenna)
+            link = LinkSettings(carrier_hz=series.carrier_hz, transmit_power_dbm=level.transmit_power_dbm)
+            out[antenna] = Source(
+                tower=series.tower,
+                channel=series.channel,
+                unit=level.unit,
+                link=link,
+                site=site,
+                rss=RssSettings(field="power"),
+            )
+        return out
+
+
+def memory_of(place: str | Path, site: Site) -> Memory:
+    """Model of what a site remembers of its towers.
+
+    Raises
+    ------
+    UsageError
+        Nothing that a level can be predicted from.
+    """
+    every = remembered(place)
+    known = {name: one for name, one in every.items() if one.series.level and one.series.tower in site.towers}
+    if known:
+        return Memory(known)
+    raise UsageError(
+        "no flight to learn from, and the site remembers no level of its towers",
+        expected="--with flight.yaml (repeatable), a flight of this site",
+        cause="a memory of an earlier version: 'aerpaw-cmp calibrate --into-site' makes it anew" if every else "",
+    )
+
+
+def outside(position_m: FloatArray, flown: Sequence[LinkSamples]) -> BoolArray:
+    """Targets (n,) that are further than :data:`HULL_M` or :data:`HULL_UP_M` from every sample."""
+    from scipy.spatial import cKDTree
+
+    scaled = np.array([HULL_M, HULL_M, HULL_UP_M])
+    places = np.concatenate([s.position_m for s in flown])
+    return np.asarray(cKDTree(places / scaled).query(position_m / scaled, distance_upper_bound=1.0)[0] > 1.0)

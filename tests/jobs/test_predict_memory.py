@@ -1,0 +1,159 @@
+"""Prediction from what a site remembers: planted tables, and a flight that nobody named, against its planted offset."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.compare.spread import Spread
+from aerpaw_cmp.jobs.prediction import predict as job
+from aerpaw_cmp.jobs.prediction.corrected_map import corrected_maps
+from aerpaw_cmp.jobs.prediction.sources import Memory, named_flights
+from aerpaw_cmp.jobs.prediction.where import Asked
+from aerpaw_cmp.site.learned import Entry, Errors, LearnedLevel, LearnedSeries, folder_of, read_learned, remember
+from aerpaw_cmp.site.siteyaml import load_site
+from aerpaw_cmp.site.sphere_pattern import sphere_csv
+from tests.jobs.test_calibrate import OFFSET_DB, ROUTES, YAW_DEG, settings, write
+from tests.simulated import simulate
+
+pytestmark = pytest.mark.usefixtures("few_pictures")
+
+SPREAD = Spread(own_sd_db=1.0, noise_sd_db=2.0, fading_sd_db=3.0, fading_kurtosis=0.0, bin_s=4.0)
+LEVEL = LearnedLevel(offset_db=-7.0, sd_db=1.5, transmit_power_dbm=30.0, unit="dBm")
+
+
+def table(gain_db: float, sd_db: tuple[float, float], note: str = "") -> bytes:
+    """Gain of ``gain_db`` times the cosine of the azimuth; the first deviation before the antenna, the second behind."""
+    azimuth = np.radians(np.arange(0.0, 360.0, 5.0))
+    ahead = np.cos(azimuth) >= 0
+    sd = np.broadcast_to(np.where(ahead, *sd_db), (37, 72))
+    return sphere_csv(np.broadcast_to(gain_db * np.cos(azimuth), (37, 72)), sd, (note,) if note else ()).encode()
+
+
+def copied(folder: Path) -> Path:
+    """The packaged site without its memory."""
+    packaged = Path(str(folder_of("lake_wheeler"))).with_suffix(".yaml")
+    place = folder / "mine.yaml"
+    place.write_bytes(packaged.read_bytes())
+    return place
+
+
+def entry(level: LearnedLevel | None) -> Entry:
+    series = LearnedSeries(
+        tower="LW1", channel="A", reader="sounder_log", carrier_hz=3.3e9, tower_file="t.csv.gz", uav_file="u.csv.gz",
+        sd_db=1.0, level=level,
+    )  # fmt: skip
+    errors = Errors(series=2, rmse_db=3.7, rmse_4s_db=3.0, free_space_rmse_db=6.1, inside_90=0.9)
+    return Entry(command="c", made="2026-01-02", flights=["a", "b"], flown=["2025-06-01"], trained_on=["a" * 64],
+                 errors=errors, series=[series])  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A site that remembers one channel at LW1: cosines of 4 dB and 2 dB at its ends."""
+    place = copied(tmp_path_factory.mktemp("memory"))
+    files = {"t.csv.gz": table(4.0, (1.0, 5.0), SPREAD.text()), "u.csv.gz": table(2.0, (0.5, 0.5))}
+    remember(place, "planted", entry(LEVEL), files)
+    tower = load_site("lake_wheeler").towers["LW1"].position_m
+    rows = [(tower[0] + away, tower[1], tower[2], yaw) for away, yaw in ((300.0, 90.0), (300.0, 270.0), (-300.0, 90.0))]
+    pd.DataFrame(rows, columns=["east_m", "north_m", "height_m", "yaw_deg"]).to_csv(place.parent / "p.csv", index=False)
+    return place
+
+
+def test_levels_are_free_space_and_the_remembered_gains(site: Path) -> None:
+    said = job.predict(site.parent / "p.csv", [], Asked(site=str(site)), threshold_db=-80.0)
+    levels = said.table[said.table["channel"] == "A"]
+    free = 30.0 - 20 * np.log10(4 * np.pi * 300.0 * 3.3e9 / 299_792_458.0)
+    # the tower sees the UAV in the east, east and west; the nose points away from the tower, at it, and at it
+    expected = free - 7.0 + np.array([4.0 - 2.0, 4.0 + 2.0, -4.0 + 2.0])
+    np.testing.assert_allclose(levels["level_db"], expected, atol=0.02)
+    near, far = (1.0**2 + 0.5**2), (5.0**2 + 0.5**2)
+    slow = np.sqrt(np.array([near, near, far]) + 1.0**2 + 2.0**2 + 1.5**2)
+    np.testing.assert_allclose(levels["slow_sd_db"], slow, atol=0.01)
+    np.testing.assert_allclose(levels["sd_db"], np.hypot(slow, 3.0), atol=0.01)
+    assert list(levels["flag"]) == ["", "", "outside_flown"]  # behind the tower flights taught nothing
+    assert said.page.trained_on == ("a" * 64,)
+    assert "expect an RMSE of 3.7 dB on another flight, free space 6.1 dB" in said.page.verdict
+    assert said.page.units == {"LW1 A": "dBm"}
+
+
+def test_an_unknown_heading_adds_the_spread_of_the_gain_over_headings(site: Path) -> None:
+    points = pd.read_csv(site.parent / "p.csv").assign(yaw_deg=np.nan)
+    points.to_csv(site.parent / "open.csv", index=False)
+    said = job.predict(site.parent / "open.csv", [], Asked(site=str(site)))
+    known = job.predict(site.parent / "p.csv", [], Asked(site=str(site)))
+    one, other = (x.table[x.table["channel"] == "A"].iloc[0] for x in (said, known))
+    # eight headings: the cosine has mean 0 and variance 1/2
+    assert one["level_db"] - other["level_db"] == pytest.approx(2.0, abs=0.02)
+    assert one["slow_sd_db"] ** 2 - other["slow_sd_db"] ** 2 == pytest.approx(2.0**2 / 2, abs=0.05)
+
+
+def test_maps_are_corrected_by_the_memory_alone(site: Path) -> None:
+    maps = corrected_maps(str(site), 300.0, ((40.0,), (60.0,)), [])
+    assert [(item.link, item.height_m) for item in maps.levels] == [("LW1 A", 40.0)]
+    assert maps.ranks == {}  # this memory has no receiver
+    said = job.predict(site, [], Asked(heights_m=(40.0,), spacing_m=300.0))
+    np.testing.assert_allclose(maps.levels[0].corrected_dbm, said.table["level_db"] + 7.0, atol=1e-3)
+
+
+def test_a_site_that_remembers_no_level_is_one_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place = copied(tmp_path)
+    with pytest.raises(UsageError, match="the site remembers no level"):
+        job.predict(place, [])
+    remember(place, "old", entry(None), {"t.csv.gz": table(4.0, (1, 1)), "u.csv.gz": table(2.0, (1, 1))})
+    assert main(["predict", str(place), "-o", str(tmp_path / "out")]) == 2
+    assert "an earlier version" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A site that learned from two flights past a sector antenna, and a third flight that it never saw."""
+    place = tmp_path_factory.mktemp("flown")
+    for name in ROUTES:
+        path = write(place / f"{name}.yaml", settings(name, {"model": "tr38901"}, YAW_DEG))
+        simulate(path)
+        write(path, settings(name, {"model": "iso"}))
+    write(place / "calibration.yaml", {"calibration": "planted", "flights": ["first.yaml", "second.yaml"]})
+    copied(place)
+    words = ["calibrate", str(place / "calibration.yaml"), "--into-site", str(place / "mine.yaml")]
+    assert main([*words, "-o", str(place / "calibrated.yaml")]) == 0
+    return place
+
+
+def test_a_flight_is_predicted_before_it_from_the_memory_alone(flown: Path) -> None:
+    """Planted offsets are added to the measurement: 12 and 9 dB are remembered, 4 dB are flown."""
+    level = read_learned(flown / "mine.yaml").entries["planted"].series[0].level
+    assert level is not None
+    # a flight left out misses by the difference of both offsets; the prior of 1.5 dB counts as two more
+    assert level.sd_db == pytest.approx(np.sqrt((2 * 1.5**2 + 2 * 3.0**2) / 4), abs=0.4)
+    out, asked = flown / "before", ["--site", str(flown / "mine.yaml")]
+    assert main(["predict", str(flown / "aside.yaml"), *asked, "-o", str(out)]) == 0
+    assert main(["report", str(flown / "aside.yaml"), "--against", str(out), "--audit", "none", "-o",
+                 str(flown / "report")]) == 0  # fmt: skip
+    (score,) = json.loads((flown / "report" / "metrics.json").read_text())["against"]["scores"].values()
+    mean = (OFFSET_DB["first"] + OFFSET_DB["second"]) / 2
+    assert score["bias_db"] == pytest.approx(mean - OFFSET_DB["aside"], abs=1.0)
+    assert score["own_offset_rmse_db"] < 3.0
+    trained = json.loads((out / "metrics.json").read_text())["trained_on"]
+    assert set(trained) == set(read_learned(flown / "mine.yaml").entries["planted"].trained_on)
+
+
+def test_remembered_antennas_stand_beside_other_bases_but_not_on_their_own_flights(flown: Path) -> None:
+    known = {name: job.predict(flown / "aside.yaml", named_flights([flown / f"{name}.yaml"]),
+                               Asked(site=str(flown / "mine.yaml"))) for name in ("aside", "first")}  # fmt: skip
+    bases = {name: {row["base"] for row in said.page.candidates} for name, said in known.items()}
+    assert "antennas that the site remembers" in bases["aside"]
+    assert "antennas that the site remembers" not in bases["first"]
+    assert not isinstance(known["first"].model, Memory)
+
+
+def test_a_calibration_file_names_its_flights(flown: Path) -> None:
+    paths = [one.path.name for one in named_flights([flown / "calibration.yaml", flown / "aside.yaml"])]
+    assert paths == ["first.yaml", "second.yaml", "aside.yaml"]

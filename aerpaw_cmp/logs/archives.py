@@ -40,6 +40,8 @@ _DAMAGE = (
     EOFError,
     OSError,
     ValueError,
+    IndexError,
+    OverflowError,
     NotImplementedError,
 )
 """What Python's libraries raise for damaged archives; a ValueError for a directory that begins before the file does."""

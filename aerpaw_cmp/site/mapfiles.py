@@ -5,13 +5,8 @@ An element that cannot be used is left out and listed, with its line; only a fil
 
 from __future__ import annotations
 
-import io
 import json
-import lzma
 import re
-import struct
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -22,6 +17,7 @@ from xml.parsers import expat
 
 from ..common.errors import InputError
 from ..common.files import read_input
+from ..logs import archives
 from .osmfiles import read_elements
 from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, left_out, lonlat
 from .xmlfiles import xml_root
@@ -75,29 +71,19 @@ def read_map_file(path: str | Path) -> MapFile:
     raise InputError("not a map file", expected=FORMATS, path=path)
 
 
-_BROKEN_ARCHIVE = (
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, NotImplementedError, RuntimeError, EOFError, OSError,
-    ValueError, IndexError, OverflowError,
-)  # fmt: skip
-"""What damaged bytes make ``zipfile`` and its decompressors raise."""
-
-
 def _unzipped(data: bytes, path: Path) -> bytes:
-    """The first KML file of a KMZ archive."""
+    """The main KML file of a KMZ archive."""
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            names = [entry for entry in archive.infolist() if entry.filename.lower().endswith(".kml")]
-            if not names:
-                raise InputError("an archive without a .kml file", expected="KMZ", path=path)
-            main = next((entry for entry in names if entry.filename.lower() == "doc.kml"), names[0])
-            if main.file_size > MAX_BYTES:
-                raise InputError(
-                    f"{main.filename} has {main.file_size} bytes", expected=f"at most {MAX_BYTES}", path=path
-                )
-            with archive.open(main) as file:
-                return file.read(MAX_BYTES)
-    except _BROKEN_ARCHIVE as error:
-        raise InputError(f"not a KMZ archive ({error})", cause="the file was cut off", path=path) from None
+        members = archives.members(data, path)
+    except InputError as error:
+        raise InputError(f"not a KMZ archive ({error.found})", cause="the file was cut off", path=path) from None
+    maps = {name.lower(): member for name, member in members.items() if name.lower().endswith(".kml")}
+    if not maps:
+        raise InputError("an archive without a .kml file", expected="KMZ", path=path)
+    main = maps.get("doc.kml") or next(iter(maps.values()))
+    if main.size > MAX_BYTES:
+        raise InputError(f"{main.name} has {main.size} bytes", expected=f"at most {MAX_BYTES}", path=path)
+    return main.read(MAX_BYTES)
 
 
 def _from_json(data: bytes, path: Path) -> MapFile:

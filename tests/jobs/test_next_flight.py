@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.jobs.prediction import next_flight
 from aerpaw_cmp.logs.route import read_route
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted
@@ -100,3 +101,11 @@ def test_points_without_a_position_are_left_out(place: Path) -> None:
     table = pd.read_csv(out / "sd_map.csv")
     assert len(table) == 2 * 4  # four headings at each of two points
     assert table.notna().all().all()
+
+
+def test_without_a_geofence_the_area_is_that_of_the_site() -> None:
+    site = load_site("lake_wheeler")
+    west, east, south, north = site.area_m
+    area = next_flight._area(site, next_flight.PlanAsked(tower_distance_m=0.0))
+    # routes stay 3 m inside
+    np.testing.assert_allclose(area.bounds, (west + 3.0, south + 3.0, east - 3.0, north - 3.0), atol=0.1)

@@ -238,7 +238,7 @@ def _open_ends(site: Site, asked: PlanAsked) -> dict[str, tuple[str, str]]:
 def _area(site: Site, asked: PlanAsked) -> Any:
     """Area where a route may run."""
     if asked.fence is None:
-        west, south, east, north = site.area_m
+        west, east, south, north = site.area_m
         fence = shapely.box(west, south, east, north)
     else:
         fence = shapely.union_all(_polygons(asked.fence, site))

@@ -118,7 +118,7 @@ def predict(
         site, place = site_of(where, flights, known, asked.site)
         memory = None if known else memory_of(place, site)
         if memory is not None:
-            sources = memory.sources(site)
+            sources = memory.sources()
         else:
             observed, warnings = observe(known)
             sources = sources_of(known, observed)

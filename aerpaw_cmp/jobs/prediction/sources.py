@@ -212,19 +212,23 @@ class Memory:
     ----------
     known : mapping of str to Remembered
         By antenna (``tower.channel``), each with a level.
+    site : Site
     """
 
-    def __init__(self, known: Mapping[str, Remembered]) -> None:
-        self.known = known
+    def __init__(self, known: Mapping[str, Remembered], site: Site) -> None:
+        self.known, self._site = known, site
         self._gain_db: Predictor = by_degree(lambda samples: known[samples.antenna].gain_db(samples))
 
     def levels(self, each: Sequence[LinkSamples], whole: int) -> Levels:  # noqa: ARG002
-        """As :meth:`Flown.levels`; a guess where flights taught less than half of the variance of the gains."""
+        """As :meth:`Flown.levels`; a guess where flights taught less than half of the variance, or off the site."""
         antenna = each[0].antenna
         gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
         level, spread, gain_variance = self._level(antenna), self._spread(antenna), (sds**2).mean(axis=0)
         rest = spread.own_sd_db**2 + spread.noise_sd_db**2 + level.sd_db**2
-        guess = gain_variance > 0.5 * self.known[antenna].prior_variance_db2
+        west, east, south, north = self._site.area_m
+        off = np.any(np.abs(each[0].position_m[:, :2] - (0.5 * (west + east), 0.5 * (south + north)))
+                     > (0.5 * (east - west), 0.5 * (north - south)), axis=1)  # fmt: skip
+        guess = off | (gain_variance > 0.5 * self.known[antenna].prior_variance_db2)
         return gains.mean(axis=0) + level.offset_db, np.sqrt(gain_variance + gains.var(axis=0) + rest), guess
 
     def fading(self, antenna: str) -> Spread:
@@ -243,7 +247,7 @@ class Memory:
     def _spread(self, antenna: str) -> Spread:
         return Spread.from_text(self.known[antenna].tower.notes) or NO_SPREAD
 
-    def sources(self, site: Site) -> dict[str, Source]:
+    def sources(self) -> dict[str, Source]:
         """Links by antenna, with isotropic ends."""
         out = {}
         for antenna, one in self.known.items():
@@ -254,7 +258,7 @@ class Memory:
                 channel=series.channel,
                 unit=level.unit,
                 link=link,
-                site=site,
+                site=self._site,
                 rss=RssSettings(field="power"),
             )
         return out
@@ -271,7 +275,7 @@ def memory_of(place: str | Path, site: Site) -> Memory:
     every = remembered(place)
     known = {name: one for name, one in every.items() if one.series.level and one.series.tower in site.towers}
     if known:
-        return Memory(known)
+        return Memory(known, site)
     raise UsageError(
         "no flight to learn from, and the site remembers no level of its towers",
         expected="--with flight.yaml (repeatable), a flight of this site",

@@ -1,4 +1,4 @@
-"""The LLVM that Dr.Jit compiles with: find one, try it in a child process, install one.
+"""The LLVM that Dr.Jit compiles with: find one, try it in a child process, name the line that installs one.
 
 Standard library only, so that set-up can use it before anything else works.
 
@@ -408,7 +408,8 @@ def explain(trials: Sequence[Trial]) -> str:
 # ---------------------------------------------------------------------------------------------- installing
 
 
-def _os_families() -> set[str]:
+def os_families() -> set[str]:
+    """Names of the distribution and of those that it is like; the system where there is none."""
     try:
         release = platform.freedesktop_os_release()
     except OSError:
@@ -427,7 +428,7 @@ def apt_packages(search_output: str) -> list[str]:
     return [name for _, name in new_enough]
 
 
-def _known_to_apt() -> str:
+def known_to_apt() -> str:
     """Entries of apt's lists for LLVM runtimes of any version; empty where there are no lists."""
     apt_cache = shutil.which("apt-cache")
     if apt_cache is None:
@@ -438,9 +439,9 @@ def _known_to_apt() -> str:
 
 def install_line() -> str:
     """The one line that installs an LLVM on this machine."""
-    families = _os_families()
+    families = os_families()
     if families & {"debian", "ubuntu"}:
-        known = _known_to_apt()
+        known = known_to_apt()
         offered = apt_packages(known)
         if known and not offered:  # Ubuntu 22.04 ends at 15: packages of the LLVM project
             needs = "wget gnupg lsb-release software-properties-common"  # what that script calls
@@ -458,62 +459,3 @@ def install_line() -> str:
     if families & {"darwin"}:
         return "brew install llvm"
     return f"export {LIBRARY_VARIABLE}=/path/to/libLLVM.so  # any LLVM of {MINIMUM_MAJOR} or newer"
-
-
-def root_prefix() -> list[str] | None:
-    """Prefix of a command that needs root: nothing, sudo, or None when it may not be run."""
-    if hasattr(os, "geteuid") and os.geteuid() == 0:
-        return []
-    sudo = shutil.which("sudo")
-    if sudo is None:
-        return None
-    silent = subprocess.run([sudo, "-n", "true"], capture_output=True, check=False).returncode == 0
-    if silent:
-        return [sudo, "-n"]
-    return [sudo] if sys.stdin is not None and sys.stdin.isatty() else None
-
-
-def install(say: Callable[[str], None], attempt: Callable[[Library], Trial] | None = None) -> Trial | None:
-    """Install the distribution's newest LLVM runtime with apt, trying older ones if its trial fails.
-
-    Parameters
-    ----------
-    say : callable
-        Told each command before it runs.
-    attempt : callable, optional
-        The trial; :func:`try_library` by default.
-
-    Returns
-    -------
-    Trial or None
-        The trial of what was installed; None if nothing could be (not Debian or Ubuntu, no root, no package).
-    """
-    prefix = root_prefix()
-    if prefix is None or not _os_families() & {"debian", "ubuntu"} or shutil.which("apt-get") is None:
-        return None
-
-    def apt_get(*arguments: str) -> bool:
-        command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", *arguments]
-        say(" ".join(command))
-        # a person may have to answer sudo; apt itself asks nothing
-        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-        if done.returncode:
-            say(done.stdout.strip()[-1000:])
-        return done.returncode == 0
-
-    def apt_install(*packages: str) -> Trial | None:
-        if not apt_get("install", "-y", "-qq", "--no-install-recommends", *packages):
-            return None
-        trials = first_that_works(candidates(), attempt)
-        return trials[-1] if trials else None
-
-    apt_get("update", "-qq")  # old lists name packages that the mirror no longer has
-    # an LLVM is there and only Dr.Jit's own need is missing, or else the distribution's LLVMs, newest first
-    wanted: list[tuple[str, ...]] = [(APT_RUNTIME,)] if candidates() else []
-    wanted += [(package, APT_RUNTIME) for package in apt_packages(_known_to_apt())]
-    last: Trial | None = None
-    for packages in wanted:
-        last = apt_install(*packages) or last
-        if last is not None and last.ok:
-            break
-    return last

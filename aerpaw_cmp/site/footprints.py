@@ -483,39 +483,22 @@ def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 
 def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
-    group = sorted(group, key=lambda shape: -shape.height_m)
-    tree = shapely.STRtree([shape.area for shape in group])
-    home: list[_Shape | None] = []  # the kept shape that each one became or was merged into
-    pieces: dict[int, list[BaseGeometry]] = {}
-    for index, shape in enumerate(group):
-        higher = sorted(int(j) for j in tree.query(shape.area, predicate="intersects") if j < index)
-        covered = shapely.union_all([group[j].area for j in higher])
-        free = _areas_only(shape.area.difference(covered))
+    kept: list[_Shape] = []
+    for shape in sorted(group, key=lambda shape: -shape.height_m):
+        over = [other for other in kept if other.area.intersects(shape.area)]
+        free = _areas_only(shape.area.difference(shapely.union_all([other.area for other in over])))
         if free.is_empty:
             actions.append(f"{shape.source}: left out, it lies inside buildings at least as high")
-            home.append(None)
             continue
-        same = next((h for j in higher if (h := home[j]) is not None and _alike(h, shape)), None)
-        if same is None:
-            same = _Shape(
-                name=shape.name,
-                source=shape.source,
-                area=free,
-                height_m=shape.height_m,
-                stated=shape.stated,
-                material=shape.material,
-            )
-            pieces[id(same)] = [free]
-            if shape.area.area - free.area > 0.01:
-                actions.append(f"{shape.source}: the part under a higher building was cut away")
-        else:
-            others = shapely.union_all([group[j].area for j in higher if home[j] is not same])
-            pieces[id(same)].append(shape.area.difference(others))
+        same = next((other for other in over if _alike(other, shape)), None)
+        if same is not None:
+            same.area = _areas_only(same.area.union(free))
             actions.append(f"{shape.source}: overlaps {same.source} at the same height; they were merged")
-        home.append(same)
-    kept = list({id(shape): shape for shape in home if shape is not None}.values())
-    for shape in kept:
-        shape.area = _areas_only(shapely.union_all(pieces[id(shape)]))
+            continue
+        if shape.area.area - free.area > 0.01:
+            actions.append(f"{shape.source}: the part under a higher building was cut away")
+        shape.area = free
+        kept.append(shape)
     return kept
 
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
+import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from aerpaw_cmp.common.errors import CheckError
 from aerpaw_cmp.machine import llvm
 
+ROOT = Path(__file__).resolve().parents[2]
 ABORTS = (
     "import os, sys; sys.stderr.write('x\\nLLVM ERROR: Cannot select: fmaximum\\ny\\n'); sys.stderr.flush(); os.abort()"
 )
@@ -21,6 +25,17 @@ ANSWERS = "print('noise'); print('{\"right\": true, \"llvm\": [%d, 1, 7]}')"
 def put(folder: Path, *names: str) -> None:
     for name in names:
         (folder / name).write_bytes(b"\x7fELF")
+
+
+@pytest.fixture
+def setup() -> ModuleType:
+    """The script of ``make setup``, which alone installs anything."""
+    spec = importlib.util.spec_from_file_location("setup_llvm", ROOT / "tools" / "setup_llvm.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture
@@ -129,7 +144,9 @@ def test_what_sionna_wants_of_typing_is_there() -> None:
     assert hasattr(typing, "Self")
 
 
-def test_what_drjit_itself_lacks_is_named_and_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_drjit_itself_lacks_is_named_and_installed(
+    tmp_path: Path, setup: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As on a minimal Debian: the loader's message comes first, an unrelated NameError last."""
     program = (
         "try: raise ImportError('libatomic.so.1: cannot open shared object file: No such file or directory')\n"
@@ -144,10 +161,10 @@ def test_what_drjit_itself_lacks_is_named_and_installed(tmp_path: Path, monkeypa
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(tmp_path))
     monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "_os_families", lambda: {"debian"})
-    monkeypatch.setattr(llvm, "root_prefix", list)
+    monkeypatch.setattr(llvm, "os_families", lambda: {"debian"})
+    monkeypatch.setattr(setup, "root_prefix", list)
     said: list[str] = []
-    again = llvm.install(said.append, lambda library: llvm.Trial(library, (tmp_path / "installed").exists()))
+    again = setup.install(said.append, lambda library: llvm.Trial(library, (tmp_path / "installed").exists()))
     assert again is not None
     assert again.ok
     assert [line.split()[-1] for line in said] == ["-qq", "libatomic1"]
@@ -202,8 +219,8 @@ def test_prepare_points_drjit_to_what_works(
 def test_prepare_without_any_gives_the_line_that_mends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(tmp_path))
     monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "_os_families", lambda: {"debian"})
-    monkeypatch.setattr(llvm, "_known_to_apt", lambda: "libllvm19 - x\n")
+    monkeypatch.setattr(llvm, "os_families", lambda: {"debian"})
+    monkeypatch.setattr(llvm, "known_to_apt", lambda: "libllvm19 - x\n")
     llvm._trials.cache_clear()
     with pytest.raises(CheckError, match=r"no libLLVM was found.*apt-get install -y libllvm19") as caught:
         llvm.prepare_llvm()
@@ -217,7 +234,7 @@ def fake_tool(folder: Path, name: str, script: str) -> None:
 
 
 def test_install_takes_the_newest_and_falls_back_when_its_trial_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, setup: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """apt is a shell script that puts libraries down; version 22 fails its trial, 19 passes."""
     tools, libraries = tmp_path / "bin", tmp_path / "lib"
@@ -232,14 +249,14 @@ def test_install_takes_the_newest_and_falls_back_when_its_trial_fails(
     monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(libraries))
     monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "_os_families", lambda: {"debian"})
-    monkeypatch.setattr(llvm, "root_prefix", list)
+    monkeypatch.setattr(llvm, "os_families", lambda: {"debian"})
+    monkeypatch.setattr(setup, "root_prefix", list)
     said: list[str] = []
 
     def attempt(library: llvm.Library) -> llvm.Trial:
         return llvm.Trial(library, library.version == (19,), "" if library.version == (19,) else "aborted")
 
-    trial = llvm.install(said.append, attempt)
+    trial = setup.install(said.append, attempt)
     assert trial is not None
     assert trial.ok
     assert trial.library == llvm.Library(libraries / "libLLVM.so.19", (19,))
@@ -250,10 +267,10 @@ def test_install_takes_the_newest_and_falls_back_when_its_trial_fails(
     ]
 
 
-def test_install_refuses_without_root(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(llvm, "root_prefix", lambda: None)
+def test_install_refuses_without_root(setup: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(setup, "root_prefix", lambda: None)
     said: list[str] = []
-    assert llvm.install(said.append) is None
+    assert setup.install(said.append) is None
     assert said == []
 
 
@@ -262,7 +279,7 @@ def test_install_refuses_without_root(monkeypatch: pytest.MonkeyPatch) -> None:
     [("fedora", "dnf install"), ("arch", "pacman"), ("darwin", "brew"), ("other", "DRJIT_LIBLLVM_PATH=")],
 )
 def test_every_system_gets_a_line(family: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(llvm, "_os_families", lambda: {family})
+    monkeypatch.setattr(llvm, "os_families", lambda: {family})
     assert line in llvm.install_line()
 
 
@@ -275,8 +292,8 @@ def test_every_system_gets_a_line(family: str, line: str, monkeypatch: pytest.Mo
     ],
 )
 def test_the_line_of_a_debian_names_what_can_be_had(known: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(llvm, "_os_families", lambda: {"ubuntu"})
-    monkeypatch.setattr(llvm, "_known_to_apt", lambda: known)
+    monkeypatch.setattr(llvm, "os_families", lambda: {"ubuntu"})
+    monkeypatch.setattr(llvm, "known_to_apt", lambda: known)
     assert line in llvm.install_line()
     assert ("apt.llvm.org" in llvm.install_line()) == ("apt.llvm.org" in line)
 
@@ -299,19 +316,25 @@ def test_this_machines_llvm_traces_two_paths() -> None:
     assert trials[-1].ok, trials
 
 
-def test_setup_script_installs_no_llvm_where_a_package_is_what_fails(tmp_path: Path) -> None:
-    """The real script beside a Dr.Jit that asks typing for a name that is not there, as Sionna RT did on Python 3.10."""
-    import subprocess
+def run_setup(folder: Path, *, path: str = "", before: str = "") -> subprocess.CompletedProcess[str]:
+    """The real script, for which a folder holds all the libraries that there are."""
+    environ = {**os.environ, "PYTHONPATH": path, llvm.FOLDERS_VARIABLE: str(folder)}
+    environ.pop(llvm.LIBRARY_VARIABLE, None)
+    script = str(ROOT / "tools" / "setup_llvm.py")
+    program = f"import os, runpy, shutil\n{before}\nrunpy.run_path({script!r}, run_name='__main__')"
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=ROOT, env=environ, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    return done
 
+
+def test_setup_script_installs_no_llvm_where_a_package_is_what_fails(tmp_path: Path) -> None:
+    """The script beside a Dr.Jit that asks typing for a name that is not there, as Sionna RT did on Python 3.10."""
     (tmp_path / "drjit").mkdir()
     (tmp_path / "drjit/__init__.py").write_text("from typing import no_such_name\n")
     (tmp_path / "libLLVM.so.19.1").touch()
-    root = Path(__file__).resolve().parents[2]
-    environ = {**os.environ, "PYTHONPATH": str(tmp_path), llvm.FOLDERS_VARIABLE: str(tmp_path)}
-    environ.pop(llvm.LIBRARY_VARIABLE, None)
-    command = [sys.executable, str(root / "tools/setup_llvm.py")]
-    done = subprocess.run(command, cwd=root, env=environ, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
+    done = run_setup(tmp_path, path=str(tmp_path))
     assert "whatever the LLVM" in done.stderr
     assert "no_such_name" in done.stderr
     assert "apt-get" not in done.stderr
@@ -319,19 +342,7 @@ def test_setup_script_installs_no_llvm_where_a_package_is_what_fails(tmp_path: P
 
 @pytest.mark.sionna
 def test_setup_script_prints_the_one_line_when_nothing_can_be_installed(tmp_path: Path) -> None:
-    """The real script, told that there is no library anywhere and no way to become root."""
-    import subprocess
-
-    script = Path(__file__).resolve().parents[2] / "tools/setup_llvm.py"
-    program = (
-        "import runpy, sys; from aerpaw_cmp.machine import llvm; llvm.root_prefix = lambda: None;"
-        f"runpy.run_path({str(script)!r}, run_name='__main__')"
-    )
-    environ = {**os.environ, llvm.FOLDERS_VARIABLE: str(tmp_path)}
-    environ.pop(llvm.LIBRARY_VARIABLE, None)
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=script.parents[1], env=environ, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 1
+    """There is no library anywhere, and no way to become root."""
+    nobody = "os.geteuid = lambda: 1\nwhich = shutil.which\nshutil.which = lambda name: which(name) if name != 'sudo' else None"
+    done = run_setup(tmp_path, before=nobody)
     assert done.stderr.splitlines()[-1].strip() == llvm.install_line()
-    assert "Traceback" not in done.stderr

@@ -22,6 +22,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -90,7 +91,7 @@ def load_variant(prefer: str | None = None) -> str:
         If no LLVM serves.
     """
     let_sionna_load()
-    _leave_viewer_for_later()
+    _leave_viewers_for_later()
     kinds = (prefer,) if prefer else ("cuda", "llvm")
     without_llvm: CheckError | None = None
     if "llvm" in kinds:
@@ -116,21 +117,23 @@ def load_variant(prefer: str | None = None) -> str:
     )
 
 
-def _leave_viewer_for_later() -> None:
-    """Let Sionna load its viewer for notebooks when a scene is previewed, not with the package.
+def _leave_viewers_for_later() -> None:
+    """Let Sionna load its viewers for notebooks when a scene is previewed, not with the package.
 
-    With it come ipywidgets, pythreejs and IPython: a sixth of the time of ``import sionna.rt``.
+    With them come ipywidgets, pythreejs and IPython: a sixth of the time of ``import sionna.rt``.
     """
-    name = "sionna.rt.preview"
+    if "sionna.rt" in sys.modules:
+        return
+    for name, viewer in (("preview", "Previewer"), ("rcs.scattering_model_viewer", "ScatteringModelViewer")):
+        later = sys.modules[f"sionna.rt.{name}"] = ModuleType(f"sionna.rt.{name}")
+        vars(later)[viewer] = partial(_view, later, viewer)
 
-    def previewer(*given: Any, **named: Any) -> Any:
-        if sys.modules.get(name) is later:
-            del sys.modules[name]
-        return import_module(name).Previewer(*given, **named)
 
-    if "sionna.rt" not in sys.modules:
-        later = sys.modules[name] = ModuleType(name)
-        vars(later)["Previewer"] = previewer
+def _view(later: ModuleType, viewer: str, *given: Any, **named: Any) -> Any:
+    """Load a viewer in place of the module that stood for it, and make one."""
+    if sys.modules.get(later.__name__) is later:
+        del sys.modules[later.__name__]
+    return getattr(import_module(later.__name__), viewer)(*given, **named)
 
 
 def free_memory() -> None:
@@ -174,6 +177,7 @@ class _Builder:
 
     def scene(self, chosen: IntArray) -> _Scene:
         """Scene of the faces ``chosen``."""
+        import drjit as dr
         import sionna.rt as rt
 
         if _ALIVE:
@@ -194,6 +198,9 @@ class _Builder:
             objects.append(rt.SceneObject(mi_mesh=mesh, name=plain, radio_material=material))
             owners.append(owner[rows])
         scene.add(objects)
+        # read when a kernel runs: literals would be compiled anew for each carrier
+        made = scene.radio_materials.values()
+        dr.make_opaque(scene.frequency, *((m.relative_permittivity, m.conductivity) for m in made))
         return _Scene(scene, {int(o.object_id): f for o, f in zip(objects, owners, strict=True)})
 
     def _mesh(self, name: str, vertices: FloatArray, triangle: IntArray) -> Any:

@@ -50,11 +50,6 @@ class PredictionPage:
     stages_s: Mapping[str, float]
 
     @property
-    def outside_flown(self) -> float:
-        """Share of the points where the model is a guess."""
-        return outside_share(self.table)
-
-    @property
     def series(self) -> list[tuple[str, pd.DataFrame]]:
         """Rows of each tower and channel that has levels."""
         levels = self.table[self.table["channel"] != "rank"]

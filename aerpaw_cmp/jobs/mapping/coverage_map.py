@@ -60,6 +60,7 @@ from ...propagation.replay import Replay, replay
 from ...propagation.scene import Scene
 from ...propagation.search.crowns import Crowns
 from ...report import maps_data as page
+from ...report.prediction_html import outside_share
 from ...site.site import Site
 from ...site.siteyaml import load_site
 from ..prediction.corrected_map import CorrectedMaps
@@ -502,7 +503,7 @@ def maps_record(
         corrected=() if flown is None else tuple(flown.rss_maps(result.grid)),
         corrected_rank=tuple(_rank_versions(outcome)),
         flown_m=() if flown is None else tuple(line.T for line in flown.prediction.flown.values()),
-        outside_flown=0.0 if flown is None else flown.prediction.outside_flown,
+        outside_flown=0.0 if flown is None else outside_share(flown.prediction.table),
         corrected_words="" if flown is None else flown.prediction.verdict,
         rank=rank,
         rank_by_tower=tuple(by_tower),

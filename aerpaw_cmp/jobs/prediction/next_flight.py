@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,16 +16,17 @@ import shapely
 from ...common.errors import InputError, UsageError
 from ...common.stages import Stages
 from ...common.units import FloatArray
-from ...compare import calibration
-from ...compare.calibration import Recipe
+from ...common.versions import versions
 from ...compare.correction import choose
 from ...compare.direction_gain import GainModel, LinkSamples
 from ...compare.next_flight import Known, rms_db
 from ...flight.patterns import NOSES, Pattern, Route, Waypoint, allowed_area, cut, flown, route_of
+from ...flight.route_files import kml_text, plan_text, waypoints_csv
 from ...flight.training import counted_once
 from ...logs.route import read_areas
+from ...report.plan_html import PlanPage
 from ...site.site import Site
-from ..learning.calibrate import learned_antennas, observe, rotation
+from ..learning.calibrate import learned_antennas, observe
 from .predict import site_of
 from .sources import NamedFlight, sources_of
 from .where import Asked, Targets, find_targets, level_samples
@@ -92,45 +94,15 @@ class Ranked:
     sd_db: float
     refused: str = ""
 
+    @property
+    def row(self) -> dict[str, Any]:
+        """For metrics.json."""
+        length = {"length_m": self.route.length_m, "minutes": self.route.duration_s / 60.0}
+        return {"name": self.route.name, "sd_db": self.sd_db, **length, "refused": self.refused}
+
 
 Candidate = tuple[Route, Pattern | None, str]
 """Route, pattern (None of a file), and why it may not be flown."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CurvePoint:
-    """Standard deviation that a flight of some minutes leaves [dB]."""
-
-    minutes: float
-    length_m: float
-    sd_db: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlightPlan:
-    """The outcome: candidates, best first, and the standard deviation over the target before and after the best.
-
-    ``place_m`` (n, 3), ``before_db``, ``after_db`` (n,): root mean square over antennas and headings.
-    """
-
-    target: str
-    site: Site
-    area: Any
-    antennas: tuple[str, ...]
-    flights: tuple[str, ...]
-    asked: PlanAsked
-    candidates: tuple[Ranked, ...]
-    now_db: float
-    curve: tuple[CurvePoint, ...]
-    place_m: FloatArray
-    before_db: FloatArray
-    after_db: FloatArray
-    warnings: tuple[str, ...]
-
-    @property
-    def best(self) -> Ranked:
-        """The candidate that is written."""
-        return self.candidates[0]
 
 
 def plan_flight(
@@ -140,7 +112,7 @@ def plan_flight(
     *,
     logs_root: Path | None = None,
     stages: Stages | None = None,
-) -> FlightPlan:
+) -> PlanPage:
     """Rank candidate flights by the standard deviation that they would leave over a target.
 
     Parameters
@@ -155,7 +127,8 @@ def plan_flight(
 
     Returns
     -------
-    FlightPlan
+    PlanPage
+        Candidates best first, the files of the best, and the standard deviation over the target before and after it.
 
     Raises
     ------
@@ -193,22 +166,43 @@ def plan_flight(
     with stages("map"):
         shown = {a: _thinned(s, 6 * MOST_TARGETS) for a, s in wanted.items()}
         before, after = known.sd_db([], shown), known.sd_db(_samples(ranked[0].route, ends, site), shown)
-        place = next(iter(shown.values())).position_m
-    return FlightPlan(
+    best, ways, speed = ranked[0], ranked[0].route.waypoints, asked.speed_mps
+    return PlanPage(
         target=target,
-        site=site,
-        area=area,
+        sentence=_sentence(best, curve, rms_db(known.sd_db([], thin))),
         antennas=tuple(ends),
-        flights=tuple(d.settings.flight.name for d in datas),
-        asked=asked,
-        candidates=tuple(ranked),
-        now_db=rms_db(known.sd_db([], thin)),
-        curve=tuple(curve),
-        place_m=place,
+        flights=[data.settings.flight.name for data in datas],
+        candidates=[one.row for one in ranked],
+        curve=curve,
+        outline_m=np.array(area.exterior.coords),
+        holes_m=[np.array(ring.coords) for ring in area.interiors],
+        track_m=best.route.position_m,
+        place_m=next(iter(shown.values())).position_m,
         before_db=_over(before),
         after_db=_over(after),
-        warnings=tuple(said),
+        towers={name: np.asarray(t.position_m) for name, t in site.towers.items()},
+        files={
+            "route.plan": plan_text(ways, site.frame, speed),
+            "route.kml": kml_text(ways, site.frame, best.route.name),
+            "route.csv": waypoints_csv(ways, site.frame),
+        },
+        warnings=said,
+        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        versions=versions(),
+        stages_s=stages.seconds,
     )
+
+
+def _sentence(best: Ranked, curve: Sequence[Mapping[str, float]], now_db: float) -> str:
+    """Opening text of the page."""
+    minutes = best.route.duration_s / 60.0
+    text = (
+        f"Fly {best.route.name}: {best.route.length_m / 1000.0:.1f} km, {minutes:.0f} min. It lowers the standard "
+        f"deviation over the target from {now_db:.1f} to {best.sd_db:.1f} dB."
+    )
+    for enough in [p for p in curve if p["minutes"] < 0.9 * minutes][-1:]:
+        text += f" A flight of {enough['minutes']:.0f} min leaves {enough['sd_db']:.1f} dB."
+    return text
 
 
 def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float], stages: Stages) -> list[Ranked]:
@@ -377,8 +371,7 @@ def _known(series: Sequence[LinkSamples]) -> Known:
     """Strengths and residual field by the flights that were flown; the model's own without any."""
     model, left = GainModel(), None
     if series:
-        learned = calibration.learn(series, Recipe(model=model, rotation=rotation))
-        model = learned.model
+        model = learned_antennas(series).model
         correction = choose(series, {"learned": lambda train: learned_antennas(train).predict})
         left = correction.model if correction.on else None
     return Known(series=series, model=model, field=left)
@@ -401,19 +394,19 @@ CURVE_OF = 3
 
 def _curve(
     ranked: Sequence[Ranked], leaves_db: Callable[[Route], float], site: Site, area: Any, asked: PlanAsked
-) -> list[CurvePoint]:
+) -> list[dict[str, float]]:
     """Standard deviations that shorter and longer flights of the best candidates leave; of files, shorter ones."""
-    out: list[CurvePoint] = []
+    out: list[dict[str, float]] = []
     best = [r for r in ranked if not r.refused][:CURVE_OF]
     for share in SHARES:
         tried = []
         for route in filter(None, (_of_length(item, share, area, asked) for item in best)):
             raised = _raised(route, site)
             sd = leaves_db(raised)
-            tried.append(CurvePoint(minutes=raised.duration_s / 60.0, length_m=raised.length_m, sd_db=sd))
-        for point in sorted(tried, key=lambda point: point.sd_db)[:1]:
-            least = min([point.sd_db, *(p.sd_db for p in out)])  # a longer flight may hold the shorter one
-            out.append(replace(point, sd_db=least))
+            tried.append({"minutes": raised.duration_s / 60.0, "length_m": raised.length_m, "sd_db": sd})
+        for point in sorted(tried, key=lambda point: point["sd_db"])[:1]:
+            least = min([point["sd_db"], *(p["sd_db"] for p in out)])  # a longer flight may hold the shorter one
+            out.append(point | {"sd_db": least})
     return out
 
 

@@ -61,13 +61,6 @@ class _Parts(NamedTuple):
     gain: float
 
 
-class _Fitted(NamedTuple):
-    """Largest log likelihood at a lag, and the parts that have it."""
-
-    log_likelihood: float
-    parts: _Parts
-
-
 _START = _Parts(5.0, 0.3, 1.0)
 
 
@@ -190,8 +183,9 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     Means y over a second are normal with mean offset + slope log10(d) + p(t - lag), p the prediction of a model, and
     three parts that vary: gains over the direction at either end (Gaussian processes), a residual with memory
     (Ornstein-Uhlenbeck) and a white one. Offset, slope and gains are integrated out, the scale is profiled; memory,
-    white share and gain are those of largest likelihood on a small grid, per channel. The model is that of the largest
-    likelihood of all channels. A level that depends on no position must be less likely than that.
+    white share and gain are those of largest likelihood on a small grid, per channel, at lag 0 or at the likeliest lag
+    of a model. Each lag counts with the model that explains it best: one that is no likelier than another, at another
+    lag, excludes nothing. A level that depends on no position must be less likely than that.
     """
     models = list(channels[0].along.predicted_db)
     tables = {id(c.along): c.along.tables() for c in {id(c.along): c for c in channels}.values()}
@@ -200,20 +194,17 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
         return _nothing(NO_OVERLAP, window_s)
     lags = _symmetric(window_s, _STEP_S)
     first = np.sum([b.likelihood(lags, _START) for b in bins.values()], axis=0)
-    starts = lags[first.argmax(axis=0)].tolist()  # of each model; those that begin at one lag are fitted together
-    fitted_at = {lag: [b.fitted(lag) for b in bins.values()] for lag in dict.fromkeys(starts)}
-    fits = [[fit[m] for fit in fitted_at[lag]] for m, lag in enumerate(starts)]
-    likeliest = [sum(fit.log_likelihood for fit in fit_of) for fit_of in fits]
-    model = int(np.argmax(likeliest))
-    fitted = dict(zip(bins, fits[model], strict=True))
+    starts = {0.0, *lags[first.argmax(axis=0)].tolist()}  # of each model, and of clocks that agree
+    parts = {name: dict.fromkeys(p for lag in starts for p in b.fitted(lag)) for name, b in bins.items()}
 
     def likelihood(some: FloatArray) -> FloatArray:
-        return np.stack([b.likelihood(some, fitted[name].parts)[:, model] for name, b in bins.items()])
+        return np.stack([np.max([b.likelihood(some, p) for p in parts[name]], axis=0).T for name, b in bins.items()])
 
-    tried = _finer(lags, likelihood, window_s)
-    estimate = _judged(*tried, tuple(bins), window_s)
-    estimate = replace(estimate, model=models[model], n=sum(b.n for b in bins.values()))
-    explained = likeliest[model] - sum(b.constant() for b in bins.values())
+    tried, own = _finer(lags, likelihood, window_s)
+    estimate = _judged(tried, own, tuple(bins), window_s)
+    total = own.sum(axis=0).max(axis=1)  # of each model at its likeliest lag
+    estimate = replace(estimate, model=models[int(total.argmax())], n=sum(b.n for b in bins.values()))
+    explained = total.max() - sum(b.constant() for b in bins.values())
     if explained < EVIDENCE_NAT + np.log(len(lags)):  # so much is had by trying as many lags
         return replace(estimate, verdict=CANNOT_TELL, reason=NO_DEPENDENCE)
     return estimate
@@ -226,19 +217,19 @@ NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
 def _finer(
     lags: FloatArray, likelihood: Callable[[FloatArray], FloatArray], window_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Lags (m,), finer where the log likelihood (channels, m) of all channels is near its largest."""
+    """Lags (m,), finer where the log likelihood (channels, models, m) of all channels is near its largest."""
     own, step = likelihood(lags), _STEP_S
     while step > _FINEST_S:
-        total = own.sum(axis=0)
+        total = own.sum(axis=0).max(axis=0)
         near = lags[total > total.max() - EVIDENCE_NAT - 2.0]
         if len(near) > _MOST_FINE:
             break
         step /= 5.0
         fine = np.unique(np.round((near[:, None] + step * np.arange(-4, 5)).ravel(), 6))
         fine = fine[(np.abs(fine) <= window_s) & ~np.isin(fine, np.round(lags, 6))]
-        lags, own = np.concatenate([lags, fine]), np.concatenate([own, likelihood(fine)], axis=1)
+        lags, own = np.concatenate([lags, fine]), np.concatenate([own, likelihood(fine)], axis=-1)
         order = np.argsort(lags)
-        lags, own = lags[order], own[:, order]
+        lags, own = lags[order], own[..., order]
     return lags, own
 
 
@@ -256,9 +247,9 @@ def _nothing(reason: str, window_s: float) -> ClockEstimate:
 
 
 def _judged(lags: FloatArray, own: FloatArray, names: Sequence[str], window_s: float) -> ClockEstimate:
-    """The verdict of log likelihoods (channels, lags)."""
-    total = own.sum(axis=0)
-    total = total - total.max()
+    """The verdict of log likelihoods (channels, models, lags)."""
+    models = own.sum(axis=0)
+    best, total = int(models.max(axis=1).argmax()), models.max(axis=0) - models.max()
     left = np.flatnonzero(total > -EVIDENCE_NAT)
     first, last = lags[max(left[0] - 1, 0)], lags[min(left[-1] + 1, len(lags) - 1)]  # the nearest that are excluded
     low, high = max(float(first) - STAMPS_S, -window_s), min(float(last) + STAMPS_S, window_s)
@@ -275,7 +266,7 @@ def _judged(lags: FloatArray, own: FloatArray, names: Sequence[str], window_s: f
         ci95_s=(low, high),
         verdict=verdict,
         reason=reason,
-        channels_s={name: float(lags[value.argmax()]) for name, value in zip(names, own, strict=True)},
+        channels_s={name: float(lags[value.argmax()]) for name, value in zip(names, own[:, best], strict=True)},
         window_s=window_s,
         against_zero_nat=against,
     )
@@ -335,21 +326,22 @@ class _Bins:
         memory = _Memory(self.mean_s, parts.memory_s, parts.white)
         return np.stack([memory.likelihood(*self.system(lag), (parts.gain,))[0] for lag in lags])
 
-    def fitted(self, lag: float) -> list[_Fitted]:
+    def fitted(self, lag: float) -> list[_Parts]:
         """The parts of largest likelihood at a lag, of each model."""
-        return self._fitted(*self.system(lag), _GAIN)
+        return [parts for _, parts in self._fitted(*self.system(lag), _GAIN)]
 
     def constant(self) -> float:
         """Largest log likelihood of a level that depends on no position."""
         level = np.column_stack([np.ones(self.n), np.zeros(self.n)])
-        return self._fitted(level, (self.mean_db - self.mean_db.mean())[:, None], (0.0,))[0].log_likelihood
+        return self._fitted(level, (self.mean_db - self.mean_db.mean())[:, None], (0.0,))[0][0]
 
-    def _fitted(self, features: FloatArray, residual: FloatArray, gains: Sequence[float]) -> list[_Fitted]:
+    def _fitted(self, features: FloatArray, residual: FloatArray, gains: Sequence[float]) -> list[tuple[float, _Parts]]:
+        """Largest log likelihood of each model, and the parts that have it."""
         memories = list(product(_MEMORY_S, _WHITE))
         tried = [_Memory(self.mean_s, *memory).likelihood(features, residual, gains) for memory in memories]
         values = np.stack(tried).reshape(-1, residual.shape[1])  # the gain varies fastest
         parts = [_Parts(*memory, gain) for memory, gain in product(memories, gains)]
-        return [_Fitted(float(values[best, m]), parts[best]) for m, best in enumerate(values.argmax(axis=0))]
+        return [(float(values[best, m]), parts[best]) for m, best in enumerate(values.argmax(axis=0))]
 
 
 def _averaged(table: FloatArray, width: float) -> FloatArray:
@@ -360,7 +352,7 @@ def _averaged(table: FloatArray, width: float) -> FloatArray:
     """
     from scipy.ndimage import uniform_filter1d
 
-    known = np.isfinite(table).all(axis=1)
+    known: BoolArray = np.asarray(np.isfinite(table).all(axis=1))
     size = max(round(width), 1)
     share = uniform_filter1d(known.astype(np.float64), size, mode="nearest")
     out = uniform_filter1d(np.where(known[:, None], table, 0.0), size, axis=0, mode="nearest")

@@ -192,7 +192,7 @@ def test_the_verdict_follows_from_the_lags_that_are_left(peaks, verdict):
     total = np.full((1, len(lags)), -30.0)
     for lag, value in peaks.items():
         total[0, np.argmin(np.abs(lags - lag))] = value
-    clock = _judged(lags, total, ["one"], 15.0)
+    clock = _judged(lags, total[:, None], ["one"], 15.0)
     assert clock.verdict == verdict
     assert clock.radio_minus_telemetry_s in peaks
     assert -15.0 <= clock.ci95_s[0] <= clock.radio_minus_telemetry_s <= clock.ci95_s[1] <= 15.0
@@ -243,17 +243,26 @@ def test_ratios_do_not_vote_on_the_clock_where_levels_do(monkeypatch):
     assert [c.name for c in flight_replay.clock_channels(data, series[1:])] == ["quality"]
 
 
+def test_a_lag_is_excluded_only_where_no_model_explains_it():
+    """Two models of the same likelihood, one of them sharp at 9 s: AFAR 328 loc 3, whose node the levels placed."""
+    lags = np.arange(-15.0, 15.01, 0.5)
+    shifted, agreeing = (np.full(len(lags), -30.0) for _ in range(2))
+    shifted[lags == 9.0], agreeing[np.abs(lags) <= 0.5] = 0.0, -0.2
+    assert _judged(lags, np.stack([shifted, agreeing])[None], ["one"], 15.0).verdict == CANNOT_TELL
+    assert _judged(lags, np.stack([shifted, agreeing - 5.0])[None], ["one"], 15.0).verdict == SHIFTED
+
+
 def test_a_mirrored_likelihood_has_the_mirrored_interval():
     lags = np.arange(-15.0, 15.01, 0.5)
     total = -0.8 * (lags - 3.0)[None] ** 2 - np.array([[0.1], [2.3]]) * np.abs(lags)
-    there, back = (_judged(lags, own, ["one", "two"], 15.0) for own in (total, total[:, ::-1]))
+    there, back = (_judged(lags, own[:, None], ["one", "two"], 15.0) for own in (total, total[:, ::-1]))
     assert back.radio_minus_telemetry_s == -there.radio_minus_telemetry_s
     assert back.ci95_s == (-there.ci95_s[1], -there.ci95_s[0])
     assert back.channels_s == {name: -lag for name, lag in there.channels_s.items()}
     assert (back.verdict, back.against_zero_nat) == (there.verdict, there.against_zero_nat)
     alone = np.full((1, len(lags)), -30.0)
     alone[0, 36] = 0.0  # 3 s alone: as far as the nearest lags that are excluded, and what stamps are off
-    assert _judged(lags, alone, ["one"], 15.0).ci95_s == (2.5 - STAMPS_S, 3.5 + STAMPS_S)
+    assert _judged(lags, alone[:, None], ["one"], 15.0).ci95_s == (2.5 - STAMPS_S, 3.5 + STAMPS_S)
 
 
 def test_half_a_second_is_no_shift_on_any_grid():
@@ -263,4 +272,4 @@ def test_half_a_second_is_no_shift_on_any_grid():
         total = np.full((1, 301), -30.0)
         for lag, value in ((3.0, 0.0), (0.5, -3.9)):
             total[0, np.argmin(np.abs(lags - sign * lag))] = value
-        assert _judged(lags, total, ["one"], 15.0).against_zero_nat == pytest.approx(3.9)
+        assert _judged(lags, total[:, None], ["one"], 15.0).against_zero_nat == pytest.approx(3.9)

@@ -69,6 +69,7 @@ SMALLEST: dict[str, list[str]] = {
     "planted_causes": ["--flights", "16"],
     "planted_fields": ["--sets", "1", "--targets", "200"],
     "planted_faults": ["--only", "foliage", "--every", "20"],
+    "predict_scale": ["--points", "500", "--flights", "2"],
     "replay": ["--quick"],
     "report": ["--quick"],
     "scaling": ["--axes", "poses"],

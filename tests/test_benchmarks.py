@@ -34,20 +34,3 @@ def test_what_needs_the_field_data_is_left_out_without(
     monkeypatch.delenv("AERPAW_CMP_FIELD_DATA", raising=False)
     assert every["check"](["kriging_field"]) == 0
     assert "left out: AERPAW_CMP_FIELD_DATA is not set" in capsys.readouterr().out
-
-
-def test_equal_error_is_the_fewest_samples_that_find_as_many_paths() -> None:
-    peers = runpy.run_path(str(BENCHMARKS / "peers.py"))
-    ran, missed = [], {1_000: 43, 10_000: 0, 100_000: 0, 1_000_000: 0}
-
-    def search(poses: int, samples: int, **_: int) -> dict:
-        ran.append(samples)
-        return {"ratio": samples / 100.0, "extra_paths": missed[samples], "samples": samples}
-
-    ratios = peers["path_search_ratios"]
-    ratios.__globals__["path_search"] = search
-    equal = ratios(1_000, tuple(missed))["equal_error"]
-    assert (equal["samples"], equal["ratio"]) == (10_000, 100.0)
-    assert ran == [1_000_000, 1_000, 10_000]  # no more than is needed
-    missed |= {1_000: 7, 10_000: 7}
-    assert ratios(1_000, (1_000, 10_000, 100_000))["equal_error"]["samples"] == 100_000

@@ -20,14 +20,14 @@ from .shown import number, print_json, say, table
 )
 def bench(
     poses: Annotated[int, typer.Option(min=2, help="Poses of the flight that is replayed.")] = 200,
-    quick: Annotated[bool, typer.Option("--quick", help="Few poses, at most 1e4 samples.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
     as_json: Json = False,
 ) -> None:
     """Speed against error on this machine."""
     from ..jobs import bench as job
 
     if quick:
-        result = job.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), progress=say)
+        result = job.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), ratios=False, progress=say)
     else:
         result = job.run_bench(poses=poses, progress=say)
     if as_json:
@@ -62,6 +62,8 @@ def bench(
         "RSS error dB max / rms",
     ]
     table([*header, "rank disagreement per K"], rows, f"Speed against error ({_conditions(result['conditions'])})")
+    for name, ratio in result["ratios"].items():
+        print(f"{name}: {ratio:.3g} times")
 
 
 def _conditions(made: Mapping[str, Any]) -> str:

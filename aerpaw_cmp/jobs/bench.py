@@ -1,9 +1,11 @@
-"""Speed against error of the engines, for ``aerpaw-cmp bench``."""
+"""Speed against error of the engines, and the tool beside its peers, for ``aerpaw-cmp bench``."""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
+import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,6 +37,9 @@ BATCH = 50
 EXPLICIT_BATCH = 10
 """The same with explicit arrays, which multiply sources and targets."""
 
+LINES = 20_523
+"""Lines of a real channel-sounder flight."""
+
 T = TypeVar("T")
 
 Row: TypeAlias = "dict[str, Any]"
@@ -44,9 +49,10 @@ def run_bench(
     *,
     poses: int = 200,
     samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000),
+    ratios: bool = True,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Speed against error of the replay, from one run.
+    """Speed against error of the replay, and how many times faster than its peers each part is, from one run.
 
     Parameters
     ----------
@@ -54,20 +60,45 @@ def run_bench(
         Of the flight that is replayed.
     samples : tuple of int
         Rays per tower of the sionna engine.
+    ratios : bool
+        Compare with the peers, too.
     progress : Progress
 
     Returns
     -------
     dict
-        ``conditions`` and ``replay.rows``.
+        ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
     """
     site, link, some = random_scene(poses)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
+    measured = _against_peers(progress) if ratios else {}
     about = {"poses": poses, "towers": list(link.tower_arrays), "buildings": len(site.buildings)}
     return {
         "conditions": {**about, "cpus": os.cpu_count()},
         "replay": {"rows": rows},
+        "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None},
+        "details": measured,
     }
+
+
+def _against_peers(progress: Progress) -> dict[str, Any]:
+    """Ratios to each peer; at equal error and with the same work on both sides first."""
+    progress("path search against PathSolver, at equal error and at 1e6 samples")
+    searches = path_search_ratios()
+    progress("Kriging against PyKrige")
+    shared = kriging_shared_weights()
+    measured: dict[str, Any] = {
+        "path_search_image_vs_sionna_equal_error": searches["equal_error"],
+        "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
+        "kriging_vs_pykrige_one_field": shared and {**shared, "ratio": shared["ratio_one_field"]},
+        "kriging_vs_pykrige": shared,
+    }
+    progress("ingest against pandas")
+    measured["ingest_vs_pandas"] = ingest_vs_pandas()
+    return measured
+
+
+# --- speed against error --------------------------------------------------------------------------------------------
 
 
 def speed_against_error(
@@ -237,6 +268,159 @@ def _between(at: Any, known: Any, values: FloatArray, nearest: Any) -> FloatArra
         return np.full(len(at), np.nan)
     line = np.interp(at, known[good], values[good])
     return np.asarray(np.where(good[nearest], line, np.nan))
+
+
+# --- beside the peers -----------------------------------------------------------------------------------------------
+
+
+def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5) -> dict[str, Any]:
+    """Path search of the image engine against Sionna's PathSolver, both warm, in this one run.
+
+    Parameters
+    ----------
+    poses : int
+        Of :func:`random_scene`.
+    samples : int
+        Of PathSolver.
+    repeats : int
+        Runs of the image engine before, and as many after Sionna's; the median counts. The load of the machine may
+        change in between.
+
+    Returns
+    -------
+    dict
+        ``seconds_image``, ``seconds_sionna``, ``ratio``, ``paths_image``, ``paths_sionna``, ``missing_paths``,
+        ``extra_paths`` and ``rss_max_error_db`` (image against Sionna), and the conditions.
+    """
+    from ..propagation.search import mirror, sionna
+
+    site, link, some = random_scene(poses)
+    scene = Scene.of(site, link, some)
+    rays, alone = Search("sionna", samples=samples, batch=BATCH), Run(cache_dir="")
+
+    def search() -> float:
+        started = time.perf_counter()
+        mirror.find_paths(scene.faces, scene.links_to(some), max_depth=DEPTH)
+        return time.perf_counter() - started
+
+    search()
+    times = [search() for _ in range(repeats)]
+    replay(site, link, _take(some, slice(BATCH)), rays, run=alone)  # compiles the kernels
+    theirs = replay(site, link, some, rays, run=alone)
+    times += [search() for _ in range(repeats)]
+    difference = compare(replay(site, link, some), theirs, np.arange(poses))
+    seconds = float(np.median(times))
+    return {
+        "ratio": theirs.search_seconds / seconds,
+        "seconds_image": seconds,
+        "seconds_sionna": theirs.search_seconds,
+        "paths_image": difference.reference_paths - difference.missing_paths + difference.extra_paths,
+        "paths_sionna": difference.reference_paths,
+        "missing_paths": difference.missing_paths,
+        "extra_paths": difference.extra_paths,
+        "rss_max_error_db": difference.rss_max_error_db,
+        "poses": poses,
+        "samples": samples,
+        "batch": BATCH,
+        "faces": len(scene.faces),
+        "depth": DEPTH,
+        "versions": sionna.engine_versions(),
+    }
+
+
+def median_seconds(action: Callable[[], Any], repeats: int = 5) -> float:
+    """Median processor time after a warm-up (none for a single run): other work on the machine does not count."""
+    if repeats > 1:
+        action()
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        action()
+        times.append(time.process_time() - start)
+    return statistics.median(times)
+
+
+def path_search_ratios(
+    poses: int = 1000, samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000)
+) -> dict[str, Any]:
+    """Path search of the image engine against PathSolver with ``samples`` (increasing), and at equal error.
+
+    Returns
+    -------
+    dict
+        ``at`` maps samples to the numbers of :func:`path_search`; ``equal_error``
+        is the entry of the fewest samples with which PathSolver finds as many of the paths as with the most: more
+        samples than that buy it nothing, so a ratio to more of them flatters us.
+    """
+    most = path_search(poses, samples[-1])
+    at = {samples[-1]: most}
+    for count in samples[:-1]:
+        at[count] = path_search(poses, count, repeats=3)
+        if at[count]["extra_paths"] <= most["extra_paths"]:
+            break
+    enough = min(n for n, measured in at.items() if measured["extra_paths"] <= most["extra_paths"])
+    return {"at": {f"{n:.0e}": measured for n, measured in sorted(at.items())}, "equal_error": at[enough]}
+
+
+def kriging_shared_weights(fields: int = 27, neighbours: int = 20) -> dict[str, Any] | None:
+    """Prediction at 2556 targets with one set of weights for all fields on our side and PyKrige's compiled back end.
+
+    Both have the same neighbours and the same exponential variogram. PyKrige has no several fields: one run is timed,
+    which for ``ratio`` counts as many times as there are fields; ``ratio_one_field`` gives us one field, too.
+    """
+    try:
+        from pykrige.ok import OrdinaryKriging as Peer
+    except ImportError:
+        return None
+    from ..maps.grid import Grid
+    from ..maps.kriging import OrdinaryKriging
+
+    generator = np.random.default_rng(2)
+    grid = Grid.over_area((-540.0, 540.0, -1065.0, 1065.0))
+    points = grid.points_m + generator.uniform(-5, 5, (len(grid), 2))
+    targets = points + generator.uniform(5, 10, points.shape)
+    values = generator.integers(1, 5, (len(grid), fields)).astype(np.float64)
+
+    def correlation(distance: Any) -> Any:
+        return 0.9 * np.exp(-3.0 * distance / 900.0)
+
+    def ours(count: int) -> float:
+        model = OrdinaryKriging(correlation, neighbours=neighbours, radius_m=np.inf).fit(points, values[:, :count])
+        return median_seconds(lambda: model.predict(targets), 3)
+
+    def peer() -> Any:
+        model = Peer(*points.T, values[:, 0], "exponential", {"psill": 0.9, "range": 900.0, "nugget": 0.1})
+        return model.execute("points", *targets.T, backend="C", n_closest_points=neighbours)
+
+    theirs, one, every = median_seconds(peer, 3), ours(1), ours(fields)
+    return {
+        "ratio": fields * theirs / every,
+        "ratio_one_field": theirs / one,
+        "seconds_pykrige_one_field": theirs,
+        "seconds_ours_one_field": one,
+        "seconds_ours_all_fields": every,
+        "fields": fields,
+    }
+
+
+def ingest_vs_pandas(lines: int = LINES, repeats: int = 5) -> dict[str, Any]:
+    """Reading a synthetic power log, against ``pandas.read_csv(engine="c")`` on the same bytes.
+
+    Ours gives UTC times, levels, flags and the account of every line; pandas columns of text and numbers.
+    """
+    import pandas as pd
+
+    from ..logs.readers import ReadOptions, by_name
+    from ..logs.writers import format_power_log
+
+    zone = "America/New_York"
+    generator = np.random.default_rng(1)
+    times = np.datetime64("2025-03-02T15:00:00", "ns") + np.arange(lines) * np.timedelta64(32_760_000, "ns")
+    data = format_power_log(times, generator.normal(-40, 12, lines), zone)
+    reader, options = by_name("sounder_log"), ReadOptions(timezone=zone)
+    ours = median_seconds(lambda: reader.read(data, options), repeats)
+    theirs = median_seconds(lambda: pd.read_csv(io.BytesIO(data), engine="c", header=None, sep=r"\s+"), repeats)
+    return {"ratio": theirs / ours, "seconds_ours": ours, "seconds_pandas": theirs, "lines": lines}
 
 
 def random_scene(poses: int, *, buildings: int = 12, towers: int = 1, seed: int = 1) -> tuple[Site, Link, Poses]:

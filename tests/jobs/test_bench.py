@@ -1,0 +1,41 @@
+"""What the ratios of ``bench`` stand for; the times themselves are not tested."""
+
+from __future__ import annotations
+
+import pytest
+
+from aerpaw_cmp.jobs import bench
+
+
+def test_equal_error_is_the_fewest_samples_that_find_as_many_paths(monkeypatch):
+    missed = {1_000: 43, 10_000: 0, 100_000: 0, 1_000_000: 0}
+    ran = []
+
+    def search(poses, samples, **_):
+        ran.append(samples)
+        return {"ratio": samples / 100.0, "extra_paths": missed[samples], "samples": samples}
+
+    monkeypatch.setattr(bench, "path_search", search)
+    found = bench.path_search_ratios()
+    assert found["equal_error"]["samples"] == 10_000
+    assert found["equal_error"]["ratio"] < found["at"]["1e+06"]["ratio"]
+    assert ran == [1_000_000, 1_000, 10_000]  # no more than is needed
+
+
+def test_where_only_the_most_samples_find_all_that_is_equal_error(monkeypatch):
+    monkeypatch.setattr(
+        bench, "path_search", lambda _poses, samples, **_: {"ratio": 1.0, "extra_paths": 10 // len(str(samples))}
+    )
+    assert bench.path_search_ratios(samples=(1_000, 10_000_000_000))["equal_error"]["extra_paths"] == 0
+
+
+def test_both_sides_of_kriging_and_of_ingest_are_there():
+    pytest.importorskip("pykrige")
+    kriging = bench.kriging_shared_weights(fields=3)
+    assert kriging["ratio"] == pytest.approx(
+        3 * kriging["seconds_pykrige_one_field"] / kriging["seconds_ours_all_fields"]
+    )
+    assert kriging["ratio_one_field"] == pytest.approx(
+        kriging["seconds_pykrige_one_field"] / kriging["seconds_ours_one_field"]
+    )
+    assert bench.ingest_vs_pandas(500)["lines"] == 500

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import shutil
 import subprocess
 import sys
 import time
@@ -71,13 +72,8 @@ def test_not_a_serial_port(tmp_path, content):
         run_tap(TapSettings(tmp_path / "log", str(path)))
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="dropping privileges needs root")
-def test_no_permission_names_the_group(modem, tmp_path):
-    import grp
-
-    sim = modem()
-    sim.node.chmod(0o660)
-    os.chown(sim.node, 0, grp.getgrnam("dialout").gr_gid)
+def opened_by_nobody(node):
+    """What a user without rights is told who opens a port."""
     code = (
         "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"
         "from aerpaw_cmp.common.errors import InputError\nos.setgroups([])\nos.setuid(65534)\n"
@@ -85,11 +81,22 @@ def test_no_permission_names_the_group(modem, tmp_path):
     )
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     done = subprocess.run(
-        [sys.executable, "-c", code, sim.node], env=environment, text=True, capture_output=True, check=False
+        [sys.executable, "-c", code, node], env=environment, text=True, capture_output=True, check=False
     )
     assert done.returncode == 3, done.stderr
-    assert "no permission to open the port (owner root, group dialout, mode 660)" in done.stdout
-    assert "usermod -aG dialout" in done.stdout
+    return done.stdout
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="dropping privileges needs root")
+def test_no_permission_names_the_group(modem, tmp_path):
+    import grp
+
+    sim = modem()
+    sim.node.chmod(0o660)
+    os.chown(sim.node, 0, grp.getgrnam("dialout").gr_gid)
+    said = opened_by_nobody(sim.node)
+    assert "no permission to open the port (owner root, group dialout, mode 660)" in said
+    assert "usermod -aG dialout" in said
 
 
 def test_the_port_vanishes_during_open(monkeypatch):
@@ -212,25 +219,16 @@ def test_modem_manager_is_named_to_a_user_who_may_not_see_its_files(modem):
 
     sim = modem()
     sim.node.chmod(0o666)
-    code = (
-        "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"
-        "from aerpaw_cmp.common.errors import InputError\nos.setgroups([])\nos.setuid(65534)\n"
-        "try:\n SerialPort.open(Path(sys.argv[1]))\nexcept InputError as error:\n print(error); sys.exit(error.exit_code)"
-    )
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     with sim.node.open("rb", buffering=0) as node:
         fcntl.ioctl(node, termios.TIOCEXCL)  # as ModemManager does
         process = modem_manager(node)
         try:
-            done = subprocess.run(
-                [sys.executable, "-c", code, sim.node], env=environment, text=True, capture_output=True, check=False
-            )
+            said = opened_by_nobody(sim.node)
         finally:
             process.kill()
             process.wait()
-    assert done.returncode == 3, done.stderr
-    assert "a process that we may not look at" in done.stdout
-    assert "systemctl stop ModemManager" in done.stdout
+    assert "a process that we may not look at" in said
+    assert "systemctl stop ModemManager" in said
 
 
 def test_ten_megabyte_line(modem, tap, tools, tmp_path):
@@ -293,24 +291,28 @@ def test_a_folder_with_an_earlier_log(modem, tap, tools, tmp_path):
 # finding the port, in a made-up /dev and /sys ---------------------------------------------------------------
 
 
-def usb_tree(root, numbers):
-    """Four ttys of one modem, like the kernel shows them."""
-    for interface, number in enumerate(numbers):
-        device = root / f"sys/devices/usb1/1-1/1-1:1.{interface}"
+def wire(root, wires):
+    """The ttys of one modem, as the kernel shows them: ``{number: (interface, where it leads or None)}``."""
+    roots = Roots(root / "dev", root / "sys")
+    for folder in (roots.dev, roots.sys):
+        shutil.rmtree(folder, ignore_errors=True)
+    roots.dev.mkdir(parents=True)
+    for number, (interface, node) in wires.items():
+        device = roots.sys / f"devices/usb1/1-1/1-1:1.{interface}"
         (device / f"ttyUSB{number}").mkdir(parents=True)
-        (device / "bInterfaceNumber").write_text(f"0{interface}\n")
-        entry = root / f"sys/class/tty/ttyUSB{number}"
+        (device / "bInterfaceNumber").write_text(f"{interface:02d}\n")
+        entry = roots.sys / f"class/tty/ttyUSB{number}"
         entry.mkdir(parents=True)
         (entry / "device").symlink_to(device / f"ttyUSB{number}")
-        (root / "dev").mkdir(exist_ok=True)
-        (root / f"dev/ttyUSB{number}").touch()
-    (root / "sys/devices/usb1/1-1/idVendor").write_text("2c7c\n")
-    (root / "sys/devices/usb1/1-1/idProduct").write_text("0800\n")
-    return Roots(root / "dev", root / "sys")
+        name = roots.dev / f"ttyUSB{number}"
+        name.touch() if node is None else name.symlink_to(node)
+    (roots.sys / "devices/usb1/1-1/idVendor").write_text("2c7c\n")
+    (roots.sys / "devices/usb1/1-1/idProduct").write_text("0800\n")
+    return roots
 
 
 def test_the_at_port_is_found_by_interface_not_by_number(tmp_path):
-    roots = usb_tree(tmp_path, [7, 3, 5, 11])
+    roots = wire(tmp_path, {number: (i, None) for i, number in enumerate([7, 3, 5, 11])})
     assert [(p.path.name, p.how, p.interface, p.product) for p in find_candidates(roots)] == [
         ("ttyUSB5", "usb", "02", "2c7c:0800"),
         ("ttyUSB11", "usb", "03", "2c7c:0800"),
@@ -318,7 +320,7 @@ def test_the_at_port_is_found_by_interface_not_by_number(tmp_path):
 
 
 def test_the_by_id_name_comes_first_and_is_followed(tmp_path):
-    roots = usb_tree(tmp_path, [0, 1, 2, 3])
+    roots = wire(tmp_path, {i: (i, None) for i in range(4)})
     by_id = tmp_path / "dev/serial/by-id"
     by_id.mkdir(parents=True)
     for interface in range(4):
@@ -346,38 +348,18 @@ def test_the_second_at_port_is_taken_when_the_first_is_held(modem, tmp_path):
         process.wait()
 
 
-def rewire(roots, wires):
-    """Numbers of a modem's ttys, each leading to a pseudo-terminal: ``{number: (interface, node)}``."""
-    import shutil
-
-    for folder in (roots.dev, roots.sys):
-        shutil.rmtree(folder, ignore_errors=True)
-    roots.dev.mkdir(parents=True)
-    for number, (interface, node) in wires.items():
-        device = roots.sys / f"devices/usb1/1-1/1-1:1.{interface}"
-        (device / f"ttyUSB{number}").mkdir(parents=True)
-        (device / "bInterfaceNumber").write_text(f"{interface:02d}\n")
-        entry = roots.sys / f"class/tty/ttyUSB{number}"
-        entry.mkdir(parents=True)
-        (entry / "device").symlink_to(device / f"ttyUSB{number}")
-        (roots.dev / f"ttyUSB{number}").symlink_to(node)
-    (roots.sys / "devices/usb1/1-1/idVendor").write_text("2c7c\n")
-    (roots.sys / "devices/usb1/1-1/idProduct").write_text("0800\n")
-
-
 def test_numbers_that_swap_are_followed_by_the_interface(modem, tap, tools, tmp_path):
     # without by-id names: ttyUSB2 was the AT port and comes back as the GPS port, the AT port as ttyUSB5
-    roots = Roots(tmp_path / "dev", tmp_path / "sys")
     sim = modem(link=None, faults=Faults(latency_s=0.0))
     gps = modem(link=None, kind="gps")
-    rewire(roots, {1: (1, gps.node), 2: (2, sim.node)})
+    roots = wire(tmp_path, {1: (1, gps.node), 2: (2, sim.node)})
     session = tap(roots.dev / "ttyUSB2", roots=roots, reconnect_min_s=0.02, reconnect_max_s=0.05)
     session.wait(lambda: len(sim.journal) > 20)
     sim.unplug()
     gps.unplug()
     gps.replug()
     sim.replug()
-    rewire(roots, {2: (1, gps.node), 5: (2, sim.node)})
+    wire(tmp_path, {2: (1, gps.node), 5: (2, sim.node)})
     count = len(sim.journal)
     session.wait(lambda: len(sim.journal) > count + 20)
     session.end()

@@ -66,7 +66,10 @@ def decode_record(line: bytes) -> Record:
         raise ValueError("torn line: it does not end with a checksum")
     if b"%08x" % zlib.crc32(body) != tail[:8]:
         raise ValueError("damaged line: its checksum does not fit")
-    record = json.loads(body + b"}")
+    try:
+        record = json.loads(body + b"}")
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
     if not isinstance(record, dict):
         raise ValueError("not a record")
     return record

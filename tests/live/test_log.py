@@ -100,6 +100,16 @@ def test_any_flipped_bit_or_cut_is_seen(place, bit):
             decoder(line[: place % len(line)])
 
 
+@pytest.mark.parametrize(
+    ("body", "reason"), [(b'{"kind":"x","a":' + b"[" * 9000 + b"]" * 9000, "nested too deeply"), (b"[1", "delimiter")]
+)
+def test_a_line_that_is_no_record_is_told_with_its_reason(body, reason):
+    line = body + b',"crc":"%08x"}' % zlib.crc32(body)
+    for decoder in (decode_record, decode_line):
+        with pytest.raises(ValueError, match=reason):
+            decoder(line)
+
+
 FULL_DISK = """
 import resource, signal, sys
 from pathlib import Path

@@ -52,6 +52,7 @@ KINDS: dict[str, tuple[str, ...]] = {
         "map lake_wheeler --spacing 0",
         "map lake_wheeler --rss-altitude -3",
         "map lake_wheeler --foliage autumn",
+        "map lake_wheeler --tile-m 1",
         "explain flight.yaml --tower LW9 --time 5",
         "explain flight.yaml --tower LW1 --time noon",
         "predict lake_wheeler --with flight.yaml --height high",

@@ -190,6 +190,10 @@ def map_(
     study: Annotated[
         bool, typer.Option("--study/--no-study", help="Also spatial correlation and interpolation.")
     ] = True,
+    tile_m: Annotated[
+        float | None,
+        typer.Option(help="Side of tiles written to a Zarr store [m]  [default: 128 positions, from 1e6 receivers on]"),
+    ] = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,
     dry_run: DryRun = False,
@@ -214,6 +218,7 @@ def map_(
         "samples": samples,
         "threshold_dbm": threshold_dbm,
         "study": study,
+        "tile_m": tile_m,
     }
     settings = map_settings(wanted, quick=quick)
     options = RunOptions(out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say)
@@ -229,3 +234,5 @@ def map_(
     for path in outcome.files:
         if path.parent == outcome.folder:
             print(path)
+    if outcome.metrics["tiles"]:
+        print(outcome.metrics["tiles"]["store"])

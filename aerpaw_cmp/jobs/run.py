@@ -472,6 +472,7 @@ def run_map(
         With what was found, expected, and the likely cause.
     """
     from ..common.versions import versions
+    from ..maps.grid import Grid
     from ..report.maps_html import maps_metrics, write_maps
     from ..site.siteyaml import load_site
     from .mapping import coverage_map as mapping
@@ -481,18 +482,23 @@ def run_map(
 
     known = named_flights(flights)
     place, progress, stages = load_site(site), options.progress, Stages(options.progress)
+    if (flights or remembered) and settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m)):
+        raise UsageError("flights and a map in tiles", expected="fewer receivers, or a map without --with")
     folder = options.out or _map_folder(site)
     inputs = [Path(site), *([] if flight is None else [flight]), *files_of(known, options.logs_root)]
     with OutputFolder(folder, job="map", inputs=inputs, force=options.force) as output:
         file = [Path(site).absolute()] if Path(site).is_file() else []
         with open_workers(options.workers, options.scheduler, paths=file, progress=progress) as crew:
-            outcome = mapping.make_maps(place, settings, stages, workers=crew, name=str(file[0] if file else site))
+            outcome = mapping.make_maps(
+                place, settings, stages, workers=crew, name=str(file[0] if file else site),
+                store=folder.with_name(f"{folder.name}.zarr"), force=options.force,
+            )  # fmt: skip
         if flights or remembered:
             from .prediction.corrected_map import corrected_maps
 
             heights = settings.rss_altitudes_m, settings.rank_altitudes_m
             outcome.corrected = corrected_maps(site, settings.spacing_m, heights, known, options.logs_root, stages)
-        if settings.study:
+        if outcome.settings.study:
             if flight is not None:
                 outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, options.logs_root)
             mapping.study_maps(outcome, stages)

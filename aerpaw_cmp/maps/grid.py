@@ -85,6 +85,15 @@ class Grid:
             axes.append((low + high) / 2 + spacing_m * (np.arange(cells) - (cells - 1) / 2))
         return cls(np.asarray(axes[0], dtype=np.float64), np.asarray(axes[1], dtype=np.float64), float(spacing_m))
 
+    @property
+    def area_m(self) -> tuple[float, float, float, float]:
+        """Extent of the cells ``(east_min, east_max, north_min, north_max)``."""
+        half = self.spacing_m / 2
+        return (
+            float(self.east_m[0] - half), float(self.east_m[-1] + half),
+            float(self.north_m[0] - half), float(self.north_m[-1] + half),
+        )  # fmt: skip
+
     def __len__(self) -> int:
         return len(self.east_m) * len(self.north_m)
 

@@ -5,7 +5,7 @@ The replay engine is handed in as a function, so that nothing here knows an engi
     evaluate(position_m (n, 3), tower_names) -> Evaluation
 
 It is called for one altitude and at most ``chunk`` positions at a time; what grows with the number of altitudes is
-the result alone: per tower and position 16 bytes of RSS, 16 bytes of singular-value ratios, 1 byte of rank per K.
+the result alone: per tower and position 24 bytes of levels, 16 bytes of singular-value ratios, 1 byte of rank per K.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from .grid import (
 PAPER_RSS_ALTITUDES_M = (30.0, 70.0, 110.0)
 PAPER_RANK_ALTITUDES_M = (3.0, *(float(h) for h in range(30, 111, 10)))
 PAPER_KS = (10.0, 100.0, 1000.0)
-CHUNK = 512
+CHUNK = 2048
 HIGHEST_RANK = 4
 RATIO_LIMIT_DB = 180.0
 """Largest ratio of singular values that is drawn and exported: values below 1e-9 of the largest are rounding."""
@@ -50,13 +50,21 @@ class Evaluation:
     ----------
     rss_siso_dbm, rss_mimo_dbm : (n, t)
         Received power with one element at both ends, and with the arrays.
+    level_sd_db : (n, t)
+        Standard deviation of the level over the element pairs of the arrays.
     singular_values : (n, t, r)
         Of the channel matrix, descending.
     """
 
     rss_siso_dbm: FloatArray
     rss_mimo_dbm: FloatArray
+    level_sd_db: FloatArray
     singular_values: FloatArray
+
+    @property
+    def levels(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Values of each RSS altitude in a map."""
+        return self.rss_siso_dbm, self.rss_mimo_dbm, self.level_sd_db
 
 
 Evaluate = Callable[[FloatArray, tuple[str, ...]], Evaluation]
@@ -76,7 +84,7 @@ class MapResult:
         East, north, up [m].
     rss_altitudes_m, rank_altitudes_m, ks : tuple of float
         The axes.
-    rss_siso_dbm, rss_mimo_dbm : (RSS altitudes, towers, n)
+    rss_siso_dbm, rss_mimo_dbm, level_sd_db : (RSS altitudes, towers, n)
         NaN out of coverage.
     rank : (rank altitudes, K, towers, n) int8
         0 out of coverage.
@@ -96,6 +104,7 @@ class MapResult:
     ks: tuple[float, ...]
     rss_siso_dbm: FloatArray
     rss_mimo_dbm: FloatArray
+    level_sd_db: FloatArray
     rank: NDArray[np.int8]
     spread_db: FloatArray
     condition_db: FloatArray
@@ -171,7 +180,7 @@ def map_job(
     places = np.array([np.asarray(towers[name], dtype=np.float64) for name in names])
     at = {"rss": tuple(map(float, rss_altitudes_m)), "rank": tuple(map(float, rank_altitudes_m))}
     t, n = len(names), len(grid)
-    rss = np.full((2, len(at["rss"]), t, n), np.nan)
+    rss = np.full((3, len(at["rss"]), t, n), np.nan)
     rank = np.zeros((len(at["rank"]), len(ks), t, n), dtype=np.int8)
     ratio = np.full((2, len(at["rank"]), t, n), np.nan)
     heights = sorted({*at["rss"], *at["rank"]})
@@ -183,8 +192,8 @@ def map_job(
             _check(evaluated, part.stop - part.start, t)
             if height in at["rss"]:
                 row = at["rss"].index(height)
-                rss[0, row, :, part] = evaluated.rss_siso_dbm.T
-                rss[1, row, :, part] = evaluated.rss_mimo_dbm.T
+                for values, level in zip(rss, evaluated.levels, strict=True):
+                    values[row, :, part] = level.T
             if height in at["rank"]:
                 row = at["rank"].index(height)
                 rank[row, :, :, part] = np.moveaxis(
@@ -193,9 +202,6 @@ def map_job(
                 ratio[:, row, :, part] = np.moveaxis(_ratios_db(evaluated.singular_values), (1, 2), (2, 1))
             if progress is not None:
                 progress((step * n + part.stop) / (len(heights) * n))
-    area = (grid.east_m[0], grid.east_m[-1], grid.north_m[0], grid.north_m[-1])
-    half = grid.spacing_m / 2
-    borders = voronoi_borders(places, (area[0] - half, area[1] + half, area[2] - half, area[3] + half))
     return MapResult(
         grid=grid,
         tower_names=names,
@@ -205,11 +211,12 @@ def map_job(
         ks=tuple(map(float, ks)),
         rss_siso_dbm=rss[0],
         rss_mimo_dbm=rss[1],
+        level_sd_db=rss[2],
         rank=rank,
         spread_db=ratio[0],
         condition_db=ratio[1],
         serving=serving_tower(grid.points_m, places),
-        borders=borders,
+        borders=voronoi_borders(places, grid.area_m),
     )
 
 
@@ -230,7 +237,7 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
 
 
 def _check(evaluated: Evaluation, n: int, towers: int) -> None:
-    shapes = evaluated.rss_siso_dbm.shape, evaluated.rss_mimo_dbm.shape, evaluated.singular_values.shape[:2]
+    shapes = (*(level.shape for level in evaluated.levels), evaluated.singular_values.shape[:2])
     if set(shapes) != {(n, towers)}:
         raise ValueError(f"the engine returned shapes {shapes} for {n} positions and {towers} towers")
 

@@ -132,6 +132,8 @@ def _levels(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
     kinds: dict[str, tuple[str, str, str, str, Callable[[MapResult], FloatArray]]] = {
         "rss_siso": ("received level, one element at both ends", "height", DBM, "dBm", lambda m: m.rss_siso_dbm),
         "rss_mimo": ("received level, arrays at both ends", "height", DBM, "dBm", lambda m: m.rss_mimo_dbm),
+        "rss_sd": ("standard deviation of the level over the element pairs", "height", DB, "dB",
+                   lambda m: m.level_sd_db),
         "spread": (f"largest over second singular value, {limit}", "height_of_rank", DB, "dB",
                    lambda m: np.minimum(m.spread_db, RATIO_LIMIT_DB)),
         "condition": (f"largest over last singular value, {limit}", "height_of_rank", DB, "dB",

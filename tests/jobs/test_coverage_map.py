@@ -382,20 +382,17 @@ def test_kriging_bridges_blocks_of_a_real_flight():
 def test_the_notes_say_where_p833_is_continued():
     def notes(**change):
         bare = types.SimpleNamespace(trees=())
-        return " ".join(mapping._notes(types.SimpleNamespace(settings=settings(**change), site=bare)))
+        return " ".join(mapping._notes(types.SimpleNamespace(settings=settings(**change), site=bare, tiles={})))
 
     assert "Trees at 3.4 GHz: an extrapolation of ITU-R P.833" in notes(foliage=("opaque", "attenuating"))
     assert "extrapolation" not in notes(foliage=("opaque", "none"))
     assert "extrapolation" not in notes(foliage=("attenuating",), carrier_hz=1.8e9)
 
 
-def test_workers_evaluate_the_pieces_to_the_same_digit(monkeypatch) -> None:
+def test_workers_evaluate_the_tiles_to_the_same_digit() -> None:
     from aerpaw_cmp.common.stages import Stages
     from aerpaw_cmp.site.siteyaml import load_site
 
-    monkeypatch.setattr(mapping, "CHUNK", 16)
-    monkeypatch.setattr("aerpaw_cmp.maps.job.CHUNK", 16)
-    monkeypatch.setattr(mapping.map_job, "__kwdefaults__", {**mapping.map_job.__kwdefaults__, "chunk": 16})
     some, crew = settings(spacing_m=300.0, rank_altitudes_m=(30.0,), foliage=("none", "opaque")), SentByPickle()
     alone = mapping.make_maps(load_site("lake_wheeler"), some, Stages())
     shared = mapping.make_maps(load_site("lake_wheeler"), some, Stages(), workers=crew, name="lake_wheeler")

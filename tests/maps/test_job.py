@@ -42,7 +42,7 @@ class Engine:
         one = np.where(seen, 1.0 / d, np.nan)
         ratio = (20.0 / d) * (1 + 0.5 * np.sin(position_m[:, :1] / 40 + position_m[:, 2:] / 9))
         sigma = np.stack([one, one * ratio, one * 1e-4, np.where(seen, 0.0, np.nan)], axis=-1)
-        return Evaluation(siso, siso + 12.0, sigma)
+        return Evaluation(siso, siso + 12.0, 0 * siso, sigma)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,8 @@ def test_memory_grows_with_results_only():
         tracemalloc.start()
         found = map_job(GRID, TOWERS, Engine(), rss_altitudes_m=altitudes, rank_altitudes_m=altitudes, chunk=100)
         size = sum(
-            getattr(found, n).nbytes for n in ("rss_siso_dbm", "rss_mimo_dbm", "rank", "spread_db", "condition_db")
+            getattr(found, n).nbytes
+            for n in ("rss_siso_dbm", "rss_mimo_dbm", "level_sd_db", "rank", "spread_db", "condition_db")
         )
         top = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
@@ -195,7 +196,7 @@ def test_rank_study_runs_the_papers_comparison(result):
 def test_rank_study_of_a_flat_map_says_so():
     def flat(position_m, names):
         one = np.ones((len(position_m), len(names)))
-        return Evaluation(-one, -one, np.stack([one, 0 * one, 0 * one, 0 * one], axis=-1))
+        return Evaluation(-one, -one, 0 * one, np.stack([one, 0 * one, 0 * one, 0 * one], axis=-1))
 
     made = map_job(GRID, TOWERS, flat, rss_altitudes_m=(), rank_altitudes_m=(30, 40))
     study = interpolation_study(GRID, rank_fields(made)[1], made.towers_m)
@@ -213,7 +214,7 @@ def test_wrong_engine_and_no_tower_are_named():
     with pytest.raises(UsageError, match="no tower"):
         map_job(GRID, {}, Engine())
     with pytest.raises(ValueError, match="shapes"):
-        map_job(GRID, TOWERS, lambda *_: Evaluation(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1, 4))))
+        map_job(GRID, TOWERS, lambda *_: Evaluation(*3 * [np.zeros((1, 1))], np.zeros((1, 1, 4))))
 
 
 def test_papers_variance_over_altitudes():

@@ -33,6 +33,7 @@ def made(seed):
     return MapResult(
         grid=GRID, tower_names=NAMES, towers_m=TOWERS_M, rss_altitudes_m=HEIGHTS, rank_altitudes_m=RANK_HEIGHTS, ks=KS,
         rss_siso_dbm=levels(len(HEIGHTS), -120, -40), rss_mimo_dbm=levels(len(HEIGHTS), -120, -40),
+        level_sd_db=levels(len(HEIGHTS), 0, 9),
         rank=rng.integers(0, 5, (len(RANK_HEIGHTS), len(KS), towers, n)).astype(np.int8),
         spread_db=levels(len(RANK_HEIGHTS), 0, 60), condition_db=levels(len(RANK_HEIGHTS), 100, 400),
         serving=serving_tower(GRID.points_m, TOWERS_M), borders=voronoi_borders(TOWERS_M, AREA),

@@ -8,17 +8,21 @@ the links that foliage touches.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime, timezone
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...common.cf import file_attributes
-from ...common.errors import InputError, UsageError
-from ...common.stages import Progress, Stages, share_of, silent
-from ...common.units import AnyArray, ComplexArray, FloatArray, wavelength_m
+from ...common.errors import InputError, UsageError, noting_interrupts
+from ...common.stages import Progress, Stages, share_of
+from ...common.units import THERMAL_NOISE_DBM_HZ, AnyArray, ComplexArray, FloatArray, db_from_power, wavelength_m
+from ...common.versions import versions
 from ...compare.rank import singular_values
 from ...maps import export
 from ...maps import grid as cells
@@ -34,7 +38,6 @@ from ...maps.evaluate import (
 from ...maps.grid import Grid
 from ...maps.interpolate import InverseDistance, Nearest, ServingTowerMean
 from ...maps.job import (
-    CHUNK,
     PAPER_KS,
     PAPER_RANK_ALTITUDES_M,
     PAPER_RSS_ALTITUDES_M,
@@ -48,13 +51,15 @@ from ...maps.job import (
     map_job,
 )
 from ...maps.netcdf import write_netcdf
+from ...maps.store import TileStore
 from ...maps.study import HeldOutStudy, Study, held_out_study, interpolation_study, rank_fields
+from ...maps.tiles import Budget, Reach, Tiling
 from ...maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ...propagation.arrays import Link, Poses, linear_array, single_element
 from ...propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
 from ...propagation.field.stands import stand_loss_db
 from ...propagation.field.sum import channel_matrices, rss_dbm
-from ...propagation.options import Engine, Search
+from ...propagation.options import Engine, Run, Search, Whole
 from ...propagation.paths import PathSet
 from ...propagation.replay import Replay, replay
 from ...propagation.scene import Scene
@@ -65,12 +70,23 @@ from ...site.site import Site
 from ...site.siteyaml import load_site
 from ..prediction.corrected_map import CorrectedMaps
 from ..reporting.foliage_notes import p833_note
-from ..tasks.workers import Lost, Workers
+from ..tasks.manifest import site_inputs
+from ..tasks.outcomes import code_digest
+from ..tasks.workers import Here, Lost, Workers
 
 FOLIAGE = ("none", "attenuating", "opaque")
 """Modes of the trees, from no loss to total loss; the paper's is the last."""
 
 RATIOS = ("spread", "condition")
+
+TILED_ABOVE = 1_000_000
+"""Receivers, positions times heights, beyond which a map is written tile by tile."""
+
+TILE_CELLS = 128
+"""Positions along a side of a tile: some 0.7 MB of values per tower, height and foliage mode."""
+
+SHOWN_POSITIONS = 20_000
+"""Of a map in tiles, as many positions are drawn and exported beside the store."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +121,9 @@ class MapSettings:
         A level below it is out of coverage in the RSS maps.
     seed : int
         Of random samples.
+    tile_m : float, optional
+        Side of the tiles of a map that is written tile by tile. Default: :data:`TILE_CELLS` positions where there are
+        more than :data:`TILED_ABOVE` receivers, else the map is made in one piece.
     """
 
     foliage: tuple[str, ...] = FOLIAGE
@@ -126,6 +145,7 @@ class MapSettings:
     study: bool = True
     threshold_dbm: float = -np.inf
     seed: int = 0
+    tile_m: float | None = None
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.foliage if name not in FOLIAGE]
@@ -138,6 +158,15 @@ class MapSettings:
             raise UsageError(f"K {self.ks}", expected="ratios of singular values, above 1")
         if not self.carrier_hz > 0:
             raise UsageError(f"a carrier of {self.carrier_hz} Hz", expected="a positive frequency [Hz]")
+        if self.tile_m is not None and not self.tile_m >= self.spacing_m > 0:
+            raise UsageError(f"tiles of {self.tile_m:g} m", expected=f"at least the spacing, {self.spacing_m:g} m")
+
+    def tile_cells(self, grid: Grid) -> int | None:
+        """Positions along a side of the tiles that are written one by one; None for a map in one piece."""
+        if self.tile_m is not None:
+            return max(1, round(self.tile_m / self.spacing_m))
+        receivers = len(grid) * len({*self.rss_altitudes_m, *self.rank_altitudes_m})
+        return TILE_CELLS if receivers > TILED_ABOVE else None
 
     @property
     def shown(self) -> str:
@@ -170,16 +199,29 @@ class SiteChannels:
     """
 
     def __init__(self, site: Site, settings: MapSettings) -> None:
-        self.site, self.settings = site, settings
-        line = linear_array(settings.elements, settings.element_spacing * wavelength_m(settings.carrier_hz), 0.0)
-        self.siso = self._link(single_element())
-        self.mimo = self._link(line)
-        self.sources_m = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
+        self.settings, self.names = settings, tuple(site.towers)
         reflect = settings.crown_reflections and "opaque" in settings.foliage and len(site.trees) > 0
         self.mirrors = Crowns(site.trees) if reflect else None
         self.crowns = self.mirrors.index if self.mirrors else CrownIndex(site.trees)
+        budget = Budget(
+            carrier_hz=settings.carrier_hz,
+            transmit_power_dbm=settings.transmit_power_dbm,
+            gain_db=float(db_from_power(settings.elements)),
+            floor_dbm=max(settings.threshold_dbm, THERMAL_NOISE_DBM_HZ),
+        )
+        cast = settings.engine != "image"
+        self.reach = Reach(site, budget, max_depth=settings.max_depth, every=cast, crowns=reflect)
         self.paths = self.paths_off_crowns = 0
         self._kept: dict[tuple[str, bytes], Evaluation] = {}
+        self._look_at(site)
+
+    def _look_at(self, site: Site) -> None:
+        """Take the part of the site that reaches a tile."""
+        self.site = site
+        apart_m = self.settings.element_spacing * wavelength_m(self.settings.carrier_hz)
+        self.siso = self._link(single_element())
+        self.mimo = self._link(linear_array(self.settings.elements, apart_m, 0.0))
+        self.sources_m = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
 
     def _link(self, array: Any) -> Link:
         towers = dict.fromkeys(self.site.towers, array)
@@ -189,7 +231,7 @@ class SiteChannels:
         """The evaluation of one foliage mode."""
 
         def evaluate(position_m: FloatArray, towers: tuple[str, ...]) -> Evaluation:
-            if towers != tuple(self.site.towers):
+            if towers != self.names:
                 raise ValueError(f"towers {towers} are not those of the site")
             chunk = position_m.tobytes()
             if (mode, chunk) not in self._kept:
@@ -198,41 +240,44 @@ class SiteChannels:
 
         return evaluate
 
-    def spread(self, workers: Workers, site: str, grid: Grid, progress: Progress = silent) -> None:
-        """Let workers evaluate every piece of the grid at every height; they get its number, not its points.
-
-        Parameters
-        ----------
-        workers : Workers
-        site : str
-            As :func:`~aerpaw_cmp.site.siteyaml.load_site` takes it.
-        grid : Grid
-        progress : Progress
-        """
+    def tile(self, order: TileOrder, progress: Callable[[float], None] | None = None) -> TileDone:
+        """Maps of one tile, with the towers and buildings that can reach it."""
         s = self.settings
-        heights = sorted({*map(float, s.rss_altitudes_m), *map(float, s.rank_altitudes_m)})
-        orders = [
-            PieceOrder(site=site, settings=s, height_m=height, start=start)
-            for height in heights
-            for start in range(0, len(grid), CHUNK)
-        ]
+        grid = Tiling(Grid.over_area(self.reach.site.area_m, s.spacing_m), order.cells).grid_of(order.number)
+        west, east, south, north = grid.area_m
+        heights = (*s.rss_altitudes_m, *s.rank_altitudes_m)
+        self._look_at(self.reach.of(np.array([[west, south, min(heights)], [east, north, max(heights)]])))
+        self.paths = self.paths_off_crowns = 0
+        maps = self._maps(grid, progress)
+        return TileDone(maps=maps, paths=self.paths, paths_off_crowns=self.paths_off_crowns)
 
-        def done(number: int, result: PieceDone | Lost) -> None:
-            if isinstance(result, Lost):
-                raise InputError(f"a piece of the map: {result.message}")
-            order = orders[number]
-            chunk = grid.positions_m(order.height_m)[order.start : order.start + CHUNK].tobytes()
-            self._kept |= {(mode, chunk): evaluated for mode, evaluated in result.modes.items()}
-            self.paths += result.paths
-            self.paths_off_crowns += result.paths_off_crowns
-            progress("maps on workers", len(self._kept) / (len(orders) * len(s.foliage)))
+    def _maps(self, grid: Grid, progress: Callable[[float], None] | None = None) -> dict[str, MapResult]:
+        s = self.settings
+        towers = {name: tower.position_m for name, tower in self.reach.site.towers.items()}
+        return {
+            mode: map_job(
+                grid, towers, self.of(mode), rss_altitudes_m=s.rss_altitudes_m, rank_altitudes_m=s.rank_altitudes_m,
+                ks=s.ks, progress=progress if mode == s.foliage[0] else None,
+            )
+            for mode in s.foliage
+        }  # fmt: skip
 
-        workers.run(map_piece, orders, done)
+    def empty(self, grid: Grid) -> dict[str, MapResult]:
+        """Maps by foliage mode without any coverage."""
+        self._look_at(replace(self.reach.site, towers={}))
+        return self._maps(grid)
 
     def _all_modes(self, position_m: FloatArray) -> dict[str, Evaluation]:
-        poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (len(position_m), 3, 3)))
-        s = self.settings
-        replayed = replay(self.site, self.siso, poses, Search(s.engine, max_depth=s.max_depth, samples=s.samples))
+        s, n = self.settings, len(position_m)
+        if not self.site.towers:
+            none = np.empty((n, 0))
+            nothing = Evaluation(none, none, none, np.empty((n, 0, s.elements)))
+            return dict.fromkeys(s.foliage, self._for_all_towers(nothing))
+        poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (n, 3, 3)))
+        search = Search(s.engine, max_depth=s.max_depth, samples=s.samples)
+        links = n * len(self.site.towers)
+        run = Run(whole=Whole(self.reach.extent_m, links, links))
+        replayed = replay(self.site, self.siso, poses, search, run=run)
         self.paths += len(replayed.paths)
         siso, mimo = replayed.h, self._matrices(replayed, replayed.paths, poses, self.mimo, None)
         result = {}
@@ -242,8 +287,26 @@ class SiteChannels:
             many = self._shaded(mimo, replayed, poses, self.mimo, loss)
             if mode == "opaque" and self.mirrors:
                 one, many = self._with_bounces(self.mirrors, poses, one, many)
-            result[mode] = Evaluation(self._rss_dbm(one), self._rss_dbm(many), singular_values(many))
+            level = self._rss_dbm(many)
+            covered = np.isfinite(level)
+            spread = np.where(covered, level_sd_db(many), np.nan)
+            sigma = np.where(covered[..., None], singular_values(many), 0.0)
+            result[mode] = self._for_all_towers(Evaluation(self._rss_dbm(one), level, spread, sigma))
         return result
+
+    def _for_all_towers(self, some: Evaluation) -> Evaluation:
+        """The evaluation of the towers that reach a tile, with the others out of coverage."""
+        if len(self.site.towers) == len(self.names):
+            return some
+        at = [self.names.index(name) for name in self.site.towers]
+
+        def placed(values: FloatArray) -> FloatArray:
+            every = np.full((len(values), len(self.names), *values.shape[2:]), np.nan)
+            every[:, at] = values
+            return every
+
+        siso, mimo, spread = (placed(level) for level in some.levels)
+        return Evaluation(siso, mimo, spread, placed(some.singular_values))
 
     def _with_bounces(
         self, mirrors: Crowns, poses: Poses, siso: ComplexArray, mimo: ComplexArray
@@ -297,37 +360,45 @@ class SiteChannels:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PieceOrder:
-    """Some positions of a map, for a worker: from ``start`` on, :data:`~aerpaw_cmp.maps.job.CHUNK` of them."""
+class TileOrder:
+    """A tile of a map, for a worker: its number among tiles of so many positions a side."""
 
     site: str
     settings: MapSettings
-    height_m: float
-    start: int
+    cells: int
+    number: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PieceDone:
-    """Answer of a worker: an evaluation per foliage mode, and how many paths there were."""
+class TileDone:
+    """Answer of a worker: maps by foliage mode, and how many paths there were."""
 
-    modes: Mapping[str, Evaluation]
+    maps: Mapping[str, MapResult]
     paths: int
     paths_off_crowns: int
 
 
-def map_piece(order: PieceOrder) -> PieceDone:
-    """Evaluate some positions of a map."""
-    site = load_site(order.site)
-    channels = SiteChannels(site, order.settings)
-    positions = Grid.over_area(site.area_m, order.settings.spacing_m).positions_m(order.height_m)
-    modes = channels._all_modes(positions[order.start : order.start + CHUNK])
-    return PieceDone(modes=modes, paths=channels.paths, paths_off_crowns=channels.paths_off_crowns)
+def map_tile(order: TileOrder) -> TileDone:
+    """Evaluate a tile of a map."""
+    return _channels_of(order.site, order.settings).tile(order)
+
+
+@lru_cache(maxsize=1)
+def _channels_of(site: str, settings: MapSettings) -> SiteChannels:
+    """Channels of a site, which a worker keeps from tile to tile."""
+    return SiteChannels(load_site(site), settings)
 
 
 def beam_power(h: ComplexArray) -> FloatArray:
     """Received share of the transmit power of channels (..., n_rx, n_tx): equal feed in phase, mean over receivers."""
     amplitude = h.sum(axis=-1) / np.sqrt(h.shape[-1])
     return np.asarray((amplitude.real**2 + amplitude.imag**2).mean(axis=-1), dtype=np.float64)
+
+
+def level_sd_db(h: ComplexArray) -> FloatArray:
+    """Standard deviation of the level over the element pairs of channels (..., n_rx, n_tx) [dB]."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(db_from_power(h.real**2 + h.imag**2).std(axis=(-2, -1)))
 
 
 # --- the job -------------------------------------------------------------------------------------------------------
@@ -337,8 +408,9 @@ def beam_power(h: ComplexArray) -> FloatArray:
 class MapOutcome:
     """Everything that one run found.
 
-    ``maps`` by foliage mode. ``studies``: positions out of coverage as no sample ("missing"), as rank 0 ("zero"), and
-    as rank 0 with M random samples within the radius in place of the M nearest ("random").
+    ``maps`` by foliage mode; of a map in tiles some positions, as ``tiles`` says. ``studies``: positions out of
+    coverage as no sample ("missing"), as rank 0 ("zero"), and as rank 0 with M random samples within the radius in
+    place of the M nearest ("random").
     """
 
     site: Site
@@ -353,6 +425,7 @@ class MapOutcome:
     paths_off_crowns: int = 0
     trajectory_m: FloatArray | None = None
     trajectory_name: str = ""
+    tiles: dict[str, Any] = field(default_factory=dict)
     corrected: CorrectedMaps | None = None
 
     @property
@@ -366,7 +439,14 @@ class MapOutcome:
 
 
 def make_maps(
-    site: Site, settings: MapSettings, stages: Stages, *, workers: Workers | None = None, name: str = ""
+    site: Site,
+    settings: MapSettings,
+    stages: Stages,
+    *,
+    workers: Workers | None = None,
+    name: str = "",
+    store: Path | None = None,
+    force: bool = False,
 ) -> MapOutcome:
     """Evaluate the grid of a site in every foliage mode.
 
@@ -379,27 +459,98 @@ def make_maps(
         Share the pieces of the grid.
     name : str
         The site as workers load it.
+    store : Path, optional
+        Where a map in tiles is written; without it every map is made in one piece.
+    force : bool
+        Replace the store of another map.
 
     Returns
     -------
     MapOutcome
         Maps by foliage mode; no study yet.
+
+    Raises
+    ------
+    UsageError, InputError, OutputError
+        The store is not that of this map; tiles were lost; the disk does not take them.
     """
     outcome = MapOutcome(site, settings)
     grid = Grid.over_area(site.area_m, settings.spacing_m)
-    channels = SiteChannels(site, settings)
-    towers = {name: tower.position_m for name, tower in site.towers.items()}
+    crew = workers or Here()
+    share = share_of(stages.progress, "maps")
+    tile_cells = None if store is None else settings.tile_cells(grid)
+    shared = math.ceil(math.sqrt(len(grid) / (4 * crew.count)))
+    tiling = Tiling(grid, tile_cells or (shared if crew.count > 1 else max(grid.shape)))
     with stages("maps"):
-        if workers is not None and workers.count > 1:
-            channels.spread(workers, name, grid, stages.progress)
+        channels = SiteChannels(site, settings)
+        evaluate = partial(channels.tile, progress=share if len(tiling) < 2 else None) if crew.count < 2 else map_tile
+        order = partial(TileOrder, site=name, settings=settings, cells=tiling.cells)
+        if store is not None and tile_cells:
+            book = TileStore(store, tiling, job_of(name, settings), force=force)
+            _write_tiles(outcome, book, channels, partial(crew.run, evaluate), order, stages.progress)
+            return outcome
+        parts: dict[int, Mapping[str, MapResult]] = {}
+
+        def done(number: int, result: TileDone | Lost) -> None:
+            if isinstance(result, Lost):
+                raise InputError(f"a tile of the map: {result.message}")
+            parts[number] = result.maps
+            outcome.paths += result.paths
+            outcome.paths_off_crowns += result.paths_off_crowns
+            share(len(parts) / len(tiling))
+
+        crew.run(evaluate, [order(number=number) for number in range(len(tiling))], done)
         for mode in settings.foliage:
-            outcome.maps[mode] = map_job(
-                grid, towers, channels.of(mode), rss_altitudes_m=settings.rss_altitudes_m,
-                rank_altitudes_m=settings.rank_altitudes_m, ks=settings.ks,
-                progress=share_of(stages.progress, "maps") if mode == settings.foliage[0] else None,
-            )  # fmt: skip
-    outcome.paths, outcome.paths_off_crowns = channels.paths, channels.paths_off_crowns
+            outcome.maps[mode] = tiling.joined({number: maps[mode] for number, maps in parts.items()})
     return outcome
+
+
+def _write_tiles(
+    outcome: MapOutcome,
+    store: TileStore,
+    channels: SiteChannels,
+    run: Callable[..., None],
+    order: Callable[..., TileOrder],
+    progress: Progress,
+) -> None:
+    """Compute the tiles that a store lacks, write each as it comes, and read some positions of all for the page."""
+    empty, tiling = channels.empty(store.tiling.grid_of(0)), store.tiling
+    generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    missing = store.begin(empty, outcome.site.frame, about_maps(outcome.site.name, generated, versions()["aerpaw-cmp"]))
+    if len(missing) < len(tiling):
+        progress(f"{len(tiling) - len(missing)} of {len(tiling)} tiles were computed before")
+    lost: list[str] = []
+    written = itertools.count(len(tiling) - len(missing) + 1)
+
+    def done(number: int, result: TileDone | Lost) -> None:
+        if isinstance(result, Lost):
+            lost.append(result.message)
+            return
+        store.write(missing[number], result.maps, (result.paths, result.paths_off_crowns))
+        progress("maps", next(written) / len(tiling))
+
+    with noting_interrupts(f"{store.path} keeps the finished tiles: the same command goes on"):
+        run([order(number=number) for number in missing], done)
+    if lost:
+        raise InputError(
+            f"{len(lost)} of {len(tiling)} tiles were lost: {lost[0]}",
+            cause="too little memory; the finished tiles are kept, and the same command computes the others",
+        )
+    outcome.paths, outcome.paths_off_crowns = (int(count) for count in store.paths().sum(axis=(0, 1)))
+    step = math.ceil(math.sqrt(len(tiling.grid) / SHOWN_POSITIONS))
+    outcome.maps |= store.read(empty, step)
+    outcome.settings = replace(outcome.settings, study=False)
+    outcome.tiles = {
+        "store": str(store.path), "tiles": len(tiling), "positions": len(tiling.grid), "shown_every": step,
+    }  # fmt: skip
+
+
+def job_of(site: str, settings: MapSettings) -> dict[str, Any]:
+    """All that the values of a map depend on: settings, content of the site's files, program."""
+    without = ("study", "neighbours", "radius_m", "block_m", "seed")
+    chosen = {key: str(value) for key, value in asdict(settings).items() if key not in without}
+    files = [entry.sha256 for entry, _ in site_inputs(site, Path())]
+    return {"site": files, **chosen, "program": code_digest()}
 
 
 def study_maps(outcome: MapOutcome, stages: Stages) -> None:
@@ -685,9 +836,16 @@ def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
 
 
 def _notes(outcome: MapOutcome) -> tuple[str, ...]:
-    """Note on the loss in crowns where it is continued beyond its table."""
+    """Notes on the loss in crowns where it is continued beyond its table, and on tiles."""
     note = p833_note(outcome.settings.carrier_hz) if "attenuating" in outcome.settings.foliage else None
-    return () if note is None else (note,)
+    notes = [] if note is None else [note]
+    if outcome.tiles:
+        each, all_ = outcome.tiles["shown_every"], outcome.tiles["positions"]
+        notes.append(
+            f"All {all_} positions of the map are in {Path(outcome.tiles['store']).name}. "
+            f"This page and the files beside it hold one in {each} along either axis."
+        )
+    return tuple(notes)
 
 
 def _metrics(outcome: MapOutcome) -> dict[str, Any]:
@@ -696,6 +854,7 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
         "paths": outcome.paths,
         "paths_off_crowns": outcome.paths_off_crowns,
         "settings": asdict(outcome.settings),
+        "tiles": outcome.tiles,
     }
     for key in ("zero", "missing"):
         if key not in outcome.studies:
@@ -775,13 +934,7 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
         export.write_json(folder / "maps.json", all_joint, summary),
         export.write_kmz(folder / "maps.kmz", levels_and_ranks, title=site.name),
     ]
-    about = file_attributes(
-        title=site.name,
-        source="ray tracing",
-        generated=str(summary.get("generated", "")),
-        version=str(summary.get("version", "")),
-        comment="A missing level has no path or lies below the threshold. A rank of 0 is a code: no path.",
-    )
+    about = about_maps(site.name, str(summary.get("generated", "")), str(summary.get("version", "")))
     maps = dict(outcome.ordered())
     writers: tuple[Callable[[], Path], ...] = (
         lambda: write_netcdf(folder / "maps.nc", maps, site.frame, about, flown),
@@ -793,6 +946,17 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
         except UsageError as missing:
             progress(str(missing))
     return written
+
+
+def about_maps(title: str, generated: str, version: str) -> dict[str, str]:
+    """Attributes of maps.nc and of a store of tiles."""
+    return file_attributes(
+        title=title,
+        source="ray tracing",
+        generated=generated,
+        version=version,
+        comment="A missing level has no path or lies below the threshold. A rank of 0 is a code: no path.",
+    )
 
 
 def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:

@@ -51,13 +51,13 @@ def other_inputs(
     for key, text, place in named_files(content, roots):
         if key != "site.file":
             entries.setdefault(os.path.realpath(place), _entry(text, place, key))
-    for entry, place in _site_inputs(settings.site.file, flight.parent):
+    for entry, place in site_inputs(settings.site.file, flight.parent):
         entries.setdefault(os.path.realpath(place), entry)
     return tuple(entries.values())
 
 
-def _site_inputs(name: str, folder: Path) -> Iterator[tuple[InputFile, Path]]:
-    """The site file and what it names."""
+def site_inputs(name: str, folder: Path) -> Iterator[tuple[InputFile, Path]]:
+    """The site file, as it is named in a folder, and what it names."""
     path = folder / name
     if path.is_file():
         yield _entry(name, path, "site file"), path

@@ -41,6 +41,9 @@ CELLS_PER_CHUNK = 1_000_000
 TARGETS_AT_ONCE = 1024
 """Targets whose heights over all faces are held."""
 
+REACH_SLACK_M = 1e-3
+"""Margin of :class:`Mirrors` [m]: far above the tolerance of any search that it thins out."""
+
 
 def find_paths(
     faces: Faces,
@@ -255,6 +258,30 @@ class _Growth:
             window = self.bounds.corners_m[last[part]]
             keep[part] = _beam_meets(level.images_m[part, -1], window, *hull_m, self.tolerance_m)
         return Sequences(level.faces[keep], level.images_m[keep])
+
+
+class Mirrors:
+    """Faces that one reflection may reach a box over; built once for many boxes.
+
+    Parameters
+    ----------
+    faces : Faces
+    extent_m : (points, 3)
+        Points that span sources and boxes.
+    """
+
+    def __init__(self, faces: Faces, extent_m: FloatArray) -> None:
+        bounds = _Bounds.of(faces, float(max(1.0, np.abs(extent_m).max(initial=0.0))))
+        none = np.zeros((0, len(faces)), np.bool_)
+        self._growth = _Growth(
+            faces=faces, bounds=bounds, facing=none, tolerance_m=REACH_SLACK_M, max_depth=1, budget=len(faces) + 1
+        )
+
+    def toward(self, source_m: FloatArray, box_m: FloatArray) -> IntArray:
+        """Every face of a path from a source (3,) over one face into a box (lowest and highest corner, 3)."""
+        points = np.array(np.meshgrid(*box_m.T)).reshape(3, -1).T
+        levels = self._growth.sequences(source_m, np.ones(len(self._growth.faces), np.bool_), points)
+        return levels[1].faces[:, 0] if len(levels) > 1 else np.zeros(0, np.int64)
 
 
 def _facing(faces: Faces, box: _Bounds, tolerance_m: float) -> BoolArray:

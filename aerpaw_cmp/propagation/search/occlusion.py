@@ -87,12 +87,13 @@ class Occlusion:
         return cut
 
     def _cut(self, start: FloatArray, end: FloatArray) -> BoolArray:
-        near = self._boxes(start, end)
+        solids = self._beside(start, end)
+        near = self._boxes(start, end, solids)
         result = np.zeros(len(start), dtype=np.bool_)
         seams: list[tuple[IntArray, FloatArray, FloatArray, int, int]] = []
-        for solid, pieces in enumerate(self.pieces):
-            rows = np.flatnonzero(near[:, solid] & ~result)
-            for number, planes in enumerate(pieces):
+        for column, solid in enumerate(solids.tolist()):
+            rows = np.flatnonzero(near[:, column] & ~result)
+            for number, planes in enumerate(self.pieces[solid]):
                 if not len(rows):
                     break
                 before, after = _heights(planes, start[rows], end[rows])
@@ -108,17 +109,28 @@ class Occlusion:
             self._seams(result, start, end, seams)
         return result
 
-    def _boxes(self, start: FloatArray, end: FloatArray) -> BoolArray:
+    def _beside(self, start: FloatArray, end: FloatArray) -> IntArray:
+        """Solids whose boxes meet the box of all segments, and from above also that turned to their mean direction."""
+        east, north = np.nansum((end - start)[:, :2], axis=0)
+        axes = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [east, north, 0], [-north, east, 0]])
+        ends = np.concatenate([start, end]) @ axes.T
+        middle = (self.low + self.high) / 2 @ axes.T
+        reach = (self.high - self.low) / 2 @ np.abs(axes).T + 1e-6 * np.abs(axes).sum(axis=1)
+        good = (middle + reach >= np.fmin.reduce(ends)) & (middle - reach <= np.fmax.reduce(ends))
+        return np.flatnonzero(good.all(axis=1))
+
+    def _boxes(self, start: FloatArray, end: FloatArray, solids: IntArray) -> BoolArray:
         """Check whether segments meet bounding boxes: slab test, (segments, solids)."""
         direction = end - start
         direction = np.where(direction == 0.0, 1e-300, direction)
-        enter = np.zeros((len(start), len(self.pieces)))
+        low, high = self.low[solids], self.high[solids]
+        enter = np.zeros((len(start), len(solids)))
         leave = np.ones_like(enter)
         with np.errstate(over="ignore"):
             for axis in range(3):
                 inverse = 1.0 / direction[:, axis, None]
-                at_low = (self.low[:, axis] - start[:, axis, None]) * inverse
-                at_high = (self.high[:, axis] - start[:, axis, None]) * inverse
+                at_low = (low[:, axis] - start[:, axis, None]) * inverse
+                at_high = (high[:, axis] - start[:, axis, None]) * inverse
                 np.maximum(enter, np.minimum(at_low, at_high), out=enter)
                 np.minimum(leave, np.maximum(at_low, at_high), out=leave)
         return np.asarray(enter <= leave)

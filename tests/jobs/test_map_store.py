@@ -1,0 +1,248 @@
+"""The store of a map in tiles: what it holds, and what becomes of it when a run, a worker or a disk ends early."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
+from aerpaw_cmp.common.stages import Stages
+from aerpaw_cmp.jobs.mapping import coverage_map as mapping
+from aerpaw_cmp.jobs.tasks.workers import Here, Processes
+from aerpaw_cmp.maps.grid import Grid
+from aerpaw_cmp.maps.store import LEDGER
+from aerpaw_cmp.maps.tiles import PLANES
+from aerpaw_cmp.site.siteyaml import load_site
+
+zarr = pytest.importorskip("zarr", reason="zarr is not installed (extra 'geo', Python 3.11)")
+xarray = pytest.importorskip("xarray")
+
+SITE = "lake_wheeler"
+SETTINGS = mapping.MapSettings(
+    spacing_m=120.0, rss_altitudes_m=(30.0,), rank_altitudes_m=(3.0, 30.0), foliage=("none", "opaque"), max_depth=1,
+    study=False, tile_m=600.0,
+)  # fmt: skip
+TILES = 8  # 9 x 17 positions in tiles of 5
+
+
+def make(store, settings=SETTINGS, **more):
+    return mapping.make_maps(load_site(SITE), settings, Stages(), name=SITE, store=store, **more)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return mapping.make_maps(load_site(SITE), replace(SETTINGS, tile_m=None), Stages(), name=SITE)
+
+
+def assert_like(outcome, whole):
+    assert (outcome.paths, outcome.paths_off_crowns) == (whole.paths, whole.paths_off_crowns)
+    for mode, one in outcome.maps.items():
+        for name in PLANES:
+            expected = getattr(whole.maps[mode], name)
+            if name in ("spread_db", "condition_db"):
+                expected = np.minimum(expected, mapping.RATIO_LIMIT_DB)
+            np.testing.assert_allclose(getattr(one, name), expected, atol=0.00501, err_msg=f"{mode} {name}")
+
+
+class Watched(Here):
+    """Runs tasks here; ends as told after so many."""
+
+    def __init__(self, ending=None, after=99):
+        self.numbers, self.ending, self.after = [], ending, after
+
+    def run(self, function, items, done):
+        for place, item in enumerate(items):
+            if place == self.after:
+                raise self.ending
+            self.numbers.append(item.number)
+            done(place, function(item))
+
+
+def test_a_store_holds_the_map_in_one_piece(tmp_path, whole):
+    outcome = make(tmp_path / "map.zarr")
+    assert_like(outcome, whole)
+    assert outcome.tiles == {
+        "store": str(tmp_path / "map.zarr"), "tiles": TILES, "positions": 153, "shown_every": 1,
+    }  # fmt: skip
+    with xarray.open_zarr(tmp_path / "map.zarr", consolidated=False) as data:
+        at = data.isel(foliage=0, y=11, x=7)
+        level = whole.maps["none"].rss("siso", "LW2")[0, 11 * 9 + 7]
+        assert float(at["rss_siso"].sel(height=30.0)[1]) == pytest.approx(level, abs=0.006)
+        assert data["rank"].dims == ("foliage", "tower", "k", "height_of_rank", "y", "x")
+        assert data["rss_siso"].chunks[-1] == (5, 4)
+        assert data.attrs["Conventions"] == "CF-1.11"
+        serving = whole.maps["none"].grid.raster(whole.maps["none"].serving)
+        np.testing.assert_array_equal(data["serving_tower"], serving)
+
+
+def test_every_so_many_positions_of_a_large_map_are_shown(tmp_path, whole, monkeypatch):
+    monkeypatch.setattr(mapping, "SHOWN_POSITIONS", 20)
+    outcome = make(tmp_path / "map.zarr")
+    assert outcome.tiles["shown_every"] == 3
+    shown = outcome.maps["none"]
+    assert shown.grid.shape == (6, 3)
+    every = whole.maps["none"].grid.raster(whole.maps["none"].rss_siso_dbm[0, 2])
+    np.testing.assert_allclose(shown.grid.raster(shown.rss_siso_dbm[0, 2]), every[::3, ::3], atol=0.006)
+    assert "one in 3" in " ".join(mapping._notes(outcome))
+
+
+def test_many_receivers_are_tiles_by_themselves_and_few_are_not():
+    one, grid = replace(SETTINGS, tile_m=None), Grid.over_area((0.0, 800.0, 0.0, 800.0), 1.0)
+    assert one.tile_cells(grid) == 128  # 640 000 positions at two heights
+    assert replace(one, rank_altitudes_m=(30.0,)).tile_cells(grid) is None
+    assert SETTINGS.tile_cells(grid) == 5
+
+
+@pytest.mark.parametrize(
+    "ending", [InputError("the scheduler of the workers went away"), KeyboardInterrupt()], ids=["cluster", "interrupt"]
+)
+def test_a_half_written_store_is_gone_on_with(ending, tmp_path, whole):
+    crew = Watched(ending, after=3)
+    with pytest.raises(type(ending)):
+        make(tmp_path / "map.zarr", workers=crew)
+    rest = Watched()
+    assert_like(make(tmp_path / "map.zarr", workers=rest), whole)
+    assert crew.numbers == [0, 1, 2]
+    assert rest.numbers == [3, 4, 5, 6, 7]
+    done = Watched()
+    assert_like(make(tmp_path / "map.zarr", workers=done), whole)
+    assert not done.numbers, "nothing is computed twice"
+
+
+def test_a_store_killed_as_it_was_made_is_made_anew(tmp_path, whole):
+    half = tmp_path / ".map.zarr.aerpaw-part"
+    half.mkdir()
+    (half / "zarr.json").write_text('{"zarr_for')
+    assert_like(make(tmp_path / "map.zarr"), whole)
+    assert not half.exists()
+
+
+def test_a_tile_cut_short_before_its_entry_is_computed_again(tmp_path, whole):
+    make(tmp_path / "map.zarr")
+    (tmp_path / "map.zarr" / LEDGER / "c" / "1" / "0" / "0").unlink()
+    (tmp_path / "map.zarr" / "rss_siso" / "c" / "0" / "0" / "0" / "1" / "0").write_bytes(b"cut")
+    crew = Watched()
+    assert_like(make(tmp_path / "map.zarr", workers=crew), whole)
+    assert crew.numbers == [2]
+
+
+def test_the_store_of_another_job_is_refused(tmp_path, whole):
+    store = tmp_path / "map.zarr"
+    make(store, replace(SETTINGS, carrier_hz=2e9, max_depth=0))
+    with pytest.raises(
+        UsageError, match=r"another job: carrier_hz and 1 more differs \(2000000000.0, now 3400000000.0\)"
+    ):
+        make(store)
+    assert_like(make(store, force=True), whole)
+
+
+@pytest.mark.parametrize("content", ["notes", "damaged", "file"])
+def test_what_is_no_store_stays(content, tmp_path):
+    store = tmp_path / "map.zarr"
+    if content == "file":
+        store.write_text("mine")
+    else:
+        store.mkdir()
+        (store / {"notes": "notes.txt", "damaged": "zarr.json"}[content]).write_text('{"attributes": {')
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    for force in (False, True):
+        with pytest.raises(UsageError, match="no map store of this tool"):
+            make(store, force=force)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == before
+
+
+def test_a_full_disk_is_one_message_and_the_run_goes_on_later(tmp_path, whole):
+    store, soft, hard = tmp_path / "map.zarr", *resource.getrlimit(resource.RLIMIT_FSIZE)
+    written, full = [], mapping.TileStore.write
+
+    def write(self, number, *more):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (60 if len(written) == 2 else soft, hard))
+        try:
+            full(self, number, *more)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        written.append(number)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mapping.TileStore, "write", write)
+        with pytest.raises(OutputError, match=r"map.zarr: cannot be written") as caught:
+            make(store)
+    assert caught.value.exit_code == 3
+    crew = Watched()
+    assert_like(make(store, workers=crew), whole)
+    assert crew.numbers == [2, 3, 4, 5, 6, 7]
+
+
+def kills_once(order):
+    """As ``map_tile``, but the worker of tile 4 ends: once, or every time where the folder says so."""
+    folder = Path(os.environ["TEST_MAP_STORE"])
+    with (folder / "tries").open("a") as stream:
+        stream.write(f"{order.number}\n")
+    if order.number == 4 and ((folder / "always").exists() or not (folder / "killed").exists()):
+        (folder / "killed").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return mapping.map_tile(order)
+
+
+@pytest.mark.parametrize("always", [False, True], ids=["once", "always"])
+def test_a_killed_worker_costs_one_tile(always, tmp_path, whole, monkeypatch):
+    monkeypatch.setenv("TEST_MAP_STORE", str(tmp_path))
+    if always:
+        (tmp_path / "always").touch()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mapping, "map_tile", kills_once)
+        if always:
+            with pytest.raises(InputError, match="1 of 8 tiles were lost: its worker process ended"):
+                make(tmp_path / "map.zarr", workers=Processes(2))
+        else:
+            assert_like(make(tmp_path / "map.zarr", workers=Processes(2)), whole)
+    tries = sorted(int(line) for line in (tmp_path / "tries").read_text().split())
+    assert tries == sorted([*range(TILES), *[4] * (2 if always else 1)])
+    crew = Watched()
+    assert_like(make(tmp_path / "map.zarr", workers=crew), whole)
+    assert crew.numbers == ([4] if always else [])
+
+
+def test_without_zarr_the_message_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(UsageError, match=r"zarr is not installed.*aerpaw-cmp\[geo\]"):
+        make(tmp_path / "map.zarr")
+
+
+def test_the_command_in_tiles(tmp_path):
+    words = [
+        "--spacing",
+        "240",
+        "--tile-m",
+        "600",
+        "--rss-altitude",
+        "30",
+        "--rank-altitude",
+        "30",
+        "--foliage",
+        "none",
+    ]
+    command = [sys.executable, "-m", "aerpaw_cmp", "map", SITE, "-o", "out", *words]
+    first = subprocess.run([*command, "--json"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert first.returncode == 0, first.stderr
+    told = json.loads(first.stdout)["tiles"]
+    assert (told["store"], told["tiles"], told["shown_every"]) == ("out.zarr", 8, 1)
+    assert (tmp_path / "out" / "map.html").is_file()
+    other = subprocess.run([*command, "-k", "5"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert other.returncode == 2
+    assert "another job: ks" in other.stderr
+    assert (tmp_path / "out" / "map.html").is_file()
+
+
+def test_flights_and_tiles_are_refused_before_anything_runs(tmp_path):
+    from aerpaw_cmp.jobs import run
+
+    with pytest.raises(UsageError, match="--with and a map in tiles"):
+        run.run_map(SITE, SETTINGS, flights=(tmp_path / "flight.yaml",))

@@ -1,0 +1,169 @@
+"""Tiles of a map against the map in one piece with every building, and the faults that such tiles could have."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import box
+
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.jobs.mapping import coverage_map as mapping
+from aerpaw_cmp.maps.grid import Grid
+from aerpaw_cmp.maps.tiles import PLANES, Budget, Reach, Tiling
+from aerpaw_cmp.propagation.search.occlusion import Occlusion
+from aerpaw_cmp.site.site import Building, Site, Tower, Trees
+
+FRAME = SiteFrame(35.7, -78.7)
+
+
+def town(buildings=80, side_m=800.0, seed=1, trees=0):
+    """Buildings turned at random, some that touch, one that holds a tower; towers on ground of two heights."""
+    rng = np.random.default_rng(seed)
+    middle = rng.uniform(-side_m / 2, side_m / 2, (buildings, 2))
+    blocks = []
+    for number, (east, north) in enumerate(middle):
+        shape = box(east - rng.uniform(4, 20), north - rng.uniform(4, 20), east + 12, north + 9)
+        if number % 7:
+            shape = shapely.affinity.rotate(shape, rng.uniform(0, 180))
+        else:  # two that share a wall
+            _, south, top_east, top_north = shape.bounds
+            next_door = box(top_east, south, top_east + 10, top_north)
+            blocks.append(Building(f"annex {number}", next_door, rng.uniform(4, 25)))
+        blocks.append(Building(f"house {number}", shape, rng.uniform(4, 25)))
+    at = {"A": (-150.0, 20.0, 0.0), "B": (310.0, 260.0, 0.0), "C": (40.0, -330.0, 3.0)}
+    towers = {name: Tower(name, 35.7, -78.7, east, north, 18.0, ground) for name, (east, north, ground) in at.items()}
+    like = np.ones(trees)
+    east, north = rng.uniform(-side_m / 4, side_m / 4, (2, trees))
+    wood = Trees(east, north, 0 * like, 14 * like, 7 * like, 3 * like, 0.4 * like)
+    half = side_m / 2
+    return Site("town", FRAME, towers, tuple(blocks), trees=wood, area_m=(-half, half, -half, half))
+
+
+def settings(**change):
+    some = {"spacing_m": 40.0, "rss_altitudes_m": (2.0,), "rank_altitudes_m": (2.0, 12.0), "foliage": ("none",)}
+    return mapping.MapSettings(**{**some, "max_depth": 1, "study": False, **change})
+
+
+def in_tiles(site, chosen, cells):
+    """Maps by mode, and how many buildings each tile has."""
+    channels = mapping.SiteChannels(site, chosen)
+    tiling = Tiling(Grid.over_area(site.area_m, chosen.spacing_m), cells)
+    done, kept = [], []
+    for number in range(len(tiling)):
+        done.append(channels.tile(mapping.TileOrder(site="", settings=chosen, cells=cells, number=number)))
+        kept.append(len(channels.site.buildings))
+    maps = {mode: tiling.joined({n: tile.maps[mode] for n, tile in enumerate(done)}) for mode in chosen.foliage}
+    return maps, kept, sum(tile.paths for tile in done)
+
+
+def in_one_piece(site, chosen):
+    """The same with every tower and every building everywhere."""
+    channels = mapping.SiteChannels(site, chosen)
+    channels.reach.of = lambda _box: site
+    grid = Grid.over_area(site.area_m, chosen.spacing_m)
+    done = channels.tile(mapping.TileOrder(site="", settings=chosen, cells=max(grid.shape), number=0))
+    return dict(done.maps), done.paths
+
+
+def assert_equal(maps, others):
+    for mode, one in maps.items():
+        for name in PLANES:
+            np.testing.assert_allclose(
+                getattr(one, name), getattr(others[mode], name), rtol=1e-9, err_msg=f"{mode} {name}"
+            )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"max_depth": 0},
+        {"max_depth": 1},
+        {"max_depth": 1, "foliage": mapping.FOLIAGE, "trees": 25},
+        {"max_depth": 2, "spacing_m": 50.0, "buildings": 12},
+        {"max_depth": 2, "spacing_m": 100.0, "buildings": 90},
+    ],
+    ids=lambda change: " ".join(f"{key} {value}" for key, value in change.items() if key != "foliage"),
+)
+def test_tiles_are_the_map_in_one_piece(change):
+    chosen = {key: value for key, value in change.items() if key not in ("trees", "buildings")}
+    site = town(change.get("buildings", 80), trees=change.get("trees", 0))
+    whole, paths = in_one_piece(site, settings(**chosen))
+    maps, kept, of_tiles = in_tiles(site, settings(**chosen), 5 if chosen["max_depth"] < 2 else 4)
+    assert of_tiles == paths
+    assert_equal(maps, whole)
+    if chosen["max_depth"] < 2 and not change.get("trees"):
+        left = {0: 0.4, 1: 0.9}[chosen["max_depth"]]
+        assert np.mean(kept) < left * len(site.buildings), "some are left out"
+    assert (maps["none"].rank.max(axis=(0, 1, 2)) > 0).mean() > 0.5
+
+
+def test_sionna_in_tiles_keeps_every_building():
+    site = town(12)
+    reach = mapping.SiteChannels(site, settings(engine="sionna")).reach
+    assert reach.of(np.array([[0.0, 0.0, 2.0], [10.0, 10.0, 2.0]])).buildings == site.buildings
+
+
+def _nothing(*_):
+    return shapely.linestrings(np.zeros((0, 2, 2)))
+
+
+FAULTS = {
+    "a shorter tile": ("_beside", lambda right: lambda self, tower, box_m: right(self, tower, (box_m + box_m[:1]) / 2)),
+    "no way in": ("_way_in", lambda _: _nothing),
+    "no way out": ("_way_out", lambda _: _nothing),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_shortened_reach_is_seen(fault, monkeypatch):
+    site, chosen = town(), settings()
+    whole, _ = in_one_piece(site, chosen)
+    name, wrong = FAULTS[fault]
+    monkeypatch.setattr(Reach, name, wrong(getattr(Reach, name)))
+    maps, _, _ = in_tiles(site, chosen, 5)
+    with pytest.raises(AssertionError):
+        assert_equal(maps, whole)
+
+
+def test_a_tower_out_of_range_is_left_out_and_nothing_changes():
+    site = town(20, side_m=4000.0)
+    free = in_one_piece(site, settings(spacing_m=200.0))[0]["none"]
+    floor = float(np.nanmax(free.rss_siso_dbm)) - 3.0
+    chosen = settings(spacing_m=200.0, threshold_dbm=floor)
+    maps, _, _ = in_tiles(site, chosen, 5)
+    assert_equal(maps, in_one_piece(site, chosen)[0])
+    reach = mapping.SiteChannels(site, chosen).reach
+    corner = np.array([[-2000.0, -2000.0, 2.0], [-1800.0, -1800.0, 2.0]])
+    range_m = Budget(carrier_hz=3.4e9, transmit_power_dbm=40.0, gain_db=10 * np.log10(4), floor_dbm=floor).range_m
+    far = [name for name, tower in site.towers.items() if np.hypot(tower.east_m + 1800, tower.north_m + 1800) > range_m]
+    assert far
+    assert not set(far) & set(reach.of(corner).towers)
+
+
+def test_a_tile_without_towers_is_out_of_coverage_at_once(monkeypatch):
+    site = town(5)
+    away = replace(site, area_m=tuple(side + 2e5 for side in site.area_m))
+    monkeypatch.setattr(mapping, "replay", lambda *_: pytest.fail("nothing reaches there"))
+    maps, kept, paths = in_tiles(away, settings(spacing_m=100.0), 4)
+    assert (paths, set(kept)) == (0, {0})
+    assert np.isnan(maps["none"].rss_siso_dbm).all()
+    assert (maps["none"].rank == 0).all()
+
+
+def test_solids_beside_segments_are_all_that_may_cut_them():
+    site = town(40)
+    hiding = Occlusion(mapping.Scene.of(site, mapping.SiteChannels(site, settings()).siso, _few()).faces, 1e-9)
+    rng = np.random.default_rng(5)
+    start = np.array([-350.0, -300.0, 9.0]) + rng.uniform(0, 40, (300, 3))
+    end = np.array([200.0, 330.0, 2.0]) + rng.uniform(0, 60, (300, 3))
+    beside = hiding._beside(start, end)
+    met = hiding._boxes(start, end, np.arange(len(hiding.pieces))).any(axis=0)
+    assert set(np.flatnonzero(met)) <= set(beside.tolist())
+    assert len(beside) < 0.6 * len(hiding.pieces)
+    start[0] = np.nan  # a segment without a place hides none of the others
+    assert hiding._beside(start, end).tolist() == beside.tolist()
+
+
+def _few():
+    return mapping.Poses(np.array([[0.0, 0.0, 30.0]]), np.eye(3)[None])

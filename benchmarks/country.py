@@ -1,14 +1,23 @@
 """A map of a country: a synthetic region of 3 towers and 3 000 buildings in tiles, by number of receivers.
 
-    python benchmarks/country.py                      1e5 and 1e6 receivers, two workers
-    python benchmarks/country.py --receivers 1e7      that number too
+    python benchmarks/country.py                            1e5 and 1e6 receivers, two workers
+    python benchmarks/country.py --receivers 1e5,1e6,1e7    that one too
+    python benchmarks/country.py --keep FOLDER              the stores stay there; a run that was ended goes on
 
-Each map is the command ``aerpaw-cmp map`` in a process of its own, its store on disk, without pages of other programs.
-Seconds are wall clock with imports; the peak is the largest resident size of one worker.
+Each map is ``aerpaw-cmp map`` at one height, 3 m, with one reflection and 4 x 4 elements, in a process of its own.
+Seconds are of the wall, imports, store and page included; MiB are the peaks of the largest worker and of the first
+process.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
+import math
+import subprocess
+import sys
+import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -39,10 +48,86 @@ def region(folder: Path, seed: int = 1) -> Path:
         latitude, longitude = (round(float(x), 9) for x in frame.to_geographic(*place))
         towers[name] = {"latitude_deg": latitude, "longitude_deg": longitude, "antenna_height_m": 30.0}
     half = SIDE_M / 2
-    content = {
-        "name": "a synthetic region", "origin": {"latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
-        "towers": towers, "area_m": [-half, half, -half, half], "buildings": buildings,
-    }  # fmt: skip
+    origin = {"latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg}
+    content = {"name": "a synthetic region", "origin": origin, "towers": towers, "area_m": [-half, half, -half, half]}
+    content["buildings"] = buildings
     path = folder / "region.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path
+
+
+MAP = """
+import json, resource, sys, time
+from aerpaw_cmp.__main__ import main
+code = main(sys.argv[1:])
+peak = {w: resource.getrusage(getattr(resource, w)) for w in ("RUSAGE_SELF", "RUSAGE_CHILDREN")}
+json.dump({w: [u.ru_utime + u.ru_stime, u.ru_maxrss / 1024] for w, u in peak.items()}, open("usage.json", "w"))
+sys.exit(code)
+"""
+"""Runs a command and leaves processor seconds and peaks [MiB] of itself and of its workers."""
+
+
+def mapped(site: Path, receivers: float, workers: int, cells: int) -> dict[str, float]:
+    """Seconds, peaks and size of one map."""
+    folder = site.parent / f"{receivers:g}"
+    folder.mkdir(exist_ok=True)
+    spacing = SIDE_M / math.ceil(math.sqrt(receivers))
+    words = f"--max-depth 1 --foliage none --rss-altitude {HEIGHT_M} --rank-altitude {HEIGHT_M} --json".split()
+    tiles = ["--spacing", repr(spacing), "--tile-m", repr(cells * spacing), "--workers", str(workers)]
+    started = time.perf_counter()
+    command = [sys.executable, "-c", MAP, "map", str(site), "-o", "out", *tiles, *words]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    seconds = time.perf_counter() - started
+    told = json.loads(done.stdout)
+    usage = json.loads((folder / "usage.json").read_text(encoding="utf-8"))
+    files = [path.stat().st_size for path in (folder / "out.zarr").rglob("*") if path.is_file()]
+    here, there = usage["RUSAGE_SELF"], usage["RUSAGE_CHILDREN"]
+    count = told["tiles"]["positions"]
+    return {
+        "receivers": count, "tiles": told["tiles"]["tiles"], "paths": told["paths"], "wall_s": seconds,
+        "maps_s": told["stages"]["maps_s"], "cpu_s": here[0] + there[0], "first_cpu_s": here[0],
+        "receivers_per_s": count / seconds, "worker_mib": there[1] if workers > 1 else here[1], "first_mib": here[1],
+        "store_mib": sum(files) / 2**20, "files": len(files),
+    }  # fmt: skip
+
+
+def extrapolated(rows: list[dict[str, float]], receivers: float) -> dict[str, float]:
+    """A larger map by the slopes between the two largest ones."""
+    few, many = rows[-2:]
+    slopes = {
+        name: math.log(many[name] / few[name]) / math.log(many["receivers"] / few["receivers"])
+        for name in ("wall_s", "first_cpu_s", "first_mib", "store_mib", "files")
+    }
+    times = receivers / many["receivers"]
+    return {"receivers": receivers, **{name: many[name] * times**slope for name, slope in slopes.items()}}
+
+
+def main() -> None:
+    """Measure, print a table and what larger maps would take."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--receivers", default="1e5,1e6")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--cells", type=int, default=128, help="positions along a side of a tile")
+    parser.add_argument("--keep", type=Path)
+    parser.add_argument("--json", action="store_true")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = asked.keep or Path(scratch)
+        folder.mkdir(exist_ok=True)
+        site = region(folder.resolve())
+        rows = []
+        for receivers in map(float, asked.receivers.split(",")):
+            rows.append(mapped(site, receivers, asked.workers, asked.cells))
+            if not asked.json:
+                print("  ".join(f"{name} {value:,.6g}" for name, value in rows[-1].items()), flush=True)
+    larger = [extrapolated(rows, size) for size in (1e8, 1e9)] if len(rows) > 1 else []
+    if asked.json:
+        print(json.dumps({"workers": asked.workers, "cells": asked.cells, "rows": rows, "extrapolated": larger}))
+    for row in () if asked.json else larger:
+        print("extrapolated: " + "  ".join(f"{name} {value:,.4g}" for name, value in row.items()))
+
+
+if __name__ == "__main__":
+    main()

@@ -148,7 +148,8 @@ class Reach:
         if self._every:
             return
         faces = self._faces = site_faces(site)
-        self._near = shapely.STRtree(footprints)
+        bounds = shapely.bounds(footprints) + NEAR_M * np.array([-1.0, -1.0, 1.0, 1.0])
+        self._near = shapely.STRtree(shapely.box(*bounds.T))
         self._ends = corners(faces, 1e9)[:, :2, :2]  # along the foot of a wall
         self._is_wall = (faces.solid >= 0) & (faces.normal[:, 2] == 0.0)
         self._mirrors = Mirrors(faces, self.extent_m)
@@ -179,7 +180,7 @@ class Reach:
             lines += [self._way_in(at, lit), self._way_out(at, lit, tile)]
         near = np.zeros(len(self.site.buildings), dtype=np.bool_)
         for shapes in map(shapely.convex_hull, lines):
-            near[self._near.query(shapes, predicate="dwithin", distance=NEAR_M)[1]] = True
+            near[self._near.query(shapes, predicate="intersects")[1]] = True
         return near
 
     def _way_in(self, at: FloatArray, walls: IntArray) -> AnyArray:

@@ -59,17 +59,22 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
         Ground planes first (``solid`` is -1), then walls and roof of each building.
     """
     grounds = sorted({site.towers[name].ground_m for name in (towers or site.towers)}) or [0.0]
-    faces = [_ground(height, site.ground_material, len(grounds) > 1) for height in grounds]
-    for index, building in enumerate(site.buildings):
+    return _faces(tuple(grounds), site.ground_material, site.buildings)
+
+
+@lru_cache(maxsize=4)
+def _faces(grounds: tuple[float, ...], ground_material: str, buildings: tuple[Building, ...]) -> Faces:
+    """Faces of ground planes and buildings; kept, for a replay in parts asks again with each part."""
+    faces = [_ground(height, ground_material, len(grounds) > 1) for height in grounds]
+    for index, building in enumerate(buildings):
         faces.extend(_building_faces(building, index))
     columns: dict[str, Any] = dict(zip(_Face._fields, zip(*faces, strict=True), strict=True))
     numbers = {name: np.array(columns[name]) for name in _Face._fields if name not in ("material", "label", "polygon")}
     return Faces(**(columns | numbers))
 
 
-@lru_cache(maxsize=4096)
 def _building_faces(building: Building, solid: int) -> tuple[_Face, ...]:
-    """Walls and roof; kept, for a replay in parts asks again with each part."""
+    """Walls and roof."""
     faces: list[_Face] = []
     for part in _parts(building.footprint):
         faces += [*_walls(building, part, solid), _roof(building, part, solid)]
@@ -263,9 +268,10 @@ def triangles(faces: Faces, reach_m: float) -> tuple[FloatArray, IntArray, IntAr
 def inside_solids(site: Site, points_m: FloatArray) -> BoolArray:
     """Points (points,) strictly inside a building."""
     result = np.zeros(len(points_m), dtype=np.bool_)
-    for building in site.buildings:
-        top = building.base_m + building.height_m
-        low = np.flatnonzero(points_m[:, 2] < top)
-        if len(low):
-            result[low] |= shapely.contains_xy(building.footprint, points_m[low, 0], points_m[low, 1])
+    top = np.array([building.base_m + building.height_m for building in site.buildings])
+    low = np.flatnonzero(np.isfinite(points_m).all(axis=1) & (points_m[:, 2] < top.max(initial=-np.inf)))
+    if len(low):
+        tree = shapely.STRtree([building.footprint for building in site.buildings])
+        point, building = tree.query(shapely.points(points_m[low, :2]), predicate="within")
+        result[low[point[points_m[low[point], 2] < top[building]]]] = True
     return result

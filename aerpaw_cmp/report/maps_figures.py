@@ -90,13 +90,14 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
 
 def draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
     """Outlines of buildings and forests, and the towers; only the named tower when one is named."""
+    from matplotlib.collections import PolyCollection
+
     for forest in site.forests:
         outline = np.asarray(forest.area.exterior.coords)
         ax.plot(outline[:, 0], outline[:, 1], color="white", linewidth=1.4, zorder=2)
         ax.plot(outline[:, 0], outline[:, 1], color="#2F5D28", linewidth=0.8, linestyle=(0, (2, 1)), zorder=2.1)
-    for building in drawn_buildings(site):
-        outline = np.asarray(building.footprint.exterior.coords)
-        ax.fill(outline[:, 0], outline[:, 1], facecolor="white", edgecolor="black", linewidth=0.7, zorder=2.2)
+    outlines = [np.asarray(building.footprint.exterior.coords)[:, :2] for building in drawn_buildings(site)]
+    ax.add_collection(PolyCollection(outlines, facecolor="white", edgecolor="black", linewidth=0.7, zorder=2.2))
     for name, tower in site.towers.items():
         if highlight is None or name == highlight:
             ax.plot(

@@ -123,7 +123,7 @@ def _forget() -> None:
     from aerpaw_cmp.propagation import faces
     from aerpaw_cmp.propagation.field import foliage
 
-    faces._building_faces.cache_clear()
+    faces._faces.cache_clear()
     foliage._last_index.clear()
 
 

@@ -241,8 +241,8 @@ def test_the_command_in_tiles(tmp_path):
     assert (tmp_path / "out" / "map.html").is_file()
 
 
-def test_flights_and_tiles_are_refused_before_anything_runs(tmp_path):
+def test_flights_and_tiles_are_refused_before_anything_runs():
     from aerpaw_cmp.jobs import run
 
-    with pytest.raises(UsageError, match="--with and a map in tiles"):
-        run.run_map(SITE, SETTINGS, flights=(tmp_path / "flight.yaml",))
+    with pytest.raises(UsageError, match="flights and a map in tiles"):
+        run.run_map(SITE, SETTINGS, remembered=True)

@@ -153,7 +153,14 @@ def test_the_page_lists_every_knob_with_its_default() -> None:
     from aerpaw_cmp.flight import settings as config
 
     text = (ROOT / "docs" / "flight_yaml.md").read_text()
-    block = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)[1]
+    first, block = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)[:2]
+    usual = parse_yaml("flight: f\nlogs: [{path: a}]\n" + first[first.index("\nrt:") :], config.FlightFile)
+    for shown in (usual.rt, usual.rss):
+        assert shown == type(shown)()
+        assert shown.model_fields_set >= set(type(shown).model_fields) - {"advanced", "foliage_model"}
+    log = config.LogSettings(path="a")
+    assert f"floor_db: {log.floor_db:g}" in first
+    assert f"antenna_height_m: {config.GroundNode(track=log).antenna_height_m:g}}}" in first
     listed = parse_yaml("flight: f\nlogs: [{path: a}]\n" + block, config.FlightFile)
     for knobs in (listed.rt.advanced, listed.rss.advanced, listed.rank.advanced):
         assert knobs == type(knobs)()

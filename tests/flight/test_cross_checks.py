@@ -58,6 +58,7 @@ def test_the_name_of_a_file_is_compared_with_its_start(name: str, start: str, as
 def test_a_nemo_summary_beside_a_log_is_compared_with_its_start(tmp_path: Path, start: str, asked: bool) -> None:
     (tmp_path / "24Feb09_172055.1.csv").write_text("guid\nDevice ID;1\nMeasurement start;2024 Feb 09 17:20\n")
     (tmp_path / "other.csv").write_text("Measurement start;2001 Jan 01 17:20\n")
+    (tmp_path / "24Feb09_172055.2.csv").mkdir()  # a folder holds no words
     found = _asked(_log(tmp_path / "24Feb09_172055.1.gpx", start))
     assert bool(found) is asked
     if asked:

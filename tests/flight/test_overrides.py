@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.flight.overrides import overridden
-from aerpaw_cmp.flight.settings import FlightFile, load_flight
+from aerpaw_cmp.flight.settings import FlightFile, LinksSettings, load_flight
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
 
@@ -66,3 +68,17 @@ def test_the_last_element_of_a_list_is_one_and_the_next_is_none(settings: Flight
     assert overridden(settings, {f"logs.{count - 1}.channel": "Q"}).logs[-1].channel == "Q"
     with pytest.raises(UsageError, match=f"0 to {count - 1}"):
         overridden(settings, {f"logs.{count}.channel": "Q"})
+
+
+def test_links_are_those_of_the_paper_unless_the_file_says_otherwise() -> None:
+    """arXiv 2502.10324: RSS flights at 3.3 GHz sent by the UAV; rank at 3.4 GHz, 10 W, arrays at 45 and 315 degrees."""
+    links = LinksSettings()
+    assert (links.rss.carrier_hz, links.rss.uav_transmits, links.rss.tower.layout) == (3.3e9, True, "single")
+    rank = links.rank
+    assert (rank.carrier_hz, rank.uav_transmits, rank.transmit_power_dbm) == (3.4e9, False, 40.0)
+    assert (rank.tower.layout, rank.uav.layout) == ("tower_comparison", "uav_comparison")
+    assert (rank.tower.yaw_deg, rank.uav.yaw_deg, rank.uav.roll_deg) == (45.0, 315.0, 90.0)
+    for array in (rank.tower, rank.uav):
+        assert sorted(array.slant_deg) == [-45.0, -45.0, 45.0, 45.0]
+    lobe = rank.tower.build(wavelength_m(3.4e9), Path()).mount @ [1.0, 0.0, 0.0]  # yaw is counter-clockwise from east
+    np.testing.assert_allclose(lobe, [np.sqrt(0.5), np.sqrt(0.5), 0.0], atol=1e-12)

@@ -32,7 +32,7 @@ def rt(**more: object) -> RtSettings:
     return RtSettings.model_validate({"max_depth": 1, "audit_links": 0, **more})
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.02, 0.1, 9.0])
+@pytest.mark.parametrize("sigma", [0.0, 0.02, 0.1, 1.0, 9.0])
 def test_the_replay_is_the_two_ray_form_of_that_roughness(sigma):
     found = replay_poses(BARE, rt(ground_roughness_m=sigma), LINK, POSES)
     expected = two_ray_dbm(LW1[None], POSES.position_m, 3.4e9, 40.0, roughness_m=sigma)

@@ -100,6 +100,10 @@ def test_materials_a_second_time(name):
     eta, thickness = reference.permittivity(name, carrier)
     assert eta == pytest.approx(what.relative_permittivity(carrier), rel=1e-12)
     assert thickness == what.thickness_m
+    for ghz, beyond in ((what.bands[0][0], 0.999), (what.bands[0][1], 1.001)):
+        eta = reference.permittivity(name, 1e9 * ghz)[0]
+        assert eta == pytest.approx(what.relative_permittivity(1e9 * ghz), rel=1e-12)
+        assert reference.permittivity(name, 1e9 * ghz * beyond) is None
     assert reference.permittivity("vegetation", 3e9)[0] == pytest.approx(VEGETATION.relative_permittivity(3e9))
 
 

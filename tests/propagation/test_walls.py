@@ -208,7 +208,7 @@ def test_steps_of_a_path_are_its_walls_in_order_and_roofs_count() -> None:
     target = np.array([90.0, 8.0, 6.0])
     found = run(dataclasses.replace(town(), buildings=row), target, max_depth=1)
     assert found.through is not None
-    paths, kinds = found.through.paths, set()
+    paths, kinds, bent = found.through.paths, set(), found.through.reflections()
     for k in range(len(paths)):
         depth = int(paths.depth[k])
         faces, points = paths.faces[k, :depth], paths.vertices_m[k, :depth]
@@ -226,6 +226,7 @@ def test_steps_of_a_path_are_its_walls_in_order_and_roofs_count() -> None:
             expected += [a + s * (b - a) for s in sorted(shares)[1:-1]] + [b]
         assert np.abs(points - np.array(expected[:-1])).max() < 1e-9
         kinds.add((int(own.sum()), int((~own).sum())))
+        assert (bent.depth[k], set(bent.faces[k].tolist())) == (own.sum(), {-1})
     assert {(0, 4), (1, 4)} <= kinds
 
 

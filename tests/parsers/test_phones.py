@@ -238,12 +238,6 @@ def test_processed_flights_have_no_clock_and_say_so() -> None:
     assert any("no clock" in text for text in result.warnings)
 
 
-def test_matlab_73_holds_the_same_flight() -> None:
-    old, new = read("flight_mat", samples.mat_flight()), read("flight_mat", samples.mat_73())
-    for one, other in zip(old.streams, new.streams, strict=True):
-        pd.testing.assert_frame_equal(one.frame, other.frame)
-
-
 def test_quectel_console_names_the_cells_by_their_tables() -> None:
     result = read("quectel_console", samples.QUECTEL_CONSOLE)
     assert stream(result, "nr_pci77").frame[["rss_db", "rsrq_db", "sinr_db"]].values.tolist() == [[-82.0, -11.0, 21.0]]

@@ -137,14 +137,6 @@ def test_tr38901_reference_points() -> None:
     assert gain(0, 180) == pytest.approx(-22.0)  # the floor holds for the sum
 
 
-def _missing(rows: np.ndarray) -> np.ndarray:
-    return np.delete(rows, 700, axis=0)
-
-
-def _meridian(rows: np.ndarray) -> np.ndarray:
-    return rows[rows[:, 0] > 0.01]
-
-
 def _degrees(rows: np.ndarray) -> np.ndarray:
     return rows * [180 / math.pi, 180 / math.pi, 1, 1, 1, 1, 1]
 
@@ -164,8 +156,6 @@ def _too_strong(rows: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (_missing, r"1 directions are missing .* phi 15.0 deg, theta 105.0 deg"),
-        (_meridian, "phi runs from 3.0 to 177.0 deg in 59"),
         (_degrees, "line .*: angles reach 180; expected angles in radians.*degrees"),
         (_phase_degrees, "phases reach .* expected phases in radians"),
         (_linear, "linear amplitudes instead of dBi"),
@@ -179,12 +169,9 @@ def test_bad_files_are_explained(tmp_path: Path, change: object, words: str) -> 
     assert caught.value.path == str(path)
 
 
-def test_truncated_and_foreign_files(tmp_path: Path) -> None:
+def test_foreign_files(tmp_path: Path) -> None:
     path = write(tmp_path / "cut.txt", rows_of())
     text = path.read_text()
-    path.write_text(text[:-20])  # inside the last line
-    with pytest.raises(InputError, match=r"line 7264: .*expected 7 numbers.*cut off"):
-        read_pattern_text(path)
     path.write_text("hello\n1 2 3\n")
     with pytest.raises(InputError, match="no pattern found"):
         read_pattern_text(path)
@@ -227,10 +214,6 @@ def test_bad_gain_grids_are_explained(tmp_path: Path) -> None:
     path = grid_file(tmp_path / "rad_pat.mat")
     with pytest.raises(UsageError, match="no gain grid 'tiltd'; expected one of tilted"):
         read_gain_grid(path, "tiltd")
-    with pytest.raises(InputError, match="radians instead of degrees"):
-        read_gain_grid(grid_file(path, theta2=np.radians(np.arange(90, -91, -3.0))), "tilted")
-    with pytest.raises(InputError, match=r"azimuth .*angles are missing"):
-        read_gain_grid(grid_file(path, phi2=np.arange(0, 240, 2.0)), "tilted")
     path.write_bytes(b"MATLAB 5.0 nonsense" * 20)
     with pytest.raises(AerpawCmpError, match="no MATLAB"):
         read_gain_grid(path, "tilted")
@@ -271,7 +254,7 @@ SMALL = [
         ([*SMALL[:-1], SMALL[-1][:-1]], 40, "'0.47', has fewer digits than those above it. Likely cause: the line was cut off"),
         ([*SMALL[:-1], SMALL[-1][:-20]], 40, "expected 7 numbers. Likely cause: the line was cut off"),
         ([*SMALL, SMALL[0]], 41, "given twice.*a line was copied"),
-        ([*SMALL[:10], *SMALL[11:]], None, "phi 45.0 deg, theta -135.0 deg .missing.*a line is lost"),
+        ([*SMALL[:10], *SMALL[11:]], None, "1 directions are missing.*phi 45.0 deg, theta -135.0 deg.*a line is lost"),
         ([*SMALL[:9], *SMALL[18:]], None, "phi runs from 0.0 to 135.0 deg in 3 values.*angles are missing"),
         ([row.replace(".", ",") for row in SMALL], 5, "decimal commas"),
         ([row.replace("-3.0103\t-6.0206\t-6.0206", "-43.0103\t-46.0206\t-46.0206") for row in SMALL], None,
@@ -302,7 +285,8 @@ ELEVATION, AZIMUTH = np.linspace(90, -90, 7), np.arange(12) * 30.0
         (np.where(ELEVATION == 0, np.nan, ELEVATION), AZIMUTH, "", "elevation .* runs from nan"),
         (90 - ELEVATION, AZIMUTH, "", "zenith angles in place of elevation"),
         (ELEVATION, np.linspace(0, 360, 13), "", "a direction stands twice, such as 0 and 360"),
-        (ELEVATION[:4], AZIMUTH, "", "angles are missing"),
+        (ELEVATION[:4], AZIMUTH, "", "elevation .*angles are missing"),
+        (ELEVATION, AZIMUTH[:8], "", "azimuth .*angles are missing"),
         (np.radians(ELEVATION), AZIMUTH, "", "radians instead of degrees"),
     ],
 )

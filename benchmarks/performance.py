@@ -218,6 +218,41 @@ def town(found: list[dict[str, Any]]) -> list[str]:
     return [*out, ""]
 
 
+COUNTRY = (
+    "receivers", "tiles", "wall_s", "cpu_s", "receivers_per_s", "worker_mib", "first_mib", "store_mib", "files",
+)  # fmt: skip
+
+
+def country(found: list[dict[str, Any]]) -> list[str]:
+    """A map in tiles by its receivers, and what larger ones would take."""
+    when, result = last_result(found, "country")
+    if not result:
+        return []
+    out = [
+        "## A map of a country", "",
+        f"Villages on 32 x 32 km: 3 towers, 3 000 buildings, one height of 3 m, one reflection, 4 x 4 elements, "
+        f"{result['workers']} workers, tiles of {result['cells']} x {result['cells']} positions ({when}). Seconds of "
+        "the wall hold imports, store and page. `python benchmarks/country.py --receivers 1e7` measures it.", "",
+        "| receivers | tiles | wall s | processor s | receivers a second | largest worker MiB | first process MiB "
+        "| store MiB | files |",
+        "| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+        *("| " + " | ".join(number(row[key]) for key in COUNTRY) + " |" for row in result["rows"]),
+        "",
+    ]  # fmt: skip
+    for row in result["extrapolated"]:
+        out.append(
+            f"- **{number(row['receivers'])} receivers**, by the slopes between the last two rows: "
+            f"{row['wall_s'] / 3600:.1f} h, {row['store_mib'] / 1024:.0f} GiB in {number(row['files'])} files, first "
+            f"process {number(row['first_mib'])} MiB and {number(row['first_cpu_s'])} s of processor."
+        )
+    return [
+        *out,
+        "- **What breaks first**: the number of cells. A grid has at most 10 000 a side, so 1e8 receivers at one "
+        "height are the largest map, and 1e9 are refused: ten maps. Then the files of the store, then the one process "
+        "that writes it: workers beyond the ratio of processor seconds to its own would wait for it.", "",
+    ]  # fmt: skip
+
+
 def kriging(found: list[dict[str, Any]]) -> list[str]:
     """Kriging in totals and by the marginal cost of a target, set-up apart."""
     when, result = last_result(found, "kriging")
@@ -295,7 +330,7 @@ def page(found: list[dict[str, Any]]) -> str:
         *scaling_tables(scaling),
         "## Extrapolated", "",
         *long_flight(scaling), *season(scaling), *city(scaling), "",
-        *peers(found), *town(found), *kriging(found),
+        *country(found), *peers(found), *town(found), *kriging(found),
     ]  # fmt: skip
     return "\n".join(lines).rstrip() + "\n"
 

@@ -192,8 +192,7 @@ def map_job(
             _check(evaluated, part.stop - part.start, t)
             if height in at["rss"]:
                 row = at["rss"].index(height)
-                for values, level in zip(rss, evaluated.levels, strict=True):
-                    values[row, :, part] = level.T
+                rss[:, row, :, part] = np.stack(evaluated.levels).swapaxes(1, 2)
             if height in at["rank"]:
                 row = at["rank"].index(height)
                 rank[row, :, :, part] = np.moveaxis(

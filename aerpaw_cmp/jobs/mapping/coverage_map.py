@@ -549,8 +549,8 @@ def job_of(site: str, settings: MapSettings) -> dict[str, Any]:
     """All that the values of a map depend on: settings, content of the site's files, program."""
     without = ("study", "neighbours", "radius_m", "block_m", "seed")
     chosen = {key: str(value) for key, value in asdict(settings).items() if key not in without}
-    files = [entry.sha256 for entry, _ in site_inputs(site, Path())]
-    return {"site": files, **chosen, "program": code_digest()}
+    files = [entry.sha256[:12] for entry, _ in site_inputs(site, Path())]
+    return {"site": files, **chosen, "program": code_digest()[:12]}
 
 
 def study_maps(outcome: MapOutcome, stages: Stages) -> None:

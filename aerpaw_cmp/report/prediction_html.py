@@ -132,14 +132,14 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
 
 def _dataset(data: PredictionPage) -> Any:
     """Points along one dimension, towers and channels along another."""
-    names = [name for name, _ in data.series]
-    first = data.series[0][1]
+    series = data.series
+    names, first = [name for name, _ in series], series[0][1]
     variables: dict[str, Any] = {"series": ("series", np.array(names), {"long_name": "tower and channel"})}
     for name, unit in (("time_s", "s"), ("east_m", "m"), ("north_m", "m"), ("height_m", "m"), ("yaw_deg", "degree")):
         variables[name] = ("point", first[name].to_numpy(np.float64), {"units": unit})
     for name in ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db", "p_above", "p_serving"):
         if name in first:
-            values = np.stack([part[name].to_numpy(np.float64) for _, part in data.series]).astype(np.float32)
+            values = np.stack([part[name].to_numpy(np.float32) for _, part in series])
             variables[name] = (("series", "point"), values, {"units": "dB" if name.endswith("_db") else "1"})
     variables["level_db"][2]["comment"] = ", ".join(f"{name}: {unit}" for name, unit in data.units.items())
     about = file_attributes(
@@ -179,6 +179,10 @@ def _map_spec(data: PredictionPage, name: str, part: pd.DataFrame, height: str =
     )  # fmt: skip
 
 
+MOST_DOTS = 50_000
+"""Points of a map that are drawn."""
+
+
 def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
     fig = canvas.figure((9.2, 5.2))
     axes = fig.subplots(1, 2, sharex=True, sharey=True)
@@ -191,7 +195,8 @@ def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
         for line in data.flown.values():
             ax.plot(line[0], line[1], color="0.7", linewidth=0.6, zorder=1)
         if data.shape is None:
-            shown = ax.scatter(east, north, c=values, s=7, cmap=colours, zorder=2, rasterized=True)
+            some = slice(None, None, -(-len(values) // MOST_DOTS))
+            shown = ax.scatter(east[some], north[some], c=values[some], s=7, cmap=colours, zorder=2, rasterized=True)
         else:
             grid = [v.reshape(data.shape) for v in (east, north, values)]
             shown = ax.pcolormesh(*grid, cmap=colours, shading="nearest", rasterized=True, zorder=0)

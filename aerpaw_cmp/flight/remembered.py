@@ -12,10 +12,12 @@ import numpy as np
 from ..common.errors import InputError, UsageError
 from ..common.units import FloatArray
 from ..compare.direction_gain import LinkSamples
+from ..compare.spread import NO_SPREAD, Spread
 from ..site.learned import (
     Entry,
     Errors,
     Learned,
+    LearnedLevel,
     LearnedLock,
     LearnedSeries,
     Named,
@@ -37,6 +39,17 @@ class Remembered:
     series: LearnedSeries
     tower: SpherePattern
     uav: SpherePattern
+
+    @property
+    def level(self) -> LearnedLevel:
+        """Level of the log; only of memories that keep it."""
+        assert self.series.level is not None
+        return self.series.level
+
+    @property
+    def spread(self) -> Spread:
+        """Spread of a level besides the standard deviation of the gains."""
+        return Spread.from_text(self.tower.notes) or NO_SPREAD
 
     @property
     def prior_variance_db2(self) -> float:
@@ -63,8 +76,7 @@ def remembered(site: str | Path) -> dict[str, Remembered]:
         for series in entry.series:
             tower, uav = (read_sphere_csv(folder / file) for file in (series.tower_file, series.uav_file))
             named = Named(entry=entry, part="", folder=folder)
-            for pattern, file in ((tower, series.tower_file), (uav, series.uav_file)):
-                check_logs(pattern.trained_on, named, folder / file)
+            check_logs((*tower.trained_on, *uav.trained_on), named, folder / series.tower_file)
             out[f"{series.tower}.{series.channel}"] = Remembered(entry=entry, series=series, tower=tower, uav=uav)
     return out
 

@@ -165,7 +165,7 @@ def memory_words(known: Sequence[Remembered], outside: float) -> str:
     for one in known:
         each.setdefault(one.entry.about(), []).append(f"{one.series.tower} {one.series.channel}")
     learned = ". ".join(f"{', '.join(names)}: {about}" for about, names in each.items())
-    sd = max(one.series.level.sd_db for one in known if one.series.level is not None)
+    sd = max(one.level.sd_db for one in known)
     texts = [NO_FLIGHT, *([UNSEEN] if outside > MANY else [])]
     return " ".join(filled(texts, learned=learned, sd=sd, percent=100.0 * outside))
 

@@ -24,7 +24,6 @@ from ...flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings
 from ...flight.track import body_rotation
 from ...propagation.arrays import Poses
 from ...propagation.field.baselines import free_space_dbm
-from ...site.learned import LearnedLevel
 from ...site.site import Site
 from ..learning.calibrate import load_calibration
 from .where import is_settings, level_samples
@@ -221,37 +220,29 @@ class Memory:
 
     def levels(self, each: Sequence[LinkSamples], whole: int) -> Levels:  # noqa: ARG002
         """As :meth:`Flown.levels`; a guess where flights taught less than half of the variance, or off the site."""
-        antenna = each[0].antenna
+        one = self.known[each[0].antenna]
         gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
-        level, spread, gain_variance = self._level(antenna), self._spread(antenna), (sds**2).mean(axis=0)
+        level, spread, gain_variance = one.level, one.spread, (sds**2).mean(axis=0)
         rest = spread.own_sd_db**2 + spread.noise_sd_db**2 + level.sd_db**2
         west, east, south, north = self._site.area_m
         off = np.any(np.abs(each[0].position_m[:, :2] - (0.5 * (west + east), 0.5 * (south + north)))
                      > (0.5 * (east - west), 0.5 * (north - south)), axis=1)  # fmt: skip
-        guess = off | (gain_variance > 0.5 * self.known[antenna].prior_variance_db2)
+        guess = off | (gain_variance > 0.5 * one.prior_variance_db2)
         return gains.mean(axis=0) + level.offset_db, np.sqrt(gain_variance + gains.var(axis=0) + rest), guess
 
     def fading(self, antenna: str) -> Spread:
         """As :meth:`Flown.fading`."""
-        return dataclasses.replace(self._spread(antenna), own_sd_db=0.0, noise_sd_db=0.0)
+        return dataclasses.replace(self.known[antenna].spread, own_sd_db=0.0, noise_sd_db=0.0)
 
     def offset_db(self, antenna: str) -> float:
         """Mean of logged levels minus those of the antennas [dB]."""
-        return self._level(antenna).offset_db
-
-    def _level(self, antenna: str) -> LearnedLevel:
-        level = self.known[antenna].series.level
-        assert level is not None
-        return level
-
-    def _spread(self, antenna: str) -> Spread:
-        return Spread.from_text(self.known[antenna].tower.notes) or NO_SPREAD
+        return self.known[antenna].level.offset_db
 
     def sources(self) -> dict[str, Source]:
         """Links by antenna, with isotropic ends."""
         out = {}
         for antenna, one in self.known.items():
-            series, level = one.series, self._level(antenna)
+            series, level = one.series, one.level
             link = LinkSettings(carrier_hz=series.carrier_hz, transmit_power_dbm=level.transmit_power_dbm)
             out[antenna] = Source(
                 tower=series.tower,

@@ -487,18 +487,17 @@ def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
     for shape in sorted(group, key=lambda shape: -shape.height_m):
         over = [other for other in kept if other.area.intersects(shape.area)]
         free = _areas_only(shape.area.difference(shapely.union_all([other.area for other in over])))
+        same = next((other for other in over if _alike(other, shape)), None)
         if free.is_empty:
             actions.append(f"{shape.source}: left out, it lies inside buildings at least as high")
-            continue
-        same = next((other for other in over if _alike(other, shape)), None)
-        if same is not None:
+        elif same is not None:
             same.area = _areas_only(same.area.union(free))
             actions.append(f"{shape.source}: overlaps {same.source} at the same height; they were merged")
-            continue
-        if shape.area.area - free.area > 0.01:
-            actions.append(f"{shape.source}: the part under a higher building was cut away")
-        shape.area = free
-        kept.append(shape)
+        else:
+            if shape.area.area - free.area > 0.01:
+                actions.append(f"{shape.source}: the part under a higher building was cut away")
+            shape.area = free
+            kept.append(shape)
     return kept
 
 

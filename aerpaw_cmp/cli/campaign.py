@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 
-from ..common.errors import UsageError
 from ..common.stages import duration
 from ..jobs.options import RunOptions
 from .app import Export, Force, Json, LogsRoot, Scheduler, Workers, command
@@ -20,17 +19,11 @@ from .shown import number, print_json, say, table
         "aerpaw-cmp campaign campaign.yaml --workers 4",
         "aerpaw-cmp campaign campaign.yaml -o reports/spring --keep outcomes --strict",
         "aerpaw-cmp campaign campaign.yaml --scheduler tls://scheduler:8786 --keep /shared/outcomes",
-        "aerpaw-cmp campaign status campaign.yaml",
+        "aerpaw-cmp campaign campaign.yaml --dry-run",
     ],
 )
 def campaign(
-    words: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="[status|resume] CAMPAIGN",
-            help="campaign.yaml; 'status' lists finished and open tasks; 'resume' lists them and runs the open tasks.",
-        ),
-    ],
+    campaign_yaml: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="campaign.yaml")],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/<campaign>]")
     ] = None,
@@ -54,14 +47,11 @@ def campaign(
     """Many flights and settings, with what can be said only of several flights."""
     from ..jobs import run
 
-    action, campaign_yaml = _action(words)
     options = RunOptions(out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say)
-    if dry_run or action != "run":
+    if dry_run:
         status = run.campaign_status(campaign_yaml, options, keep=keep, fresh=fresh)
-        if action != "resume" or dry_run:
-            print_json(status.metrics()) if as_json else _print_status(status)
-            return 0
-        say(_one_line(status))
+        print_json(status.metrics()) if as_json else _print_status(status)
+        return 0
     outcome = run.run_campaign(campaign_yaml, options, keep=keep, fresh=fresh, export=export or ())
     if as_json:
         print_json(outcome.metrics)
@@ -74,34 +64,18 @@ def campaign(
     return 1 if strict and outcome.failed_checks else 0
 
 
-def _action(words: list[str]) -> tuple[str, Path]:
-    """Action asked for, and the path of the campaign.yaml."""
-    if len(words) == 1 and words[0] not in ("status", "resume"):
-        return "run", Path(words[0])
-    if len(words) == 2 and words[0] in ("status", "resume"):
-        return words[0], Path(words[1])
-    raise UsageError(
-        f"campaign {' '.join(words)}",
-        expected="campaign CAMPAIGN, or campaign status (or resume) CAMPAIGN",
-    )
-
-
-def _one_line(status: Any) -> str:
-    time = "no time was measured yet" if status.estimate_s is None else f"about {duration(status.estimate_s)}"
-    if not status.to_do:
-        time = "nothing to compute"
-    return (
-        f"{status.name}: {len(status.states)} tasks, {status.kept} kept in {status.keep}, {status.failed} failed the "
-        f"last time, {status.to_do} to do, {time} with {status.workers} worker{'s' if status.workers > 1 else ''}"
-    )
-
-
 _SHOWN = 20
 """Tasks of a list on the terminal; --json has them all."""
 
 
 def _print_status(status: Any) -> None:
-    print(_one_line(status))
+    time = "no time was measured yet" if status.estimate_s is None else f"about {duration(status.estimate_s)}"
+    if not status.to_do:
+        time = "nothing to compute"
+    print(
+        f"{status.name}: {len(status.states)} tasks, {status.kept} kept in {status.keep}, {status.failed} failed the "
+        f"last time, {status.to_do} to do, {time} with {status.workers} worker{'s' if status.workers > 1 else ''}"
+    )
     rows = [[s.task.flight, s.task.setting, (s.failure or s.trouble)[:100]] for s in status.states if not s.kept]
     if rows:
         title = "To do" if len(rows) <= _SHOWN else f"To do: the first {_SHOWN} of {len(rows)}"

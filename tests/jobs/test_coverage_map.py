@@ -20,6 +20,7 @@ from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs.mapping import coverage_map as mapping
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import rank_of_singular_values
+from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL
 from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.field.foliage import CrownIndex, Opaque, foliage_loss_db
 from aerpaw_cmp.propagation.options import Field, Search
@@ -402,3 +403,12 @@ def test_workers_evaluate_the_tiles_to_the_same_digit() -> None:
     for mode in some.foliage:
         assert np.array_equal(shared.maps[mode].rss_siso_dbm, alone.maps[mode].rss_siso_dbm, equal_nan=True)
         assert np.array_equal(shared.maps[mode].rank, alone.maps[mode].rank)
+
+
+def test_the_stated_curve_is_the_one_that_maps_are_held_against(made):
+    stated = {
+        row["what"].split()[0]: float(row["paper"]) for row in made[1]["paper"] if "bi-exponential" in row["what"]
+    }
+    assert len(stated) == 5
+    for name, value in stated.items():
+        assert getattr(PAPER_BIEXPONENTIAL, name.lower()) == value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import AerpawCmpError
-from ...common.stages import Progress, duration
+from ...common.stages import Progress
 from ...report.campaign_data import Failure, FlownTrack
 from ..tasks.outcomes import OutcomeStore
 from ..tasks.workers import Lost, Workers
@@ -35,7 +34,7 @@ class TaskState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignStatus:
-    """Answer of ``campaign status``.
+    """Answer of ``campaign --dry-run``.
 
     ``estimate_s`` is the time of what is to do with ``workers`` tasks side by side: for every task the mean cost of
     the kept tasks of its setting, else of all; None where nothing was measured yet.
@@ -140,41 +139,6 @@ def _state(task: Task, store: OutcomeStore) -> TaskState:
     )
 
 
-class Watch:
-    """Progress of tasks: done, failed, running, links per second, time left.
-
-    Parameters
-    ----------
-    total, kept : int
-        Tasks of the campaign, and those that are not computed.
-    workers : int
-        Tasks at a time.
-    progress : Progress
-    """
-
-    def __init__(self, total: int, kept: int, workers: int, progress: Progress) -> None:
-        self.total, self.kept, self.workers, self.progress = total, kept, max(workers, 1), progress
-        self.done = self.failed = self.links = 0
-        self._start = time.monotonic()
-
-    def __call__(self, outcome: Outcome, links: int) -> None:
-        """One more is through."""
-        self.done += 1
-        self.failed += outcome.failure is not None
-        self.links += links
-        self.progress(f"flights\t{self.words()}", (self.kept + self.done) / max(self.total, 1))
-
-    def words(self) -> str:
-        """One line."""
-        spent = max(time.monotonic() - self._start, 1e-9)
-        left = self.total - self.kept - self.done
-        parts = [f"{self.kept + self.done} of {self.total} done"]
-        parts += [f"{self.failed} failed"] if self.failed else []
-        parts += [f"{min(left, self.workers)} running", f"{self.links / spent:.0f} links/s"]
-        parts += [f"{duration(spent / self.done * left)} left"] if left and self.done else []
-        return ", ".join(parts)
-
-
 class Outcomes:
     """Outcomes of a campaign's tasks by number, each held without what its setting is not asked for.
 
@@ -247,12 +211,12 @@ def compute(
     store : OutcomeStore, optional
         Keeps the new ones, and failures.
     progress : Progress
-        Tasks done, and the time left.
+        Tasks done.
     """
-    watch = Watch(len(outcomes) + len(orders), len(outcomes), workers.count, progress)
-    numbers = list(orders)
+    numbers, total, failed = list(orders), len(outcomes) + len(orders), 0
 
     def through(place: int, result: Done | Lost) -> None:
+        nonlocal failed
         order = orders[numbers[place]]
         if isinstance(result, Lost):
             task = order.task
@@ -266,7 +230,8 @@ def compute(
                 told = {"message": failure.message, "traceback": failure.traceback}
                 store.save_failure(order.key, {**result.about, **told})
         outcomes.put(numbers[place], result.outcome)
-        watch(result.outcome, result.links)
+        failed += failure is not None
+        progress(f"flights\t{len(outcomes)} of {total} done, {failed} failed", len(outcomes) / total)
 
     if orders:
         workers.run(carry_out, [orders[number] for number in numbers], through)

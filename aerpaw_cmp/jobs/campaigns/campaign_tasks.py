@@ -175,12 +175,6 @@ class Done:
     outcome: Outcome
     about: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def links(self) -> int:
-        """Poses times towers and channels."""
-        ranks = {row.tower: row.n for row in self.outcome.rank}
-        return sum(len(row.measured_db) for row in self.outcome.rss) + sum(ranks.values())
-
 
 TRIES = 2
 """A task that fails is tried once more."""

@@ -35,10 +35,9 @@ def bench(
         return
     rows = []
     for r in result["replay"]["rows"]:
-        what = "" if r["thinning"] == 1 else f", 1 in {r['thinning']} poses"
         rows.append(
             [
-                f"{r['engine']}{what}",
+                r["engine"],
                 "-" if r["samples"] is None else f"{r['samples']:.0e}",
                 r["arrays"],
                 str(r["depth"]),

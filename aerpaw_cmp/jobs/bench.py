@@ -108,7 +108,6 @@ def speed_against_error(
     *,
     samples: Sequence[int] = (1_000, 10_000, 100_000, 1_000_000),
     depths: Sequence[int] = (0, 1, 2, 3),
-    thinning: Sequence[int] = (2, 5),
     explicit_poses: int = 50,
     progress: Progress = silent,
 ) -> list[Row]:
@@ -120,7 +119,7 @@ def speed_against_error(
         What to replay. Rows of Sionna's own arrays need isotropic elements.
     samples : sequence of int
         Rays of the Sionna rows; empty for none.
-    depths, thinning : sequence of int
+    depths : sequence of int
         Rows of the image engine.
     explicit_poses : int
         Explicit arrays multiply the work by the element pairs: their rows take this many poses, evenly spread.
@@ -132,11 +131,11 @@ def speed_against_error(
     list of dict
         Image engine first: once Sionna is loaded the process stays larger. Each row has ``engine``, ``samples`` (rays
         per tower and batch), ``arrays`` (who evaluates H: this package in ``float64``, Sionna with ``synthetic`` plane
-        waves or with every element traced, ``explicit``), ``depth``, ``thinning`` (every n-th pose is replayed; RSS is
-        interpolated, rank taken from the nearest), ``seconds`` (wall time, warm), ``links_per_s`` (pose-tower pairs
-        answered), ``peak_mib`` (of the whole process; 0 where the system does not say it), ``missing_paths`` and
-        ``extra_paths`` (None where there is no path list), ``rss_max_error_db`` and ``rss_rms_error_db`` over links
-        that both cover (None without one), ``coverage_differs`` (links that one covers) and ``rank_disagreement`` by K.
+        waves or with every element traced, ``explicit``), ``depth``, ``seconds`` (wall time, warm), ``links_per_s``
+        (pose-tower pairs answered), ``peak_mib`` (of the whole process; 0 where the system does not say it),
+        ``missing_paths`` and ``extra_paths`` (None where there is no path list), ``rss_max_error_db`` and
+        ``rss_rms_error_db`` over links that both cover (None without one), ``coverage_differs`` (links that one covers)
+        and ``rank_disagreement`` by K.
     """
     case = _Case(site, link, poses, replay(site, link, poses, Search(max_depth=DEPTH)))
     every = np.arange(len(poses))
@@ -144,9 +143,6 @@ def speed_against_error(
     for depth in depths:
         progress(f"image engine, depth {depth}")
         rows.append(case.replayed(Search(max_depth=depth)))
-    for step in thinning:
-        progress(f"image engine, one of {step} positions")
-        rows.append(case.thinned(step))
     for count in samples:
         for kind in ("synthetic", "explicit"):
             progress(f"sionna, {count} samples, its own {kind} arrays")
@@ -182,19 +178,6 @@ class _Case:
         }
         return self._row(difference, spent, **about, **found)
 
-    def thinned(self, step: int) -> Row:
-        """The replay of every n-th pose; the others are interpolated."""
-        every = np.arange(len(self.poses))
-        chosen = every[::step]
-        result, spent = _measured(
-            lambda: replay(self.site, self.link, _take(self.poses, chosen), Search(max_depth=DEPTH))
-        )
-        nearest = np.minimum((every + step // 2) // step, len(chosen) - 1)
-        level = np.stack([_between(every, chosen, column, nearest) for column in result.rss_dbm.T], axis=1)
-        left_out = np.flatnonzero(every % step)  # poses that were replayed have no error, and say nothing
-        difference = self._difference(result.h[nearest[left_out]], level[left_out], left_out)
-        return self._row(difference, spent, thinning=step)
-
     def own_arrays(self, samples: int, kind: str, chosen: IntArray) -> Row:
         """Channels as Sionna evaluates them."""
         from ..propagation.search.sionna import Rays, own_channels
@@ -229,7 +212,7 @@ class _Case:
         )
 
     def _row(self, difference: Difference, spent: Mapping[str, Any], poses: int | None = None, **about: Any) -> Row:
-        plain: dict[str, Any] = {"engine": "image", "samples": None, "arrays": "float64", "depth": DEPTH, "thinning": 1}
+        plain: dict[str, Any] = {"engine": "image", "samples": None, "arrays": "float64", "depth": DEPTH}
         links = (len(self.poses) if poses is None else poses) * len(self.link.tower_arrays)
         errors = {name: getattr(difference, name) for name in ("rss_max_error_db", "rss_rms_error_db")}
         return {
@@ -259,15 +242,6 @@ def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:
 
 def _take(poses: Poses, chosen: Any) -> Poses:
     return Poses(poses.position_m[chosen], poses.rotation[chosen])
-
-
-def _between(at: Any, known: Any, values: FloatArray, nearest: Any) -> FloatArray:
-    """Values interpolated over the pose index; where a neighbour is NaN, the nearest decides."""
-    good = np.isfinite(values)
-    if not good.any():
-        return np.full(len(at), np.nan)
-    line = np.interp(at, known[good], values[good])
-    return np.asarray(np.where(good[nearest], line, np.nan))
 
 
 # --- beside the peers -----------------------------------------------------------------------------------------------

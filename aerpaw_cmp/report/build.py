@@ -107,7 +107,8 @@ def rss_warnings(result: RssResult) -> tuple[str, ...]:
         out.append(f"{result.name}: no sample could be compared; its numbers are missing, not zero.")
     elif result.score.at_edge:
         out.append(
-            f"{result.name}: the best offset lies at the edge of the searched span; widen rss.span_db before using it."
+            f"{result.name}: the best offset lies at the edge of the searched span, so it and its RMSE are no result. "
+            "Widen rss.span_db, and check the transmit power and the unit of the log."
         )
     return tuple(out)
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..compare.result import RankResult, RssResult
 from .against_figures import against_specs
 from .canvas import POINTS_PER_CLOUD, FigureSpec
-from .data import GEOMETRY, ReportData, Track
+from .data import ReportData, Track
 from .names import safe_name
 from .rank_figures import (
     agreement_curve,
@@ -26,7 +26,6 @@ from .rss_figures import (
     detection_reliability,
     ladder,
     overview,
-    residual_against_geometry,
     rss_over_time,
     trajectory,
 )
@@ -137,13 +136,6 @@ def _rss_specs(data: ReportData, panel: RssResult) -> Iterator[FigureSpec]:
             f"forecast is calibrated. Brier score {score.brier:.3f}, constant forecast {score.constant_brier:.3f}; log "
             f"score {score.log_score:.3f}, constant {score.constant_log_score:.3f} ({learned_on(score)}).",
             partial(detection_reliability, score),
-        )  # fmt: skip
-    if any(name in GEOMETRY for name in panel.geometry):
-        yield FigureSpec(
-            f"rss_residual_{stem}", section, f"{panel.name}: where it fails",
-            "Residual against the geometry of the link. Lines: running median, and the 10 and 90 % points.",
-            partial(residual_against_geometry, panel),
-            page=False,
         )  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from .canvas import (
     time_axis,
     used_towers,
 )
-from .data import GEOMETRY, ReportData, Track
+from .data import ReportData, Track
 from .words import count, pretty, signed
 
 if TYPE_CHECKING:
@@ -216,59 +216,6 @@ def detection_reliability(score: DetectionScore) -> Figure:
     ax.set_ylim(0, 100)
     ax.legend(loc="upper left")
     return fig
-
-
-def residual_against_geometry(panel: RssResult) -> Figure:
-    """Residual against distance, angles, height, foliage, split by line of sight where known."""
-    names = [name for name in GEOMETRY if name in panel.geometry]
-    columns = -(-len(names) // 2) if len(names) > 3 else len(names)
-    rows = -(-len(names) // columns)
-    fig = figure((9.2, 2.6 * rows + 0.5))
-    grid = fig.add_gridspec(rows, columns)
-    axes: list[Axes] = []
-    for number, name in enumerate(names):
-        row, column = divmod(number, columns)
-        ax = fig.add_subplot(grid[row, column], sharey=axes[0] if axes else None)
-        axes.append(ax)
-        residual_cloud(ax, panel.geometry[name], panel)
-        ax.locator_params(axis="x", nbins=5)
-        ax.set_xlabel(GEOMETRY[name].replace(" in the frame of the tower antenna", ",\ntower antenna frame")
-                      .replace(" seen from the tower", "").replace(" above ground", "")
-                      .replace("deg clockwise from north", "deg from north"))  # fmt: skip
-        if column:
-            ax.tick_params(labelleft=False)
-        else:
-            ax.set_ylabel("Measured − simulated [dB]")
-    robust_limits(axes[0], [panel.residual_db], around=0.0)
-    legend = fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, markerscale=4)
-    handles: list[Any] = legend.legend_handles
-    for handle in handles:
-        if handle.get_linestyle() not in ("None", ""):  # markers on a line are not enlarged
-            handle.set_markersize(1.6)
-    return fig
-
-
-def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssResult) -> None:
-    """Residual against one quantity, with its running median and middle 80 %."""
-    residual = panel.residual_db
-    sight = panel.line_of_sight == 1.0
-    groups = [
-        ("line of sight", sight & np.isfinite(residual), "#56B4E9", "."),
-        ("no line of sight", ~sight & np.isfinite(residual), "#D55E00", "x"),
-    ]
-    for label, chosen, colour, marker in groups:
-        if chosen.any():
-            label = f"{label} ({count(int(chosen.sum()))})"
-            dots(ax, quantity[chosen], residual[chosen], marker=marker, alpha=0.5, color=colour, label=label)
-    ax.axhline(0.0, color=SIMULATED, linewidth=0.8)
-    good = np.isfinite(quantity) & np.isfinite(residual)
-    if good.sum() < 40 or np.ptp(quantity[good]) == 0:
-        return
-    bins = int(np.clip(good.sum() // 40, 8, 20))
-    middle, low, median, high = running_levels(quantity, residual, bins).T
-    ax.plot(middle, median, color=SIMULATED, linewidth=1.3, marker="o", markersize=1.6, label="median")
-    ax.plot(middle, low, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)), label="10 % and 90 %")
-    ax.plot(middle, high, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)))
 
 
 FEWEST_PER_BIN = 8

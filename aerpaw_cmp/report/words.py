@@ -545,11 +545,6 @@ def warnings(data: ReportData) -> list[str]:
 
 def _rss_warnings(panel: RssResult) -> list[str]:
     texts, score = [], panel.score
-    if score.at_edge:
-        texts.append(
-            f"{panel.name}: the best offset lies at the edge of the searched span, so it and its RMSE are no result. "
-            "Widen the span, and check the transmit power and the unit of the log."
-        )
     if 0 < score.n < FEW_SAMPLES:
         texts.append(f"{panel.name}: only {score.n} samples were scored, too few for a verdict.")
     if score.n_out_of_coverage > 0.2 * len(panel.time):

@@ -7,7 +7,6 @@ import pytest
 
 from aerpaw_cmp.common.errors import CheckError
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.jobs import bench
 from aerpaw_cmp.jobs.bench import random_scene, speed_against_error
 from aerpaw_cmp.propagation.arrays import (
     rotation_from_aircraft,
@@ -120,39 +119,15 @@ def test_memory_beyond_the_results_does_not_grow_with_the_poses(scenes, monkeypa
 def test_rows_of_speed_against_error_without_sionna():
     site, link, poses = random_scene(40, buildings=4)
     said = []
-    rows = speed_against_error(site, link, poses, samples=(), depths=(0, 2), thinning=(2,), progress=said.append)
-    shallow, full, thinned = rows
-    assert [row["engine"] for row in rows] == ["image"] * 3
+    rows = speed_against_error(site, link, poses, samples=(), depths=(0, 2), progress=said.append)
+    shallow, full = rows
+    assert [row["engine"] for row in rows] == ["image"] * 2
     assert full["missing_paths"] == full["extra_paths"] == 0
     assert full["rss_max_error_db"] == 0.0
     assert set(full["rank_disagreement"].values()) == {0.0}
     assert shallow["missing_paths"] > 0
     assert shallow["rss_max_error_db"] > shallow["rss_rms_error_db"] > 0.1
-    assert thinned["missing_paths"] is None
-    assert thinned["thinning"] == 2
-    assert thinned["rss_max_error_db"] > 0.0
-    assert len(said) == 3
+    assert len(said) == 2
     assert full["rank_disagreement"] == {"10": 0.0, "100": 0.0, "1000": 0.0}
     assert full["seconds"] > 0
     assert full["peak_mib"] > 10
-
-
-def test_thinning_keeps_what_is_constant():
-    site, link, poses = random_scene(30, buildings=0)
-    still = type(poses)(np.repeat(poses.position_m[:1], 30, axis=0), np.repeat(poses.rotation[:1], 30, axis=0))
-    (row,) = speed_against_error(site, link, still, samples=(), depths=(), thinning=(7,))
-    assert row["rss_max_error_db"] == pytest.approx(0.0, abs=1e-9)
-    assert set(row["rank_disagreement"].values()) == {0.0}
-
-
-def test_thinning_is_scored_on_the_poses_that_it_left_out(monkeypatch):
-    site, link, poses = random_scene(20, buildings=0)
-    scored = []
-    own = bench._Case._difference
-    monkeypatch.setattr(
-        bench._Case,
-        "_difference",
-        lambda self, h, level, chosen: scored.append(chosen) or own(self, h, level, chosen),
-    )
-    speed_against_error(site, link, poses, samples=(), depths=(), thinning=(5,))
-    assert scored[0].tolist() == [i for i in range(20) if i % 5]

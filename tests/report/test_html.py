@@ -17,7 +17,7 @@ from aerpaw_cmp.compare.rank import CommonestRank, RankRepeat
 from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
 from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.logs.records import RejectedLine
-from aerpaw_cmp.report import html, words
+from aerpaw_cmp.report import build, html, words
 from aerpaw_cmp.report.canvas import Picture
 from aerpaw_cmp.report.data import InputFile, ReportData
 from benchmarks.fabricated import with_numbers
@@ -245,9 +245,9 @@ class TestWords:
         assert "better" not in text
 
     def test_edge_of_the_search(self, report_data):
-        data = dataclasses.replace(report_data, rss=(with_numbers(report_data.rss[0], at_edge=True),))
-        assert any("edge of the searched span" in w for w in words.warnings(data))
-        assert not any("edge of the searched span" in w for w in words.warnings(report_data))
+        at_edge = with_numbers(report_data.rss[0], at_edge=True)
+        assert any("edge of the searched span" in w for w in build.rss_warnings(at_edge))
+        assert build.rss_warnings(report_data.rss[0]) == ()
 
     def test_nothing_to_score(self, report_data):
         panel = with_numbers(report_data.rss[0], n=0, rmse_db=np.nan, offset_db=np.nan)

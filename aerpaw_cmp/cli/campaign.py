@@ -104,21 +104,4 @@ def _print_campaign_summary(outcome: Any) -> None:
     ]
     if rows:
         table(["setting", "flight", "tower", "K", "total variation", "agreement", "kappa"], rows, "Rank")
-    rows = [
-        [g["setting"], g["group"], number(g["offset_db"], "{:.1f}"), number(g["spread_db"], "{:.2f}"),
-         number(g["own_rmse_db"], "{:.2f}"), number(g["pooled_rmse_db"], "{:.2f}")]
-        for g in m["calibration"]["groups"]
-    ]  # fmt: skip
-    if rows and m["calibration"]["per"] != "link":
-        header = ["setting", "group", "offset dB", "spread of own dB", "RMSE own dB", "RMSE shared dB"]
-        table(header, rows, f"Offsets shared per {m['calibration']['per']}")
-    rows = [
-        [f"{p['tower']} {p['channel']}", f"{p['first']}, {p['second']}", str(p["n"]), number(p["rmse_db"], "{:.2f}"),
-         number(p["place_correlation"], "{:.2f}")]
-        for p in sorted(m["repeatability"]["pairs"], key=lambda p: -p["n"])[:_SHOWN]
-    ]  # fmt: skip
-    if rows:
-        more = m["repeatability"]["pairs_total"] - len(rows)
-        title = "Same places, two flights" + (f"; {more} more in {m['repeatability']['table']}" if more else "")
-        table(["link", "flights", "pairs", "differ by dB", "residual corr. by place"], rows, title)
     print(f"report: {outcome.folder / 'campaign.html'}")

@@ -17,7 +17,7 @@ from ..compare.passes import Repeated
 from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
 from .campaign_pairs import TABLE as PAIR_TABLE
-from .campaign_pairs import by_link, pair_frame, telling, telling_ranks
+from .campaign_pairs import by_link, pair_frame, telling
 from .campaign_words import (
     FEW,
     beside_baselines,
@@ -84,7 +84,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "links": by_link(data.repeats),
             "pairs": _entries(telling(data.repeats)),
             "rank_pairs_total": len(data.rank_repeats),
-            "rank_pairs": _entries(telling_ranks(data.rank_repeats)),
+            "rank_pairs": _entries(telling(data.rank_repeats)),
             "table": f"{PAIR_TABLE}.csv" if data.repeats or data.rank_repeats else None,
         },
         "season": {

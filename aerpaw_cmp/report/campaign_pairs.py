@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -12,32 +12,19 @@ import pandas as pd
 from .campaign_data import CampaignData, RankPairing, Repeat
 
 KEPT = 1000
-"""Pairs of each kind that campaign.json lists; of more, those with the most places and those that differ most."""
+"""Pairs of each kind that campaign.json lists; of more, those with the most places."""
 
 TABLE = "pairs"
 """The file with all of them, less its ending."""
 
 
-def telling(pairs: Sequence[Repeat], most: int = KEPT) -> list[Repeat]:
-    """All pairs, or half of ``most`` by their number of places and half by their difference, in their order."""
-    by_places = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))
-    by_difference = sorted(range(len(pairs)), key=lambda i: (-np.nan_to_num(pairs[i].rmse_db, nan=-1.0), i))
-    return [pairs[i] for i in _chosen(by_places, by_difference, most)]
+Pair = TypeVar("Pair", Repeat, RankPairing)
 
 
-def telling_ranks(pairs: Sequence[RankPairing], most: int = KEPT) -> list[RankPairing]:
-    """The same of reported ranks: by their number of places, and by how little they agree."""
-    by_places = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))
-    by_kappa = sorted(range(len(pairs)), key=lambda i: (np.nan_to_num(pairs[i].kappa, nan=2.0), i))
-    return [pairs[i] for i in _chosen(by_places, by_kappa, most)]
-
-
-def _chosen(one: Sequence[int], other: Sequence[int], most: int) -> list[int]:
-    if len(one) <= most:
-        return sorted(one)
-    first = one[: most // 2]
-    known = set(first)
-    return sorted([*first, *[i for i in other if i not in known][: most - len(first)]])
+def telling(pairs: Sequence[Pair], most: int = KEPT) -> list[Pair]:
+    """All pairs, or of more than ``most`` those with the most places, in their order."""
+    chosen = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))[:most]
+    return [pairs[i] for i in sorted(chosen)]
 
 
 def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:

@@ -9,10 +9,10 @@ import numpy as np
 from ..compare.rss import LEARNED_HERE
 from ..compare.verdicts import Verdict, campaign_verdict
 from .campaign_data import CampaignData, RssRow
-from .first_screen import most_telling, pooled_db
+from .first_screen import judge, pooled_db
 from .names import k_key
 from .phrases import said_of
-from .words import Judged, first_sentence, pretty, ranking_sentence
+from .words import first_sentence, pretty, ranking_sentence
 
 FEW = 8
 """Warnings of flights that stand one by one."""
@@ -153,18 +153,10 @@ def verdict(data: CampaignData) -> list[str]:
     rows = [row for row in data.rss if row.setting == next(iter(data.settings)) and np.isfinite(row.rmse_db) and row.n]
     if not rows:
         return []
-    total = pooled_db([row.rmse_db for row in rows], [row.n for row in rows])
-    every = []
-    for name in dict.fromkeys(name for row in rows for name in row.baselines):
-        errors = [row.baselines.get(name, np.nan) for row in rows]
-        if np.isfinite(errors).all():
-            said = [row.verdicts[name] for row in rows if row.verdicts.get(name, "no interval") != "no interval"]
-            every.append(
-                Judged(ray_db=total, channels=len(rows), name=name, other_db=pooled_db(errors, [row.n for row in rows]),
-                       judged=len(said), better=said.count("better"), worse=said.count("worse"),
-                       unit="flights x channels")
-            )  # fmt: skip
-    out = [first_sentence(most_telling(every) if every else Judged(ray_db=total, channels=len(rows)))]
+    scored = [(row.rmse_db, row.n) for row in rows]
+    known = {name: [row.baselines.get(name, np.nan) for row in rows] for row in rows for name in row.baselines}
+    errors = {name: pooled_db(each, [row.n for row in rows]) for name, each in known.items() if np.isfinite(each).all()}
+    out = [first_sentence(judge(scored, errors, [row.verdicts for row in rows], "flights x channels"))]
     held = [row.held_out_rmse_db for row in rows if np.isfinite(row.held_out_rmse_db)]
     own = float(np.mean([row.rmse_db for row in rows]))
     if held:

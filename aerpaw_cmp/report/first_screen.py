@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,18 +117,44 @@ def _paired(panels: Sequence[RssResult], name: str) -> list[PairedDifference]:
 
 
 def judged(panels: Sequence[RssResult]) -> Judged | None:
-    """Ray tracing against the baseline that matters most: the best of those that it loses to, else the best of all."""
+    """Ray tracing against the baseline that matters most; None without a scored channel."""
     if not panels:
         return None
-    total, best = _pooled(panels), best_baseline(panels)
-    if best is None:
-        return Judged(ray_db=total, channels=len(panels))
+    scored = [(p.score.rmse_db, p.score.n) for p in panels]
+    verdicts = [{name: pair.verdict for name, pair in p.further.compared_with.items()} for p in panels]
+    return judge(scored, baseline_errors(panels), verdicts)
+
+
+def judge(
+    scored: Sequence[tuple[float, int]],
+    baselines_db: Mapping[str, float],
+    verdicts: Sequence[Mapping[str, str]],
+    unit: str = "channels",
+) -> Judged:
+    """Ray tracing against the baseline that matters most: the best of those that it loses to, else the best of all.
+
+    Parameters
+    ----------
+    scored : sequence of (float, int)
+        RMSE [dB] and samples of each series.
+    baselines_db : mapping of str to float
+        Pooled RMSE of each baseline that all series have [dB].
+    verdicts : sequence of mapping
+        By baseline, what the paired interval of a series says.
+    unit : str
+        What a series is, in words.
+
+    Returns
+    -------
+    Judged
+    """
+    total, count_of = pooled_db(*map(list, zip(*scored, strict=True))), len(scored)
     every = []
-    for name, error in baseline_errors(panels).items():
-        said = [pair.verdict for pair in _paired(panels, name) if pair.verdict != "no interval"]
-        every.append(Judged(ray_db=total, channels=len(panels), name=name, other_db=error, judged=len(said),
-                            better=said.count("better"), worse=said.count("worse")))  # fmt: skip
-    return most_telling(every)
+    for name, error in baselines_db.items():
+        said = [own[name] for own in verdicts if own.get(name, "no interval") != "no interval"]
+        every.append(Judged(ray_db=total, channels=count_of, name=name, other_db=error, judged=len(said),
+                            better=said.count("better"), worse=said.count("worse"), unit=unit))  # fmt: skip
+    return most_telling(every) if every else Judged(ray_db=total, channels=count_of, unit=unit)
 
 
 def most_telling(every: Sequence[Judged]) -> Judged:

@@ -215,12 +215,14 @@ def run_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOpt
     from ..flight.data import load_data
     from ..flight.replay import replay_flight
     from ..flight.settings import load_flight
+    from ..report.build import report_data
     from ..report.export import metrics as metrics_of
     from ..report.exports.formats import chosen_formats
     from ..report.write import FIGURES, STYLES, write_report
     from .reporting.flight_run import run_flight
+    from .reporting.foliage_notes import foliage_notes
     from .reporting.ladder import recommended_text
-    from .reporting.report_record import report_record
+    from .reporting.pose_paths import pose_paths
     from .tasks.manifest import other_inputs
 
     for given, known in ((asked.figures, FIGURES), (asked.style, STYLES)):
@@ -246,7 +248,14 @@ def run_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOpt
                 before = score_against(data, Path(asked.against))
         replays = replay_flight(data, stages)
         flight_run = run_flight(data, stages, replays=replays, ladder=True)
-        record = report_record(flight_run, other_inputs(settings, flight, options.logs_root, learned))
+        carriers = {replayed.link.carrier_hz for replayed in replays.all}
+        record = report_data(
+            data,
+            flight_run.result,
+            notes=foliage_notes(len(data.site.trees), settings.rt, carriers),
+            other_inputs=other_inputs(settings, flight, options.logs_root, learned),
+            paths=pose_paths(data, replays),
+        )
         if before is not None:
             extra = {**record.extra_metrics, "against": before.metrics()}
             record = replace(record, against=before, extra_metrics=extra)

@@ -139,7 +139,7 @@ def _state(task: Task, store: OutcomeStore) -> TaskState:
     )
 
 
-class Outcomes:
+class Outcomes(dict[int, Outcome]):
     """Outcomes of a campaign's tasks by number, each held without what its setting is not asked for.
 
     Series of samples stay for the first setting; of the others a row holds numbers, and the flown line of a flight is
@@ -151,8 +151,8 @@ class Outcomes:
     """
 
     def __init__(self, tasks: Sequence[Task]) -> None:
+        super().__init__()
         self._tasks = tasks
-        self._found: dict[int, Outcome] = {}
         self._tracks: dict[str, FlownTrack] = {}
 
     def put(self, number: int, outcome: Outcome) -> None:
@@ -166,13 +166,7 @@ class Outcomes:
                 for name in ("time_s", "position_m")
             )
             fitted = replace(fitted, track=known if same else fitted.track)
-        self._found[number] = fitted
-
-    def __getitem__(self, number: int) -> Outcome:
-        return self._found[number]
-
-    def __len__(self) -> int:
-        return len(self._found)
+        self[number] = fitted
 
 
 def kept_outcomes(

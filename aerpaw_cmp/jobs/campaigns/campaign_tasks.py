@@ -176,10 +176,6 @@ class Done:
     about: Mapping[str, Any] = field(default_factory=dict)
 
 
-TRIES = 2
-"""A task that fails is tried once more."""
-
-
 def carry_out(order: Order) -> Done:
     """Run a task; what runs in worker processes of every kind.
 
@@ -194,15 +190,13 @@ def carry_out(order: Order) -> Done:
     if facts is not None and facts.key != order.key:
         return Done(outcome=_not_the_same(task))
     start, cpu = time.perf_counter(), _cpu_s()
-    tried, outcome = 1, run_task(task)
-    while outcome.failure is not None and tried < TRIES:
-        tried, outcome = tried + 1, run_task(task)
+    outcome = run_task(task)
     if facts is None:
         return Done(outcome=outcome)
     about = {
         "flight": task.flight, "setting": task.setting, "flight_file": str(task.path),
         "logs_root": None if task.logs_root is None else str(task.logs_root), "overrides": dict(task.overrides),
-        "seconds": time.perf_counter() - start, "cpu_s": _cpu_s() - cpu, "tries": tried, "host": platform.node(),
+        "seconds": time.perf_counter() - start, "cpu_s": _cpu_s() - cpu, "host": platform.node(),
         "process": os.getpid(), "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "versions": _versions(), "code": code_digest(), "inputs": facts.inputs,
         "settings": facts.settings.model_dump(mode="json"),

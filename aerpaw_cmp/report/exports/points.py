@@ -21,7 +21,7 @@ from ...site.site import Site
 from ..campaign_data import CampaignData, FlownRank, RssRow
 from ..data import ReportData
 from ..export import DECIMALS, rank_tables, rss_tables
-from ..names import iso_time, k_key
+from ..names import k_key
 
 DEGREE_DECIMALS = 8
 """1 mm."""
@@ -103,23 +103,6 @@ class Points:
         """Flight, tower, channel and table of each link, in their order."""
         for key, rows in self.table.groupby(["flight", "tower", "channel"], sort=False, observed=True):
             yield *map(str, key), rows
-
-    def rows(self) -> Iterator[tuple[Any, ...]]:
-        """Samples as Python's own values, None where missing: time, labels, up, columns; codes are whole numbers."""
-        for start in range(0, len(self), 20_000):  # bounds what a writer holds at once
-            part = self.table.iloc[start : start + 20_000]
-            lists = [[text or None for text in iso_time(part["time"].to_numpy()).tolist()]]
-            lists += [part[name].astype(str).tolist() for name in LABELS]
-            lists += [_plain(part[c.name].to_numpy(), whole=bool(c.flags)) for c in (UP, *self.columns)]
-            yield from zip(*lists, strict=True)
-
-
-def _plain(values: FloatArray, *, whole: bool) -> list[Any]:
-    known = np.isfinite(values)
-    boxed = np.where(known, values, 0.0).astype(np.int64 if whole else np.float64).astype(object)
-    boxed[~known] = None
-    listed: list[Any] = boxed.tolist()
-    return listed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -231,7 +231,7 @@ def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkey
     assert len(asked) == 6
     assert not list(tmp_path.glob("*.failed.json")), "what succeeds is no failure any more"
     run_tasks(tasks, Here())
-    assert len(asked) == 11, "nothing is kept unless asked for"
+    assert len(asked) == 10, "nothing is kept unless asked for"
 
 
 def test_a_new_name_or_place_in_the_list_computes_nothing(

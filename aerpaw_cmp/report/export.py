@@ -43,7 +43,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         "site": {"name": data.site.name, "illustrative": data.site.illustrative},
         "versions": dict(sorted(data.versions.items())),
         "inputs": [
-            _named(f, "path sha256 reader lines accepted rejected blank role warnings")
+            named(f, "path sha256 reader lines accepted rejected blank role warnings")
             | ({"learned_on": f.learned_on} if f.learned_on else {})
             for f in data.inputs
         ],
@@ -64,7 +64,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
     return safe
 
 
-def _named(record: Any, names: str) -> dict[str, Any]:
+def named(record: Any, names: str) -> dict[str, Any]:
     """Fields of a record by name."""
     return {name: getattr(record, name) for name in names.split()}
 
@@ -72,9 +72,9 @@ def _named(record: Any, names: str) -> dict[str, Any]:
 def _rss_metrics(one: RssResult) -> dict[str, Any]:
     score = one.score
     return {
-        **_named(score, "offset_db rmse_db n n_out_of_coverage"),
+        **named(score, "offset_db rmse_db n n_out_of_coverage"),
         "at_search_edge": score.at_edge,
-        **_named(score, "correlation rmse_ci95_db"),
+        **named(score, "correlation rmse_ci95_db"),
         "offset_ci95_db": score.intervals.offset_db,
         "correlation_ci95": score.intervals.correlation,
         "n_effective": score.intervals.autocorrelation.n_effective,
@@ -82,7 +82,7 @@ def _rss_metrics(one: RssResult) -> dict[str, Any]:
         "lag_verdict": one.clock_verdict,
         "unit": one.unit,
         "fitted": score.fitted_on_scored,
-        "baselines": {name: _named(model, "offset_db rmse_db") for name, model in one.baselines.items()},
+        "baselines": {name: named(model, "offset_db rmse_db") for name, model in one.baselines.items()},
         **fields_of(one.further),
         "residual_by": {name: table.as_dict() for name, table in one.residual_by.items()},
     }
@@ -92,7 +92,7 @@ def clock_metrics(clock: ClockResult) -> dict[str, Any]:
     """``clock.<receiver>`` of metrics.json: numbers, verdict, whether applied, and the checks it rests on."""
     return {
         **clock.checks,
-        **_named(clock, "radio_minus_telemetry_s ci95_s verdict reason"),
+        **named(clock, "radio_minus_telemetry_s ci95_s verdict reason"),
         "applied": clock.applied in (APPLIED, GIVEN),
     }
 
@@ -110,7 +110,7 @@ def _rank_metrics(one: RankResult) -> dict[str, Any]:
     simulated = {
         k_key(k): {
             **_histogram(fit.histogram, fit.histogram_ci95),
-            **_named(fit, "out_of_coverage agreement agreement_ci95 kappa total_variation total_variation_ci95"),
+            **named(fit, "out_of_coverage agreement agreement_ci95 kappa total_variation total_variation_ci95"),
             "wasserstein": fit.wasserstein,
             "p_value": fit.p_histogram,
             "confusion": fit.confusion[1:],
@@ -142,15 +142,15 @@ def further_numbers(one: RssResult | RankResult) -> dict[str, Any]:
 def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
     audit = engine.audit
     return {
-        **_named(engine, "engine links seconds paths left_out"),
+        **named(engine, "engine links seconds paths left_out"),
         "audit": None
         if audit is None
         else {
             "summary": audit_summary(audit),
-            **_named(audit, "reference links missing_paths extra_paths rss_max_error_db"),
+            **named(audit, "reference links missing_paths extra_paths rss_max_error_db"),
             "rank_disagreement": {k_key(k): v for k, v in audit.rank_disagreement.items()},
             "field": None if audit.fields is None else audit.fields.as_dict(),
-            **_named(audit, "seconds reference_seconds"),
+            **named(audit, "seconds reference_seconds"),
         },
     }
 

@@ -15,6 +15,7 @@ from ...compare.passes import Pass, PassPair, PassTable, Visit
 from ...compare.rank import repeat_rank
 from ...flight.settings import Positive, Settings
 from ...report.campaign_data import FlownRank, PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
+from ...report.export import named
 
 
 class RepeatSettings(Settings):
@@ -109,22 +110,15 @@ def repeats(rows: Sequence[RssRow], settings: RepeatSettings) -> list[Repeat]:
 
 
 def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat:
+    same = "n rmse_db rmse_ci95_db offset_db residual_rmse_db place_rmse_db place_correlation cells height_difference_m"
     return Repeat(
         tower=first.tower,
         channel=first.channel,
         first=first.flight,
         second=second.flight,
-        n=pair.n,
         share=pair.n / max(known, 1),
-        rmse_db=pair.rmse_db,
-        rmse_ci95_db=pair.rmse_ci95_db,
-        offset_db=pair.offset_db,
         single_db=pair.rmse_db / 2.0**0.5,
-        residual_rmse_db=pair.residual_rmse_db,
-        place_rmse_db=pair.place_rmse_db,
-        place_correlation=pair.place_correlation,
-        cells=pair.cells,
-        height_difference_m=pair.height_difference_m,
+        **named(pair, same),
     )
 
 
@@ -145,10 +139,7 @@ def rank_repeats(flown: Sequence[FlownRank], radius_m: float) -> list[RankPairin
                     tower=first.tower,
                     first=first.flight,
                     second=second.flight,
-                    n=repeated.n,
-                    agreement=repeated.agreement,
-                    kappa=repeated.kappa,
-                    kappa_ci95=repeated.kappa_ci95,
+                    **named(repeated, "n agreement kappa kappa_ci95"),
                 )
             )
     return out

@@ -228,3 +228,32 @@ def test_the_packaged_memory_is_small_and_says_where_it_comes_from() -> None:
         assert one.command.startswith("aerpaw-cmp calibrate ")
         assert one.source.title
     assert known.entries["dataset12"].source.doi == "10.5061/dryad.2z34tmpvv"
+
+
+@pytest.mark.parametrize(
+    ("name", "rmse_db", "rmse_4s_db", "of_free_space"),
+    [("dataset12", 3.7, 3.0, 0.62), ("lte", 6.1, 3.75, 0.9), ("afar", 12.0, 8.8, 0.8)],
+)
+def test_packaged_antennas_predict_flights_left_out(name, rmse_db, rmse_4s_db, of_free_space) -> None:
+    """Bounds on what tests/field/test_learned_site.py makes anew from the logs."""
+    errors = read_learned("lake_wheeler").entries[name].errors
+    assert errors is not None
+    assert errors.rmse_db < min(rmse_db, of_free_space * errors.free_space_rmse_db)
+    assert errors.rmse_4s_db < rmse_4s_db
+    assert 0.87 <= errors.inside_90 <= 0.93
+
+
+def test_packaged_receiver_beats_a_constant_on_flights_left_out() -> None:
+    receivers = read_learned("lake_wheeler").entries["nr_rank"].receivers
+    assert receivers
+    for one in receivers:
+        assert one.kappa > 0.35
+        assert one.log_score < 0.85 * one.constant_log_score
+
+
+def test_packaged_lock_beats_a_constant_on_flights_left_out() -> None:
+    (lock,) = (s.lock for s in read_learned("lake_wheeler").entries["afar"].series)
+    assert lock is not None
+    assert lock.brier < 0.8 * lock.constant_brier
+    assert lock.log_score < 0.8 * lock.constant_log_score
+    assert lock.floor_rmse_db < 8.3

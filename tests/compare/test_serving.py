@@ -52,3 +52,14 @@ def test_wrong_shapes_are_refused() -> None:
 def test_values_at_the_nearest_time() -> None:
     assert at_times([0.4, 5.0, 9.9], [0.0, 1.0, 10.0], [1.0, 2.0, 3.0], within_s=1.0).tolist()[::2] == [1.0, 3.0]
     assert np.isnan(at_times([5.0], [0.0, 10.0], [1.0, 2.0], within_s=1.0)).all()
+
+
+def test_the_value_nearest_in_time_is_that_of_a_search_through_all():
+    rng = np.random.default_rng(8)
+    for count in (1, 2, 3, 9):
+        known, value = np.sort(rng.uniform(0.0, 10.0, count)), rng.normal(size=count)
+        wanted = np.concatenate([rng.uniform(-2.0, 12.0, 40), known])
+        away = np.abs(wanted[:, None] - known)
+        expected = np.where(away.min(axis=1) <= 0.7, value[away.argmin(axis=1)], np.nan)
+        np.testing.assert_array_equal(at_times(wanted, known, value, within_s=0.7), expected)
+    assert np.isnan(at_times([1.0], [], [], within_s=0.7)).all()

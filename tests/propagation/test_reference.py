@@ -129,6 +129,13 @@ def test_layouts_a_second_time():
         assert theirs == pytest.approx(array.positions_m, abs=1e-15)
 
 
+def test_arrays_of_the_comparison_look_north_east_and_from_the_uav_south_east_upright():
+    """arXiv 2502.10324: yaw 45 and 315 degrees counter-clockwise from east; the UAV's 2 x 2 is rolled by 90 degrees."""
+    for array, yaw, roll in ((tower_comparison_array(), 45.0, 0.0), (uav_comparison_array(0.09), 315.0, 90.0)):
+        assert array.mount == pytest.approx(np.array(reference.turned(yaw, 0.0, roll)), abs=1e-12)
+        assert sorted(np.degrees(array.slant_rad)) == pytest.approx([-45.0, -45.0, 45.0, 45.0])
+
+
 def test_free_space_and_a_perfect_ground_in_closed_form(scenes):
     site = scenes.site()
     link = field_audit.Expected.of(scenes.link(site)).link

@@ -223,10 +223,10 @@ def passed(
     scene, level, shaped, notes = _shaped_ground(site, scene, link, poses, paths)
     clear = _clear_of_terrain(site, scene, poses, level)
     if search.diffraction != "none" and site.dem is not None:
-        hidden = np.flatnonzero(~clear & (level.depth == 0))
-        ends = scene.sources_m[level.tower[hidden]], poses.position_m[level.pose[hidden]]
-        level.terrain_db[hidden] = ridge_loss_db(site.dem, *ends, wavelength_m(link.carrier_hz), search.ridges)
-        clear[hidden] = True
+        direct = np.flatnonzero(level.depth == 0)
+        ends = scene.sources_m[level.tower[direct]], poses.position_m[level.pose[direct]]
+        level.terrain_db[direct] = ridge_loss_db(site.dem, *ends, wavelength_m(link.carrier_hz), search.ridges)
+        clear[direct] = True
     lost = int((~clear).sum())
     notes += [f"{lost} of {len(level)} paths end at the terrain of the elevation model"] if lost else []
     paths = level.select(clear) if lost else level

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from aerpaw_cmp.propagation.field.ridges import bullington_db, deygout_db, knife_edge_db
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.propagation.field.ridges import Ridges, bullington_db, deygout_db, knife_edge_db, ridge_loss_db
+from aerpaw_cmp.site.dem import Dem
 
 # ITU-R study group 3, validation examples for the delta-Bullington method, path 2 (132.3 km, heights above the sea):
 # the two ends and the highest points of the profile; the others change no maximum. Its ends: 569 m and 528 m.
@@ -85,3 +89,26 @@ def test_unknown_ground_is_no_edge() -> None:
         known = law(np.array([900.0]), share, intrusion, 0.1)
         assert law(np.array([900.0]), share, np.where(share < 0.3, np.nan, intrusion), 0.1) == pytest.approx(known)
         assert law(np.array([900.0]), share, np.full_like(share, np.nan), 0.1).tolist() == [0.0]
+
+
+@pytest.mark.parametrize("method", ["deygout", "bullington"])
+def test_the_loss_has_no_step_at_the_line_of_sight(method: Ridges) -> None:
+    east = np.arange(-20.0, 1021.0, 10.0)
+    crest = np.where(np.abs(east - 400.0) < 5.0, 30.0, 0.0) + 0.02 * east
+    dem = Dem(
+        height_m=np.tile(crest, (5, 1)), west=-20.0, south=-20.0, step_x=10.0, step_y=10.0, crs="local",
+        frame=SiteFrame(35.7, -78.7), anchored=False,
+    )  # fmt: skip
+    # lines from deep in the shadow to well above the crest, a millimetre apart round the line of sight
+    up = np.concatenate([np.linspace(20.5, 37.9, 180), np.linspace(37.9, 38.1, 201), np.linspace(38.1, 60.0, 220)])
+    ends = np.column_stack([np.zeros_like(up), np.zeros_like(up), up]), np.column_stack([up * 0 + 1000.0, up * 0, up])
+    loss = ridge_loss_db(dem, *ends, 0.1, method)
+    assert np.abs(np.diff(loss)).max() < 0.5
+    assert (np.diff(loss) <= 1e-9).all()
+    assert loss[-1] == 0.0
+    grazing = loss[np.abs(up - 38.0).argmin()]
+    assert grazing == pytest.approx({"deygout": 6.03, "bullington": 12.4}[method], abs=0.2)
+    # a plane, sloped or level, is a mirror and no edge, however low the line
+    plane = replace(dem, height_m=np.tile(0.02 * east, (5, 1)))
+    low = np.array([[0.0, 0.0, 1.5]]), np.array([[1000.0, 0.0, 21.5]])
+    assert ridge_loss_db(plane, *low, 0.1, method).tolist() == [0.0]

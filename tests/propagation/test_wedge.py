@@ -10,7 +10,8 @@ import pytest
 from scipy.special import jv, wofz
 
 from aerpaw_cmp.common.units import ComplexArray, FloatArray
-from aerpaw_cmp.propagation.field.wedge import face_coefficients, transition, wedge
+from aerpaw_cmp.propagation.field.fresnel import coefficients
+from aerpaw_cmp.propagation.field.wedge import transition, wedge
 
 WAVELENGTH = 299792458.0 / 3.4e9
 K = 2.0 * np.pi / WAVELENGTH
@@ -121,7 +122,8 @@ def seen(source: FloatArray, target: FloatArray, wave: FloatArray, turn: float) 
         across = np.cross(before, NORMAL)
         across /= np.linalg.norm(across)
         field = wave - (wave @ before) * before
-        te, tm = face_coefficients(np.array(abs(before @ NORMAL)), *CONCRETE)
+        te_re, te_im, tm_re, tm_im = coefficients(np.array(abs(before @ NORMAL)), *CONCRETE)
+        te, tm = te_re + 1j * te_im, tm_re + 1j * tm_im
         upright = np.cross(across, before)
         reflected = te * (across @ field) * across - tm * (upright @ field) * (upright * mirror)
         total = total + reflected * np.exp(-1j * K * length) / length

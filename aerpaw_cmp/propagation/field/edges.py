@@ -20,10 +20,10 @@ from ..edges import EdgePaths, Edges
 from ..paths import Faces
 from . import dyads
 from .dyads import Number, Rotation, Vector
-from .fresnel import FaceMaterials
+from .fresnel import FaceMaterials, coefficients
 from .geometry import parts_of, pattern_fields, plain, rows_of
 from .sum import parts_between_poses
-from .wedge import along_face, at_face, face_coefficients, wedge
+from .wedge import along_face, at_face, wedge
 
 PATHS_PER_CHUNK = 4096
 
@@ -32,21 +32,17 @@ STEP_RAD = 1e-6
 
 
 class Tables(NamedTuple):
-    """Edges, faces and ends as the laws take them; the last entry of the faces' tables stands for no face."""
+    """Edges, mirrors and ends as the laws take them, a row each.
 
-    start: FloatArray
-    along: FloatArray
-    inward: FloatArray
-    out: FloatArray
-    exterior: FloatArray
-    face: IntArray
-    normal: FloatArray
-    offset: FloatArray
-    material: FloatArray
+    ``edge`` (edges, 22): start, direction, axes of faces 0 and n, normal of face 0, exterior angle, materials of faces
+    0 and n. ``mirror`` (faces + 1, 7): normal, offset, material; the last stands for no face. ``source`` (towers, 12)
+    and ``target`` (poses, 12): place and axes. Places (towers or 1, 3, elements) and slants (towers or 1, 2, elements).
+    """
+
+    edge: FloatArray
+    mirror: FloatArray
     source: FloatArray
-    tower_axes: FloatArray
-    place: FloatArray
-    axes: FloatArray
+    target: FloatArray
     tower_m: FloatArray
     tower_slant: FloatArray
     uav_m: FloatArray
@@ -72,24 +68,20 @@ class Tables(NamedTuple):
         wavelength = wavelength_m(link.carrier_hz)
         arrays, uav = list(link.tower_arrays.values()), link.uav_array
         slants = [np.stack([np.cos(a.slant_rad), np.sin(a.slant_rad)]) for a in (*arrays, uav)]
+        material = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
+        inward_n = np.cross(edges.along, edges.normal_n)
+        lines = edges.start_m, edges.along, edges.face_axis, inward_n, edges.normal, edges.exterior[:, None]
+        axes = np.einsum("nij,jk->nki", poses.rotation, uav.mount)
+        mounts = np.stack([array.mount.T for array in arrays])
         return cls(
-            start=edges.start_m,
-            along=edges.along,
-            inward=np.stack([edges.face_axis, np.cross(edges.along, edges.normal_n)], axis=1),
-            out=edges.normal,
-            exterior=edges.exterior,
-            face=edges.face,
-            normal=np.vstack([faces.normal, np.zeros(3)]),
-            offset=np.append(faces.offset_m, 0.0),
-            material=FaceMaterials.of(faces, link.carrier_hz).table(wavelength),
-            source=sources_m,
-            tower_axes=np.stack([array.mount.T for array in arrays]),
-            place=poses.position_m,
-            axes=np.einsum("nij,jk->nki", poses.rotation, uav.mount),
+            edge=np.hstack([*lines, *(material[edges.face[:, side]] for side in (0, 1))]),
+            mirror=np.column_stack([np.vstack([faces.normal, np.zeros(3)]), np.append(faces.offset_m, 0.0), material]),
+            source=np.hstack([sources_m, mounts.reshape(-1, 9)]),
+            target=np.hstack([poses.position_m, axes.reshape(-1, 9)]),
             tower_m=np.stack([array.positions_m.T for array in arrays]),
             tower_slant=np.stack(slants[:-1]),
-            uav_m=uav.positions_m.T,
-            uav_slant=slants[-1],
+            uav_m=uav.positions_m.T[None],
+            uav_slant=slants[-1][None],
             wave_number=2.0 * np.pi / wavelength,
         )
 
@@ -131,7 +123,7 @@ def edge_channels(
     """
     tables = Tables.of(edges, faces, sources_m, poses, link)
     shape = (len(poses), len(sources_m))
-    uavs, ports = tables.uav_m.shape[1], tables.tower_m.shape[2]
+    uavs, ports = tables.uav_m.shape[2], tables.tower_m.shape[2]
     h = np.zeros((shape[0] * shape[1], uavs, ports), dtype=np.complex128)
     power = np.zeros(len(h))
     lost = np.ones(len(paths)) if loss_db is None else amplitude_from_db(-loss_db)
@@ -148,7 +140,8 @@ def edge_channels(
         h[key[first]] = np.add.reduceat(amplitude, first, axis=0)
         power[key[first]] = np.add.reduceat((np.abs(amplitude) ** 2).mean(axis=(1, 2)), first)
 
-    compiled.in_threads(run, parts_between_poses(paths.pose, PATHS_PER_CHUNK), 1 if kernels is None else threads)
+    many, workers = (PATHS_PER_CHUNK, 1) if kernels is None else (4 * PATHS_PER_CHUNK, threads)
+    compiled.in_threads(run, parts_between_poses(paths.pose, many), workers)
     matrices = h.swapaxes(1, 2) if link.uav_transmits else h
     return np.ascontiguousarray(matrices).reshape(*shape, *matrices.shape[1:]), power.reshape(shape)
 
@@ -171,7 +164,7 @@ def amplitudes(paths: EdgePaths, tables: Tables, link: Link) -> ComplexArray:
     ``g_u . M_2 D M_1 . g_t  lambda / (4 pi) / sqrt(k s s' (s + s')) e^{-j k (s + s')}`` with s' and s the lengths
     before and after the edge, D the diffraction matrix times the square root of k, and M the dyads of mirrors.
     """
-    out = np.empty((len(paths), tables.uav_m.shape[1], tables.tower_m.shape[2]), dtype=np.complex128)
+    out = np.empty((len(paths), tables.uav_m.shape[2], tables.tower_m.shape[2]), dtype=np.complex128)
     fields = pattern_ends(paths, tables, link)
     for two in (False, True):
         rows = np.flatnonzero((paths.edge[:, 1] >= 0) == two)
@@ -191,14 +184,17 @@ def _alike(paths: EdgePaths, t: Tables, fields: list[FloatArray | None], two: bo
             paths.shared[:, 0, None], paths.shared[:, 1, None], t.wave_number,
         )  # fmt: skip
     else:
-        before, after, cosines, joined, turn = over_one(here[0], there[0], edge_1, t.wave_number)
+        before, after, cosines, distance, spread, angles = over_one(here[0], there[0], edge_1, t.wave_number)
+        bb, bp, pp = wedge(angles[0], angles[1], cosines[0], edge_1[5], distance, edge_1[6], edge_1[7])
+        joined, turn = (bb * spread, bp * spread, -bp * spread, pp * spread), STRAIGHT
     parts = []
     for side, (end, edge, way) in enumerate(((here, edge_1, before), (there, edge_2, after))):
-        te, tm = mirror_coefficients(way, end[2], parts_of(t.material[paths.ground[:, side]]))
-        mirror = end[2], (paths.ground[:, side] >= 0)[:, None], te, tm
+        mirrors = coefficients(dyads.incidence(way, end[2]), *parts_of(t.mirror[paths.ground[:, side], 4:]))
+        mirror = end[2], (paths.ground[:, side] >= 0)[:, None], mirrors
         given = (1.0, 0.0, 0.0, 0.0) if fields[side] is None else tuple(fields[side].swapaxes(0, 1))  # type: ignore[union-attr]
         units = end_parts(end[1], (way, 1.0 - 2.0 * side), mirror, edge[1], cosines[side])
-        parts.append(element_parts(units, given, (end[4][..., 0, :], end[4][..., 1, :])))
+        b_re, b_im, p_re, p_im = element_parts(units, given, (end[4][..., 0, :], end[4][..., 1, :]))
+        parts.append((b_re + 1j * b_im, p_re + 1j * p_im))
     u_s, v_s = _in_edge(here, edge_1)
     along, radius = _in_edge(there, edge_2)
     u_t, v_t = turn[0] + turn[1] * along + turn[2] * radius, turn[3] + turn[4] * along + turn[5] * radius
@@ -212,24 +208,21 @@ def _alike(paths: EdgePaths, t: Tables, fields: list[FloatArray | None], two: bo
 
 def _end(paths: EdgePaths, t: Tables, side: int) -> tuple[Vector, Rotation, Vector, FloatArray, FloatArray]:
     """An end of paths in the space where its leg is straight: centre, axes, normal of its mirror; elements, slants."""
-    face = paths.ground[:, side]
-    index = (paths.tower, paths.pose)[side]
-    normal = parts_of(t.normal[face])
-    centre = mirrored(parts_of((t.source, t.place)[side][index]), normal, t.offset[face, None])
-    axes = rows_of((t.tower_axes, t.axes)[side][index])
-    turned = tuple(mirrored(axis, normal, 0.0) for axis in axes)
+    mirror = t.mirror[paths.ground[:, side]]
+    row = t.target[paths.pose] if side else t.source[paths.tower]
+    normal = parts_of(mirror[:, :3])
+    centre = mirrored(parts_of(row[:, :3]), normal, mirror[:, 3, None])
+    turned = tuple(mirrored(axis, normal, 0.0) for axis in rows_of(row[:, 3:].reshape(-1, 3, 3)))
     if side:
-        return centre, turned, normal, t.uav_m[None], t.uav_slant[None]  # type: ignore[return-value]
+        return centre, turned, normal, t.uav_m, t.uav_slant  # type: ignore[return-value]
     return centre, turned, normal, t.tower_m[paths.tower], t.tower_slant[paths.tower]  # type: ignore[return-value]
 
 
 def _edge(t: Tables, edge: IntArray) -> Any:
     """Edges (paths,) as the laws take them: start, direction, both faces' axes, normal of face 0, angle, materials."""
-    materials = tuple(parts_of(t.material[t.face[edge, side]]) for side in (0, 1))
-    return (
-        parts_of(t.start[edge]), parts_of(t.along[edge]), parts_of(t.inward[edge, 0]), parts_of(t.inward[edge, 1]),
-        parts_of(t.out[edge]), t.exterior[edge, None], *materials,
-    )  # fmt: skip
+    row = t.edge[edge]
+    vectors = [parts_of(row[:, k : k + 3]) for k in (0, 3, 6, 9, 12, 16, 19)]
+    return (*vectors[:5], row[:, 15, None], *vectors[5:])
 
 
 def _in_edge(end: Any, edge: Any) -> tuple[FloatArray, FloatArray]:
@@ -317,13 +310,8 @@ def element_place(centre: Vector, axes: Rotation, element: Vector, edge: Any) ->
 
 def angle_round(place: Vector) -> Number:
     """Angle of a point round an edge from face 0 [rad]."""
-    angle = np.arctan2(place[2], place[1])
+    angle = dyads.arctangent(place[2], place[1])
     return dyads.select(angle < 0.0, angle + 2.0 * np.pi, angle)
-
-
-def mirror_coefficients(way: Vector, normal: Vector, material: Vector) -> tuple[Any, Any]:
-    """TE and TM coefficients of the mirror of a leg."""
-    return face_coefficients(dyads.incidence(way, normal), material[0], material[1], material[2])
 
 
 def end_parts(axes: Rotation, way: Any, mirror: Any, along: Vector, cosine: Number) -> Any:
@@ -336,7 +324,7 @@ def end_parts(axes: Rotation, way: Any, mirror: Any, along: Vector, cosine: Numb
     way : (Vector, Number)
         Direction of the wave, and 1 at the source, -1 at the target, which radiates against it.
     mirror : tuple
-        Normal of the leg's mirror, whether there is one, and its coefficients TE and TM.
+        Normal of the leg's mirror, whether there is one, and its coefficients TE and TM (four real numbers).
     along : Vector
         Direction of the edge.
     cosine : Number
@@ -344,7 +332,8 @@ def end_parts(axes: Rotation, way: Any, mirror: Any, along: Vector, cosine: Numb
 
     Returns
     -------
-    theta_beta, theta_phi, phi_beta, phi_phi : complex
+    tuple of 8 Number
+        Real and imaginary parts of theta's field along beta and phi, then of phi's.
     """
     (x, y, z), sign = way
     toward = sign * x, sign * y, sign * z
@@ -353,15 +342,15 @@ def end_parts(axes: Rotation, way: Any, mirror: Any, along: Vector, cosine: Numb
     theta = after_mirror(dyads.field_vector(axes, toward, 1.0, 0.0), way[0], mirror)
     phi = after_mirror(dyads.field_vector(axes, toward, 0.0, 1.0), way[0], mirror)
     return (
-        dot(theta[0], flat) + 1j * dot(theta[1], flat), dot(theta[0], cross) + 1j * dot(theta[1], cross),
-        dot(phi[0], flat) + 1j * dot(phi[1], flat), dot(phi[0], cross) + 1j * dot(phi[1], cross),
+        dot(theta[0], flat), dot(theta[1], flat), dot(theta[0], cross), dot(theta[1], cross),
+        dot(phi[0], flat), dot(phi[1], flat), dot(phi[0], cross), dot(phi[1], cross),
     )  # fmt: skip
 
 
 def after_mirror(wave: Vector, way: Vector, mirror: Any) -> tuple[Vector, Vector]:
     """Real and imaginary part of a real field vector after the mirror of its leg, or as it is."""
-    normal, bounced, te, tm = mirror
-    re, im = dyads.reflected(wave, (0.0, 0.0, 0.0), way, normal, te.real, te.imag, tm.real, tm.imag)
+    normal, bounced, (te_re, te_im, tm_re, tm_im) = mirror
+    re, im = dyads.reflected(wave, (0.0, 0.0, 0.0), way, normal, te_re, te_im, tm_re, tm_im)
     x, y, z = wave
     return (
         (dyads.select(bounced, re[0], x), dyads.select(bounced, re[1], y), dyads.select(bounced, re[2], z)),
@@ -369,10 +358,16 @@ def after_mirror(wave: Vector, way: Vector, mirror: Any) -> tuple[Vector, Vector
     )
 
 
-def element_parts(parts: Any, field: Any, slant: Any) -> tuple[Any, Any]:
-    """Field of an element in the edge-fixed basis from those of unit fields, its pattern and its slant."""
-    e_theta, e_phi = dyads.slant_rotation(field[0] + 1j * field[1], field[2] + 1j * field[3], slant[0], slant[1])
-    return e_theta * parts[0] + e_phi * parts[2], e_theta * parts[1] + e_phi * parts[3]
+def element_parts(parts: Any, field: Any, slant: Any) -> tuple[Number, Number, Number, Number]:
+    """Field of an element along beta and phi (re, im each) from those of unit fields, its pattern and its slant."""
+    a_re, c_re = dyads.slant_rotation(field[0], field[2], slant[0], slant[1])
+    a_im, c_im = dyads.slant_rotation(field[1], field[3], slant[0], slant[1])
+    return (
+        a_re * parts[0] - a_im * parts[1] + c_re * parts[4] - c_im * parts[5],
+        a_re * parts[1] + a_im * parts[0] + c_re * parts[5] + c_im * parts[4],
+        a_re * parts[2] - a_im * parts[3] + c_re * parts[6] - c_im * parts[7],
+        a_re * parts[3] + a_im * parts[2] + c_re * parts[7] + c_im * parts[6],
+    )
 
 
 def over_one(source: Vector, target: Vector, edge: Any, wave_number: float) -> Any:
@@ -392,32 +387,37 @@ def over_one(source: Vector, target: Vector, edge: Any, wave_number: float) -> A
         Directions of the legs.
     cosines : (Number, Number)
         Of the angles between legs and edges.
-    joined : tuple of 4 complex
-        Matrix over (after, before) and (beta, phi) with spreading, but for one over the root of the length.
-    turn : tuple of 6 Number
-        Place of a target element where the path is straight: ``turn[0] + turn[1] along + turn[2] radius`` and so on.
+    distance : Number
+        As for :func:`aerpaw_cmp.propagation.field.wedge.wedge`.
+    spread : Number
+        Factor of the wedge's matrix, but for one over the root of the length.
+    angles : (Number, Number)
+        Of source and target round the edge [rad].
     """
     here, there = round_edge(source, edge), round_edge(target, edge)
     near, far = np.sqrt(here[1] ** 2 + here[2] ** 2), np.sqrt(there[1] ** 2 + there[2] ** 2)
     rise = there[0] - here[0]
     total = np.sqrt((near + far) ** 2 + rise * rise)
     sine, cosine = (near + far) / total, rise / total
-    bb, bp, pp = wedge(
-        angle_round(here), angle_round(there), cosine, edge[5], wave_number * near * far / total, edge[6], edge[7]
-    )
     at, start, along = here[0] + rise * near / (near + far), edge[0], edge[1]
     point = start[0] + at * along[0], start[1] + at * along[1], start[2] + at * along[2]
     # lambda / (4 pi) = 1 / 2k; the legs are near / sine and far / sine long, both bases lack a factor 1 / sine
     spread = 1.0 / (2.0 * wave_number * sine * np.sqrt(wave_number * near * far))
-    joined = bb * spread, bp * spread, -bp * spread, pp * spread
-    return unit(source, point), unit(point, target), (cosine, cosine), joined, (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    return (
+        unit(source, point), unit(point, target), (cosine, cosine), wave_number * near * far / total, spread,
+        (angle_round(here), angle_round(there)),
+    )  # fmt: skip
+
+
+STRAIGHT = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+"""``turn`` of :func:`over_two` for a path over one edge, whose legs lie in one plane as they are."""
 
 
 def over_two(
     source: Vector, target: Vector, edge_1: Any, edge_2: Any, point_1: Vector, point_2: Vector, shared_1: Number,
     shared_2: Number, wave_number: float,
 ) -> Any:  # fmt: skip
-    """A path over two edges of one plane face, along that face between them; as :func:`over_one`.
+    """A path over two edges of one plane face, along that face between them.
 
     Sources: Luebbers, IEEE Trans. Antennas Propag. 37 (1989) 206, doi 10.1109/8.18707 (slope term); Andersen, IEEE
     Trans. Antennas Propag. 45 (1997) 654, doi 10.1109/8.564091 (edges in a row).
@@ -434,8 +434,14 @@ def over_two(
 
     Returns
     -------
-    before, after, cosines, joined, turn
-        As of :func:`over_one`.
+    before, after : Vector
+        Directions of the legs.
+    cosines : (Number, Number)
+        Of the angles between legs and edges.
+    joined : tuple of 4 complex
+        Matrix over (after, before) and (beta, phi) with spreading, but for one over the root of the length.
+    turn : tuple of 6 Number
+        Place of a target element where the path is straight: ``turn[0] + turn[1] along + turn[2] radius`` and so on.
 
     Notes
     -----

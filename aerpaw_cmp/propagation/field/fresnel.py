@@ -145,13 +145,13 @@ def coefficients(cosine: Any, eta_re: Any, eta_im: Any, thickness: Any) -> tuple
     te_re, te_im, tm_re, tm_im : (...)
     """
     passes = thickness < 0.0
-    if passes.any():
+    if np.any(passes):
         other = coefficients(cosine, eta_re, eta_im, np.where(passes, np.inf, thickness))
         through = transmission(cosine, eta_re, eta_im, np.where(passes, -thickness, 0.0))
         return tuple(np.where(passes, a, b) for a, b in zip(through, other, strict=True))  # type: ignore[return-value]
     te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
     finite = np.isfinite(thickness)
-    if not finite.any():
+    if not np.any(finite):
         return te_re, te_im, tm_re, tm_im
     e_re, e_im = (np.where(finite, part, 0.0) for part in echo(np.where(finite, thickness, 0.0), root_re, root_im))
     return *slab(te_re, te_im, e_re, e_im), *slab(tm_re, tm_im, e_re, e_im)

@@ -50,7 +50,7 @@ for _one in (
 
 
 @kernel
-def _vector(v: FloatArray) -> Any:
+def vector(v: FloatArray) -> Any:
     """Three numbers as a tuple, which stays in registers."""
     return v[0], v[1], v[2]
 
@@ -58,17 +58,17 @@ def _vector(v: FloatArray) -> Any:
 @kernel
 def _rotation(m: FloatArray) -> Any:
     """Axes (3, 3) as tuples."""
-    return _vector(m[0]), _vector(m[1]), _vector(m[2])
+    return vector(m[0]), vector(m[1]), vector(m[2])
 
 
 @kernel
-def _put(w: FloatArray, at: int, v: Any) -> None:
+def put(w: FloatArray, at: int, v: Any) -> None:
     """Three numbers into rows of the workspace."""
     w[at], w[at + LANES], w[at + 2 * LANES] = v
 
 
 @kernel
-def _taken(w: FloatArray, at: int) -> Any:
+def taken(w: FloatArray, at: int) -> Any:
     """Three numbers out of rows of the workspace."""
     return w[at], w[at + LANES], w[at + 2 * LANES]
 
@@ -82,7 +82,7 @@ def _radiate(
         for p in range(pairs):
             e_theta, e_phi = dyads.slant_rotation(1.0, 0.0, slant[0, first + p], slant[1, first + p])
             toward = sign * w[_X + p], sign * w[_Y + p], sign * w[_Z + p]
-            _put(w, out + p, dyads.field_vector(m, toward, e_theta, e_phi))
+            put(w, out + p, dyads.field_vector(m, toward, e_theta, e_phi))
         w[out + 3 * LANES : out + 6 * LANES] = 0.0
         return
     for half in range(2):
@@ -90,20 +90,20 @@ def _radiate(
             q = first + p
             e_theta, e_phi = dyads.slant_rotation(e[half, q], e[2 + half, q], slant[0, q], slant[1, q])
             toward = sign * w[_X + p], sign * w[_Y + p], sign * w[_Z + p]
-            _put(w, out + half * 3 * LANES + p, dyads.field_vector(m, toward, e_theta, e_phi))
+            put(w, out + half * 3 * LANES + p, dyads.field_vector(m, toward, e_theta, e_phi))
 
 
 @kernel
 def _reflect(w: FloatArray, pairs: int, normal: Any, eta_re: float, eta_im: float, thickness: float) -> None:
     """The wave after one reflection, or with a negative thickness after one slab."""
     for p in range(pairs):
-        cosine = dyads.incidence(_taken(w, _X + p), normal)
+        cosine = dyads.incidence(taken(w, _X + p), normal)
         te_re, te_im, tm_re, tm_im, root_re, root_im = fresnel.half_space(cosine, eta_re, eta_im)
         w[_TE + p], w[_TE + LANES + p], w[_TM + p], w[_TM + LANES + p] = te_re, te_im, tm_re, tm_im
         w[_ROOT + p], w[_ROOT + LANES + p] = root_re, root_im
     if thickness < 0.0:
         for p in range(pairs):
-            cosine = dyads.incidence(_taken(w, _X + p), normal)
+            cosine = dyads.incidence(taken(w, _X + p), normal)
             te_re, te_im, tm_re, tm_im = fresnel.transmission(cosine, eta_re, eta_im, -thickness)
             w[_TE + p], w[_TE + LANES + p], w[_TM + p], w[_TM + LANES + p] = te_re, te_im, tm_re, tm_im
     elif math.isfinite(thickness):
@@ -113,11 +113,11 @@ def _reflect(w: FloatArray, pairs: int, normal: Any, eta_re: float, eta_im: floa
                 w[at + p], w[at + LANES + p] = fresnel.slab(w[at + p], w[at + LANES + p], e_re, e_im)
     for p in range(pairs):
         re, im = dyads.reflected(
-            _taken(w, _WAVE + p), _taken(w, _WAVE + 3 * LANES + p), _taken(w, _X + p), normal,
+            taken(w, _WAVE + p), taken(w, _WAVE + 3 * LANES + p), taken(w, _X + p), normal,
             w[_TE + p], w[_TE + LANES + p], w[_TM + p], w[_TM + LANES + p],
         )  # fmt: skip
-        _put(w, _WAVE + p, re)
-        _put(w, _WAVE + 3 * LANES + p, im)
+        put(w, _WAVE + p, re)
+        put(w, _WAVE + 3 * LANES + p, im)
 
 
 @kernel
@@ -127,7 +127,7 @@ def _fill(
     """Amplitudes (paths, pairs, 2)."""
     w, total = np.empty(ROWS * LANES), out.shape[1]
     for path in range(len(out)):
-        image, place, tower = _vector(g.image_m[path]), _vector(g.place_m[path]), g.tower[path]
+        image, place, tower = vector(g.image_m[path]), vector(g.place_m[path]), g.tower[path]
         frame, axes = _rotation(g.frame[path]), _rotation(g.axes[path])
         here, there = elements.tower_m[tower], elements.uav_m
         for first in range(0, total, LANES):
@@ -136,17 +136,17 @@ def _fill(
                 q = first + p
                 tower_m, uav_m = (here[0, q], here[1, q], here[2, q]), (there[0, q], there[1, q], there[2, q])
                 x, y, z, length = dyads.direction(image, frame, tower_m, place, axes, uav_m)
-                _put(w, _X + p, (x, y, z))
+                put(w, _X + p, (x, y, z))
                 w[_LENGTH + p] = length
             _radiate(w, pairs, first, frame, 1.0, elements.tower_slant[tower], e_tower[path % len(e_tower)], _WAVE)
             _radiate(w, pairs, first, axes, -1.0, elements.uav_slant, e_uav[path % len(e_uav)], _UAV)
             for step in range(g.depth[path]):
-                face = _vector(g.face[path, step])
-                _reflect(w, pairs, _vector(g.normal[path, step]), face[0], face[1], face[2])
+                face = vector(g.face[path, step])
+                _reflect(w, pairs, vector(g.normal[path, step]), face[0], face[1], face[2])
             for p in range(pairs):
                 re, im = dyads.received(
-                    _taken(w, _WAVE + p), _taken(w, _WAVE + 3 * LANES + p), _taken(w, _UAV + p),
-                    _taken(w, _UAV + 3 * LANES + p), w[_LENGTH + p] / wavelength,
+                    taken(w, _WAVE + p), taken(w, _WAVE + 3 * LANES + p), taken(w, _UAV + p),
+                    taken(w, _UAV + 3 * LANES + p), w[_LENGTH + p] / wavelength,
                 )  # fmt: skip
                 out[path, first + p, 0], out[path, first + p, 1] = re, im
 

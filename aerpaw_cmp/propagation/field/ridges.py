@@ -15,6 +15,9 @@ from ...site.dem import Dem, above_line
 
 Ridges = Literal["deygout", "bullington"]
 
+_PLANE_M = 1e-6
+"""Ground that rises less over its chord is a plane."""
+
 
 def ridge_loss_db(
     dem: Dem, source_m: FloatArray, target_m: FloatArray, wavelength_m: float, method: Ridges = "deygout"
@@ -38,8 +41,20 @@ def ridge_loss_db(
     length = np.linalg.norm(target_m - source_m, axis=1)
     for some, share, ground in dem.profiles(source_m, target_m):
         intrusion = above_line(source_m[some], target_m[some], share, ground)
-        loss[some] = law(length[some], share, intrusion, wavelength_m)
+        edge = _edge_share(length[some], share, ground, intrusion, wavelength_m)
+        loss[some] = law(length[some], share, intrusion, wavelength_m) * edge
     return loss
+
+
+def _edge_share(
+    length_m: FloatArray, share: FloatArray, ground_m: FloatArray, intrusion_m: FloatArray, wavelength_m: float
+) -> FloatArray:
+    """Share of an edge that the ground nearest to each line (links,) is: 1 where it blocks the line, 0 on a plane."""
+    main = _parameter(intrusion_m, share * length_m, (1.0 - share) * length_m, wavelength_m).argmax(axis=0)
+    at, over, ground = (np.take_along_axis(a, main[None], axis=0)[0] for a in (share, intrusion_m, ground_m))
+    rise = ground - (1.0 - at) * ground_m[0] - at * ground_m[-1]
+    ridge = (over <= 0.0) & (rise > _PLANE_M)
+    return np.where(over > 0.0, 1.0, np.where(ridge, rise / np.where(ridge, rise - over, 1.0), 0.0))
 
 
 def knife_edge_db(nu: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from scipy.special import wofz
 
 from ...common.units import FloatArray
 from .dyads import Number, larger, select, sine_cosine, smaller
-from .fresnel import echo, half_space, slab
+from .fresnel import coefficients, echo, half_space
 
 MIDDLE = 2.0
 """Argument of the transition function that the variable of its polynomial has at 0."""
@@ -88,27 +88,82 @@ def wedge(
     and Pathak, eq. 25). Matrices ``R`` of the faces stand in place of Luebbers' plus and minus one, so that a screen
     that conducts perfectly is theirs, and the sum with direct and reflected waves is continuous at any obliquity.
     """
-    sin_beta = np.sqrt(1.0 - cos_beta * cos_beta)
     less, more = phi_out - phi_in, phi_out + phi_in
-    up, up_sine = edge_term(np.pi + less, exterior, distance)
-    down, down_sine = edge_term(np.pi - less, exterior, distance)
-    at_n, _ = edge_term(np.pi + more, exterior, distance)
-    at_0, _ = edge_term(np.pi - more, exterior, distance)
+    terms = tuple(edge_term(np.pi + turn, exterior, distance) for turn in (less, -less, more, -more))
+    upright, across = obliquity(phi_in, phi_out, exterior, terms[0][2], terms[1][2])
+    sine = np.abs(upright) * np.sqrt(1.0 - cos_beta * cos_beta)
+    bb_re, bb_im, bp_re, bp_im, pp_re, pp_im = matrix(
+        tuple(part for term in terms for part in term[:2]), (upright, across, cos_beta, exterior),
+        coefficients(sine, *face_0), coefficients(sine, *face_n),
+    )  # fmt: skip
+    return bb_re + 1j * bb_im, bp_re + 1j * bp_im, pp_re + 1j * pp_im
+
+
+def obliquity(phi_in: Number, phi_out: Number, exterior: Number, up: Number, down: Number) -> tuple[Number, Number]:
+    """Sine and cosine of the angle under which the faces of a wedge are taken to be hit, in the plane across the edge.
+
+    Away from the reflection boundary no angle of incidence is given. Taken is that on the mirror through the edge
+    which would send the ray to the target, half of ``pi - less``, times a factor that is 1 on both reflection
+    boundaries (continuity), the same both ways (reciprocity), and 0 where source or target lies in a face: there the
+    field of a face that does not conduct perfectly vanishes.
+
+    Parameters
+    ----------
+    phi_in, phi_out, exterior : Number
+        As for :func:`wedge`.
+    up, down : Number
+        Sines of ``(pi + less) / 2n`` and ``(pi - less) / 2n``, ``less = phi_out - phi_in``.
+
+    Returns
+    -------
+    upright, across : Number
+    """
     sine_in, _ = sine_cosine(phi_in / (2.0 * np.pi * exterior))
     sine_out, _ = sine_cosine(phi_out / (2.0 * np.pi * exterior))
-    across, upright = sine_cosine(less / (4.0 * np.pi))
-    near, far = smaller(np.abs(up_sine), np.abs(down_sine)), larger(np.abs(up_sine), np.abs(down_sine))
+    across, upright = sine_cosine((phi_out - phi_in) / (4.0 * np.pi))
+    near, far = smaller(np.abs(up), np.abs(down)), larger(np.abs(up), np.abs(down))
     upright = select(near < 1e-9, exterior, upright / larger(near, 1e-9)) * sine_in * sine_out / larger(far, 1e-9)
-    upright = larger(smaller(upright, 1.0), -1.0)
-    te_0, mixed_0, tm_0 = face_matrix(upright, across, cos_beta, sin_beta, face_0)
+    return larger(smaller(upright, 1.0), -1.0), across
+
+
+def matrix(terms: Any, angles: Any, face_0: Any, face_n: Any) -> Any:
+    """Diffraction matrix of :func:`wedge` from its parts: (beta, beta), (beta, phi), (phi, phi) as six real numbers.
+
+    Parameters
+    ----------
+    terms : tuple of 8 Number
+        Real and imaginary parts of ``T(pi + d), T(pi - d), T(pi + u), T(pi - u)``.
+    angles : tuple of 4 Number
+        What :func:`obliquity` returns, cosine of the angle between ray and edge, exterior angle over pi.
+    face_0, face_n : tuple of 4 Number
+        Coefficients TE and TM of the faces, real and imaginary parts.
+
+    Returns
+    -------
+    tuple of 6 Number
+    """
+    upright, across, cos_beta, exterior = angles
+    up_re, up_im, down_re, down_im, n_re, n_im, o_re, o_im = terms
+    # angle between the edge-fixed basis and the plane of incidence, whose unit normal is sigma
+    askew = cos_beta * upright  # as across, times the sine of incidence: -(sigma . phi) and -(sigma . beta)
+    size = across * across + askew * askew
+    weight = 1.0 / select(size == 0.0, 1.0, size)
+    along, mixed = select(size == 0.0, 1.0, across * across * weight), across * askew * weight
     # from face n both the angles and the edge run the other way, which leaves the matrix as it is
-    te_n, mixed_n, tm_n = face_matrix(upright, across, cos_beta, sin_beta, face_n)
-    scale = -np.exp(-0.25j * np.pi) / (2.0 * np.sqrt(2.0 * np.pi)) / (exterior * sin_beta)
+    te_re = n_re * face_n[0] - n_im * face_n[1] + o_re * face_0[0] - o_im * face_0[1]
+    te_im = n_re * face_n[1] + n_im * face_n[0] + o_re * face_0[1] + o_im * face_0[0]
+    tm_re = n_re * face_n[2] - n_im * face_n[3] + o_re * face_0[2] - o_im * face_0[3]
+    tm_im = n_re * face_n[3] + n_im * face_n[2] + o_re * face_0[3] + o_im * face_0[2]
+    both_re, both_im, rest = up_re + down_re, up_im + down_im, askew * askew * weight
+    bb_re, bb_im = both_re + te_re * along - tm_re * rest, both_im + te_im * along - tm_im * rest
+    pp_re, pp_im = both_re + tm_re * along - te_re * rest, both_im + tm_im * along - te_im * rest
+    bp_re, bp_im = (te_re + tm_re) * mixed, (te_im + tm_im) * mixed
+    # -e^{-j pi/4} / (2 sqrt(2 pi)) = (j - 1) / (4 sqrt(pi))
+    scale = 0.25 / np.sqrt(np.pi) / (exterior * np.sqrt(1.0 - cos_beta * cos_beta))
     return (
-        scale * (up + down + at_n * te_n + at_0 * te_0),
-        scale * (at_n * mixed_n + at_0 * mixed_0),
-        scale * (up + down + at_n * tm_n + at_0 * tm_0),
-    )
+        -scale * (bb_re + bb_im), scale * (bb_re - bb_im), -scale * (bp_re + bp_im), scale * (bp_re - bp_im),
+        -scale * (pp_re + pp_im), scale * (pp_re - pp_im),
+    )  # fmt: skip
 
 
 def at_face(angle: Number, top: Number, rise: Number, exterior: Number, distance: Number) -> tuple[Any, Any]:
@@ -138,13 +193,19 @@ def at_face(angle: Number, top: Number, rise: Number, exterior: Number, distance
     angle = select(on_plane, angle + 8.0 * rise, angle)
     scale = -np.exp(-0.25j * np.pi) / (2.0 * np.sqrt(2.0 * np.pi)) / exterior
     less = top - angle
-    hard = edge_term(np.pi + less, exterior, distance)[0] + edge_term(np.pi - less, exterior, distance)[0]
-    less, more = top + rise - angle, top + rise + angle
-    near = edge_term(np.pi + less, exterior, distance)[0] + edge_term(np.pi - less, exterior, distance)[0]
-    far = edge_term(np.pi + more, exterior, distance)[0] + edge_term(np.pi - more, exterior, distance)[0]
+    hard = both_ways(less, exterior, distance)
+    near = both_ways(top + rise - angle, exterior, distance)
+    far = both_ways(top + rise + angle, exterior, distance)
     half, _ = sine_cosine((np.pi - np.abs(top - angle)) / (4.0 * np.pi))
     depth = 2.0 * distance * half * half
     return scale * hard * (depth / (1.0 + depth)), scale * (near - far) / np.abs(rise)
+
+
+def both_ways(less: Number, exterior: Number, distance: Number) -> Any:
+    """``T(pi + less) + T(pi - less)`` of :func:`wedge` as a complex number."""
+    up_re, up_im, _ = edge_term(np.pi + less, exterior, distance)
+    down_re, down_im, _ = edge_term(np.pi - less, exterior, distance)
+    return up_re + down_re + 1j * (up_im + down_im)
 
 
 def along_face(gap: Number, face: Any) -> tuple[Any, Any]:
@@ -180,11 +241,20 @@ def ground_wave(gap: Number, impedance: Any) -> Any:
     return 2.0 * np.sqrt(1j * gap / (1.0 + np.sqrt(1j * np.pi * q) + 2j * q))
 
 
-def edge_term(angle: Number, exterior: Number, distance: Number) -> tuple[Any, Number]:
+def edge_term(angle: Number, exterior: Number, distance: Number) -> tuple[Number, Number, Number]:
     """``cot(angle / 2n) F(x)``, whose pole at a shadow boundary F takes away; and the sine of ``angle / 2n``.
 
     Round the edge the angle repeats every 2 pi n; measured from the nearest boundary the argument of F is
     ``x = 2 distance sin^2(angle / 2)``, so the factor sin(angle / 2) cancels the pole in closed form.
+
+    Parameters
+    ----------
+    angle, exterior, distance : Number
+        Angle [rad]; exterior angle and distance as for :func:`wedge`.
+
+    Returns
+    -------
+    re, im, sine : Number
     """
     turns = angle / (2.0 * np.pi * exterior)
     turns = turns - np.floor(turns + 0.5)
@@ -195,56 +265,5 @@ def edge_term(angle: Number, exterior: Number, distance: Number) -> tuple[Any, N
     ratio = select(below == 0.0, exterior, above / select(below == 0.0, 1.0, below))
     reach = np.sqrt(2.0 * distance)
     re, im = transition(reach * above)
-    return (re + 1j * im) * (cosine * ratio * reach), below
-
-
-def face_matrix(sine: Number, across: Number, cos_beta: Number, sin_beta: Number, face: Any) -> tuple[Any, Any, Any]:
-    """Reflection at a face in the edge-fixed basis: elements (beta, beta), (beta, phi), (phi, phi) of its matrix.
-
-    Away from the reflection boundary no angle of incidence is given. Taken is that on the mirror through the edge
-    which would send the ray to the target, half of ``pi - less``, times a factor that is 1 on both reflection
-    boundaries (continuity), the same both ways (reciprocity), and 0 where source or target lies in a face: there the
-    field of a face that does not conduct perfectly vanishes.
-
-    Parameters
-    ----------
-    sine, across : Number
-        Sine and cosine of that angle.
-    cos_beta, sin_beta : Number
-        Of the angle between ray and edge.
-    face : tuple of 3 Number
-        Permittivity and thickness in wavelengths.
-
-    Returns
-    -------
-    bb, bp, pp : complex
-    """
-    eta_re, eta_im, thickness = face
-    te, tm = face_coefficients(np.abs(sine) * sin_beta, eta_re, eta_im, thickness)
-    # angle between the edge-fixed basis and the plane of incidence, whose unit normal is sigma
-    askew = cos_beta * sine  # as across, times the sine of incidence: -(sigma . phi) and -(sigma . beta)
-    size = across * across + askew * askew
-    none = size == 0.0
-    scale = 1.0 / select(none, 1.0, size)
-    across2, askew2 = select(none, 1.0, across * across * scale), askew * askew * scale
-    return te * across2 - tm * askew2, (te + tm) * (across * askew * scale), tm * across2 - te * askew2
-
-
-def face_coefficients(cosine: Number, eta_re: Number, eta_im: Number, thickness: Number) -> tuple[Any, Any]:
-    """TE and TM coefficients of a face as complex numbers; a thickness in wavelengths, infinite for a half-space.
-
-    Parameters
-    ----------
-    cosine, eta_re, eta_im, thickness : Number
-
-    Returns
-    -------
-    te, tm : complex
-    """
-    te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
-    finite = np.isfinite(thickness)
-    e_re, e_im = echo(select(finite, thickness, 0.0), root_re, root_im)
-    e_re, e_im = select(finite, e_re, 0.0), select(finite, e_im, 0.0)
-    te_re, te_im = slab(te_re, te_im, e_re, e_im)
-    tm_re, tm_im = slab(tm_re, tm_im, e_re, e_im)
-    return te_re + 1j * te_im, tm_re + 1j * tm_im
+    scale = cosine * ratio * reach
+    return re * scale, im * scale, below

@@ -1,8 +1,8 @@
 """The search of paths over edges as compiled loops over poses, towers and edges; imported only where numba is there.
 
 The place of each pose round each edge is computed once and serves all towers; a candidate is then a comparison of two
-sums. What is left is decided by the rules of reflections: prisms as in :mod:`aerpaw_cmp.propagation.search.occlusion`,
-triangles as in :mod:`aerpaw_cmp.propagation.search.beams`.
+sums, made for all edges at once. What is left is decided by the rules of reflections: prisms as in
+:mod:`aerpaw_cmp.propagation.search.occlusion`, triangles as in :mod:`aerpaw_cmp.propagation.search.beams`.
 """
 
 from __future__ import annotations
@@ -13,28 +13,34 @@ import numpy as np
 
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..edges import NEAREST_M
-from ..numba_options import kernel
+from ..numba_options import kernel, part
 from .beams import in_face, segment_cut
-from .boxtree import DEEPEST, box_missed
+from .boxtree import DEEPEST, box_missed, overlapping
 
 PROBE_M = 0.01
 """Radius round a point of an edge within which the air from face to face must be empty [m]."""
+
+LEAF = 16
+"""Most convex pieces of a leaf of the tree, whose boxes are compared at once."""
+
+ROWS = 16384
+"""Paths for which there is room at first."""
 
 
 class Solids(NamedTuple):
     """Obstacles: convex pieces of prisms, or triangles where ``rules`` has the clearances of beams.
 
     ``normal``, ``offset`` (planes, ...) are those of the pieces, one piece after another from ``first`` (pieces + 1,)
-    on, ``lower`` and ``upper`` (pieces, 3) their boxes; ``corners`` (triangles, 3, 3); ``tree`` is over pieces or
-    triangles.
+    on, in the order of the leaves of ``tree``, which is over pieces or over triangles. ``boxes`` (leaves, 6, LEAF) are
+    those of pieces, low corners first, ``block`` (nodes,) numbers the leaves; ``corners`` (triangles, 3, 3).
     """
 
     normal: FloatArray
     offset: FloatArray
     first: IntArray
     tolerance: float
-    lower: FloatArray
-    upper: FloatArray
+    boxes: FloatArray
+    block: IntArray
     corners: FloatArray
     tree: Any
     rules: Any
@@ -79,21 +85,20 @@ class Bends(NamedTuple):
     turn: FloatArray
 
 
-@kernel
+@part
 def _height(m, f, p):  # type: ignore[no-untyped-def]
     return m.normal[f, 0] * p[0] + m.normal[f, 1] * p[1] + m.normal[f, 2] * p[2] - m.offset[f]
 
 
-@kernel
-def _mirrored(m, f, p, out):  # type: ignore[no-untyped-def]
-    twice = 0.0
-    if f >= 0:
-        twice = 2.0 * _height(m, f, p)
-    for axis in range(3):
-        out[axis] = p[axis] - twice * m.normal[f, axis] if f >= 0 else p[axis]
+@part
+def _mirrored(m, f, p):  # type: ignore[no-untyped-def]
+    if f < 0:
+        return p
+    twice = 2.0 * _height(m, f, p)
+    return p[0] - twice * m.normal[f, 0], p[1] - twice * m.normal[f, 1], p[2] - twice * m.normal[f, 2]
 
 
-@kernel
+@part
 def _round(b, point, a, reach):  # type: ignore[no-untyped-def]
     """Places (edges,) of a point along edges and its distances from them; -1 inside the wedge or on the edge."""
     for e in range(len(a)):
@@ -106,54 +111,81 @@ def _round(b, point, a, reach):  # type: ignore[no-untyped-def]
         reach[e] = far if far >= NEAREST_M and (up >= 0.0 or up_n >= 0.0) else -1.0
 
 
-@kernel
-def _bounce(m, f, image, end, corner, out):  # type: ignore[no-untyped-def]
-    """Check whether a leg from an image to an edge is bent by a face inside its bounds, and where."""
-    for axis in range(3):
-        out[axis] = np.nan
+@part
+def _bounce(m, f, image, end, corner):  # type: ignore[no-untyped-def]
+    """Find where a face bends a leg from an image to an edge, and whether inside its bounds; the end without one."""
     if f < 0:
-        return True
-    above = _height(m, f, corner)
+        return True, end
+    above, below = _height(m, f, corner), _height(m, f, image)
     if above <= NEAREST_M or _height(m, f, end) <= 0.0:
-        return False
-    below = _height(m, f, image)
+        return False, end
     share = below / (below - above)
-    for axis in range(3):
-        out[axis] = image[axis] + share * (corner[axis] - image[axis])
+    x = image[0] + share * (corner[0] - image[0])
+    y = image[1] + share * (corner[1] - image[1])
+    z = image[2] + share * (corner[2] - image[2])
     if len(m.first):
-        return in_face(m.first, m.flat, m.along, m.across, f, out, 0.0)
-    a = m.along[f, 0] * out[0] + m.along[f, 1] * out[1] + m.along[f, 2] * out[2]
-    b = m.across[f, 0] * out[0] + m.across[f, 1] * out[1] + m.across[f, 2] * out[2]
-    return m.lower[f, 0] <= a <= m.upper[f, 0] and m.lower[f, 1] <= b <= m.upper[f, 1]
+        return in_face(m.first, m.flat, m.along, m.across, f, np.array([x, y, z]), 0.0), (x, y, z)
+    u = m.along[f, 0] * x + m.along[f, 1] * y + m.along[f, 2] * z
+    v = m.across[f, 0] * x + m.across[f, 1] * y + m.across[f, 2] * z
+    return m.lower[f, 0] <= u <= m.upper[f, 0] and m.lower[f, 1] <= v <= m.upper[f, 1], (x, y, z)
 
 
-@kernel
-def _pieces_cut(s, work, a, b):  # type: ignore[no-untyped-def]
-    """Check whether the segment runs inside a convex piece, deeper than the tolerance (Cyrus and Beck, 1978)."""
-    lower, upper, child, start, count, items = s.tree
-    inverse, todo = work
-    for axis in range(3):
-        d = b[axis] - a[axis]
-        inverse[axis] = 1.0 / d if d != 0.0 else 1e300
-    todo[0] = 0
+@part
+def _pieces_cut(s, work, a, b, own):  # type: ignore[no-untyped-def]
+    """Check whether the segment runs inside a convex piece but ``own``, deeper than the tolerance."""
+    lower, upper, child, start, _, _ = s.tree
+    inverse = (
+        1.0 / (b[0] - a[0]) if b[0] != a[0] else 1e300,
+        1.0 / (b[1] - a[1]) if b[1] != a[1] else 1e300,
+        1.0 / (b[2] - a[2]) if b[2] != a[2] else 1e300,
+    )
+    work[0] = 0
     waiting = 1
     while waiting > 0:
         waiting -= 1
-        node = todo[waiting]
-        if box_missed(lower, upper, node, a, inverse):
-            continue
+        node = work[waiting]
         if child[node] >= 0:
-            todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
-            waiting += 2
+            if not box_missed(lower, upper, node, a, inverse):
+                work[waiting], work[waiting + 1] = child[node], child[node] + 1
+                waiting += 2
             continue
-        for k in range(start[node], start[node] + count[node]):
-            if _piece_cut(s, items[k], a, b):
+        met = 0
+        for k in range(LEAF):
+            met += _box_met(s.boxes, s.block[node], k, a, inverse) << k
+        piece = start[node]
+        if piece <= own < piece + LEAF:
+            met &= ~(1 << (own - piece))
+        while met > 0:
+            if met & 1 and _piece_cut(s, piece, a, b):
                 return True
+            met, piece = met >> 1, piece + 1
     return False
 
 
-@kernel
+@part
+def _least(a, b):  # type: ignore[no-untyped-def]
+    return a if a < b else b
+
+
+@part
+def _most(a, b):  # type: ignore[no-untyped-def]
+    return a if a > b else b
+
+
+@part
+def _box_met(boxes, n, k, a, inverse):  # type: ignore[no-untyped-def]
+    """1 where a segment meets the box of a piece, else 0; as :func:`.boxtree.box_missed`, without branches."""
+    x, x2 = (boxes[n, 0, k] - a[0]) * inverse[0], (boxes[n, 3, k] - a[0]) * inverse[0]
+    y, y2 = (boxes[n, 1, k] - a[1]) * inverse[1], (boxes[n, 4, k] - a[1]) * inverse[1]
+    z, z2 = (boxes[n, 2, k] - a[2]) * inverse[2], (boxes[n, 5, k] - a[2]) * inverse[2]
+    enter = _most(_most(_least(x, x2), _least(y, y2)), _most(_least(z, z2), 0.0))
+    leave = _least(_least(_most(x, x2), _most(y, y2)), _least(_most(z, z2), 1.0))
+    return 1 if enter <= leave + 1e-12 * (abs(enter) + abs(leave)) else 0
+
+
+@part
 def _piece_cut(s, piece, a, b):  # type: ignore[no-untyped-def]
+    """Check whether the segment runs inside a convex piece (Cyrus and Beck, 1978)."""
     enter, leave, level = 0.0, 1.0, -s.tolerance
     for p in range(s.first[piece], s.first[piece + 1]):
         before = s.normal[p, 0] * a[0] + s.normal[p, 1] * a[1] + s.normal[p, 2] * a[2] - s.offset[p]
@@ -170,88 +202,61 @@ def _piece_cut(s, piece, a, b):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel
-def _near(s, b, f, source, e, hits):  # type: ignore[no-untyped-def]
-    """Pieces that may cut a leg from a source to an edge, into ``hits``; how many, -1 for triangles.
-
-    Seen from above the leg lies in a triangle, whether the ground bends it or not; a wall's image is left to the tree.
-    """
-    if s.triangles or (f >= 0 and b.wall[f]):
-        return -1
-    x, y, many = np.empty(3), np.empty(3), 0
-    for axis, row in ((0, x), (1, y)):
-        row[0] = source[axis]
-        row[1], row[2] = b.start[e, axis], b.start[e, axis] + b.length[e] * b.along[e, axis]
-    top = max(source[2], b.start[e, 2], b.start[e, 2] + b.length[e] * b.along[e, 2])
-    low = 0.0 if f >= 0 else min(source[2], b.start[e, 2], b.start[e, 2] + b.length[e] * b.along[e, 2])
-    for k in range(len(s.first) - 1):
-        lower, upper = s.lower[k], s.upper[k]
-        apart = x.max() < lower[0] or x.min() > upper[0] or y.max() < lower[1] or y.min() > upper[1]
-        if apart or (f < 0 and upper[2] < low) or lower[2] > top:
-            continue
-        for i in range(3):
-            j, other = (i + 1) % 3, (i + 2) % 3
-            n0, n1 = y[j] - y[i], x[i] - x[j]
-            inside = n0 * (x[other] - x[i]) + n1 * (y[other] - y[i])
-            if inside < 0.0:
-                n0, n1 = -n0, -n1
-            best = n0 * ((upper[0] if n0 > 0.0 else lower[0]) - x[i]) + n1 * (
-                (upper[1] if n1 > 0.0 else lower[1]) - y[i]
-            )
-            if best < 0.0:
-                apart = True
-        if not apart:
-            hits[many] = k
-            many += 1
-    return many
+@part
+def _own(s, b, own):  # type: ignore[no-untyped-def]
+    """A piece that both faces of each edge bound, or -1, into ``own``: no leg from outside the wedge enters it."""
+    own[:] = -1
+    if s.triangles:
+        return
+    hits = np.empty(len(s.first), np.int64)
+    for e in range(len(own)):
+        middle = b.start[e] + 0.5 * b.length[e] * b.along[e]
+        for k in range(overlapping(s.tree, middle, middle, hits)):
+            bounds = 0
+            for p in range(s.first[hits[k]], s.first[hits[k] + 1]):
+                n = s.normal[p]
+                if abs(n[0] * middle[0] + n[1] * middle[1] + n[2] * middle[2] - s.offset[p]) < 0.5 * s.tolerance:
+                    for face, out in ((1, b.out[e]), (2, b.out_n[e])):
+                        bounds |= face if n[0] * out[0] + n[1] * out[1] + n[2] * out[2] > 1.0 - 1e-12 else 0
+            if bounds == 3:
+                own[e] = hits[k]
 
 
 @kernel
-def _any_piece_cut(s, some, a, b):  # type: ignore[no-untyped-def]
-    for piece in some:  # noqa: SIM110 - compiled
-        if _piece_cut(s, piece, a, b):
-            return True
-    return False
-
-
-@kernel
-def _cut(s, m, work, a, b, f, g):  # type: ignore[no-untyped-def]
-    """Check whether a segment is cut; ``f`` and ``g`` are the mirrors at its ends or -1."""
-    if not s.triangles:
-        return _pieces_cut(s, work, a, b)
+def _triangles_cut(s, m, a, b, f, g):  # type: ignore[no-untyped-def]
     before, after, none = m.normal[f], m.normal[g], np.zeros(3)
     return segment_cut(
-        s.corners, s.tree, a, b, before if f >= 0 else none, m.offset[f], after if g >= 0 else none, m.offset[g],
-        s.rules,
+        s.corners, s.tree, np.array(a), np.array(b), before if f >= 0 else none, m.offset[f], after if g >= 0 else none,
+        m.offset[g], s.rules,
     )  # fmt: skip
 
 
-@kernel
-def _leg_cut(s, m, work, end, bounce, corner, f):  # type: ignore[no-untyped-def]
-    """Check whether a leg between an end and an edge is cut."""
-    if f < 0:
-        return _cut(s, m, work, end, corner, -1, -1)
-    return _cut(s, m, work, bounce, corner, f, -1) or _cut(s, m, work, end, bounce, -1, f)
+@part
+def _cut(s, m, work, a, b, f, g, own):  # type: ignore[no-untyped-def]
+    """Check whether a segment is cut; ``f`` and ``g`` are the mirrors at its ends or -1."""
+    if s.triangles:
+        return _triangles_cut(s, m, a, b, f, g)
+    return _pieces_cut(s, work, a, b, own)
 
 
 @kernel
-def _covered(s, m, work, b, e, corner):  # type: ignore[no-untyped-def]
+def _covered(s, m, b, e, corner):  # type: ignore[no-untyped-def]
     """Check whether a triangle lies in the air round a point of an edge."""
-    if not s.triangles:
-        return False
-    last, point = np.empty(3), np.empty(3)
+    last = corner
     for k in range(4):
         turn = np.pi * b.exterior[e] * (0.06 + 0.88 * k / 3.0)
         x, y = PROBE_M * np.cos(turn), PROBE_M * np.sin(turn)
-        for axis in range(3):
-            point[axis] = corner[axis] + x * b.axis[e, axis] + y * b.out[e, axis]
-        if k and _cut(s, m, work, last, point, -1, -1):
+        point = (
+            corner[0] + x * b.axis[e, 0] + y * b.out[e, 0], corner[1] + x * b.axis[e, 1] + y * b.out[e, 1],
+            corner[2] + x * b.axis[e, 2] + y * b.out[e, 2],
+        )  # fmt: skip
+        if k and _triangles_cut(s, m, last, point, -1, -1):
             return True
-        last[:] = point
+        last = point
     return False
 
 
-@kernel
+@part
 def _allowed(b, before, after, tower, pose):  # type: ignore[no-untyped-def]
     """Check whether two faces may bend the legs of a link."""
     if before >= 0 and after >= 0 and (b.wall[before] or b.wall[after]):
@@ -262,32 +267,20 @@ def _allowed(b, before, after, tower, pose):  # type: ignore[no-untyped-def]
     return not (after >= 0 and not b.wall[after] and after != ground)
 
 
-@kernel
-def _over_pair(b, k, a_s, r_s, a_t, r_t, points):  # type: ignore[no-untyped-def]
-    """Find the points where a path over a pair of edges meets them: straight in the plane of the face between them."""
+@part
+def _over_pair(b, k, a_s, r_s, a_t, r_t):  # type: ignore[no-untyped-def]
+    """Places on a pair of edges where a path over them is straight in the plane of the face between them."""
     t = b.turn[k]
     u_t, v_t = t[0] + t[1] * a_t + t[2] * r_t, t[3] + t[4] * a_t + t[5] * r_t
-    if v_t <= 0.0:
-        return False
     first = r_s / (v_t + r_s)
-    u = a_s + first * (u_t - a_s)
     # the source in the frame of the second edge, whose axes in that of the first are t[1], t[4] and -t[2], -t[5]
     x, y = a_s - t[0], -r_s - t[3]
     ahead = -(x * t[2] + y * t[5])
-    if ahead <= 0.0:
-        return False
     second = ahead / (ahead + r_t)
     along = x * t[1] + y * t[4]
-    w = along + second * (a_t - along)
-    e, g = b.pair[k, 0], b.pair[k, 1]
-    if second <= first or u < 0.0 or u > b.length[e] or w < 0.0 or w > b.length[g]:
-        return False
-    gap = 0.0
-    for axis in range(3):
-        points[1, axis] = b.start[e, axis] + u * b.along[e, axis]
-        points[2, axis] = b.start[g, axis] + w * b.along[g, axis]
-        gap += (points[2, axis] - points[1, axis]) ** 2
-    return gap > NEAREST_M**2
+    u, w = a_s + first * (u_t - a_s), along + second * (a_t - along)
+    on = 0.0 <= u <= b.length[b.pair[k, 0]] and 0.0 <= w <= b.length[b.pair[k, 1]]
+    return v_t > 0.0 and ahead > 0.0 and second > first and on, u, w
 
 
 @kernel
@@ -313,95 +306,108 @@ def search(b, m, s, sources, targets, excluded, poses):  # type: ignore[no-untyp
     edges, towers, options = len(b.start), len(sources), len(b.options)
     a_s, r_s = np.empty((towers, options, edges)), np.empty((towers, options, edges))
     a_t, r_t = np.empty((options, edges)), np.empty((options, edges))
-    pieces = 0 if s.triangles else len(s.first) - 1
-    near = np.empty((towers, options, edges, pieces), np.int32)
-    near_many = np.empty((towers, options, edges), np.int64)
-    image_s, image_t = np.empty((towers, options, 3)), np.empty((options, 3))
     for tower in range(towers):
         for i in range(options):
-            _mirrored(m, b.options[i], sources[tower], image_s[tower, i])
-            _round(b, image_s[tower, i], a_s[tower, i], r_s[tower, i])
-            for e in range(edges):
-                f = b.options[i]
-                near_many[tower, i, e] = _near(s, b, f, sources[tower], e, near[tower, i, e])
-    space, total = 1024, 0
-    index, vertices = np.empty((space, 8), np.int64), np.empty((space, 4, 3))
-    points = np.full((4, 3), np.nan)
-    work = np.empty(3), np.empty(DEEPEST, np.int64)
+            _round(b, _mirrored(m, b.options[i], _vector(sources, tower)), a_s[tower, i], r_s[tower, i])
+    own, seen = np.empty(edges, np.int64), np.empty(edges, np.bool_)
+    _own(s, b, own)
+    index, vertices, total = np.empty((ROWS, 8), np.int64), np.empty((ROWS, 4, 3)), 0
+    work = np.empty(DEEPEST, np.int64)
     for pose in poses:
-        target = targets[pose]
+        target = _vector(targets, pose)
         for j in range(options):
-            _mirrored(m, b.options[j], target, image_t[j])
-            _round(b, image_t[j], a_t[j], r_t[j])
-        for tower in range(towers):
-            if excluded[tower, pose]:
+            _round(b, _mirrored(m, b.options[j], target), a_t[j], r_t[j])
+        for link in range(towers * options * options):
+            tower, i, j = link // (options * options), link // options % options, link % options
+            f, g, source = b.options[i], b.options[j], _vector(sources, tower)
+            if excluded[tower, pose] or not _allowed(b, f, g, tower, pose):
                 continue
-            for i in range(options):
-                for j in range(options):
-                    f, g = b.options[i], b.options[j]
-                    if not _allowed(b, f, g, tower, pose):
-                        continue
-                    walled = (f >= 0 and b.wall[f]) or (g >= 0 and b.wall[g])
-                    for k in range(edges if walled else edges + len(b.pair)):
-                        two = k - edges
-                        e, last = k, k
-                        if two >= 0:
-                            e, last = b.pair[two, 0], b.pair[two, 1]
-                        close, far = r_s[tower, i, e], r_t[j, last]
-                        if close < 0.0 or far < 0.0:
-                            continue
-                        here, there = a_s[tower, i, e], a_t[j, last]
-                        if two < 0:
-                            share = here * far + there * close
-                            if share < 0.0 or share > b.length[e] * (close + far):
-                                continue
-                            share /= close + far
-                            for axis in range(3):
-                                points[1, axis] = points[2, axis] = b.start[e, axis] + share * b.along[e, axis]
-                        elif not _over_pair(b, two, here, close, there, far, points):
-                            continue
-                        if not _bounce(m, f, image_s[tower, i], sources[tower], points[1], points[0]):
-                            continue
-                        if not _bounce(m, g, image_t[j], target, points[2], points[3]):
-                            continue
-                        some = near_many[tower, i, e]
-                        if some < 0:
-                            if _leg_cut(s, m, work, sources[tower], points[0], points[1], f):
-                                continue
-                        elif some:
-                            hits = near[tower, i, e, :some]
-                            if f < 0:
-                                if _any_piece_cut(s, hits, sources[tower], points[1]):
-                                    continue
-                            elif _any_piece_cut(s, hits, points[0], points[1]) or _any_piece_cut(
-                                s, hits, sources[tower], points[0]
-                            ):
-                                continue
-                        if _leg_cut(s, m, work, target, points[3], points[2], g):
-                            continue
-                        if _covered(s, m, work, b, e, points[1]):
-                            continue
-                        if two >= 0:
-                            common = b.face[e, b.shared[two, 0]]
-                            if _cut(s, m, work, points[1], points[2], common, common) or _covered(
-                                s, m, work, b, last, points[2]
-                            ):
-                                continue
-                        if total == space:
-                            space *= 2
-                            index2, vertices2 = np.empty((space, 8), np.int64), np.empty((space, 4, 3))
-                            index2[:total], vertices2[:total] = index, vertices
-                            index, vertices = index2, vertices2
-                        row = index[total]
-                        row[0], row[1], row[2], row[3], row[6], row[7] = pose, tower, e, -1, f, g
-                        row[4] = row[5] = 0
-                        vertices[total] = points
-                        if two >= 0:
-                            row[3], row[4], row[5] = last, b.shared[two, 0], b.shared[two, 1]
-                        else:
-                            vertices[total, 2] = np.nan
-                        total += 1
-    return index[:total].copy(), vertices[:total].copy()
+            ends = (source, _mirrored(m, f, source), f), (target, _mirrored(m, g, target), g)
+            places = a_s[tower, i], r_s[tower, i], a_t[j], r_t[j]
+            _on_edges(b.length, places, seen)
+            walled = (f >= 0 and b.wall[f]) or (g >= 0 and b.wall[g])
+            for k in range(edges if walled else edges + len(b.pair)):
+                if k < edges and not seen[k]:
+                    continue
+                if total == len(index):
+                    index, vertices = _doubled(index, vertices)
+                if _free(b, m, s, work, ends, k, own, places, vertices[total]):
+                    _write(b, k, index[total], (pose, tower, f, g))
+                    total += 1
+    return index[:total], vertices[:total]
+
+
+@part
+def _vector(points, k):  # type: ignore[no-untyped-def]
+    return points[k, 0], points[k, 1], points[k, 2]
+
+
+@part
+def _on_edges(length, places, seen):  # type: ignore[no-untyped-def]
+    """Edges whose diffraction point lies on them, into ``seen``."""
+    a_s, r_s, a_t, r_t = places
+    for e in range(len(seen)):
+        close, far = r_s[e], r_t[e]
+        share = a_s[e] * far + a_t[e] * close
+        seen[e] = (close >= 0.0) & (far >= 0.0) & (share >= 0.0) & (share <= length[e] * (close + far))
+
+
+@part
+def _point(b, e, at):  # type: ignore[no-untyped-def]
+    return b.start[e, 0] + at * b.along[e, 0], b.start[e, 1] + at * b.along[e, 1], b.start[e, 2] + at * b.along[e, 2]
+
+
+@part
+def _free(b, m, s, work, ends, k, own, places, vertices):  # type: ignore[no-untyped-def]
+    """Check whether a candidate meets its edges and mirrors and its legs are free; its points into ``vertices``."""
+    a_s, r_s, a_t, r_t = places
+    two = k - len(own)
+    first, last = (k, k) if two < 0 else (b.pair[two, 0], b.pair[two, 1])
+    vertices[:] = np.nan
+    if two < 0:
+        u = w = (a_s[k] * r_t[k] + a_t[k] * r_s[k]) / (r_s[k] + r_t[k])
+    else:
+        on, u, w = _over_pair(b, two, a_s[first], r_s[first], a_t[last], r_t[last])
+        if r_s[first] < 0.0 or r_t[last] < 0.0 or not on:
+            return False
+    corners = _point(b, first, u), _point(b, last, w)
+    for side in range(2):
+        end, image, f = ends[side]
+        e, corner = last if side else first, corners[side]
+        met, bounce = _bounce(m, f, image, end, corner)
+        if not met or _cut(s, m, work, bounce, corner, f, -1, own[e]):
+            return False
+        if f >= 0:
+            if _cut(s, m, work, end, bounce, -1, f, -1):
+                return False
+            vertices[3 * side, 0], vertices[3 * side, 1], vertices[3 * side, 2] = bounce
+        if side == 0 or two >= 0:
+            vertices[1 + side, 0], vertices[1 + side, 1], vertices[1 + side, 2] = corner
+            if s.triangles and _covered(s, m, b, e, corner):
+                return False
+    if two < 0:
+        return True
+    (x, y, z), (x2, y2, z2), common = corners[0], corners[1], b.face[first, b.shared[two, 0]]
+    apart = (x2 - x) ** 2 + (y2 - y) ** 2 + (z2 - z) ** 2 > NEAREST_M**2
+    return apart and not _cut(s, m, work, corners[0], corners[1], common, common, -1)
+
+
+@kernel
+def _doubled(index, vertices):  # type: ignore[no-untyped-def]
+    """Rows with room for as many more."""
+    more = np.empty((2 * len(index), 8), np.int64), np.empty((2 * len(index), 4, 3))
+    more[0][: len(index)], more[1][: len(index)] = index, vertices
+    return more
+
+
+@part
+def _write(b, k, row, link):  # type: ignore[no-untyped-def]
+    """Write pose, tower, edges, shared faces and mirrors of a path into its row."""
+    two = k - len(b.start)
+    row[0], row[1], row[6], row[7] = link
+    row[2], row[3], row[4], row[5] = k, -1, 0, 0
+    if two >= 0:
+        row[2], row[3], row[4], row[5] = b.pair[two, 0], b.pair[two, 1], b.shared[two, 0], b.shared[two, 1]
 
 
 def try_out() -> None:

@@ -29,6 +29,9 @@ from .occlusion import Occlusion
 PROBE_M = 1e-3
 """How far beside an edge point the air on both of its faces is looked for."""
 
+FAR_M = 1e7
+"""Place of boxes that no segment meets."""
+
 LINKS_AT_ONCE = 200_000
 """Pairs of edge and pose that are looked at together."""
 
@@ -126,7 +129,8 @@ def _compiled(
     paths = EdgePaths.of(index, vertices)
     if hiding is None:
         return paths
-    return paths.select(_beyond_bounds(edges, faces, ends, hiding, paths))
+    good = _beyond_bounds(edges, faces, ends, hiding, paths)
+    return paths if good.all() else paths.select(good)
 
 
 def _beyond_bounds(
@@ -225,8 +229,8 @@ def _solids(kernels: ModuleType, hiding: Occlusion | None, surfaces: Surfaces | 
             offset=np.zeros(0),
             first=np.zeros(1, np.int64),
             tolerance=0.0,
-            lower=np.zeros((0, 3)),
-            upper=np.zeros((0, 3)),
+            boxes=np.zeros((0, 6, kernels.LEAF)),
+            block=np.zeros(0, np.int64),
             corners=surfaces.corners_m,
             tree=tuple(surfaces.tree),
             rules=rules,
@@ -235,15 +239,22 @@ def _solids(kernels: ModuleType, hiding: Occlusion | None, surfaces: Surfaces | 
     assert hiding is not None
     planes = [piece for pieces in hiding.pieces for piece in pieces]
     solid = np.repeat(np.arange(len(hiding.pieces)), [len(pieces) for pieces in hiding.pieces])
+    tree = box_tree(hiding.low[solid], hiding.high[solid], kernels.LEAF)
+    solid, planes = solid[tree.items], [planes[k] for k in tree.items]
+    leaves = np.flatnonzero(tree.child < 0)
+    block, boxes = np.cumsum(tree.child < 0) - 1, np.full((len(leaves), 6, kernels.LEAF), FAR_M)
+    for row, first, many in zip(boxes, tree.start[leaves], tree.many[leaves], strict=True):
+        part = solid[first : first + many]
+        row[:, :many] = np.hstack([hiding.low[part], hiding.high[part]]).T
     return kernels.Solids(
         normal=np.concatenate([normal for normal, _ in planes]),
         offset=np.concatenate([offset for _, offset in planes]),
         first=np.cumsum([0, *(len(offset) for _, offset in planes)]),
         tolerance=hiding.tolerance_m,
-        lower=hiding.low[solid],
-        upper=hiding.high[solid],
+        boxes=boxes,
+        block=block,
         corners=np.zeros((0, 3, 3)),
-        tree=tuple(box_tree(hiding.low[solid], hiding.high[solid])),
+        tree=tuple(tree._replace(items=np.arange(len(planes)))),
         rules=rules,
         triangles=False,
     )

@@ -511,14 +511,17 @@ def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-
         height = _height(normal, offset, f, source)
         if (abs(height) <= rules[4] and rules[3] == 0.0) or (front_only[f] and height < -rules[4]):
             continue
-        good[f] = not (rules[6] and _wholly_hidden(mirrors, face_tree, source, f, rules, stack))
+        good[f] = not (rules[6] and _wholly_hidden(mirrors, face_tree, source, f, -1, 0.0, rules, stack))
     return good
 
 
 @kernel
-def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore[no-untyped-def]
-    """Check whether one convex face lies between the source and every corner of the outline of face ``f``."""
-    _, _, _, _, window, convex, plane, _, _, _, _ = mirrors
+def _wholly_hidden(mirrors, face_tree, source, f, before, sign, rules, stack):  # type: ignore[no-untyped-def]
+    """Check whether one convex face lies between the source and every corner of the outline of face ``f``.
+
+    Where the source is an image, it lies as well wholly before the face ``before`` (-1: none), on the side ``sign``.
+    """
+    normal, offset, _, _, window, convex, plane, _, _, _, _ = mirrors
     lower, upper, child, start, count, items = face_tree
     aim = np.zeros(3)
     for k in range(WINDOW):
@@ -542,7 +545,14 @@ def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore
             continue
         for k in range(start[node], start[node] + count[node]):
             g = items[k]
-            if convex[g] and plane[g] != plane[f] and _hides(mirrors, source, f, g, rules):
+            if not convex[g] or plane[g] == plane[f] or g == before:
+                continue
+            between = True
+            for corner in range(WINDOW if before >= 0 else 0):
+                if not sign * _height(normal, offset, before, window[g, corner]) > 10.0 * rules[1]:
+                    between = False
+                    break
+            if between and _hides(mirrors, source, f, g, rules):
                 return True
     return False
 
@@ -729,6 +739,12 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
                     ahead = True
                     break
             if not ahead:
+                continue
+            if (
+                level + 1 < max_depth
+                and rules[6]
+                and _wholly_hidden(mirrors, face_tree, here, f, before, signs[level - 1], rules, stack)
+            ):
                 continue
         followed += 1
         chain[level] = f

@@ -740,11 +740,8 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
                     break
             if not ahead:
                 continue
-            if (
-                level + 1 < max_depth
-                and rules[6]
-                and _wholly_hidden(mirrors, face_tree, here, f, before, signs[level - 1], rules, stack)
-            ):
+            asked = rules[6] and level + 1 < max_depth  # of a last face it would cost more than it saves
+            if asked and _wholly_hidden(mirrors, face_tree, here, f, before, signs[level - 1], rules, stack):
                 continue
         followed += 1
         chain[level] = f

@@ -26,6 +26,7 @@ from ..site.siteyaml import load_site
 MEASURED = "CPU seconds of reading and replay, tried on a few poses now; a stage with a dash was not tried"
 
 TRIED_POSES = (32, 160)
+TRIED_TILES = 4
 """Of the two replays that a time is extrapolated from."""
 
 
@@ -208,6 +209,17 @@ def _map_searched(site: Site, settings: Any, heights: int) -> PlannedStage | Non
     return PlannedStage("path search", work, searched[0] + pieces * searched[1].seconds)
 
 
+def _tiles(site: Site, settings: Any, tiling: Any) -> PlannedStage:
+    """The tiles of a map, from some that are spread over it; workers share their time."""
+    from .mapping.coverage_map import SiteChannels, TileOrder
+
+    channels = SiteChannels(site, settings)
+    some = np.unique(np.linspace(0, len(tiling) - 1, TRIED_TILES).round().astype(int)).tolist()
+    orders = [TileOrder(site="", settings=settings, cells=tiling.cells, number=number) for number in some]
+    seconds = _cpu_seconds(lambda: [channels.tile(order) for order in orders]) * len(tiling) / len(some)
+    return PlannedStage("maps in tiles", f"{len(tiling)} tiles of {tiling.cells} x {tiling.cells} positions", seconds)
+
+
 def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan:
     """Stages, links and time of a map; a coarse grid is computed for the estimate, and nothing is written.
 
@@ -226,15 +238,17 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
         Stages with their work and time [s].
     """
     from ..maps.grid import Grid
+    from ..maps.tiles import Tiling
     from .mapping.coverage_map import make_maps
 
     place = load_site(site)
-    positions = len(Grid.over_area(place.area_m, settings.spacing_m))
+    grid = Grid.over_area(place.area_m, settings.spacing_m)
+    positions, cells = len(grid), settings.tile_cells(grid) if settings.engine == "image" else None
     heights = len(set(settings.rss_altitudes_m) | set(settings.rank_altitudes_m))
     links = positions * heights * len(place.towers)
-    stages = []
-    searched = _map_searched(place, settings, heights) if settings.engine == "image" else None
-    for mode in settings.foliage:
+    stages = [_tiles(place, settings, Tiling(grid, cells))] if cells else []
+    searched = _map_searched(place, settings, heights) if settings.engine == "image" and not cells else None
+    for mode in () if cells else settings.foliage:
         work = f"{links} links: {positions} positions, {heights} heights, {len(place.towers)} towers"
         seconds: float | None = None
         if searched is not None:  # the modes share the paths
@@ -247,7 +261,7 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
             tried = len(Grid.over_area(place.area_m, coarse.spacing_m))
             seconds = _cpu_seconds(lambda one=coarse: make_maps(place, one, Stages())) * positions / tried
         stages.append(PlannedStage(f"maps, foliage {mode}", work, seconds))
-    if settings.study:
+    if settings.study and not cells:
         stages.append(PlannedStage("study", "correlation and interpolation"))
     layers = heights * len(place.towers) * len(settings.foliage) * (1 + len(settings.ks))
     stages.append(PlannedStage("export, page", f"some {layers} layers"))

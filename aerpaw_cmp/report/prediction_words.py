@@ -12,7 +12,7 @@ from ..compare.entries import crps_normal
 from ..compare.forecast import ForecastScore
 from ..compare.statistics import mean_interval, paired_difference, paired_verdict
 from ..compare.verdicts import Verdict, stated_errors
-from ..flight.remembered import Remembered
+from ..site.learned import Entry, LearnedSeries
 from .phrases import filled, said_of
 
 TITLES = {
@@ -148,12 +148,13 @@ UNSEEN = (
 )
 
 
-def memory_words(known: Sequence[Remembered], outside: float) -> str:
+def memory_words(known: Sequence[tuple[Entry, LearnedSeries, float]], outside: float) -> str:
     """First line of terminal and page without flights: what the site remembers, and the error to expect.
 
     Parameters
     ----------
-    known : sequence of Remembered
+    known : sequence of (Entry, LearnedSeries, float)
+        With the standard deviation of the level [dB].
     outside : float
         Share of points in directions that flights hardly saw.
 
@@ -162,10 +163,10 @@ def memory_words(known: Sequence[Remembered], outside: float) -> str:
     str
     """
     each: dict[str, list[str]] = {}
-    for one in known:
-        each.setdefault(one.entry.about(), []).append(f"{one.series.tower} {one.series.channel}")
+    for entry, series, _ in known:
+        each.setdefault(entry.about(), []).append(f"{series.tower} {series.channel}")
     learned = ". ".join(f"{', '.join(names)}: {about}" for about, names in each.items())
-    sd = max(one.level.sd_db for one in known)
+    sd = max(sd_db for *_, sd_db in known)
     texts = [NO_FLIGHT, *([UNSEEN] if outside > MANY else [])]
     return " ".join(filled(texts, learned=learned, sd=sd, percent=100.0 * outside))
 

@@ -157,7 +157,7 @@ def _about(
     if isinstance(model, Memory):
         entries = {one.entry.command: one.entry for one in model.known.values()}.values()
         return {
-            "verdict": memory_words(list(model.known.values()), guess),
+            "verdict": memory_words([(m.entry, m.series, m.level.sd_db) for m in model.known.values()], guess),
             "flights": [name for entry in entries for name in entry.flights],
             "trained_on": union(*(entry.trained_on for entry in entries), *used),
             "candidates": [],

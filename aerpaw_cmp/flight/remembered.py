@@ -177,10 +177,10 @@ def searching_airframe(
     SpherePattern or None
     """
     with suppress(InputError, UsageError):
-        for entry in read_learned(site).entries.values():
-            for s in entry.series:
-                if (s.channel, s.reader) == series and s.tower not in towers and log not in entry.trained_on:
-                    return read_sphere_csv(folder_of(site) / s.uav_file)
+        others = (entry for entry in read_learned(site).entries.values() if log not in entry.trained_on)
+        every = (s for entry in others for s in entry.series if s.tower not in towers)
+        file = next((s.uav_file for s in every if (s.channel, s.reader) == series), None)
+        return None if file is None else read_sphere_csv(folder_of(site) / file)
     return None
 
 

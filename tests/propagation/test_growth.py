@@ -141,6 +141,18 @@ def test_only_a_convex_face_leaves_out_what_its_outline_covers(name):
     np.testing.assert_array_equal(paths.faces, everything.faces)
 
 
+def test_a_square_behind_a_mirror_hides_nothing_before_it():
+    """As seen from the source's image at (20, 0, 0) the square at 15 covers the mirror at -5, but no path meets it."""
+    squares = [
+        quad((east, -half, -half), (0, 2 * half, 0), (0, 0, 2 * half)) for east, half in ((10, 3), (-5, 3), (15, 20))
+    ]
+    surfaces = merged(enumerate_.scene_of([t for square in squares for t in square]))
+    ends = Links(np.array([[0.0, 0, 0]]), np.array([[2.0, 1.0, 0.5]]))
+    paths, everything = (grow_paths(surfaces, ends, max_depth=3, shadows=on) for on in (True, False))
+    np.testing.assert_array_equal(paths.faces, everything.faces)
+    assert np.bincount(paths.depth).tolist() == [1, 2, 2, 2]
+
+
 def test_a_mirror_works_on_both_sides_and_hides_from_both():
     wall = enumerate_.scene_of(quad((0, -50, -50), (0, 100, 0), (0, 0, 100)))
     for side in (1.0, -1.0):

@@ -34,19 +34,27 @@ def test_fading_is_what_is_left_within_the_mean(freedom: float, kurtosis: float)
     assert fading_of([samples(gone)], 4.0) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("freedom", [5.0, 8.0, 30.0, np.inf])
-def test_intervals_hold_their_share_with_heavy_tails(freedom: float) -> None:
-    """Gain, nuisance and noise normal, fading of Student's t: 50, 90 and 95 % within 2 points."""
+@pytest.mark.parametrize("gone_db", [0.0, 3.0, 12.0])
+@pytest.mark.parametrize("direct", [0.0, 3.0, np.inf])
+def test_intervals_hold_their_share_where_paths_fade(direct: float, gone_db: float) -> None:
+    """Nuisance, noise and gain normal, fading of Rice's law in dB (direct power by scattered): 50, 90, 95 % hold.
+
+    Within 2.5 points, from fading alone (Rayleigh's 5.6 dB) to fading that hardly matters.
+    """
     random = np.random.default_rng(4)
-    gain = random.uniform(0.5, 3.0, N)
-    fading = random.normal(size=N) if np.isinf(freedom) else random.standard_t(freedom, N)
-    fading *= 4.0 / fading.std()
-    error = random.normal(0.0, np.sqrt(gain**2 + 3.0**2 + 2.0**2)) + fading
+    scattered = np.array([1.0, 1j]) @ random.normal(0.0, np.sqrt(0.5), (2, N))
+    wave = scattered + np.sqrt(direct) if np.isfinite(direct) else np.exp(0.2 * random.normal(size=N))
+    fading = 20.0 * np.log10(np.abs(wave))
+    fading -= fading.mean()
     kurtosis = float(np.mean(fading**4) / np.mean(fading**2) ** 2 - 3.0)
-    spread = Spread(own_sd_db=3.0, noise_sd_db=2.0, fading_sd_db=4.0, fading_kurtosis=kurtosis, bin_s=4.0)
+    sd = float(fading.std())
+    gain = gone_db * random.uniform(0.1, 0.5, N)
+    own, noise = 0.5 * gone_db, 0.3 * gone_db
+    error = random.normal(size=N) * np.sqrt(gain**2 + own**2 + noise**2) + fading
+    spread = Spread(own_sd_db=own, noise_sd_db=noise, fading_sd_db=sd, fading_kurtosis=kurtosis, bin_s=4.0)
     held = inside_shares(error, StatedSpread(gain_sd_db=gain, spread=spread))
     for share in SHARES:
-        assert held[f"inside_{100 * share:.0f}"] == pytest.approx(share, abs=0.02)
+        assert held[f"inside_{100 * share:.0f}"] == pytest.approx(share, abs=0.025)
     assert error.std() == pytest.approx(float(np.sqrt(np.mean(spread.total_db(gain) ** 2))), rel=0.02)
 
 
@@ -69,8 +77,8 @@ def test_fading_does_not_depend_on_the_zero_of_the_clock() -> None:
         assert fading_of([dataclasses.replace(one, time_s=one.time_s + shift_s)], 1.0) == pytest.approx(expected)
 
 
-def test_heavy_tails_widen_only_as_far_as_the_expansion_holds() -> None:
-    """Between an excess kurtosis of 0 and 2 the 95 % interval grows steadily; beyond 2 no more."""
+def test_the_kurtosis_counts_only_as_far_as_the_expansion_holds() -> None:
+    """Up to an excess kurtosis of 2 either way, and no further."""
     none = np.zeros(1)
 
     def width(kurtosis: float) -> float:
@@ -78,8 +86,7 @@ def test_heavy_tails_widen_only_as_far_as_the_expansion_holds() -> None:
         return float(spread.half_width_db(none, 0.95)[0])
 
     assert width(0.0) == pytest.approx(4.0 * 1.95996, rel=1e-4)
-    assert width(0.0) < width(1.0) < width(1.99) < width(2.0)
-    assert width(2.0) == width(3.0) == width(50.0)
+    assert width(1.0) != width(1.9) != width(2.0) == width(3.0) == width(50.0)
     assert width(-2.0) == width(-9.0) < width(0.0)
 
 

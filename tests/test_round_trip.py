@@ -118,6 +118,16 @@ def test_bad_lines_are_rejected_and_counted(tmp_path: Path) -> None:
         assert len(file.result.rejected) == 5 == len(truth["bad_lines"][log.path])
 
 
+def test_ranks_are_of_the_tower_that_the_log_names_or_else_of_that_of_the_flight(tmp_path: Path) -> None:
+    path = flight(tmp_path, rank_interval_s=20.0)
+    content = yaml.safe_load(path.read_text())
+    bare = {"path": "bare.csv", "reader": "quectel_ri"}
+    logs = [content["logs"][0], bare | {"path": "named.csv", "node": "LW2"}, bare]
+    path.write_text(yaml.safe_dump(content | {"logs": logs, "rank": {"tower": "LW3"}}))
+    simulate(path)
+    assert list(json.loads((tmp_path / "truth.json").read_text())["rank"]) == ["LW2", "LW3"]
+
+
 def test_the_sample_logs_are_what_simulate_writes(tmp_path: Path) -> None:
     """The logs in git are made by the command that the README names, not by hand, and have not gone stale."""
     out = tmp_path / "out"

@@ -19,6 +19,7 @@ from aerpaw_cmp.compare.calibration import (
 )
 from aerpaw_cmp.compare.detection import floored_fit
 from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term
+from aerpaw_cmp.propagation.arrays import rotation_from_yaw_pitch_roll
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
 RECIPE = Recipe(model=MODEL, rotation=lambda *_: np.eye(3), mount=False)
@@ -112,6 +113,32 @@ def test_levels_below_the_floor_of_a_receiver_teach_no_gain() -> None:
     assert error[-1.0] < 0.8 * error[None]
 
 
+@pytest.mark.parametrize("floor_db", [None, -90.0])
+@pytest.mark.parametrize("mount", [True, False])
+def test_pattern_and_learned_gain_together_are_the_planted_gain(floor_db: float | None, mount: bool) -> None:
+    """The gain is learned on top of the pattern as mounted, whatever part of the levels the pattern explains."""
+
+    def turn(yaw: float, pitch: float, roll: float) -> np.ndarray:
+        return rotation_from_yaw_pitch_roll(*np.radians([yaw, pitch, roll]))
+
+    def pattern(direction: np.ndarray) -> np.ndarray:
+        return 6.0 * direction[:, 0] ** 2 + 2.0 * direction[:, 1]
+
+    def flown(flight: str, seed: int) -> LinkSamples:
+        s = observed(flight, seed=seed).samples
+        floor = None if floor_db is None else np.full(len(s), floor_db)
+        level = s.residual_db + pattern(s.at_tower @ turn(70.0 if mount else 0.0, 0.0, 0.0))
+        return dataclasses.replace(s, residual_db=level, floor_db=floor)
+
+    recipe = Recipe(model=MODEL, rotation=turn, patterns={"LW1.USRP1": pattern}, mount=mount)
+    learned = calibration.learn([flown("a", 1), flown("b", 2)], recipe)
+    assert set(learned.mounts) == ({"LW1.USRP1"} if mount else set())
+    other = flown("c", 3)
+    error = other.residual_db - learned.mean(other)
+    assert error.std() < 0.8 < 2.0 < other.residual_db.std()
+    assert learned.mean_error(other) == pytest.approx(error.mean(), abs=1e-9)
+
+
 def test_part_and_bins_keep_or_drop_what_belongs_to_samples() -> None:
     o = observed("a")
     whole = dataclasses.replace(
@@ -152,6 +179,16 @@ def circled(flight: str, seed: int) -> Observed:
     heading = np.degrees(np.arctan2(o.samples.at_tower[:, 0], o.samples.at_tower[:, 1])) % 360.0
     samples = dataclasses.replace(o.samples, position_m=position)
     return Observed(samples, o.free_space_db + np.linspace(0.0, 6.0, count), heading)
+
+
+def test_an_antenna_that_no_other_flight_has_is_not_scored() -> None:
+    """Nor is a flight without others."""
+    flights = [circled("a", 1), circled("b", 2)]
+    alone = dataclasses.replace(flights[0], samples=dataclasses.replace(flights[0].samples, channel="USRP2"))
+    split = calibration.heading_parts
+    assert [(s.flight, s.channel) for s in leaving(split, [*flights, alone])] == [("a", "USRP1"), ("b", "USRP1")]
+    kept = {"a": calibration.learn([flights[1].samples], RECIPE)}
+    assert calibration.parts_left_out(flights[:1], RECIPE, kept, split, own=False) == ()
 
 
 @pytest.mark.parametrize("split", ["altitude", "heading", "sector"])

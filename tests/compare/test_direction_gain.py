@@ -233,6 +233,32 @@ def test_mounts_are_found_together():
         assert fit.probability.sum() == pytest.approx(1.0)
 
 
+def test_probabilities_of_mounts_by_trying_all_pairs():
+    """Least squares of levels over 4 s about the patterns, 10 dB each; of a mast, weighted over azimuths of the UAV."""
+    pattern = lambda d: 9.0 * d[:, 0] + 4.0 * d[:, 1] ** 2  # noqa: E731
+
+    def turn(yaw, pitch, roll):
+        return rotation_from_yaw_pitch_roll(*np.radians([yaw, pitch, roll]))
+
+    (flight,) = planted("f", 57, {"uav": pattern, "A": pattern}, n=60, channels=("A",))
+    found = fit_mounts([flight], {"uav": pattern, "LW1.A": pattern}, turn)
+    bins = flight.binned(4.0)
+    centred = lambda x: x - x.mean()  # noqa: E731
+    ends = [
+        np.array([centred(pattern(at @ turn(a, 0, 0))) for a in range(0, 360, 10)])
+        for at in (bins.at_uav, bins.at_tower)
+    ]
+    left = centred(bins.residual_db) - ends[0][:, None] - ends[1]
+    log = -0.5 * (left**2).sum(axis=2) / 10.0**2
+    uav = np.exp(log.max(axis=1) - log.max())
+    mast = np.exp(log - log.max(axis=1, keepdims=True))
+    uav /= uav.sum()
+    assert 0.05 < uav.max() < 0.95
+    np.testing.assert_allclose(found["uav"].probability, uav, atol=1e-9)
+    np.testing.assert_allclose(found["LW1.A"].probability, uav @ (mast / mast.sum(axis=1, keepdims=True)), atol=1e-9)
+    assert (found["uav"].azimuth_deg / 10, found["LW1.A"].azimuth_deg / 10) == np.unravel_index(log.argmax(), log.shape)
+
+
 def test_a_pattern_without_azimuth_leaves_its_mount_open():
     flat = lambda d: 5.0 * d[:, 2]  # noqa: E731
 

@@ -57,6 +57,23 @@ def test_a_longer_battery_is_a_denser_lawnmower_and_a_cut_route_ends_in_time():
     np.testing.assert_allclose(short.position_m, route.position_m[:31])
 
 
+@pytest.mark.parametrize("most_s", [np.inf, 13.0])
+def test_a_leg_lasts_as_long_as_its_length_at_the_speed(most_s):
+    """3, 4 and 5 s at 10 m/s, and 2 s of waiting before the last leg, whose heading the UAV already has."""
+    places = ((0.0, 0.0, 30.0, 90.0, 0.0), (30.0, 0.0, 30.0, 0.0, 0.0), (30.0, 40.0, 30.0, -90.0, 2.0))
+    names = ("east_m", "north_m", "height_m", "yaw_deg", "hold_s")
+    last_one = (30.0, 40.0, 80.0, 45.0, 0.0)
+    points = [Waypoint(**dict(zip(names, place, strict=True))) for place in (*places, last_one)]
+    route = flown("legs", points, 10.0, most_s)
+    east, north = [0, 10, 20, *[30] * 12], [*[0] * 4, 10, 20, 30, *[40] * 8]
+    by_hand = np.column_stack([east, north, [*[30] * 10, 40, 50, 60, 70, 80]])
+    last = int(min(14, most_s))
+    np.testing.assert_allclose(route.position_m, by_hand[: last + 1], atol=1e-12)
+    np.testing.assert_array_equal(route.time_s, np.arange(last + 1.0))
+    np.testing.assert_array_equal(route.yaw_deg, ([90] * 4 + [0] * 4 + [270] * 7)[: last + 1])
+    assert (route.duration_s, route.length_m) == pytest.approx((last, 10.0 * (last - 2)))
+
+
 def test_an_area_without_room_is_refused():
     with pytest.raises(UsageError, match="leaves no area"):
         allowed_area(shapely.box(0, 0, 50, 50), [], np.array([[25.0, 25.0, 0.0]]), 60.0)

@@ -39,7 +39,11 @@ BARE, MAPS = over(GRID, LAYERS), over(GRID, LAYERS, towers_m=TOWERS, borders=BOR
 def test_csv_keeps_order_and_gaps(tmp_path):
     levels = "rss_h030m_joint"  # as text first: pandas 2 reads to the last digit but one
     table = pd.read_csv(export.write_csv(tmp_path / "m.csv", BARE), dtype={levels: str})
+    places = ["index", "row", "column", "east_m", "north_m", "latitude_deg", "longitude_deg"]
+    assert table.columns.tolist() == [*places, "rank_k10_h030m_joint", levels]
     assert table["index"].tolist() == list(range(1, len(GRID) + 1))
+    np.testing.assert_array_equal(GRID.east_m[table["column"]], table["east_m"])
+    np.testing.assert_array_equal(GRID.north_m[table["row"]], table["north_m"])
     np.testing.assert_array_equal(table[["east_m", "north_m"]], GRID.points_m)
     np.testing.assert_array_equal(table[levels].astype(float), RSS)
     np.testing.assert_array_equal(table["rank_k10_h030m_joint"], RANK)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import importlib.util
+import itertools
 import json
 import shutil
 import subprocess
@@ -26,6 +27,7 @@ from aerpaw_cmp.propagation import compiled, engines
 from aerpaw_cmp.propagation import replay as replay_module
 from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.faces import site_faces
+from aerpaw_cmp.propagation.field import fresnel
 from aerpaw_cmp.propagation.field import sum as field_sum
 from aerpaw_cmp.propagation.options import Run
 from aerpaw_cmp.propagation.paths import Links
@@ -35,6 +37,7 @@ from aerpaw_cmp.propagation.search import mirror as image
 from aerpaw_cmp.propagation.search import prisms
 from aerpaw_cmp.propagation.search.effort import SearchRun
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
+from aerpaw_cmp.site.materials import stated_name
 from aerpaw_cmp.site.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building
 
@@ -128,6 +131,24 @@ def test_compiled_equals_numpy(monkeypatch, case, name, uav_transmits):
     np.testing.assert_allclose(ours.power, numpy.power, rtol=1e-11, atol=1e-30)
     for k in (10, 100, 1000):
         assert (channel_rank(ours.h, k) == channel_rank(numpy.h, k)).all()
+
+
+@needs_numba
+@pytest.mark.parametrize(
+    ("way", "wavelengths"), [("", None), *itertools.product(["", fresnel.THROUGH], [0.05, 0.6, 1.7])]
+)
+def test_slabs_thinner_and_thicker_than_a_wave_reflect_and_pass_the_same(monkeypatch, case, way, wavelengths):
+    site, link, poses, paths = case
+    scene, some = Scene.of(site, link, poses), paths.select(np.flatnonzero(paths.depth > 0)[::40])
+    thick = None if wavelengths is None else wavelengths * wavelength_m(link.carrier_hz)
+    stuff = way + stated_name(4.0, 0.05, thick)
+    faces = dataclasses.replace(scene.faces, material=(stuff,) * len(scene.faces))
+    fields = []
+    for switch in ("never", "always"):
+        monkeypatch.setenv(compiled.SWITCH, switch)
+        fields.append(field_sum.channel_matrices(some, faces, scene.sources_m, poses, link).h)
+    assert np.abs(fields[0]).max() > 1e-9
+    np.testing.assert_allclose(fields[1], fields[0], rtol=0, atol=1e-9 * np.abs(fields[0]).max())
 
 
 @needs_numba

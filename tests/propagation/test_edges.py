@@ -297,6 +297,25 @@ def test_a_face_that_another_building_covers_has_no_edge() -> None:
     assert one.rss_dbm == pytest.approx(two.rss_dbm, abs=1e-9)
 
 
+@pytest.mark.parametrize("east_m", [8.0, 12.0])
+@pytest.mark.parametrize("mode", ["edges", "all"])
+def test_no_path_bends_where_a_neighbour_touches_a_face(east_m: float, mode: str) -> None:
+    """From above, too: of the common wall alone what stands out of the lower roof can bend a wave."""
+    west, east = Building("west", box(40, -15, 46, 25), 8.0), Building("east", box(46, -15, 52, 25), east_m)
+    where = poses((70.0, 3.0, 20.0), (30.0, 6.0, 15.0), (46.0, -40.0, 9.0), (49.0, 60.0, 3.0))
+    halves = place(west, east, tower=(0.0, 0.0, 16.0))
+    paths = trace(halves, LINK, where, diffraction=mode).edge_paths
+    assert paths is not None
+    corners = paths.vertices_m[np.isfinite(paths.vertices_m[..., 0])]
+    between = np.isclose(corners[:, 0], 46.0)
+    assert (corners[between, 2] > 8.0 + 1e-6).all()
+    assert between.any() == (east_m > 8.0)
+    assert {40.0, 52.0} <= set(np.round(corners[:, 0], 6))
+    if east_m == 8.0 and mode == "edges":  # two edges need a face in common, and the roof has two parts here
+        one = trace(place(BARN, tower=(0.0, 0.0, 16.0)), LINK, where, diffraction=mode)
+        assert trace(halves, LINK, where, diffraction=mode).rss_dbm == pytest.approx(one.rss_dbm, abs=1e-9)
+
+
 def test_ends_on_an_edge_are_no_numbers_that_are_none() -> None:
     corner, rim = (40.0, -15.0, 4.0), (46.0, 25.0, 8.0)
     result = trace(place(BARN, tower=(40.0, 3.0, 8.0)), LINK, poses(corner, rim, (70.0, 0.0, 2.0)), diffraction="all")

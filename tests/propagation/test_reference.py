@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import (
+    Array,
     linear_array,
     rotation_from_aircraft,
     rotation_from_yaw_pitch_roll,
@@ -22,7 +24,7 @@ from aerpaw_cmp.propagation.search import occlusion as solids
 from aerpaw_cmp.propagation.search.crowns import Crowns
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
 from aerpaw_cmp.site.materials import MATERIALS, VEGETATION, material
-from aerpaw_cmp.site.site import Trees
+from aerpaw_cmp.site.site import Building, Trees
 
 KS = (10.0, 100.0)
 
@@ -134,6 +136,50 @@ def test_arrays_of_the_comparison_look_north_east_and_from_the_uav_south_east_up
     for array, yaw, roll in ((tower_comparison_array(), 45.0, 0.0), (uav_comparison_array(0.09), 315.0, 90.0)):
         assert array.mount == pytest.approx(np.array(reference.turned(yaw, 0.0, roll)), abs=1e-12)
         assert sorted(np.degrees(array.slant_rad)) == pytest.approx([-45.0, -45.0, 45.0, 45.0])
+
+
+def test_ports_of_the_comparison_are_where_the_paper_has_them():
+    """arXiv 2502.10324 VII-D: along a line, and 2 x 2 at half a wavelength; slants of neighbours a right angle apart."""
+    tower, uav = tower_comparison_array(), uav_comparison_array(0.09)
+    np.testing.assert_allclose(np.diff(tower.positions_m, axis=0), np.outer([0.06, 1.68, 0.06], [0, -1, 0]), atol=1e-15)
+    assert np.degrees(tower.slant_rad) == pytest.approx([45.0, -45.0, 45.0, -45.0])
+    assert np.degrees(uav.slant_rad[0]) == pytest.approx(45.0)
+    assert uav.positions_m[0] == pytest.approx([0.0, 0.0225, 0.0225])
+    apart = np.linalg.norm(uav.positions_m[:, None] - uav.positions_m, axis=2)
+    turned = np.degrees(np.abs(uav.slant_rad[:, None] - uav.slant_rad))
+    near = np.isclose(apart, 0.045)
+    assert near.sum() == 8
+    assert turned == pytest.approx(np.where(near, 90.0, 0.0))
+    line = linear_array(4, 0.04)  # across its boresight, which looks north
+    np.testing.assert_allclose((line.mount @ np.diff(line.positions_m, axis=0).T).T, [[0.04, 0, 0]] * 3, atol=1e-15)
+
+
+def test_elements_are_where_their_array_has_them_in_the_second_implementation(scenes):
+    """Free space between elements away from the middle of both arrays: amplitude and phase of their own distance."""
+    site = scenes.site()
+    arrays = [Array(np.array([place]), np.zeros(1)) for place in ([0.3, 0.7, 1.1], [-0.2, 0.5, -0.4])]
+    link = scenes.link(site, *arrays)
+    one = reference.Reference(site, "LW1", field_audit.Expected.of(link).link)
+    target = np.array([300.0, 40.0, 35.0])
+    length = np.linalg.norm(target + arrays[1].positions_m[0] - np.array(one.source) - arrays[0].positions_m[0])
+    h = one.pair((), 0, 0, tuple(target), reference.turned(0, 0, 0))
+    turns = length / wavelength_m(link.carrier_hz)
+    assert np.angle(h * np.exp(2j * np.pi * turns)) == pytest.approx(0.0, abs=1e-6)
+    assert abs(h) == pytest.approx(1 / (4 * np.pi * turns), rel=0.02)
+
+
+@pytest.mark.parametrize("wall_first", [True, False])
+@pytest.mark.parametrize("slope", [0.2, 5.0])
+@pytest.mark.parametrize(("clear_m", "expected"), [(1e-3, True), (None, None), (-1e-3, False)])
+def test_of_wall_and_ground_a_path_meets_first_what_it_reaches_first(scenes, wall_first, slope, clear_m, expected):
+    """Unfolded, the path is a straight line past the foot of the wall; within a hair of it there is no verdict."""
+    clear_m = max(slope, 1.0) * 5e-7 if clear_m is None else clear_m
+    above_m = clear_m if wall_first else -clear_m
+    site = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), ((-10.0, 0.0, 10 * slope + above_m),))
+    one = reference.Reference(site, "LW1", field_audit.Expected.of(scenes.link(site)).link)
+    (wall,) = (m for m in one.mirrors if m.normal[0] == -1.0)
+    sequence = (wall, one.mirrors[0]) if wall_first else (one.mirrors[0], wall)
+    assert one.verdict(sequence, (-6.0, 3.0, 6 * slope - above_m)) is expected
 
 
 def test_free_space_and_a_perfect_ground_in_closed_form(scenes):

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
@@ -118,14 +119,62 @@ def test_bad_lines_are_rejected_and_counted(tmp_path: Path) -> None:
         assert len(file.result.rejected) == 5 == len(truth["bad_lines"][log.path])
 
 
+def with_logs(path: Path, *logs: dict[str, str]) -> None:
+    """The flight file with other logs after its track; ranks are of LW3."""
+    content = yaml.safe_load(path.read_text())
+    content |= {"logs": [content["logs"][0], *logs], "rank": {"tower": "LW3"}}
+    path.write_text(yaml.safe_dump(content))
+
+
+RANKS = {"path": "bare.csv", "reader": "quectel_ri"}
+
+
 def test_ranks_are_of_the_tower_that_the_log_names_or_else_of_that_of_the_flight(tmp_path: Path) -> None:
     path = flight(tmp_path, rank_interval_s=20.0)
-    content = yaml.safe_load(path.read_text())
-    bare = {"path": "bare.csv", "reader": "quectel_ri"}
-    logs = [content["logs"][0], bare | {"path": "named.csv", "node": "LW2"}, bare]
-    path.write_text(yaml.safe_dump(content | {"logs": logs, "rank": {"tower": "LW3"}}))
+    with_logs(path, RANKS | {"path": "named.csv", "node": "LW2"}, RANKS)
     simulate(path)
     assert list(json.loads((tmp_path / "truth.json").read_text())["rank"]) == ["LW2", "LW3"]
+
+
+def test_reported_ranks_are_one_layer_off_or_without_csi_as_often_as_planned(tmp_path: Path) -> None:
+    reported = {}
+    for wrong, silent in ((0.0, 0.0), (1.0, 0.0), (0.5, 0.0), (0.0, 1.0)):
+        path = flight(tmp_path, rank_interval_s=0.5, rank_error_share=wrong, no_csi_share=silent)
+        with_logs(path, RANKS)
+        simulate(path)
+        reported[wrong, silent] = np.loadtxt(tmp_path / "bare.csv", delimiter=",", skiprows=1, usecols=5)
+        histogram = json.loads((tmp_path / "truth.json").read_text())["rank"]["LW3"]["histogram"]
+        right = reported[0.0, 0.0]
+        assert histogram == {str(r): int((right == r).sum()) for r in range(5)}
+    off = reported[1.0, 0.0] - right
+    assert set(np.abs(off)) <= {0.0, 1.0}
+    assert set(right[off == 0]) <= {1.0, 4.0}  # of the lowest and highest rank there is nothing beyond
+    assert 0.4 < (off[(right > 1) & (right < 4)] > 0).mean() < 0.6
+    between = (right > 1) & (right < 4)
+    assert between.sum() > 100
+    assert 0.35 < (reported[0.5, 0.0] != right)[between].mean() < 0.65
+    assert (reported[0.0, 1.0] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("log", "words"),
+    [
+        ({"path": "p.txt", "reader": "sounder_log", "node": "LW1"}, "does not say whose it is"),
+        ({"path": "p.txt", "reader": "sounder_log", "channel": "USRP1"}, "does not say whose it is"),
+        ({"path": "p.txt", "reader": "sounder_log", "node": "LW9", "channel": "USRP1"}, "the site has no tower 'LW9'"),
+        ({"path": "p.txt", "reader": "aadm_snr"}, "no writer for log"),
+        (RANKS | {"path": "../p.csv"}, "lies outside the folder"),
+        (RANKS | {"path": "truth.json"}, "two files of this flight are named"),
+    ],
+)
+def test_logs_that_cannot_be_written_are_named_and_nothing_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], log: dict[str, str], words: str
+) -> None:
+    path = flight(tmp_path)
+    with_logs(path, log)
+    assert main(["simulate", str(path), "-o", str(tmp_path / "out"), "--quiet"]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_sample_logs_are_what_simulate_writes(tmp_path: Path) -> None:

@@ -257,6 +257,33 @@ def test_probabilities_of_mounts_by_trying_all_pairs():
     np.testing.assert_allclose(found["uav"].probability, uav, atol=1e-9)
     np.testing.assert_allclose(found["LW1.A"].probability, uav @ (mast / mast.sum(axis=1, keepdims=True)), atol=1e-9)
     assert (found["uav"].azimuth_deg / 10, found["LW1.A"].azimuth_deg / 10) == np.unravel_index(log.argmax(), log.shape)
+    for fit in found.values():  # the circular standard deviation, and what is left beyond 45 degrees
+        off = np.radians(fit.grid_deg - fit.azimuth_deg)
+        length = np.hypot(fit.probability @ np.cos(off), fit.probability @ np.sin(off))
+        assert fit.azimuth_sd_deg == pytest.approx(max(np.degrees(np.sqrt(-2 * np.log(length))), 10 / np.sqrt(12)))
+        assert fit.identified == (fit.probability[np.cos(off) < np.cos(np.radians(45.0)) - 1e-9].sum() < 0.05)
+        assert (fit.pitch_deg, fit.roll_deg, fit.tilt_sd_deg) == (0.0, 0.0, 0.0)
+
+
+def test_a_planted_tilt_is_fitted_at_the_best_azimuth_with_its_spread():
+    pattern = lambda d: 8.0 * d[:, 0] + 6.0 * d[:, 1] * d[:, 2] + 9.0 * d[:, 2]  # noqa: E731
+
+    def turn(yaw, pitch, roll):
+        return rotation_from_yaw_pitch_roll(*np.radians([yaw, pitch, roll]))
+
+    flight = planted("f", 58, {"uav": lambda d: pattern(d @ turn(120, 15, -10)), "A": lambda _: 0.0}, channels="A")[0]
+    found = fit_mounts([flight], {"uav": pattern}, turn, tilt=True)["uav"]
+    assert abs(found.azimuth_deg - 120.0) <= 10.0
+    tilts = np.array([(p, r) for p in range(-20, 21, 5) for r in range(-20, 21, 5)], dtype=float)
+    bins = flight.binned(4.0)
+    gain = np.array([pattern(bins.at_uav @ turn(found.azimuth_deg, *tilt)) for tilt in tilts])
+    error = bins.residual_db - bins.residual_db.mean() - gain + gain.mean(axis=1, keepdims=True)
+    weight = np.exp(-0.5 * (error**2).sum(axis=1) / 10.0**2)
+    weight /= weight.sum()
+    assert (found.pitch_deg, found.roll_deg) == tuple(tilts[weight.argmax()])
+    assert (found.pitch_deg, found.roll_deg) != (0.0, 0.0)
+    spread = np.sqrt(weight @ ((tilts - weight @ tilts) ** 2).sum(axis=1) / 2)  # of one axis
+    assert found.tilt_sd_deg == pytest.approx(spread, abs=1e-9)
 
 
 def test_a_pattern_without_azimuth_leaves_its_mount_open():

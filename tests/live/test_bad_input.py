@@ -19,6 +19,7 @@ from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, find_candida
 from aerpaw_cmp.live.session import TapSettings
 from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.tap import run_tap
+from tests.live.terminals import held
 
 
 @pytest.mark.parametrize(
@@ -196,7 +197,7 @@ def modem_manager(node):
 
 def test_modem_manager_is_named_with_the_line_that_frees_the_port(modem, tmp_path):
     sim = modem()
-    with sim.node.open("rb", buffering=0) as node:
+    with held(sim.node) as node:
         process = modem_manager(node)
     try:
         until = time.monotonic() + 10
@@ -219,7 +220,7 @@ def test_modem_manager_is_named_to_a_user_who_may_not_see_its_files(modem):
 
     sim = modem()
     sim.node.chmod(0o666)
-    with sim.node.open("rb", buffering=0) as node:
+    with held(sim.node) as node:
         fcntl.ioctl(node, termios.TIOCEXCL)  # as ModemManager does
         process = modem_manager(node)
         try:
@@ -334,7 +335,7 @@ def test_the_by_id_name_comes_first_and_is_followed(tmp_path):
 def test_the_second_at_port_is_taken_when_the_first_is_held(modem, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0), link=tmp_path / "dev/serial/by-id/usb-Quectel_X-if03-port0")
     other = modem(link=tmp_path / "dev/serial/by-id/usb-Quectel_X-if02-port0")
-    with other.node.open("rb", buffering=0) as node:
+    with held(other.node) as node:
         process = subprocess.Popen(["sleep", "30"], stdin=node)
     try:
         settings = TapSettings(

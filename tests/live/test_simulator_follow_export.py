@@ -22,6 +22,7 @@ from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator, 
 from aerpaw_cmp.logs.readers import Reader
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
 from aerpaw_cmp.logs.records import ReadResult, Stream
+from tests.live.terminals import held
 
 TRANSCRIPT = b"""AT+QNWCFG="nr5g_csi"
 +QNWCFG: "nr5g_csi",21,3,9,11
@@ -101,7 +102,7 @@ def test_nothing_to_replay(tmp_path, content):
 def test_what_two_threads_say_at_once_comes_one_behind_the_other():
     """Longer than the system's buffer of a terminal, so that each writer has to wait in the middle."""
     said = [letter * 200_000 + b"\n" for letter in (b"a", b"b")]
-    with ModemSimulator() as modem, modem.port.open("rb", buffering=0) as reader:
+    with ModemSimulator() as modem, held(modem.port) as reader:
         threads = [threading.Thread(target=modem._write, args=(text,)) for text in said]
         for thread in threads:
             thread.start()

@@ -204,8 +204,9 @@ def town(found: list[dict[str, Any]]) -> list[str]:
         return []
     out = [
         f"Munich of Sionna RT ({number(rows[0]['faces'])} faces, {rows[0]['receivers']} receivers, one tower; {when}); "
-        "PathSolver's time holds what its kernel cache lacks:", "",
-        "| search | depth | processor s | estimated s | times ours | paths that it lacks |",
+        "PathSolver's time holds what its kernel cache lacks. The estimate is of the wall on idle cores, all of them: "
+        "processor seconds by their number:", "",
+        "| search | depth | processor s | estimated wall s | times ours | paths that it lacks |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
     for row in rows:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..common.gaussian import determining, gaussian_kernel
-from ..common.units import BoolArray, FloatArray
+from ..common.units import AnyArray, BoolArray, FloatArray
 from ..compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
 from ..compare.statistics import plain
 
@@ -38,6 +38,8 @@ _STEP_S, _FINEST_S, _MOST_FINE = 0.5, 0.02, 40
 _BINS = 900
 """Means of the level per channel, one a second or longer."""
 _FEWEST = 60
+_PER_BIN = 8
+"""Instants at which the prediction is averaged over a mean."""
 
 _CHORDS = ((0.2, 0.4, 0.8), (0.2, 0.45, 0.9))
 """Lengths (chord of the unit sphere) over which the gain of tower and UAV changes: fine, broad, both at once."""
@@ -274,10 +276,15 @@ def _judged(lags: FloatArray, own: FloatArray, names: Sequence[str], window_s: f
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bins:
-    """Means (n,) of a channel, and what they depend on, averaged over as long a time about each instant."""
+    """Means (n,) of a channel; the instants (s,) at which predictions are averaged, and the first of each mean.
+
+    ``features`` of directions are averaged over as long a time about each instant.
+    """
 
     mean_db: FloatArray
     mean_s: FloatArray
+    at_s: FloatArray
+    first: AnyArray
     along: Along
     features: FloatArray
     levels: FloatArray
@@ -306,9 +313,14 @@ class _Bins:
         _, first, count = np.unique(np.floor(t / width), return_index=True, return_counts=True)
         if len(first) < _FEWEST:
             return None
+        place = np.arange(len(t)) - np.repeat(first, count)
+        few = place % np.repeat(-(-count // _PER_BIN), count) == 0
+        starts = np.concatenate([[0], np.cumsum(few)])[first]
         mean = [np.add.reduceat(v, first) / count for v in (y, t)]
-        features, levels = (_averaged(table, width / along.step_s) for table in tables)
-        return cls(mean_db=mean[0], mean_s=mean[1], along=along, features=features, levels=levels)
+        return cls(
+            mean_db=mean[0], mean_s=mean[1], at_s=t[few], first=starts, along=along,
+            features=_averaged(features, width / along.step_s), levels=levels,
+        )  # fmt: skip
 
     def _between(self, at_s: FloatArray, table: FloatArray) -> FloatArray:
         place = (at_s - self.along.start_s) / self.along.step_s
@@ -318,7 +330,9 @@ class _Bins:
 
     def system(self, lag: float) -> tuple[FloatArray, FloatArray]:
         """Features (n, p) of offset, slope and gains, and residuals (n, models) at a lag."""
-        residual = self.mean_db[:, None] - self._between(self.mean_s - lag, self.levels)
+        count = np.diff(np.append(self.first, len(self.at_s)))[:, None]
+        predicted = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
+        residual = self.mean_db[:, None] - predicted
         return self._between(self.mean_s - lag, self.features), residual - residual.mean(axis=0)
 
     def likelihood(self, lags: FloatArray, parts: _Parts) -> FloatArray:
@@ -350,13 +364,14 @@ def _averaged(table: FloatArray, width: float) -> FloatArray:
     Attitudes jitter within a mean of the level: taken at single instants they make the likelihood jump by 10 nat
     between lags 0.1 s apart, and one of the jumps then looks like a sharp optimum.
     """
-    from scipy.ndimage import uniform_filter1d
+    from scipy.ndimage import correlate1d
 
     known: BoolArray = np.asarray(np.isfinite(table).all(axis=1))
-    size = max(round(width), 1)
-    share = uniform_filter1d(known.astype(np.float64), size, mode="nearest")
-    out = uniform_filter1d(np.where(known[:, None], table, 0.0), size, axis=0, mode="nearest")
-    return np.asarray(np.where(known[:, None], out / np.maximum(share, 0.5 / size)[:, None], np.nan))
+    reach = int(width / 2 + 0.5)
+    weights = np.clip(width / 2 + 0.5 - np.abs(np.arange(-reach, reach + 1)), 0.0, 1.0)  # about the row: no lag
+    share = correlate1d(known.astype(np.float64), weights, mode="nearest")
+    out = correlate1d(np.where(known[:, None], table, 0.0), weights, axis=0, mode="nearest")
+    return np.asarray(np.where(known[:, None], out / np.where(known, share, 1.0)[:, None], np.nan))
 
 
 def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray:

@@ -17,6 +17,7 @@ from aerpaw_cmp.flight.clock import (
     STAMPS_S,
     Along,
     ClockChannel,
+    _averaged,
     _Bins,
     _gain_features,
     _judged,
@@ -273,3 +274,10 @@ def test_half_a_second_is_no_shift_on_any_grid():
         for lag, value in ((3.0, 0.0), (0.5, -3.9)):
             total[0, np.argmin(np.abs(lags - sign * lag))] = value
         assert _judged(lags, total[:, None], ["one"], 15.0).against_zero_nat == pytest.approx(3.9)
+
+
+@pytest.mark.parametrize("width", [0.4, 3.0, 10.0, 12.6])
+def test_a_running_mean_moves_nothing_in_time(width: float) -> None:
+    """Of a line it is the line: a mean over an even number of rows, half a step early, would shift every clock."""
+    line = np.arange(60.0)[:, None] * [1.0, -3.0]
+    np.testing.assert_allclose(_averaged(line, width)[8:-8], line[8:-8], atol=1e-9)

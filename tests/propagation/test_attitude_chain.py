@@ -4,6 +4,8 @@ The pattern writes down from where it is asked; the tower stands level with the 
 hand held flat: thumb up, fingers to the nose.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -53,7 +55,7 @@ class Fixed:
 
 
 def mount_of(**angles):
-    return ArraySettings(**angles).build(0.1, None).mount
+    return ArraySettings(**angles).build(0.1, Path()).mount
 
 
 # the tower stands east of the UAV; roll is right wing down, pitch nose up, yaw clockwise from north

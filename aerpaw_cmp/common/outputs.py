@@ -112,7 +112,8 @@ def _identity(path: Path) -> _Identity | None:
     return status.st_dev, status.st_ino
 
 
-def _files_below(folder: Path) -> Iterator[Path]:
+def files_below(folder: Path) -> Iterator[Path]:
+    """Every file below a folder; links to folders are not followed."""
     for parent, _, names in os.walk(folder):
         yield from (Path(parent, name) for name in names)
 
@@ -179,7 +180,7 @@ class OutputFile:
                 raise _replaces_input(self.named, path)
         own = _ask(self._own, self.target)
         for path in () if own else self._inputs:  # an own earlier output may lie among the logs
-            if path.is_dir() and any(_identity(file) == target for file in _files_below(path)):
+            if path.is_dir() and any(_identity(file) == target for file in files_below(path)):
                 raise _replaces_input(self.named, path)
         if not own and not self._force:
             raise UsageError(
@@ -344,7 +345,7 @@ class OutputFolder:
         if not self.target.is_dir():
             return
         own = read_sums(self.target) or {}
-        if foreign := next(_foreign(self.target, own), None):
+        if foreign := next(foreign_entries(self.target, own), None):
             raise UsageError(
                 f"the folder holds what this tool did not write: {one_line(foreign)}",
                 expected="a new or empty folder after -o: a folder of results is replaced as a whole",
@@ -376,7 +377,7 @@ class OutputFolder:
         self._made = []
 
     def _commit(self, place: _Place) -> None:
-        files = [file for file in _files_below(place.part) if file.name != _UNFINISHED]
+        files = [file for file in files_below(place.part) if file.name != _UNFINISHED]
         results = sorted(file.relative_to(place.part).as_posix() for file in files)
         sums = "".join(f"{file_digest(place.part / name)}  {name}\n" for name in results)
         head = f"{_SUMS_HEAD} the files of one run of '{self._job}'; 'sha256sum -c {SUMS}' checks them\n"
@@ -402,8 +403,19 @@ class OutputFolder:
             _clear(place.part)
 
 
-def _foreign(folder: Path, own: Iterable[str]) -> Iterator[str]:
-    """Entries of a result folder that its list does not name: files, links, folders, other file systems."""
+def foreign_entries(folder: Path, own: Iterable[str]) -> Iterator[str]:
+    """Entries of a folder besides files that are this tool's: files, links, folders, other file systems.
+
+    Parameters
+    ----------
+    folder : Path
+    own : iterable of str
+        The files that are this tool's, as names below the folder.
+
+    Yields
+    ------
+    str
+    """
     known = {SUMS, *own}
     parents = {parent.as_posix() for name in known for parent in Path(name).parents}
     device = folder.stat().st_dev
@@ -566,7 +578,7 @@ def _clear(part: Path, *, keep: bool = False) -> None:
     if _mounted_below(part):
         raise OSError(errno.EXDEV, "a file system is mounted there", str(part))
     signs = [part / _UNFINISHED, part / SUMS]
-    names = _files_below(part) if signs[0].exists() else [part / name for name in read_sums(part) or ()]
+    names = files_below(part) if signs[0].exists() else [part / name for name in read_sums(part) or ()]
     for file in names:
         if file not in signs:
             file.unlink(missing_ok=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import UsageError
+from ..common.errors import UsageError, one_line
 from ..common.geodesy import SiteFrame
-from ..common.outputs import beside, explained_os_errors
+from ..common.outputs import beside, explained_os_errors, files_below, foreign_entries
 from .grid import Grid
 from .job import MapResult
 from .netcdf import maps_dataset
@@ -26,6 +27,8 @@ from .tiles import PLANES, Tiling, over_grid
 LEDGER = "tile_paths"
 NOT_COMPUTED = -1
 _JOB = "aerpaw_cmp_job"
+_OURS = re.compile(r"zarr\.json|\w+/(zarr\.json|c(/\d+)*)")
+"""Files of a store of Zarr 3, as names below its folder."""
 _NAMES = dict(zip(PLANES, ("rss_siso", "rss_mimo", "rss_sd", "rank", "spread", "condition"), strict=True))
 
 
@@ -59,7 +62,18 @@ class TileStore:
         self.path, self.tiling, self._zarr, self._job = path, tiling, zarr, json.loads(json.dumps(job))
         if os.path.lexists(path) and self._is_other_job(force):
             with explained_os_errors(path):
+                self._refuse_foreign()
                 shutil.rmtree(path)
+
+    def _refuse_foreign(self) -> None:
+        """UsageError where a store that is to be replaced holds what this tool did not write."""
+        names = (file.relative_to(self.path).as_posix() for file in files_below(self.path))
+        if foreign := next(foreign_entries(self.path, filter(_OURS.fullmatch, names)), None):
+            raise UsageError(
+                f"the store holds what this tool did not write: {one_line(foreign)}",
+                expected="another name after -o: a store is replaced as a whole",
+                path=self.path,
+            )
 
     def _is_other_job(self, force: bool) -> bool:
         """Check whether a store may be replaced; UsageError where it is neither this job's nor to be replaced."""

@@ -143,6 +143,21 @@ def test_the_store_of_another_job_is_refused(tmp_path, whole):
     assert_like(make(store, force=True), whole)
 
 
+@pytest.mark.parametrize("name", ["notes.txt", "rss_siso/c/notes.txt", "rss_siso/c/link"])
+def test_a_store_with_files_of_others_is_not_replaced(name, tmp_path):
+    store = tmp_path / "map.zarr"
+    make(store, replace(SETTINGS, carrier_hz=2e9, max_depth=0))
+    place = store / name
+    if name.endswith("link"):
+        place.symlink_to(tmp_path)
+    else:
+        place.write_text("mine")
+    before = sorted(path.relative_to(store).as_posix() for path in store.rglob("*"))
+    with pytest.raises(UsageError, match=f"the store holds what this tool did not write: {name}"):
+        make(store, force=True)
+    assert sorted(path.relative_to(store).as_posix() for path in store.rglob("*")) == before
+
+
 @pytest.mark.parametrize("content", ["notes", "damaged", "file"])
 def test_what_is_no_store_stays(content, tmp_path):
     store = tmp_path / "map.zarr"

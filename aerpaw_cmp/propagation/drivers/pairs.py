@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...common.errors import UsageError
+from ...common.units import ComplexArray, FloatArray
 from ...site.site import Site
 from ..arrays import Array, Link, Poses
 from ..engines import search_paths
 from ..field.sum import channel_matrices, mean_pair_power, rss_dbm
 from ..options import Field, Run, Search
-from ..replay import Replay, passed, replay
+from ..replay import passed
 from ..scene import Scene, within_reach
+
+
+@dataclass(frozen=True, slots=True)
+class PairChannels:
+    """Channels of links with each element pair's own paths.
+
+    Parameters
+    ----------
+    h : (poses, towers, n_rx, n_tx) complex128
+        Zero without a path.
+    rss_dbm, rss_power_dbm : (poses, towers)
+        From ``|H|^2``, and from the sum of the paths' powers; NaN without a path.
+    """
+
+    h: ComplexArray
+    rss_dbm: FloatArray
+    rss_power_dbm: FloatArray
 
 
 def replay_pairs(
@@ -23,7 +41,7 @@ def replay_pairs(
     search: Search = Search(),  # noqa: B008 - frozen
     field: Field = Field(),  # noqa: B008
     run: Run = Run(),  # noqa: B008
-) -> Replay:
+) -> PairChannels:
     """Replay with paths of each element pair; as many searches as the UAV has elements.
 
     Parameters
@@ -33,13 +51,12 @@ def replay_pairs(
 
     Returns
     -------
-    Replay
-        H and levels of the pairs' own paths; ``paths`` are those of the array centres.
+    PairChannels
 
     Raises
     ------
     UsageError
-        Another engine than ``image``; what :func:`replay` raises.
+        Another engine than ``image``; what :func:`~aerpaw_cmp.propagation.replay.replay` raises.
     """
     if search.engine != "image":
         raise UsageError(
@@ -47,7 +64,6 @@ def replay_pairs(
             expected="engine 'image'",
             cause="each element pair is searched for its own paths",
         )
-    centre = replay(site, link, poses, search, field, run)
     poses, _ = within_reach(site, poses)
     arrays, uav = list(link.tower_arrays.values()), link.uav_array
     ports, towers = len(arrays[0]), len(arrays)
@@ -75,15 +91,8 @@ def replay_pairs(
         power += fields.power.reshape(len(poses), towers, ports).sum(axis=2) / (ports * len(uav))
     h = np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
     level = rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm)
-    covered = np.isfinite(level)
-    h = np.where(covered[:, :, None, None], h, 0.0)
-    return replace(
-        centre,
-        rss_dbm=level,
-        rss_power_dbm=rss_dbm(power, link.transmit_power_dbm, link.noise_floor_dbm),
-        h=h,
-        has_path=covered,
-    )
+    h = np.where(np.isfinite(level)[:, :, None, None], h, 0.0)
+    return PairChannels(h, level, rss_dbm(power, link.transmit_power_dbm, link.noise_floor_dbm))
 
 
 def _single(array: Array, element: int) -> Array:

@@ -87,8 +87,10 @@ class GroupedSettings(Settings):
         return settings
 
 
-class AntennaSettings(Settings):
+class AntennaSettings(GroupedSettings):
     """An element pattern: a named model, or a measured file."""
+
+    WITHOUT_EFFECT = ("installed_db",)
 
     model: Literal["iso", "dipole", "tr38901", "file", "gain_grid", "sphere"] = "iso"
     file: str | None = None
@@ -97,15 +99,14 @@ class AntennaSettings(Settings):
     polarised: bool = True
     """Use both field components of a text pattern; false: its total gain on the element's slant."""
 
-    @model_validator(mode="before")
     @classmethod
-    def _gone(cls, data: Any) -> Any:
-        if isinstance(data, dict) and data.get("installed_db"):
+    def refuse_gone(cls, data: Mapping[str, Any]) -> None:
+        """Gain per azimuth written by hand."""
+        if data.get("installed_db"):
             raise ValueError(
                 "installed_db is gone: 'aerpaw-cmp calibrate' writes the gain of mast and airframe as an antenna file "
                 "(model: sphere, file: ...)"
             )
-        return {key: value for key, value in data.items() if key != "installed_db"} if isinstance(data, dict) else data
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:

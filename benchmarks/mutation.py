@@ -9,8 +9,8 @@ of them would take weeks.
     python benchmarks/mutation.py record MAP [--tests tests/compare]   # which test reaches which line (some minutes)
     python benchmarks/mutation.py draw MAP --count 60 --seed 7 [--part 1/2] [--account FILE] [--only compare/ maps/]
 
-A line that hundreds of tests reach is tried on the shortest of them, up to `--budget` seconds of the processor: what
-only a longer test would notice counts as survived, so that the score is a lower bound.
+A line that hundreds of tests reach is tried on the shortest case of each, then on further cases, up to `--budget`
+seconds of the processor: what only a longer test would notice counts as survived, so that the score is a lower bound.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ import sys
 import threading
 import time
 import types
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -309,19 +309,20 @@ class Recorder:
         self.paths = {str(ROOT / path): path for path in modules()}
         self.kept_of_tests: set[str] = set()
         self._lines: set[tuple[str, int]] = set()
+        self._left: dict[types.CodeType, set[int]] = {}
         self._fixtures: dict[Any, set[tuple[str, int]]] = {}
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any, request: Any) -> Iterator[Any]:
         """A fixture of a module runs once, for all tests that ask for it."""
         del request
-        outer, self._lines = self._lines, set()
+        outer, left, self._lines, self._left = self._lines, self._left, set(), {}
         try:
             return (yield)
         finally:
             self._fixtures.setdefault(fixturedef, set()).update(self._lines)
             outer |= self._lines
-            self._lines = outer
+            self._lines, self._left = outer, left
 
     def pytest_runtest_protocol(self, item: Any, nextitem: Any) -> bool:
         """In place of pytest's own."""
@@ -330,7 +331,7 @@ class Recorder:
         forget("aerpaw")
         if any(isinstance(value, functools._lru_cache_wrapper) for value in vars(item.module or item).values()):
             self.kept_of_tests.add(str(item.path))
-        self._lines = set()
+        self._lines, self._left = set(), {}
         begin = time.process_time()
         sys.settrace(self._call)
         threading.settrace(self._call)
@@ -349,18 +350,26 @@ class Recorder:
         return True
 
     def _call(self, frame: Any, event: str, argument: Any) -> Any:
+        """Trace a function until each of its lines was met: what is traced takes many times as long."""
         del argument
-        path = self.paths.get(frame.f_code.co_filename)
+        code = frame.f_code
+        path = self.paths.get(code.co_filename)
         if path is None or event != "call":
             return None
-        lines = self._lines
+        lines, left = self._lines, self._left.get(code)
+        if left is None:
+            left = self._left[code] = {number for _, _, number in code.co_lines() if number} - {code.co_firstlineno}
+            lines.add((path, code.co_firstlineno))
 
         def line(frame: Any, event: str, argument: Any) -> Any:
             del event, argument
-            lines.add((path, frame.f_lineno))
+            if frame.f_lineno in left:
+                left.discard(frame.f_lineno)
+                lines.add((path, frame.f_lineno))
+            frame.f_trace_lines = bool(left)
             return line
 
-        return line
+        return line if left else None
 
     def result(self) -> Reach:
         """The tests of a file that keeps what its helpers gave share what they reached."""
@@ -401,6 +410,7 @@ class Trials:
     def pytest_runtestloop(self, session: Any) -> bool:
         """In place of pytest's own."""
         items = {item.nodeid: item for item in session.items}
+        controls: dict[tuple[str, ...], bool] = {}
         for mutant in self.chosen:
             begin = time.monotonic()
             tree = ast.parse((ROOT / mutant.path).read_text(encoding="utf-8"))
@@ -411,14 +421,17 @@ class Trials:
                 tests = COMPILED.get(mutant.path) or tuple(near_tests(self.reach, mutant.path, None)[:MOST_ANEW])
                 kind = in_child(lambda one=mutant, those=tests: planted(one, one.source, those), limit + 300)
                 source = (ROOT / mutant.path).read_text(encoding="utf-8")
-                control = partial(planted, mutant, source, tests)
+                control, what = partial(planted, mutant, source, tests), (mutant.path, *tests)
             else:
                 those = [items[name] for name in near if name in items]
                 kind = in_child(lambda one=mutant, at=place, tests=those: self._fails(tests, one, at), limit)
-                control = partial(self._fails, [items[name] for name in near if kind == f"killed by {name}"])
-            sure = not kind.startswith("killed by") or kind.endswith(("crash", "import"))
-            if not sure and in_child(control, limit + 300) != "survived":
-                kind = f"unclear: {kind}, and so it is without the change"
+                what = tuple(name for name in near if kind == f"killed by {name}")
+                control = partial(self._fails, [items[name] for name in what])
+            if kind.startswith("killed by") and not kind.endswith(("crash", "import")):
+                if what not in controls:
+                    controls[what] = in_child(control, limit + 300) == "survived"
+                if not controls[what]:
+                    kind = f"unclear: {kind}, and so it is without the change"
             self.answer(mutant, kind, time.monotonic() - begin)
         return True
 
@@ -442,20 +455,29 @@ MOST_ANEW = 60
 
 
 def near_tests(reach: Reach, path: str, lines: tuple[int, int] | None) -> list[str]:
-    """Tests that reach lines of a module (None: any), the shortest first."""
+    """Tests that reach lines of a module (None: any): the shortest case of each test first, then the second ..."""
     met = []
     for name, one in reach.items():
         reached = one["lines"].get(path, ())
         if any(lines is None or lines[0] <= number <= lines[1] for number in reached):
             met.append((one["seconds"], name))
-    return [name for _, name in sorted(met)]
+    cases: Counter[str] = Counter()
+    order = []
+    for seconds, name in sorted(met):
+        test = name.partition("[")[0]
+        order.append((cases[test], seconds, name))
+        cases[test] += 1
+    return [name for _, _, name in sorted(order)]
 
 
 def within(budget_s: float, reach: Reach, path: str, lines: tuple[int, int] | None) -> list[str]:
-    """The shortest tests that reach lines of a module, as many as take so long together, one at least."""
-    near = near_tests(reach, path, lines)
-    spent = list(accumulate(reach[name]["seconds"] for name in near))
-    return near[: max(sum(seconds <= budget_s for seconds in spent), 1)]
+    """Tests that reach lines of a module, in the order of :func:`near_tests`, that fit in a time; one at least."""
+    near, out, left = near_tests(reach, path, lines), [], budget_s
+    for name in near:
+        if reach[name]["seconds"] <= left:
+            out.append(name)
+            left -= reach[name]["seconds"]
+    return out or sorted(near, key=lambda name: reach[name]["seconds"])[:1]
 
 
 def planted(mutant: Mutant, source: str, tests: tuple[str, ...]) -> str:

@@ -28,10 +28,10 @@ from .search.walls import ThroughWalls, paths_through
 from .surfaces import Surfaces
 
 LEVELS_AT_ONCE = 1024
+"""Poses of which levels are made at once."""
+
 PER_LINK = ("rss_dbm", "rss_power_dbm", "h", "has_path")
 """Arrays (poses, towers, ...) of a replay."""
-
-"""Poses of which levels are made at once."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)

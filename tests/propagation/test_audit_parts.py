@@ -9,13 +9,17 @@ import pytest
 
 from aerpaw_cmp.propagation.arrays import Isotropic, Link, Poses, rotation_from_yaw_pitch_roll, single_element
 from aerpaw_cmp.propagation.check import explain, reference
+from aerpaw_cmp.propagation.check.audit import Audit, _spread, compare, extra_rows
 from aerpaw_cmp.propagation.check.field_audit import (
     Expected,
+    _another_rank,
     _lacking,
+    _level_error,
     _link_error,
     _paths_against_sionna,
     _probe,
     impossible,
+    spread_over_paths,
 )
 from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.options import Search
@@ -139,6 +143,85 @@ def test_a_link_s_error_is_that_of_its_sum_where_all_paths_are_near_and_none_fad
         for k in ([0, 1], [6], [7])
     )
     assert _link_error(paths, h, theirs, near, 2, 3) == pytest.approx(expected, rel=1e-12)
+
+
+def test_two_replays_differ_by_what_was_planted() -> None:
+    """Of six poses three are compared: one path is taken away, one put in place of another, two levels are moved."""
+    spots = np.array([[120.0, 60, 40], [40, -90, 25], [-200, 90, 60], [60, 10, 30], [90, 0, 50], [-50, -50, 20]])
+    poses = Poses(spots, np.tile(np.eye(3), (6, 1, 1)))
+    clean, chosen = replay(SITE, LINK, poses, Search("image", max_depth=1)), np.array([4, 0, 3])
+    few = replay(SITE, LINK, Poses(spots[chosen], np.tile(np.eye(3), (3, 1, 1))), Search("image", max_depth=1))
+    same = compare(clean, few, chosen)
+    assert (same.missing_paths, same.extra_paths, same.coverage_differs) == (0, 0, 0)
+    assert (same.rss_max_error_db, set(same.rank_disagreement.values())) == (0.0, {0.0})
+    paths, level, covered = clean.paths, clean.rss_dbm.copy(), clean.has_path.copy()
+    gone, bent = (int(np.flatnonzero((paths.pose == pose) & (paths.depth == 1))[0]) for pose in (0, 3))
+    faces = paths.faces.copy()
+    plane = clean.faces.normal[faces[bent, 0]], clean.faces.offset_m[faces[bent, 0]]
+    other = (clean.faces.normal != plane[0]).any(axis=1) | (clean.faces.offset_m != plane[1])
+    unused = np.setdiff1d(np.flatnonzero(other), faces[paths.pose == 3])
+    faces[bent, 0] = unused[0]
+    rows = np.setdiff1d(np.arange(len(paths)), gone)
+    level[[4, 0, 1], 0] += [3.0, -1.0, 50.0]  # the second is not compared
+    level[3, 0], covered[3, 0] = np.nan, False
+    planted = dataclasses.replace(
+        clean, paths=dataclasses.replace(paths, faces=faces).select(rows), rss_dbm=level, has_path=covered,
+        h=clean.h * (np.arange(6) != 3)[:, None, None, None],
+    )  # fmt: skip
+    found = compare(planted, few, chosen, (10.0, 1000.0))
+    assert (found.missing_paths, found.extra_paths, found.reference_paths) == (2, 1, len(few.paths))
+    assert found.rss_max_error_db == pytest.approx(3.0)
+    assert found.rss_rms_error_db == pytest.approx(np.sqrt((9.0 + 1.0) / 2))
+    assert found.coverage_differs == 1
+    assert found.rank_disagreement == pytest.approx({10.0: 1 / 3, 1000.0: 1 / 3})
+    assert extra_rows(planted, few, chosen).tolist() == [int(np.flatnonzero(rows == bent)[0])]
+    none = compare(dataclasses.replace(planted, rss_dbm=np.full((6, 1), np.nan)), few, chosen)
+    assert np.isnan([none.rss_max_error_db, none.rss_rms_error_db]).all()
+    numbers = dict.fromkeys(("seconds", "reference_seconds"), 1.0) | dataclasses.asdict(none)
+    words = Audit(engine="image", reference="sionna", links=3, **numbers).as_dict()
+    assert (words["rss_max_error_db"], words["missing_paths"], words["field"]) == (None, 2, None)
+
+
+def test_audited_poses_are_spread_or_taken_for_the_kinds_of_their_paths() -> None:
+    """By hand: pose 3 has most kinds, then pose 1 adds one, as pose 0 does with fewer; pose 4 is not asked."""
+    kinds = {0: [7], 1: [7, 2, 3], 2: [4, 5], 3: [2, 3, 4, 5], 4: [8, 9, 10, 11, 12]}
+    some = replay(SITE, LINK, POSES, Search("image", max_depth=1))
+    pose, face = np.array([(p, f) for p, several in kinds.items() for f in several]).T
+    rows = some.paths.select(np.zeros(len(pose), dtype=np.int64))
+    paths = dataclasses.replace(rows, pose=pose, faces=face[:, None])
+    many = dataclasses.replace(some, paths=paths)
+    for count, expected in ((1, [3]), (2, [1, 3]), (3, [1, 2, 3]), (4, [2, 0, 1, 3]), (9, [2, 0, 1, 3])):
+        assert spread_over_paths(many, np.array([2, 0, 1, 3]), count).tolist() == expected
+    places = np.full((7, 3), 5.0)
+    places[2] = np.nan
+    poses = Poses(places, np.tile(np.eye(3), (7, 1, 1)))
+    for count, expected in ((None, [0, 1, 3, 4, 5, 6]), (6, [0, 1, 3, 4, 5, 6]), (3, [0, 3, 6]), (1, [0])):
+        assert _spread(poses, count).tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("level", "power", "size", "expected"),
+    [
+        (np.nan, 0.0, 1e-5, 0.0), (-90.0, 0.0, 1e-5, np.inf), (np.nan, 1e-12, 1e-5, np.inf),  # covered by one alone
+        (-80.0, 1e-12, 1e-6, 0.0), (-77.0, 1e-12, 1e-6, 3.0), (-83.5, 1e-12, 1e-6, 3.5),  # 40 dBm sent
+        (-80.0, 1e-29, 1e-5, 0.0), (np.nan, 1e-29, 1e-5, 0.0), (-77.0, 1e-12, 1.0, 0.0),  # in a fade rounding is all
+        (-77.0, 1e-12, 1e-2, 3.0 - 0.08686),
+    ],
+)  # fmt: skip
+def test_levels_differ_beyond_rounding(level: float, power: float, size: float, expected: float) -> None:
+    assert _level_error(level, power, 40.0, size) == pytest.approx(expected, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("ours", "expected", "differs"),
+    [
+        ((1.0, 0.5), (1.0, 0.5), False), ((1.0, 0.05), (1.0, 0.5), True), ((1.0, 0.5), (1.0, 0.005), True),
+        ((1.0, 0.00999), (1.0, 0.01), False), ((1.0, 0.0098), (1.0, 0.0102), True),  # within 1e-4 of 1 / 100
+        ((1.0, 0.0), (0.0, 0.0), True), ((0.0, 0.0), (0.0, 0.0), False),
+    ],
+)  # fmt: skip
+def test_ranks_differ_where_no_singular_value_lies_at_the_limit(ours, expected, differs: bool) -> None:
+    assert _another_rank(np.diag(ours).astype(complex), np.diag(expected).astype(complex), (10.0, 100.0)) is differs
 
 
 @pytest.mark.parametrize(

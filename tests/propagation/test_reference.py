@@ -68,6 +68,7 @@ def test_replay_equals_the_second_implementation(scenes, case, pattern):
     assert found.h_max_error < 1e-11
     assert (found.missing_paths, found.phantom_paths, found.doubtful) == (0, 0, 0)
     assert found.reference_paths > 20
+    assert found.reference_links == 2 * len(poses)
 
 
 @pytest.mark.parametrize(
@@ -182,6 +183,67 @@ def test_of_wall_and_ground_a_path_meets_first_what_it_reaches_first(scenes, wal
     assert one.verdict(sequence, (-6.0, 3.0, 6 * slope - above_m)) is expected
 
 
+@pytest.mark.parametrize(
+    ("source", "target", "walls", "expected"),
+    [
+        ((-10, 0, 10), (-6, 3, 0), (-1,), True), ((-10, 0, 0), (-6, 3, 7), (-1,), True),  # an end on the ground
+        ((-10, 0, 10), (-6, 3, -1e-4), (-1,), False), ((-10, 0, -1e-4), (-6, 3, 7), (-1,), False),
+        ((-10, 0, 10), (-6, 3, -1.5e-6), (-1,), None), ((-10, 0, 0), (-6, 3, 0), (-1,), False),
+        ((0, 0, 5), (-6, 3, 4), (0,), True), ((-10, 0, 5), (0, 3, 4), (0,), True),  # an end on the wall
+        ((-10, 0, 5), (-6, 3, 0), (0, -1), True), ((0, 0, 5), (-6, 3, 3), (0, -1), True),
+        ((-10, 0, 5), (1e-4, 3, 4), (0,), False), ((-10, 0, 8), (-10, 6, 8), (0,), None),  # in its upper rim
+        ((-10, 0, 8), (-10, 6, 7.9), (0,), True), ((-10, 0, 8), (-10, 6, 8.1), (0,), False),
+        ((-10, 0, 5), (20, 0, 5), (), False), ((-10, 0, 8), (20, 0, 8), (), None), ((-10, 0, 8), (20, 0, 8.1), (), True),
+        ((-10, 20, 5), (20, 20, 5), (), None), ((-10, 21, 5), (20, 21, 5), (), True),  # along a wall, and beside it
+        ((5, 0, 30), (5, 0, 9), (), True), ((5, 0, 30), (5, 0, 7), (), False), ((12, 0, 30), (12, 0, 1), (), True),
+    ],
+)  # fmt: skip
+def test_a_path_exists_up_to_the_surfaces(scenes, source, target, walls, expected):
+    """Mirrors by number, -1 the ground; an end may lie on its mirror, and what a hair decides is not judged."""
+    site = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), (source,))
+    one = reference.Reference(site, "LW1", field_audit.Expected.of(scenes.link(site)).link)
+    mirror = {-1: one.mirrors[0], 0: next(m for m in one.mirrors if m.normal[0] == -1.0)}
+    assert one.verdict([mirror[k] for k in walls], target) is expected
+
+
+def test_limits_of_links_are_those_of_the_replay(scenes):
+    """Next to the tower, 100 km away and below the ground, which lies above that of the site: no path too many."""
+    site = scenes.site(towers=((0.0, 0.0, 9.0, 1.5),))
+    spots = [(0.5, 0, 10.5), (0.0101, 0, 10.5), (0.0099, 0, 10.5), (99_999.5, 0, 10.5), (100_000.5, 0, 10.5),
+             (40, 0, -0.5), (40, 0, 0.7), (40, 0, 0.0)]  # fmt: skip
+    poses, link = scenes.poses(spots), scenes.link(site)
+    found = replay(site, link, poses)
+    assert found.has_path[:, 0].tolist() == [True, True, False, True, False, False, True, True]
+    seen = audited(site, link, poses, found)
+    assert (seen.failures, seen.missing_paths, seen.phantom_paths, seen.doubtful) == ((), 0, 0, 0)
+    rim = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), ((-10.0, 0.0, 8.0),))
+    poses, link = scenes.poses([(-10.0, 6.0, 8.0)]), scenes.link(rim)
+    seen = audited(rim, link, poses, replay(rim, link, poses))
+    assert (seen.failures, seen.doubtful) == ((), 1)  # over the upper rim of the wall
+
+
+def test_rough_ground_and_each_reflection_lose_what_their_formulas_say(scenes):
+    """Ament's factor at the ground alone, whatever else a path meets; a roof is level, too, and not the ground."""
+    site = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), ((-10.0, 0.0, 20.0),))
+    link = field_audit.Expected.of(scenes.link(site)).link
+    one = reference.Reference(site, "LW1", link, reference.ExpectedLoss(reflection_db=2.0, ground_roughness_m=0.03))
+    ground, roof = one.mirrors[0], next(m for m in one.mirrors if m.roof is not None)
+    wall = next(m for m in one.mirrors if m.normal[0] == -1.0)
+    wavelength = wavelength_m(scenes.carrier_hz)
+
+    def rough_db(flat, drop):
+        return 8.685889638 * 8 * (np.pi * 0.03 * drop / np.hypot(flat, drop) / wavelength) ** 2
+
+    for sequence, target, expected in (
+        ((), (20.0, 5.0, 20.0), 0.0),
+        ((roof,), (20.0, 0.0, 20.0), 2.0),
+        ((ground,), (-40.0, 0.0, 12.0), 2.0 + rough_db(30.0, 32.0)),
+        ((wall, ground), (-8.0, 3.0, 4.0), 4.0 + rough_db(np.hypot(18.0, 3.0), 24.0)),
+        ((ground, wall), (-8.0, 3.0, 4.0), 4.0 + rough_db(np.hypot(18.0, 3.0), 24.0)),
+    ):
+        assert one.loss_db(sequence, target) == pytest.approx(expected, rel=1e-8)
+
+
 def test_free_space_and_a_perfect_ground_in_closed_form(scenes):
     site = scenes.site()
     link = field_audit.Expected.of(scenes.link(site)).link
@@ -201,6 +263,7 @@ def test_chord_through_a_crown_in_closed_form():
     assert reference.crown_depth_m(one, (10, 0, 30), (10, 0, 0), set()) == pytest.approx(16.0, abs=1e-9)
     assert reference.crown_depth_m(one, (0, 0, 2), (20, 0, 2), set(), trunks=True) == pytest.approx(0.4, abs=1e-9)
     assert reference.crown_depth_m(one, (0, 0, 8), (20, 0, 8), {0}) == 0.0
+    assert reference.crown_depth_m(one, (0, 3.9, 8), (20, 3.9, 8), set()) == 0.0  # below its rim, beside the cone
 
 
 def _wrap(monkeypatch, where, name, change):

@@ -343,16 +343,14 @@ def _metres(length: float) -> str:
 
 
 def _outside_m(faces: Faces, face: int, point: FloatArray) -> float:
-    """Distance in its plane from a face to a point; negative inside: to its nearest edge."""
+    """Distance in its plane from a face to a point; 0 inside."""
     import shapely
 
     place = np.array([faces.along[face] @ point, faces.across[face] @ point])
     polygon = faces.polygon[face]
     if polygon is not None:
-        spot = shapely.Point(*place)
-        return float(polygon.distance(spot)) or -float(polygon.exterior.distance(spot))
-    over = np.maximum(faces.lower[face] - place, place - faces.upper[face])
-    return float(np.linalg.norm(np.maximum(over, 0.0))) if (over > 0.0).any() else float(over.max())
+        return float(polygon.distance(shapely.Point(*place)))
+    return float(np.linalg.norm(place - np.clip(place, faces.lower[face], faces.upper[face])))
 
 
 def simple_paths(replay: Replay) -> list[tuple[str, IntArray]]:

@@ -152,15 +152,15 @@ def _print_report_summary(outcome: Any) -> None:
     rows = []
     for tower, channels in outcome.metrics["rss"].items():
         for channel, m in channels.items():
-            ci = m.get("rmse_ci95_db") or [None, None]
+            ci, many = m.get("rmse_ci95_db") or [None, None], m["n"] >= FEWEST
             rows.append(
                 [
                     tower,
                     channel,
                     number(m["offset_db"], "{:.1f}"),
-                    number(m["rmse_db"] if m["n"] >= FEWEST else None, "{:.2f}"),
+                    number(m["rmse_db"] if many else None, "{:.2f}"),
                     f"{number(ci[0], '{:.2f}')} .. {number(ci[1], '{:.2f}')}",
-                    *(number(m["baselines"][name]["rmse_db"], "{:.2f}") for name in BASELINE_TITLE),
+                    *(number(m["baselines"][n]["rmse_db"] if many else None, "{:.2f}") for n in BASELINE_TITLE),
                     number(m["correlation"], "{:.2f}"),
                     str(m["n"]),
                     str(m["n_out_of_coverage"]),

@@ -29,11 +29,14 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     words = [word for word in arguments[:2] if not word.startswith("-")]
     command = " ".join(["aerpaw-cmp", *words[: 2 if words[:1] == ["site"] else 1]])
     place = None if error.path is None else Path(error.path)
+    if place is not None and not _exists(place):  # as the flight file names it
+        beside = (Path(word).parent / place for word in arguments if word.endswith(_SETTINGS))
+        place = next(filter(_exists, beside), place)
     if isinstance(error, CheckError):
         return "read the page, or run without the check"
     if isinstance(error, OutputError) or re.search(r"after -o\b|a new name", error.expected or ""):
         return "the same command with another name after -o"
-    if place is not None and place.suffix in _SETTINGS and _exists(place):
+    if place is not None and place.suffix in _SETTINGS and _exists(place) and words[:1] != ["ingest"]:
         line = "" if error.line is None else f", line {error.line},"
         return f"mend {one_line(place.name)}{line} and run the same command"
     if place is None or not isinstance(error, InputError):

@@ -304,7 +304,7 @@ class _Bins:
             low, high = (np.floor((t + side - along.start_s) / along.step_s) for side in (-window_s, window_s))
             ok: BoolArray = np.isfinite(y) & (low >= 0) & (high + 1 < len(lost))
         begin, end = (np.where(ok, side, 0).astype(np.int64) for side in (low, high))
-        ok = np.asarray(ok & (missing[end + 2] == missing[begin]))
+        ok[ok] = missing[end[ok] + 2] == missing[begin[ok]]
         order = np.flatnonzero(ok)[np.argsort(t[ok], kind="stable")]
         t, y = t[order], y[order]
         if not len(t):
@@ -425,6 +425,6 @@ class _Memory:
             inner[np.diag_indices(p)] += 1.0
             lower = np.linalg.cholesky(inner)
             half = solve_triangular(lower, spread[:, None] * gram[:p, p:], lower=True)
-            left = np.diag(gram[p:, p:]) - (half**2).sum(axis=0)
+            left = np.maximum(np.diag(gram[p:, p:]) - (half**2).sum(axis=0), np.finfo(np.float64).tiny)
             out[row] = -0.5 * n * np.log(left / n) - np.log(np.diag(lower)).sum() - 0.5 * self.log_det
         return out

@@ -695,7 +695,7 @@ def _clock_cause(timezone: str | None, time: Times, start: np.datetime64, end: n
         trap = clock_trap((time.min(), time.max()), (start, end), timezone)
     if trap is None:
         return "logs of different flights, or a wrong 'timezone' or 'clock'"
-    return f"{trap.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' beside the log"
+    return trap.advice()
 
 
 def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray, BoolArray]:

@@ -24,6 +24,7 @@ from .data import is_ratio, site_place
 from .dry_run import DryRun, dry_run
 from .grouping import Span, flights, stream_span
 from .heights import height_in_name, lacks_height
+from .hour_shift import clock_trap
 from .lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
 from .node import CARRIER_HZ, POWER_DBM, Placer, listed_places
 from .remembered import Nodes, Proposal, propose, searching_airframe
@@ -97,7 +98,9 @@ def draft(
         memory=site_place(site, folder),
         locks=any(may_lose_lock(stream) for stream in every),
     )
-    for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest
+    for file in sorted(
+        files, key=lambda f: (not entries.leads(f), entries.is_utc(f), -_samples(f))
+    ):  # the fullest copy
         entries.enter(file)
     entries.sort(files)
     if not entries.kinds & {"rss", "rank"}:
@@ -138,7 +141,8 @@ def _proof(text: str, folder: Path, files: Mapping[str, IngestedFile], paths: Se
     read = []
     for log, path in zip(settings.logs, paths, strict=True):
         moved = log.time_origin is not None and any("clock" in s.attributes for s in files[path].result.streams)
-        again = read_log(folder, log.path, log.options(settings.timezone), reader=log.reader) if moved else files[path]
+        same = not moved and log.clock is None
+        again = files[path] if same else read_log(folder, log.path, log.options(settings.timezone), reader=log.reader)
         read.append(again)
     return dry_run(settings, folder, read)
 
@@ -418,6 +422,9 @@ class _Entries:
                 asked = self._place(file, entry, asked, levels, self.placer)
             else:
                 asked = self._doubt(entry, levels, self.placer)
+        if self.is_utc(file):
+            entry["clock"] = "utc"
+            asked = _also(asked, "as local time it misses the telemetry, as UTC it meets it: is it UTC?")
         refused = self._refused(streams, entry, shown, dated=origin is not None)
         kept = [s for s in streams if s.name not in refused]
         reasons = list(dict.fromkeys(refused.values()))
@@ -549,6 +556,8 @@ class _Entries:
             span = stream_span(stream)
             if span is None:
                 return "no samples"
+            hours = np.timedelta64(round(60 * self._hours(stream)), "m")
+            span = span[0] + hours, span[1] + hours
             if stream.name in leading:
                 return f"of the same receiver and cell as {leading[stream.name]}, which is compared"
             why = self._reason(stream, span, dated=dated)
@@ -566,6 +575,19 @@ class _Entries:
         self.taken.setdefault(key, []).append((span, shown))
         return None
 
+    def is_utc(self, file: IngestedFile) -> bool:
+        """Check whether a log whose clock has no zone meets the telemetry as UTC, and not as local time."""
+        return any(self._hours(stream) for stream in file.result.streams)
+
+    def _hours(self, stream: Stream) -> float:
+        """Hours to be added to a clock in UTC that was read as local time; 0 of any other."""
+        span = stream_span(stream)
+        if self.flown is None or span is None or stream.kind == "telemetry":
+            return 0.0
+        trap = clock_trap(span, self.flown[1], self.timezone)
+        written = stream.attributes.get("clock_from") == "written"
+        return trap.hours if trap is not None and trap.is_utc and not written else 0.0
+
     def _reason(self, stream: Stream, span: Span, *, dated: bool) -> str | None:
         relative = not has_wall_clock(span[0])
         if stream.kind == "telemetry":
@@ -580,16 +602,17 @@ class _Entries:
         if relative and not (dated or beside or _has_positions(stream)):
             return "its times are relative; read it again with --time-origin"
         if self.flown is not None and not relative and not _meet(span, self.flown[1]):
-            return _late(span, self.flown[1])
+            return _late(span, self.flown[1], self.timezone)
         return RATIO if self.has_level and is_ratio(stream) else None
 
 
 RATIO = "a ratio to the noise, no level"
 
 
-def _late(span: Span, flown: Span) -> str:
+def _late(span: Span, flown: Span, timezone: str | None = None) -> str:
+    trap = clock_trap(span, flown, timezone)
     shown = [" .. ".join(str(t.astype("datetime64[s]")).replace("T", " ") for t in s) for s in (span, flown)]
-    return f"{shown[0]} is not at the time of the telemetry, {shown[1]} (UTC)"
+    return f"{shown[0]} is not at the time of the telemetry, {shown[1]} (UTC)" + (f": {trap.advice()}" if trap else "")
 
 
 def _missing(stream: Stream) -> int:

@@ -29,6 +29,12 @@ class ClockTrap:
     overlap_s: float
     shifted_overlap_s: float
     explanation: str
+    is_utc: bool = False
+    """UTC read as local time explains it."""
+
+    def advice(self) -> str:
+        """Cause and remedy, in words."""
+        return f"{self.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' beside the log"
 
 
 def clock_trap(
@@ -71,10 +77,11 @@ def clock_trap(
     if now >= 0.5 * shorter or shared[best] < max(0.5 * shorter, 1e-9):
         return None
     hours = float(shifts[best])
-    return ClockTrap(hours, now, float(shared[best]), _explain_hours(hours, float(telemetry[0]), timezone))
+    explanation, is_utc = _explain_hours(hours, float(telemetry[0]), timezone)
+    return ClockTrap(hours, now, float(shared[best]), explanation, is_utc)
 
 
-def _explain_hours(hours: float, instant: float, timezone: str | None) -> str:
+def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[str, bool]:
     if timezone is not None:
         from datetime import datetime
         from datetime import timezone as utc
@@ -84,9 +91,10 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> str:
         offset = moment.utcoffset()
         east = offset.total_seconds() / 3600.0 if offset else 0.0
         if east and hours == -east:
-            return f"radio times are local time ({timezone}) stored as if they were UTC"
+            return f"radio times are local time ({timezone}) stored as if they were UTC", False
         if east and hours == east:
-            return f"telemetry times are local time ({timezone}) stored as if they were UTC"
+            stored = "telemetry times are local time stored as if they were UTC"
+            return f"radio times are UTC read as {timezone}, or {stored}", True
         if abs(hours) == 1.0:
-            return "one hour: daylight saving taken into account in one log only"
-    return f"the clocks differ by {hours:+g} h: a time zone was taken into account in one log only"
+            return "one hour: daylight saving taken into account in one log only", False
+    return f"the clocks differ by {hours:+g} h: a time zone was taken into account in one log only", False

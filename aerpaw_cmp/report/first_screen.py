@@ -289,10 +289,9 @@ def _ends(panels: Sequence[RssResult]) -> str:
 
 
 def _difference(panels: Sequence[RssResult]) -> list[Headline]:
-    best = best_baseline(panels)
-    if best is None:
-        return []
-    paired = _paired(panels, best[0])
+    found = judged(panels)  # as the sentence above the cards
+    name = "" if found is None else found.name
+    paired = _paired(panels, name)
     if not paired:
         return []
     words = [entry.verdict for entry in paired]
@@ -302,7 +301,7 @@ def _difference(panels: Sequence[RssResult]) -> list[Headline]:
         known = math.isfinite(low) and math.isfinite(high)
         return [
             Headline(
-                label=f"Against {pretty(best[0])}, same samples",
+                label=f"Against {pretty(name)}, same samples",
                 value=f"{paired[0].difference_db:+.1f} dB".replace("-", "−"),
                 interval=f"95 %: {low:+.1f} to {high:+.1f} dB".replace("-", "−")
                 if known
@@ -312,7 +311,7 @@ def _difference(panels: Sequence[RssResult]) -> list[Headline]:
         ]
     return [
         Headline(
-            label=f"Better than {pretty(best[0])}",
+            label=f"Better than {pretty(name)}",
             value=f"{words.count('better')} of {len(words)}",
             interval=f"worse: {words.count('worse')}, not significant: {undecided}",
             beside="channels, by paired 95 % intervals",

@@ -139,7 +139,7 @@ def _flight_talk(head: bytes) -> bool:
 
 
 def _yaml(head: bytes) -> bool:
-    return re.search(rb"(?m)^flight: ", head[:4096]) is not None and re.search(rb"(?m)^logs:", head) is not None
+    return re.search(rb"(?m)^flight:", head[:4096]) is not None and re.search(rb"(?m)^logs:", head) is not None
 
 
 def _sniffer(test: Callable[[bytes], bool]) -> Callable[[bytes], bool]:

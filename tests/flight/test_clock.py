@@ -127,6 +127,18 @@ def test_too_few_samples_and_gaps_of_the_telemetry():
     assert judge_clock([part]).verdict == SHIFTED
 
 
+def test_a_track_of_one_pose_and_a_level_that_never_changes_are_no_fault():
+    """A table of one instant has no place at either side of any; a constant leaves nothing to explain."""
+    one = dataclasses.replace(
+        ALONG, distance_m=ALONG.distance_m[:1], directions=ALONG.directions[:1],
+        predicted_db={name: level[:1] for name, level in ALONG.predicted_db.items()},
+    )  # fmt: skip
+    assert judge_clock([dataclasses.replace(channel(), along=one)]).verdict == CANNOT_TELL
+    flat = dataclasses.replace(channel(), measured_db=np.full(920, -50.0))
+    with np.errstate(divide="raise", invalid="raise"):
+        assert judge_clock([flat]).verdict == CANNOT_TELL
+
+
 def test_a_lag_outside_the_window_is_not_passed_off_as_a_result():
     clock = judge_clock([channel(6.0, 6, gain_db=12.0, memory_db=0.5)], window_s=5.0)
     assert clock.verdict == CANNOT_TELL

@@ -75,6 +75,27 @@ def test_another_day_a_ratio_and_relative_times_are_left_out(logs: Path) -> None
     assert "flight: flight_2025-06-01_" in text
 
 
+def test_a_radio_clock_in_utc_is_asked_about_and_compared(logs: Path) -> None:
+    """The telemetry is local; the log of LW1 was written in UTC, that of LW2 an hour late."""
+    for name, hour in (("LW1/USRP1_power_log.txt", "2025-06-01 14:"), ("LW2/USRP1_power_log.txt", "2025-06-01 11:")):
+        (logs / name).write_text((logs / name).read_text().replace("2025-06-01 10:", hour))
+    text = (logs / "LW3/USRP1_power_log.txt").read_text()  # of another flight, four hours later
+    (logs / "LW3/USRP1_later_power_log.txt").write_text(text.replace("2025-06-01 10:", "2025-06-01 14:") + text[-40:])
+    text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
+    (line,) = [line for line in text.splitlines() if "LW1/USRP1" in line]
+    assert "clock: utc" in line
+    assert line.endswith("is it UTC?")
+    late, other = sorted(remark for remark in remarks if remark.startswith("left out: "))
+    assert "LW2/USRP1_power_log.txt" in late
+    assert "one hour: daylight saving" in late
+    assert "later_power_log.txt: LW3/USRP1_power_log.txt has" in other
+    assert any("samples can be compared" in remark for remark in remarks)
+    settings = parse_yaml(text, FlightFile)
+    data = gather(settings, logs, read_logs(settings, logs))
+    one, other = (next(s for s in data.rss if (s.tower, s.channel) == ("LW1", c)) for c in ("USRP1", "USRP2"))
+    assert abs(one.time[0] - other.time[0]) < np.timedelta64(2, "s")
+
+
 def test_what_a_draft_names_is_read_whatever_it_is_called(logs: Path) -> None:
     folder = logs / "LW1"
     names = ["a b: 'c' \"d\" #e?", "\u00fc\u2603[x]", "line\nbreak\r\u2028", "back\\", "tab\t{a, b: c}", "-", "%@`"]

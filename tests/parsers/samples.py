@@ -608,6 +608,6 @@ NO_LOGS: dict[str, bytes] = {
         b"Found 1 cells\nFound CELL 930.0 MHz, EARFCN=3500, PHYID=2, 50 PRB, 1 ports, PSS power=-21.3 dBm\n\nBye\n"
     ),
     "flight_plan": b'{\n    "fileType": "Plan",\n    "geoFence": {},\n    "mission": {"items": []}\n}\n',
-    "flight_yaml": b"flight: f\nsite: lake_wheeler\nlogs:\n  - {path: a.txt}\n",
+    "flight_yaml": b"flight:\n  name: f\nsite: lake_wheeler\nlogs:\n  - {path: a.txt}\n",
 }
 """A sample of each kind of file that is no log (the MATLAB ones aside)."""

@@ -72,6 +72,10 @@ def test_the_first_sentence_follows_from_the_paired_intervals(report_data):
     )
     # it loses to the second-best baseline alone: that is what is said
     assert pretty(second) in verdict(judged_as(report_data, {second: "worse"}))[0]
+    cards = {one.label: one for one in headlines(judged_as(report_data, {second: "worse"}))}
+    assert cards[f"Better than {pretty(second)}"].interval.startswith(
+        f"worse: {n},"
+    )  # the card has the sentence's model
     same = verdict(judged_as(report_data, {}))[0]
     assert f"The difference is not significant on any of {n} channels" in same
     assert "better" not in same

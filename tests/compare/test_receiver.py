@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.compare import receiver as receiving
 from aerpaw_cmp.compare.forecast import log_losses
 from aerpaw_cmp.compare.rank import cohen_kappa
 from aerpaw_cmp.compare.receiver import (
@@ -12,6 +13,7 @@ from aerpaw_cmp.compare.receiver import (
     decide,
     decision_weights,
     fit_mixture,
+    mixture_loss,
     out_of_group,
     sector_groups,
     stream_features,
@@ -39,7 +41,8 @@ def test_features_are_ratios_and_level_and_scale_only_moves_the_level():
     h = np.random.default_rng(0).normal(size=(5, 4, 4, 2)) @ [1, 1j]
     one, two = (stream_features(np.linalg.svd(m, compute_uv=False)) for m in (h, 10.0 * h))
     np.testing.assert_allclose(two - one, np.tile([0.0, 0.0, 0.0, 20.0], (5, 1)), atol=1e-9)
-    assert np.isnan(stream_features([0.0, 0.0, 0.0, 0.0])).all()
+    assert np.isnan(stream_features([[0.0, 0.0, 0.0, 0.0], [np.inf, 1.0, 0.0, 0.0], [np.nan] * 4])).all()
+    assert stream_features([5.0, 0.5, 0.05, 1e-9]) == pytest.approx([-20.0, -40.0, -40.0, 20 * np.log10(5.0)])
 
 
 def test_probabilities_come_near_the_planted_ones():
@@ -47,6 +50,76 @@ def test_probabilities_come_near_the_planted_ones():
     found = fit(x, rank, groups, penalties=(0.1,)).probabilities(x)
     assert np.abs(found - truth).mean() < 0.02
     assert found.sum(axis=1) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("penalty", "steep"), [(0.3, 1.0), (5.0, 1.0), (1e-3, 1.0), (0.1, 40.0)])
+def test_no_step_lessens_the_penalised_loss(penalty, steep):
+    """The slope at the solution is zero, the constant penalised by a thousandth; features that tell all need short steps."""
+    x, rank, _, groups = planted(600)
+    x[:, 1] = np.where(rank > 2, steep, -steep) * np.abs(x[:, 1])
+    x[:, 3] = 7.0  # says nothing, has no spread
+    found = fit(x, rank, groups, penalties=(penalty,))
+    columns = np.column_stack([np.ones(600), (x - found.mean) / found.scale])
+    slope = (found.probabilities(x) - np.eye(4)[rank - 1]).T @ columns
+    slope += penalty * np.array([1e-3, 1, 1, 1, 1]) * found.coefficient
+    assert np.abs(slope).max() < 1e-4
+    assert (found.scale[3], found.n, found.penalty) == (1.0, 600, penalty)
+    np.testing.assert_allclose(found.scale[:3], x.std(axis=0)[:3])
+
+
+def test_penalty_and_loss_are_those_of_sectors_left_out(monkeypatch):
+    x, rank, _, groups = planted(400)
+    both, row = np.stack([x, x[:, ::-1] ** 3]), np.arange(400)
+    loss = [
+        -np.log(np.mean([out_of_group(one, rank, groups, p) for one in both], axis=0)[row, rank - 1]).mean()
+        for p in (0.01, 3.0, 10.0, 1000.0)
+    ]
+    best = (0.01, 3.0, 10.0, 1000.0)[int(np.argmin(loss))]
+    assert {m.penalty for m in fit_mixture(both, rank, groups, penalties=(1000.0, 0.01, 10.0, 3.0)).members} == {best}
+    assert mixture_loss(both, rank, groups) == pytest.approx(loss[2], rel=1e-9)
+    several = np.stack([x, x[:, ::-1], np.roll(x, 7, axis=0), 2.0 * x])
+    choice = choose_features(several, rank, groups, finalists=3, replicates=50)
+    assert (len(choice.order), choice.candidates, choice.best) == (3, 4, choice.order[0])
+    for number, score in zip(choice.order, choice.log_score, strict=True):
+        p = out_of_group(several[number], rank, groups, 10.0)
+        assert score == pytest.approx(-np.log(p[row, rank - 1]).mean(), rel=1e-9)
+    assert list(choice.log_score) == sorted(choice.log_score)
+    monkeypatch.setattr(receiving, "_HELD", 1)
+    again = choose_features(several, rank, groups, finalists=3, replicates=50)
+    assert (again.tied, list(again.order)) == (choice.tied, list(choice.order))
+
+
+def test_weights_of_the_decision_are_the_best_of_their_grid_and_the_smallest_of_equals():
+    rng = np.random.default_rng(12)
+    rank = rng.choice([1, 2, 3, 4], 300, p=[0.2, 0.5, 0.2, 0.1])
+    p = rng.dirichlet([1, 2, 1, 0.7], 300) + 0.3 * np.eye(4)[rank - 1]
+    tried = {}
+    for below in range(-3, 13):
+        for above in range(-3, 13):
+            weight = np.exp(np.array([below, 0, above, above]) / 10)
+            tried[below, above] = cohen_kappa(rank, np.argmax(p * weight, axis=1) + 1)
+    best = max(tried.values())
+    nearest = min((abs(b), abs(a), b, a) for (b, a), kappa in tried.items() if kappa >= best - 1e-9)
+    found = receiving._kappa_weights(p, rank)
+    assert 10 * np.log(found) == pytest.approx([nearest[2], 0, nearest[3], nearest[3]], abs=1e-9)
+
+
+@pytest.mark.parametrize(("samples", "enough"), [(49, False), (50, True)])
+def test_fifty_samples_in_two_sectors_are_enough(samples, enough):
+    x, rank, _, groups = planted(50)
+    groups = groups // 4  # two
+    known = np.where(np.arange(50) < samples, rank, np.nan)
+    if enough:
+        assert fit(x, known, groups).n == 50
+    else:
+        with pytest.raises(InputError, match="49 samples"):
+            fit(x, known, groups)
+    with pytest.raises(InputError, match="one sector"):
+        fit(x, rank, np.zeros(50, dtype=int))
+    with pytest.raises(ValueError, match="not of one length"):
+        fit(x, rank[1:], groups)
+    with pytest.raises(ValueError, match="3 features"):
+        fit(x, rank, groups).probabilities(x[:, :3])
 
 
 def test_regression_equals_the_one_of_scikit_learn():
@@ -128,8 +201,9 @@ def test_mixture_is_the_mean_of_its_members():
 def test_sectors_are_contiguous_directions_of_equal_share():
     rng = np.random.default_rng(1)
     azimuth = rng.uniform(2.5, 4.5, 800)  # across the cut of arctan2
-    at = np.column_stack([100 * np.cos(azimuth), 100 * np.sin(azimuth), np.full(800, 30.0)])
-    group = sector_groups(at, np.zeros(3))
+    tower = np.array([300.0, -200.0, 10.0])
+    at = tower + np.column_stack([100 * np.cos(azimuth), 100 * np.sin(azimuth), np.full(800, 30.0)])
+    group = sector_groups(at, tower)
     assert np.bincount(group).tolist() == [100] * 8
     assert (np.diff(group[np.argsort(azimuth)]) != 0).sum() == 7
 
@@ -158,6 +232,9 @@ def test_means_in_time_are_those_of_a_loop() -> None:
     time[40:] += 30.0  # a gap
     order = rng.permutation(80)
     power = rng.exponential(size=(2, 80, 3))
+    rows = np.arange(80) * 0.1  # both ends of a window count, whatever the rounding
+    ends = time_means(power, rows, 0.0, 0.6)[0, :, 0]
+    np.testing.assert_allclose(ends, [power[0, max(i - 3, 0) : i + 4, 0].mean() for i in range(80)])
     for shift, average in ((0.0, 0.0), (3.0, 8.0), (-4.0, 5.0)):
         found = time_means(power[:, order], time[order], shift, average)
         for row, i in enumerate(order):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 from scipy.stats import norm
+from scipy.stats import t as student
 
 from aerpaw_cmp.compare import statistics
 from aerpaw_cmp.compare.memory import power_draws
@@ -82,6 +83,107 @@ def test_degenerate_sequences():
     assert constant.rmse_db == (0.0, 0.0)
 
 
+def autocorrelation_by_loops(x):
+    """Block length, effective size and variance factor, with the long-run variance that completes its covariances."""
+    n, away = len(x), np.asarray(x, dtype=float) - np.mean(x)
+    seen = [sum(away[i] * away[i + lag] for i in range(n - lag)) / (n - lag) for lag in range(n // 2 + 1)]
+    counts, long_run = 2.0 * np.sqrt(np.log10(n) / n), 0.0
+    for _ in range(25):
+        c = [value + long_run / n for value in seen]
+        rho = [value / c[0] for value in c]
+        quiet = [all(abs(r) < counts for r in rho[lag + 1 : lag + 6]) for lag in range(len(rho) - 5)]
+        lags = min(2 * max(1, quiet.index(True) if True in quiet else len(rho) - 1), len(rho) - 1)
+        window = [1.0, *(min(1.0, 2.0 * (1.0 - lag / lags)) for lag in range(1, lags + 1))]
+        width = 2.0 * sum(window) - 1.0
+        flat = 2.0 * sum(w * value for w, value in zip(window, c, strict=False)) - c[0] - width * long_run / n
+        flat = flat / (1.0 - width / n) if width < 0.8 * n else np.inf
+        reach, decayed = sum(lag * w * c[lag] for lag, w in enumerate(window)), c[0]
+        if rho[1] >= counts:
+            half = next((lag for lag, r in enumerate(rho) if r <= 0.5), len(rho))
+            pairs = range(1, min(max(2, half), len(rho) - 1))
+            decay = sum(rho[k] * rho[k + 1] for k in pairs) / sum(rho[k] ** 2 for k in pairs)
+            k = np.arange(1, 4000)
+            tail = c[0] * min(1.0, rho[1] / decay) * min(decay, 1.0 - 1.0 / n) ** k
+            decayed, reach = 2.0 * tail.sum() + c[0], max(reach, k @ tail)
+        if max(flat, decayed) >= n * c[0]:
+            return n // 5, 1.0, 2.0
+        long_run = max(flat, decayed) if max(flat, decayed) > 0 else seen[0]
+    slope = 2.0 * max(0.0, reach) / long_run
+    block = min(max(int(np.ceil(2.0 * (1.5 * slope**2 * n) ** (1 / 3))), 1), max(1, n // 5))
+    return block, min(max(n * c[0] / long_run, 1.0), n), 1.0 / (1.0 - min(0.5, slope / block))
+
+
+@pytest.mark.parametrize(("n", "keep", "noise"), [
+    (300, 0.9, 0.0), (300, 0.5, 0.0), (300, 0.0, 0.0), (600, 0.95, 1.0), (80, 0.3, 0.0), (8, 0.0, 0.0), (9, 0.2, 0.0),
+    (40, 0.8, 0.0), (300, -0.6, 0.0), (151, 0.8, 0.0), (16, 0.5, 0.0), (24, 0.6, 0.0), (50, 1.0, 0.0), (60, -0.999, 0.1),
+])  # fmt: skip
+def test_memory_and_blocks_are_those_of_plain_loops(n, keep, noise):
+    rng = np.random.default_rng(n)
+    x = lfilter([1], [1, -keep], rng.normal(size=n)) + noise * rng.normal(size=n)
+    found = autocorrelation(x)
+    block, effective, factor = autocorrelation_by_loops(x)
+    assert found.block_length == pytest.approx(block, abs=0.02 * block)
+    assert (found.n_effective, found.variance_factor) == pytest.approx((effective, factor), rel=0.02)
+    unit = autocorrelation(1e-4 * x + 3.0)  # whatever the unit
+    assert (unit.block_length, unit.n_effective) == (found.block_length, pytest.approx(found.n_effective, rel=1e-6))
+    if n < 10:
+        assert autocorrelation(x[:7]) == Autocorrelation(7, 1, 7.0, 1.0)  # too few to tell
+
+
+@pytest.mark.parametrize(
+    ("n", "length", "effective", "factor"), [(100, 7, 12.0, 1.3), (100, 90, 10.0, 2.0), (50, 5, 0.0, 1.0)]
+)
+def test_half_width_is_students_widened_by_what_is_not_known(n, length, effective, factor):
+    known = Autocorrelation(n, length, effective, factor)
+    blocks = max(n / length, 2.0)
+    unsure = 1.0 + 3.0 / effective if effective else 1.0
+    expected = student.ppf(0.975, blocks - 1) * np.sqrt(unsure * factor / (1 - 1 / blocks))
+    assert known.half_width == pytest.approx(expected, rel=1e-9)
+    assert known.enough == (effective >= 10.0)
+    drawn = np.array([1.1, 1.4, 0.9, 1.6, np.nan])  # on average 0.25 above the estimate, as it is above the truth
+    ends = interval(1.0, drawn, known)
+    reach = expected * np.nanstd(drawn, ddof=1)
+    assert ends == (
+        pytest.approx((0.75 - reach, 0.75 + reach)) if effective else (pytest.approx(np.nan, nan_ok=True),) * 2
+    )
+    if effective:  # Wilson: the shares whose own normal interval just reaches the one that was seen
+        size = 0.3 * 0.7 / (0.05 * expected / 1.959964) ** 2
+        for end in share_interval(0.3, 0.05, known):
+            assert abs(end - 0.3) == pytest.approx(1.959964 * np.sqrt(end * (1 - end) / np.clip(size, 1, n)), rel=1e-6)
+
+
+@pytest.mark.parametrize(("first", "second"), [(2.0, 1.0), (1.0, 2.0)])
+def test_powers_of_a_pair_have_the_sum_of_the_larger_and_a_ratio_of_their_own(first, second, monkeypatch):
+    ratio, power = np.array([0.0, 0.7, -2.0]), np.array([3.0, 5.0, 9.0])
+    monkeypatch.setattr(statistics, "mean_draws", lambda values, kind: ratio + (kind != "ratio") + 1e-9 * values.sum())
+    monkeypatch.setattr(statistics, "power_draws", lambda values: power * values.var())
+    wave = np.tile([1.0, -1.0], 20)
+    one, two = statistics._power_pairs(first * wave, second * wave, first**2, second**2)
+    np.testing.assert_allclose(one / two, first**2 / second**2 * np.exp(ratio), rtol=1e-6)
+    np.testing.assert_allclose(one + two, power * (first**2 + second**2))
+
+
+def test_nineteen_samples_are_too_few_for_an_interval_and_twenty_are_not():
+    values = np.random.default_rng(8).normal(size=20)
+    for n, some in ((19, False), (20, True)):
+        found = error_intervals(values[:n], 0.5 * values[:n][::-1])
+        pair = paired_difference(values[:n], 0.5 * values[:n][::-1])
+        spans = [found.offset_db, found.rmse_db, found.correlation, pair.difference_ci95_db, pair.mean_square_ci95_db2]
+        spans += [statistics.mean_interval(values[:n]), statistics.spread_interval(values[:n])]
+        assert (np.isfinite(spans) == some).all()
+        assert np.isfinite(pair.standard_error_db) == some
+        assert (pair.verdict == "no interval") != some
+
+
+def test_resamples_do_not_depend_on_how_many_are_held_at_once(monkeypatch):
+    for length in (2, 30):
+        data = np.random.default_rng(length).normal(size=(60, 3))
+        whole = bootstrap_means(data, length, replicates=50)
+        monkeypatch.setattr(statistics, "_HELD", 400)
+        np.testing.assert_allclose(bootstrap_means(data, length, replicates=50), whole, atol=1e-14)
+        monkeypatch.undo()
+
+
 @pytest.mark.parametrize(("n", "length", "columns"), [(97, 10, 2), (97, 1, 3), (97, 10, 400), (12, 12, 1), (1, 1, 2)])
 def test_resamples_have_the_moments_of_the_circular_block_bootstrap(n, length, columns):
     rng = np.random.default_rng(3)
@@ -153,6 +255,7 @@ def test_ends_are_those_of_the_central_95_percent_of_the_draws(monkeypatch):
     }
     for name, (ends, middle) in found.items():
         assert ends == pytest.approx((middle - 1.96, middle + 1.96), abs=0.01), name
+    assert paired_difference(ramp, 2 * ramp).standard_error_db == pytest.approx(1.0, abs=0.001)
     low, high = share_interval(0.5, 0.01, white)
     assert high - low == pytest.approx(2 * 1.96 * 0.01, rel=0.01)
 
@@ -189,6 +292,7 @@ def test_correlation():
     assert correlation([1, 2, np.nan, 3], [2, 4, 5, 6]) == pytest.approx(1.0)
     assert np.isnan(correlation([1, 1, 1], [1, 2, 3]))
     assert np.isnan(correlation([1], [1]))
+    assert correlation([1, 2], [5, 3]) == -1.0
     assert correlation([1e8, 1e8 + 1, 1e8 + 2], [1, 2, 3]) == pytest.approx(1.0)
 
 
@@ -298,3 +402,4 @@ def test_same_places_pairs_the_nearest_and_wraps_headings():
 def test_plain_makes_json():
     found = plain({"a": np.float64("nan"), 1: np.array([1, 2]), "b": (np.True_, np.int32(3), float("inf"), "x", None)})
     assert found == {"a": None, "1": [1, 2], "b": [True, 3, None, "x", None]}
+    assert plain([np.datetime64("2025-06-01"), np.datetime64("NaT")]) == ["2025-06-01", None]

@@ -107,7 +107,7 @@ def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float, most_s: fl
             at.append(place[i + 1])
             yaw.append(w.yaw_deg)
     seconds = np.arange(0.0, min(begin, most_s) + 1e-9, 1.0)
-    leg = np.clip(np.searchsorted(np.array(time), seconds, side="left"), 0, len(yaw) - 1)
+    leg = np.minimum(np.searchsorted(np.array(time), seconds), len(yaw) - 1)
     position = np.stack([np.interp(seconds, time, np.array(at)[:, k]) for k in range(3)], axis=1)
     return Route(
         name=name, waypoints=tuple(waypoints), position_m=position, yaw_deg=np.array(yaw)[leg] % 360.0, time_s=seconds

@@ -22,10 +22,10 @@ def _lawnmower(n: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _covariance(time_s: FloatArray) -> FloatArray:
-    """Of shadowing and scatter, from the module's constants and none of its code."""
+    """Of shadowing (8 dB over 30 s) and scatter (4 dB)."""
     lag = np.abs(np.subtract.outer(time_s, time_s))
-    shadow = locating.SHADOW_SD_DB**2 * np.exp(-lag / locating.SHADOW_S)
-    return np.asarray(shadow + locating.SCATTER_SD_DB**2 * np.eye(len(time_s)))
+    shadow = 8.0**2 * np.exp(-lag / 30.0)
+    return np.asarray(shadow + 4.0**2 * np.eye(len(time_s)))
 
 
 def _prior(track: LevelTrack, place: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -36,10 +36,10 @@ def _prior(track: LevelTrack, place: FloatArray) -> tuple[FloatArray, FloatArray
     for here in track.position_m:
         away = float(np.sqrt(((here - place) ** 2).sum()))
         up = np.arcsin((here[2] - place[2]) / away)
-        mean.append(middle - 10 * locating.SLOPE * np.log10(away / 100))
+        mean.append(middle - 30.0 * np.log10(away / 100))
         rows.append(
-            [100.0, -10 * locating.SLOPE_SD * np.log10(away / 100), locating.ELEVATION_SD_DB * np.sin(up) ** 2,
-             locating.ELEVATION_SD_DB / 2 * np.cos(4 * up)]
+            [100.0, -10.0 * np.log10(away / 100), 5.0 * np.sin(up) ** 2,
+             2.5 * np.cos(4 * up)]
         )  # fmt: skip
     return np.array(mean), cover + np.array(rows) @ np.array(rows).T
 
@@ -91,7 +91,7 @@ def _flights(count: int, floor_db: float) -> Iterator[tuple[LevelTrack, FloatArr
         mean, cover = _prior(blank, seen)
         cover = cover - 100.0**2 + 10.0**2  # the level at 100 m is free: 10 dB are enough
         level = np.maximum(random.multivariate_normal(mean, cover), floor_db)
-        truth = seen[:2] + random.normal(0.0, locating.SYSTEMATIC_M, 2)
+        truth = seen[:2] + random.normal(0.0, 20.0, 2)
         yield LevelTrack(time, position, level, floor_db), truth
 
 
@@ -146,6 +146,61 @@ def test_a_node_far_away_is_said_to_be_at_the_edge_or_anywhere() -> None:
 
 
 def test_too_few_levels_are_refused() -> None:
-    time, position = _lawnmower(10)
-    with pytest.raises(ValueError, match="10 levels"):
-        locate(LevelTrack(time, position, np.zeros(10)))
+    time, position = _lawnmower(20)
+    with pytest.raises(ValueError, match="19 levels"):
+        locate(LevelTrack(time[:19], position[:19], np.zeros(19)))
+    assert locate(LevelTrack(time, position, np.zeros(20))).radius90_m > 300.0  # levels that say nothing
+
+
+@pytest.mark.parametrize(("length_s", "window_s"), [(100.0, 4.0), (470.0, 4.0), (1200.0, 1199.5 / 120 * 1.001)])
+def test_levels_are_medians_of_four_seconds_and_at_most_120(length_s: float, window_s: float) -> None:
+    time = np.arange(50.0, 50.0 + length_s, 0.5)
+    level, place = np.sin(time), np.column_stack([time, -time, 0 * time])
+    shuffled = np.random.default_rng(6).permutation(len(time))
+    found = level_track(time[shuffled], place[shuffled], level[shuffled])
+    groups = [(time >= a) & (time < a + window_s) for a in np.arange(50.0, 50.0 + length_s, window_s)]
+    assert found.level_db == pytest.approx([np.median(level[some]) for some in groups])
+    assert found.time_s == pytest.approx([time[some].mean() for some in groups])
+    np.testing.assert_allclose(found.position_m[:, 1], -found.time_s)
+    assert len(groups) <= 120
+
+
+def test_the_grid_reaches_400_m_beyond_the_flight_and_the_region_a_tenth_of_the_tail() -> None:
+    track = LevelTrack(np.zeros(2), np.array([[0.0, 100.0, 30.0], [200.0, 130.0, 30.0]]), np.zeros(2))
+    grid = locating._grid(track)
+    assert (grid.min(axis=0).tolist(), grid.max(axis=0).tolist()) == ([-400.0, -300.0], [600.0, 540.0])
+    assert set(np.diff(np.unique(grid[:, 0]))) == set(np.diff(np.unique(grid[:, 1]))) == {40.0}
+    assert len(grid) == 26 * 22
+    for place, edge in (
+        ((-361.0, 0), 1),
+        ((-360.0, 0), 0),
+        ((561.0, 0), 1),
+        ((560.0, 0), 0),
+        ((0, 501.0), 1),
+        ((0, -261), 1),
+    ):
+        assert locating._on_edge(np.array([*place, 1.5]), grid) == bool(edge)
+    one, far = np.array([1.0]), np.array([0.0, 500.0])
+    assert locating._radius(np.array([0.0]), one) == pytest.approx(20.0 * np.sqrt(-2.0 * np.log(0.1)), abs=0.1)
+    # five percent far away: of the rest 18 in 19 are within; twenty percent: half of those far away
+    assert locating._radius(far, np.array([0.95, 0.05])) == pytest.approx(20 * np.sqrt(-2 * np.log(1 / 19)), abs=0.1)
+    assert locating._radius(far, np.array([0.8, 0.2])) == pytest.approx(500.0, abs=1.0)
+    moved = locating._refined(np.array([[0.0, 0.0, 1.5], [100.0, 40.0, 10.0]]))
+    steps = {(e, n, 1.5) for e in (-1, 0, 1) for n in (-1, 0, 1)}
+    assert {tuple(row) for row in np.round(moved[:9] / [40 / 3, 40 / 3, 1], 9).tolist()} == steps
+    assert moved[9:].mean(axis=0) == pytest.approx([100.0, 40.0, 10.0])
+    assert locating._log_prior(np.array([[0, 0, 1.5], [0, 0, 10.0]])) == pytest.approx(np.log([0.7, 0.3]))
+
+
+def test_slope_and_bend_of_the_likelihood_by_differences() -> None:
+    level = np.array([-60.0, -80.0, -80.0, -72.0])
+    track = LevelTrack(np.zeros(4), np.zeros((4, 3)), level, floor_db=-80.0)
+    latent = np.array([[-63.0, -78.0, -95.0, -60.0]])
+    _, slope, bend = locating._likelihood(track, latent, 5.0)
+    for k in range(4):
+        here, up, down = (locating._likelihood(track, latent + e * np.eye(4)[k], 5.0)[0][0] for e in (0, 1e-3, -1e-3))
+        assert slope[0, k] == pytest.approx((up - down) / 2e-3, rel=1e-5)
+        assert bend[0, k] == pytest.approx(-(up - 2 * here + down) / 1e-6, rel=1e-3, abs=1e-6)
+    assert locating._likelihood(track, latent, 5.0)[0] == pytest.approx(
+        norm.logpdf(-60, -63, 5) + norm.logcdf(-80, -78, 5) + norm.logcdf(-80, -95, 5) + norm.logpdf(-72, -60, 5)
+    )

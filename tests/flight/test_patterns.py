@@ -7,7 +7,20 @@ import pytest
 import shapely
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.flight.patterns import NOSES, Pattern, Waypoint, allowed_area, cut, flown, path_within, route_of
+from aerpaw_cmp.flight.patterns import (
+    NOSES,
+    Pattern,
+    Waypoint,
+    allowed_area,
+    cross,
+    cut,
+    flown,
+    lawnmower,
+    path_within,
+    route_of,
+    waypoints_of,
+    with_turns,
+)
 from aerpaw_cmp.flight.route_files import kml_text, plan_text, waypoints_csv
 from aerpaw_cmp.logs.route import read_areas, read_route
 from aerpaw_cmp.site.siteyaml import load_site
@@ -41,6 +54,79 @@ def test_the_way_round_an_obstacle_is_the_shorter_one():
     assert ring.buffer(1.5).covers(whole)
     assert whole.length == pytest.approx(80.0 + 2 * 10.0, abs=3.0)  # below, not above
     assert path_within(ring, np.array([10.0, 10.0]), np.array([90.0, 10.0])) == []
+    for begin, end in (((10.0, 60.0), (90.0, 60.0)), ((90.0, 60.0), (10.0, 60.0)), ((40.0, 10.0), (40.0, 90.0))):
+        way = path_within(ring, np.array(begin), np.array(end))
+        detour = shapely.LineString([begin, *way, end])
+        assert ring.buffer(1.5).covers(detour)
+        assert detour.length == pytest.approx(100.0, abs=3.0)  # 80 m, and 10 m aside and back
+        assert np.hypot(*(way[0] - begin)) < np.hypot(*(way[-1] - begin))
+    legs = [np.array([[0.0, 30.0], [30.0, 30.0]]), np.array([[70.0, 30.0], [100.0, 30.0]])]
+    assert len(waypoints_of(legs, ring, 30.0, "along")) == 4 + len(path_within(ring, legs[0][1], legs[1][0]))
+
+
+def test_legs_of_a_rectangle_are_those_by_hand():
+    area = shapely.box(0, 0, 230, 300)
+    by_hand = [[(23 + 46 * k, 0), (23 + 46 * k, 300)][:: -1 if k % 2 else 1] for k in range(5)]
+    np.testing.assert_allclose(lawnmower(area, 0.0, 45.0), by_hand, atol=1e-9)
+    lying = lawnmower(area, 90.0, 150.0)
+    np.testing.assert_allclose(np.sort(np.array(lying)[:, :, 1].ravel()), [75, 75, 225, 225], atol=1e-9)
+    np.testing.assert_allclose(lying[0][:, 0], lying[1][::-1, 0], atol=1e-9)
+    assert sorted(lying[0][:, 0]) == pytest.approx([0, 230])
+    np.testing.assert_allclose(lawnmower(area, 0.0, 1000.0), [[(115, 0), (115, 300)]], atol=1e-9)
+    notched = area.difference(shapely.box(0, 39, 300, 200))  # 39 m is no leg, 100 m are
+    assert [leg[:, 1].tolist() for leg in lawnmower(notched, 0.0, 115.0)] == [[200, 300], [300, 200]]
+    split = area.difference(shapely.box(0, 100, 300, 200))
+    assert [leg[:, 1].tolist() for leg in lawnmower(split, 0.0, 115.0)] == [[0, 100], [200, 300], [300, 200], [100, 0]]
+    np.testing.assert_allclose(cross(area, 0.0), [[(115, 0), (115, 300)], [(0, 150), (230, 150)]], atol=1e-9)
+    first, second = cross(shapely.box(-150, -150, 150, 150), 30.0)
+    assert np.degrees(np.arctan2(*(first[1] - first[0]))) == pytest.approx(30.0)
+    assert np.degrees(np.arctan2(*(second[1] - second[0]))) == pytest.approx(120.0)
+    assert np.linalg.norm(first[1] - first[0]) == pytest.approx(300.0 / np.cos(np.radians(30.0)))
+    assert cross(shapely.box(0, 0, 39, 300), 0.0)[0][:, 1].tolist() == [0.0, 300.0]
+    assert len(cross(shapely.box(0, 0, 39, 300), 0.0)) == 1
+
+
+def test_noses_turn_as_they_are_named_and_slow_turns_stand_at_four_points():
+    legs = [np.array([[100.0 * k, 300.0 * (k % 2)], [100.0 * k, 300.0 * (1 - k % 2)]]) for k in range(5)]
+    area = shapely.box(-50, -50, 500, 350)
+    course = [0, 90, 180, 90, 0, 90, 180, 90, 0, 0]  # the last point keeps its nose
+    leg_of = [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+    for nose, expected in (
+        ("along", course), ("fixed", [0] * 10),
+        ("four headings", [(c + 90 * (n % 4)) % 360 for c, n in zip(course, leg_of, strict=True)]),
+    ):  # fmt: skip
+        points = waypoints_of(legs, area, 30.0, nose)
+        assert [(w.east_m, w.north_m, w.height_m) for w in points] == [(*c, 30.0) for leg in legs for c in leg]
+        assert [w.yaw_deg for w in points] == pytest.approx(expected)
+    turned = with_turns(points)
+    assert len(turned) == 10 + 4 * 8
+    assert [w for w in turned if not w.hold_s] == points
+    for place in (0, 3, 6, 9):
+        at = [w for w in turned if w.hold_s and (w.east_m, w.north_m) == (points[place].east_m, points[place].north_m)]
+        assert [w.yaw_deg for w in at] == [(points[place].yaw_deg + 45.0 * k) % 360.0 for k in range(8)]
+        assert {w.hold_s for w in at} == {8.0}
+    assert len(with_turns(points[:2])) == 2 + 2 * 8
+
+
+def test_what_may_be_flown_is_the_fence_less_what_is_avoided_and_three_metres():
+    wide = allowed_area(SQUARE, [shapely.box(100, -150, 120, 150)], TOWER + 1000.0, 40.0)
+    assert wide.bounds == pytest.approx((-197.0, -147.0, 97.0, 147.0))  # the larger part
+    assert allowed_area(SQUARE, [], TOWER, 0.0).area == pytest.approx(394.0 * 294.0)
+    hole = 394.0 * 294.0 - allowed_area(SQUARE, [], TOWER, 40.0).area
+    assert hole == pytest.approx(np.pi * 43.0**2, rel=0.01)
+
+
+def test_a_cross_is_flown_back_and_forth_until_the_battery_ends():
+    area = shapely.box(-150, -150, 150, 150)
+    for seconds in (20.0, 200.0):
+        route = route_of(Pattern(shape="cross", azimuth_deg=0.0, height_m=30.0, nose="along"), area, 10.0, seconds)
+        assert route.duration_s == seconds
+    # 30 s north, 21.2 s to the western end, 30 s east, then back: from the southern end of the leg it began with, reversed
+    assert route.position_m[:31, 1] == pytest.approx(np.linspace(-150.0, 150.0, 31))
+    assert route.position_m[[60, 70], 1] == pytest.approx(0.0, abs=1e-6)
+    later = [tuple(row) for row in np.round(np.diff(route.position_m[83:, :2], axis=0)).tolist()]
+    assert (0.0, -10.0) in later
+    assert (-10.0, 0.0) in later
 
 
 def test_a_longer_battery_is_a_denser_lawnmower_and_a_cut_route_ends_in_time():

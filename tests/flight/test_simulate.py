@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ from aerpaw_cmp.flight.simulate import FlightSimulator, correlated_noise, plan_t
 POINTS = [(0, 0, 2, 3), (30, 40, 2, 0), (30, 40, 22, 0), (30, 40, 22, 4), (33, 44, 42, 0)]  # east, north, height, hold
 
 
-def planned(points: list[tuple[float, ...]], rss_s: float = 0.2) -> Any:
+def planned(points: Sequence[tuple[float, ...]], rss_s: float = 0.2) -> Any:
     named = [dict(zip(("east_m", "north_m", "height_m", "hold_s"), point, strict=True)) for point in points]
     return SimpleNamespace(
         waypoints=[SimpleNamespace(**point) for point in named], speed_mps=5.0, climb_mps=2.0,
@@ -29,7 +30,7 @@ def planned(points: list[tuple[float, ...]], rss_s: float = 0.2) -> Any:
 
 def simulator(**plan: Any) -> FlightSimulator:
     made = FlightSimulator.__new__(FlightSimulator)
-    made.plan, made.generator = SimpleNamespace(**plan), np.random.default_rng(1)
+    vars(made).update(plan=SimpleNamespace(**plan), generator=np.random.default_rng(1))
     return made
 
 
@@ -38,9 +39,9 @@ def test_a_leg_takes_the_longer_of_its_way_and_its_climb_and_a_hold_waits() -> N
     assert route.time_s.tolist() == pytest.approx([0, 3, 13, 23, 27, 37])
     assert route.duration_s == 37.0
     np.testing.assert_allclose(route.position_at(np.array([1.0, 8.0, 18.0, 32.0])),
-                               [[0, 0, 2], [15, 20, 2], [30, 40, 12], [31.5, 42, 32]])  # fmt: skip
+                               np.array([[0, 0, 2], [15, 20, 2], [30, 40, 12], [31.5, 42, 32.0]]))  # fmt: skip
     np.testing.assert_allclose(route.velocity_at(np.array([0.0, 3.0, 12.9, 13.0, 23.0, 27.0, 37.0])),
-                               [[0, 0, 0], [3, 4, 0], [3, 4, 0], [0, 0, 2], [0, 0, 0], [0.3, 0.4, 2], [0.3, 0.4, 2]],
+                               np.array([[0, 0, 0], [3, 4, 0], [3, 4, 0], [0, 0, 2], [0, 0, 0], *[[0.3, 0.4, 2]] * 2]),
                                atol=1e-12)  # fmt: skip
     roll, pitch, yaw = simulate.plan_attitude(route, np.array([1.0, 8.0, 18.0, 32.0]))
     assert not roll.any()
@@ -55,7 +56,7 @@ def test_a_leg_takes_the_longer_of_its_way_and_its_climb_and_a_hold_waits() -> N
     east, north = frame.to_local(records["latitude_deg"].to_numpy(), records["longitude_deg"].to_numpy())
     np.testing.assert_allclose(np.column_stack([east, north, records["altitude_m"]]),
                                route.position_at(np.arange(75) / 2), atol=1e-6)  # fmt: skip
-    assert records.loc[16, "velocity_east_mps":"velocity_down_mps"].tolist() == pytest.approx([3, 0])  # type: ignore[misc]
+    assert records.loc[16, "velocity_east_mps":"velocity_down_mps"].tolist() == pytest.approx([3, 0])
     assert records.loc[30, ["velocity_north_mps", "velocity_down_mps"]].tolist() == pytest.approx([0, -2])
 
 
@@ -126,7 +127,7 @@ def test_a_start_is_one_instant_of_a_wall_clock(start: str, right: int) -> None:
 def test_logs_of_a_plan_have_names_of_their_own_below_its_folder(names: list[str], tmp_path: Path) -> None:
     made = simulator()
     made.settings = SimpleNamespace(logs=[SimpleNamespace(path=name) for name in names])  # type: ignore[assignment]
-    with pytest.raises(UsageError, match="named|outside"):
+    with pytest.raises(UsageError, match=r"named|outside"):
         made._check_names(tmp_path)
     made.settings = SimpleNamespace(logs=[SimpleNamespace(path=n) for n in ("a.txt", "b/a.txt")])  # type: ignore[assignment]
     made._check_names(tmp_path)

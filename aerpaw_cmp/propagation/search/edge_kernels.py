@@ -24,7 +24,7 @@ LEAF = 16
 """Most convex pieces of a leaf of the tree, whose boxes are compared at once."""
 
 ROWS = 16384
-"""Paths for which there is room at first."""
+"""Fewest paths for which there is room at first."""
 
 
 class Solids(NamedTuple):
@@ -111,6 +111,11 @@ def _round(b, point, a, reach):  # type: ignore[no-untyped-def]
         reach[e] = far if far >= NEAREST_M and (up >= 0.0 or up_n >= 0.0) else -1.0
 
 
+@kernel
+def _in_triangles(m, f, p):  # type: ignore[no-untyped-def]
+    return in_face(m.first, m.flat, m.along, m.across, f, np.array(p), 0.0)
+
+
 @part
 def _bounce(m, f, image, end, corner):  # type: ignore[no-untyped-def]
     """Find where a face bends a leg from an image to an edge, and whether inside its bounds; the end without one."""
@@ -124,7 +129,7 @@ def _bounce(m, f, image, end, corner):  # type: ignore[no-untyped-def]
     y = image[1] + share * (corner[1] - image[1])
     z = image[2] + share * (corner[2] - image[2])
     if len(m.first):
-        return in_face(m.first, m.flat, m.along, m.across, f, np.array([x, y, z]), 0.0), (x, y, z)
+        return _in_triangles(m, f, (x, y, z)), (x, y, z)
     u = m.along[f, 0] * x + m.along[f, 1] * y + m.along[f, 2] * z
     v = m.across[f, 0] * x + m.across[f, 1] * y + m.across[f, 2] * z
     return m.lower[f, 0] <= u <= m.upper[f, 0] and m.lower[f, 1] <= v <= m.upper[f, 1], (x, y, z)
@@ -202,7 +207,7 @@ def _piece_cut(s, piece, a, b):  # type: ignore[no-untyped-def]
     return True
 
 
-@part
+@kernel
 def _own(s, b, own):  # type: ignore[no-untyped-def]
     """A piece that both faces of each edge bound, or -1, into ``own``: no leg from outside the wedge enters it."""
     own[:] = -1
@@ -303,38 +308,51 @@ def search(b, m, s, sources, targets, excluded, poses):  # type: ignore[no-untyp
     vertices : (paths, 4, 3)
         Points on mirror, edge, edge, mirror; NaN where unused.
     """
-    edges, towers, options = len(b.start), len(sources), len(b.options)
+    ends, edges, towers, options = (sources, targets, excluded), len(b.start), len(sources), len(b.options)
     a_s, r_s = np.empty((towers, options, edges)), np.empty((towers, options, edges))
     a_t, r_t = np.empty((options, edges)), np.empty((options, edges))
     for tower in range(towers):
         for i in range(options):
             _round(b, _mirrored(m, b.options[i], _vector(sources, tower)), a_s[tower, i], r_s[tower, i])
-    own, seen = np.empty(edges, np.int64), np.empty(edges, np.bool_)
+    own, seen, work = np.empty(edges, np.int64), np.empty(edges, np.bool_), np.empty(DEEPEST, np.int64)
     _own(s, b, own)
-    index, vertices, total = np.empty((ROWS, 8), np.int64), np.empty((ROWS, 4, 3)), 0
-    work = np.empty(DEEPEST, np.int64)
+    room, total = max(ROWS, 2 * (edges + len(b.pair))), 0
+    index, vertices = np.empty((room, 8), np.int64), np.empty((room, 4, 3))
     for pose in poses:
-        target = _vector(targets, pose)
         for j in range(options):
-            _round(b, _mirrored(m, b.options[j], target), a_t[j], r_t[j])
-        for link in range(towers * options * options):
-            tower, i, j = link // (options * options), link // options % options, link % options
-            f, g, source = b.options[i], b.options[j], _vector(sources, tower)
-            if excluded[tower, pose] or not _allowed(b, f, g, tower, pose):
-                continue
-            ends = (source, _mirrored(m, f, source), f), (target, _mirrored(m, g, target), g)
-            places = a_s[tower, i], r_s[tower, i], a_t[j], r_t[j]
-            _on_edges(b.length, places, seen)
-            walled = (f >= 0 and b.wall[f]) or (g >= 0 and b.wall[g])
-            for k in range(edges if walled else edges + len(b.pair)):
-                if k < edges and not seen[k]:
-                    continue
-                if total == len(index):
-                    index, vertices = _doubled(index, vertices)
-                if _free(b, m, s, work, ends, k, own, places, vertices[total]):
-                    _write(b, k, index[total], (pose, tower, f, g))
-                    total += 1
+            _round(b, _mirrored(m, b.options[j], _vector(targets, pose)), a_t[j], r_t[j])
+        link = 0
+        while link < towers * options * options:
+            if len(index) - total < edges + len(b.pair):
+                index, vertices = _doubled(index, vertices)
+            link, total = _links(
+                (b, m, s), ends, (a_s, r_s, a_t, r_t), (own, seen, work), (index, vertices, total), pose, link
+            )
     return index[:total], vertices[:total]
+
+
+@part
+def _links(scene, ends, places, space, rows, pose, first):  # type: ignore[no-untyped-def]
+    """Paths of the links of a pose from ``first`` on while there is room; the next link, and the rows in use."""
+    (b, m, s), (sources, targets, excluded), (a_s, r_s, a_t, r_t) = scene, ends, places
+    (own, seen, work), (index, vertices, total) = space, rows
+    edges, options, target = len(own), len(b.options), _vector(targets, pose)
+    for link in range(first, len(sources) * options * options):
+        if len(index) - total < edges + len(b.pair):
+            return link, total
+        tower, i, j = link // (options * options), link // options % options, link % options
+        f, g, source = b.options[i], b.options[j], _vector(sources, tower)
+        if excluded[tower, pose] or not _allowed(b, f, g, tower, pose):
+            continue
+        bent = (source, _mirrored(m, f, source), f), (target, _mirrored(m, g, target), g)
+        at = a_s[tower, i], r_s[tower, i], a_t[j], r_t[j]
+        _on_edges(b.length, at, seen)
+        walled = (f >= 0 and b.wall[f]) or (g >= 0 and b.wall[g])
+        for k in range(edges if walled else edges + len(b.pair)):
+            if (k >= edges or seen[k]) and _free(b, m, s, work, bent, k, own, at, vertices[total]):
+                _write(b, k, index[total], (pose, tower, f, g))
+                total += 1
+    return len(sources) * options * options, total
 
 
 @part

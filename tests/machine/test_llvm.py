@@ -197,7 +197,8 @@ def test_prepare_points_drjit_to_what_works(
     monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "")
     made: list[Path] = []
 
-    def attempt(library: llvm.Library) -> llvm.Trial:
+    def attempt(library: llvm.Library, program: str) -> llvm.Trial:
+        assert "sionna" not in program
         made.append(library.path)
         return llvm.Trial(library, True)
 
@@ -314,6 +315,26 @@ def test_this_machines_llvm_traces_two_paths() -> None:
     trials = llvm.first_that_works(llvm.candidates())
     assert trials, llvm.install_line()
     assert trials[-1].ok, trials
+
+
+@pytest.mark.sionna
+def test_a_path_of_another_length_fails_the_trial() -> None:
+    """The ground is one metre higher at one corner than what the expected lengths are of."""
+    program = llvm.TRIAL_PROGRAM.replace("800.0, 0.0]", "800.0, 1.0]")
+    assert program != llvm.TRIAL_PROGRAM
+    trial = llvm.try_library(llvm.candidates()[0], program=program)
+    assert trial.reason.startswith("the trial's path lengths are wrong: [31.62")
+
+
+@pytest.mark.sionna
+def test_the_trial_aborts_where_sionnas_solver_does() -> None:
+    """LLVM 15 and 16 cannot compile a maximum of sixteen floats for AVX-512."""
+    flags = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    old = [library for library in llvm.candidates({}) if library.version[:1] in {(15,), (16,)}]
+    if "avx512" not in flags or not old:
+        pytest.skip("needs AVX-512 and LLVM 15 or 16")
+    trial = llvm.try_library(llvm.Library(old[0].path, ()), program=llvm.TRIAL_PROGRAM)  # its name would refuse it
+    assert "Cannot select" in trial.reason
 
 
 def run_setup(folder: Path, *, path: str = "", before: str = "") -> subprocess.CompletedProcess[str]:

@@ -329,7 +329,7 @@ def test_coefficients_of_links_without_a_path(sionna, scenes):
 
 
 def test_a_second_search_compiles_nothing(sionna, scenes, lone):
-    """Dr.Jit bakes into a kernel the alignment of NumPy's memory and every literal: positions, carrier, materials."""
+    """Dr.Jit bakes into a kernel the alignment of NumPy's memory and every literal: positions, carrier, number of rays."""
     import drjit as dr
 
     site, poses = lone
@@ -347,12 +347,13 @@ def test_a_second_search_compiles_nothing(sionna, scenes, lone):
             compiled()
             few = type(poses)(poses.position_m[shift : shift + 5], poses.rotation[shift : shift + 5])
             # not seeded: what an earlier run left on disk must not serve
-            other = replace(link, carrier_hz=np.random.default_rng().uniform(3.3e9, 3.8e9))
-            replay(site, other, few, Search("sionna", samples=1000, batch=5, max_depth=1), run=Run(cache_dir=""))
+            rng = np.random.default_rng()
+            other, samples = replace(link, carrier_hz=rng.uniform(3.3e9, 3.8e9)), int(rng.integers(900, 1100))
+            replay(site, other, few, Search("sionna", samples=samples, batch=5, max_depth=1), run=Run(cache_dir=""))
             scene, probe = Scene.of(site, other, few), field_audit._probe(other)[0]
             sionna.own_coefficients(
                 scene.faces, scene.links_to(few), probe, (np.eye(3)[None], few.rotation),
-                sionna.Rays(samples=1000, batch=5, max_depth=1),
+                sionna.Rays(samples=samples, batch=5, max_depth=1),
             )  # fmt: skip
             big = [kernel for kernel in compiled() if kernel["operation_count"] > 1000]
             assert not (shift and big), "a search like the one before was compiled anew"

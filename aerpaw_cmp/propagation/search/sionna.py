@@ -33,7 +33,7 @@ import numpy as np
 from ...common.errors import CheckError, UsageError
 from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from ...common.versions import version
-from ...machine.llvm import let_sionna_load, prepare_llvm
+from ...machine.llvm import INSTALL_AGAIN, let_sionna_load, prepare_llvm
 from ...site.materials import material
 from ..arrays import Array, Link
 from ..faces import inside, triangles
@@ -91,7 +91,7 @@ def load_variant(prefer: str | None = None) -> str:
         If no LLVM serves.
     """
     let_sionna_load()
-    _leave_viewers_for_later()
+    _leave_for_later()
     kinds = (prefer,) if prefer else ("cuda", "llvm")
     without_llvm: CheckError | None = None
     if "llvm" in kinds:
@@ -117,23 +117,32 @@ def load_variant(prefer: str | None = None) -> str:
     )
 
 
-def _leave_viewers_for_later() -> None:
-    """Let Sionna load its viewers for notebooks when a scene is previewed, not with the package.
+_LATER = {
+    "preview": "Previewer",
+    "rcs.scattering_model_viewer": "ScatteringModelViewer",
+    "radio_map_solvers.radio_map_solver": "RadioMapSolver",
+    "path_solvers.sb_deterministic": "SBDeterministicCandidateGenerator",
+}
+"""Modules of Sionna RT with a class that no search makes."""
 
-    With them come ipywidgets, pythreejs and IPython: a sixth of the time of ``import sionna.rt``.
+
+def _leave_for_later() -> None:
+    """Let Sionna load its viewers for notebooks and its other solvers when one is made, not with the package.
+
+    With the viewers come ipywidgets, pythreejs and IPython: a sixth of the time of ``import sionna.rt``.
     """
     if "sionna.rt" in sys.modules:
         return
-    for name, viewer in (("preview", "Previewer"), ("rcs.scattering_model_viewer", "ScatteringModelViewer")):
+    for name, kind in _LATER.items():
         later = sys.modules[f"sionna.rt.{name}"] = ModuleType(f"sionna.rt.{name}")
-        vars(later)[viewer] = partial(_view, later, viewer)
+        vars(later)[kind] = partial(_made, later, kind)
 
 
-def _view(later: ModuleType, viewer: str, *given: Any, **named: Any) -> Any:
-    """Load a viewer in place of the module that stood for it, and make one."""
+def _made(later: ModuleType, kind: str, *given: Any, **named: Any) -> Any:
+    """Load a class in place of the module that stood for its own, and make an object of it."""
     if sys.modules.get(later.__name__) is later:
         del sys.modules[later.__name__]
-    return getattr(import_module(later.__name__), viewer)(*given, **named)
+    return getattr(import_module(later.__name__), kind)(*given, **named)
 
 
 def free_memory() -> None:
@@ -178,8 +187,11 @@ class _Builder:
     def scene(self, chosen: IntArray) -> _Scene:
         """Scene of the faces ``chosen``."""
         import drjit as dr
-        import sionna.rt as rt
 
+        try:
+            import sionna.rt as rt
+        except ImportError as error:
+            raise CheckError(f"Sionna RT cannot be loaded ({error})", cause=f"mend it with: {INSTALL_AGAIN}") from error
         if _ALIVE:
             gc.collect()  # an exception may have kept one
         scene, faces = rt.load_scene(), self.faces
@@ -348,14 +360,12 @@ class _Finder:
         self._replace_endpoints(len(sources.centres_m))
         self.solver = rt.PathSolver()
         self._watch_candidates()
+        self._share_kernels()
 
     def _watch_candidates(self) -> None:
         """Keep PathSolver's own count of candidates per source, which goes on counting beyond its limit."""
-        generator: Any = getattr(self.solver, "_candidate_generator", None)
-        inner = getattr(generator, "_shoot_and_bounce", None)
-        if inner is None:
-            self.limit = max(self.limit, 1_000_000)  # another release: the count of valid paths is all there is
-            return
+        generator = self.solver._candidate_generator
+        inner = generator._shoot_and_bounce
         place = list(inspect.signature(inner).parameters).index("paths_counter_per_source")
 
         def watched(*arguments: Any, **named: Any) -> Any:
@@ -364,6 +374,22 @@ class _Finder:
             return inner(*arguments, **named)
 
         generator._shoot_and_bounce = watched
+
+    def _share_kernels(self) -> None:
+        """Let kernels read the directions of the rays: their number, a literal, compiled the largest two anew."""
+        import drjit as dr
+        import sionna.rt.path_solvers.sb_candidate_generator as generator
+        from sionna.rt.utils import fibonacci_lattice
+
+        def lattice(count: int) -> Any:
+            directions = fibonacci_lattice(count)
+            dr.eval(directions)
+            return directions
+
+        generator.fibonacci_lattice = lattice
+        field = self.solver._field_calculator
+        # the number scales diffuse rays alone, and no search casts any
+        self.solver._field_calculator = lambda **named: field(**named | {"samples_per_src": 1})
 
     def _replace_endpoints(self, towers: int) -> None:
         """Give PathSolver arrays of positions: those of the devices would be literals in the kernels."""

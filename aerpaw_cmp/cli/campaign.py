@@ -10,7 +10,7 @@ import typer
 from ..common.stages import duration
 from ..jobs.options import RunOptions
 from .app import Export, Force, Json, LogsRoot, Scheduler, Workers, command
-from .shown import number, print_json, say, table
+from .shown import number, print_json, records, say, table
 
 
 @command(
@@ -90,18 +90,7 @@ def _print_campaign_summary(outcome: Any) -> None:
     rows = [[s, *[number(by[f], "{:.2f}") for f in names]] for s, by in m["mean_rmse_db"].items()]
     if names:
         table(["setting", *names], rows, "Mean RMSE over towers and channels (dB), own offsets")
-    rows = [
-        [
-            r["setting"],
-            r["flight"],
-            r["tower"],
-            f"{r['k']:g}",
-            number(r["total_variation"], "{:.3f}"),
-            number(r["agreement"], "{:.2f}"),
-            number(r["kappa"], "{:.2f}"),
-        ]
-        for r in m["rank"]
-    ]
-    if rows:
-        table(["setting", "flight", "tower", "K", "total variation", "agreement", "kappa"], rows, "Rank")
+    heads = {"setting": "setting", "flight": "flight", "tower": "tower", "K": "k:g"}
+    numbers = {"total variation": "total_variation:.3f", "agreement": "agreement:.2f", "kappa": "kappa:.2f"}
+    records(m["rank"], heads | numbers, "Rank")
     print(f"report: {outcome.folder / 'campaign.html'}")

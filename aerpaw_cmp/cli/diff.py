@@ -9,7 +9,7 @@ import typer
 
 from ..common.errors import one_line
 from .app import Force, Json, command
-from .shown import number, print_json, say, table
+from .shown import print_json, records, say
 
 
 @command(
@@ -77,27 +77,17 @@ def _value(value: Any) -> str:
     return "not there" if value is None else str(value)
 
 
-def _bounds(value: tuple[float, float]) -> str:
-    return "-" if value[0] != value[0] else f"{value[0]:+.3f} .. {value[1]:+.3f}"
-
-
 def _print_numbers(comparison: Any) -> None:
-    rows = [
-        [f"{d.tower} {d.channel}", f"{d.samples.common} of {d.samples.first}, {d.samples.second}",
-         number(d.rmse.other_rmse_db, "{:.3f}"), number(d.rmse.rmse_db, "{:.3f}"),
-         number(d.rmse.difference_db, "{:+.3f}"), _bounds(d.rmse.difference_ci95_db), d.rmse.verdict,
-         number(d.offset_db.difference, "{:+.1f}"), number(d.simulated_max_db, "{:.3f}")]
-        for d in comparison.levels
-    ]  # fmt: skip
-    if rows:
-        heads = ["link", "common samples", "RMSE first dB", "second", "change", "95 %", "second is", "offset", "replay"]
-        table(heads, rows, "RSS on common samples, second minus first; offset and replay: change, largest change in dB")
-    rows = [
-        [d.tower, d.k, f"{d.samples.common} of {d.samples.first}, {d.samples.second}", str(d.n_changed),
-         number(d.agreement.difference, "{:+.3f}"), _bounds(d.agreement.ci95),
-         number(d.kappa.difference, "{:+.3f}"), _bounds(d.kappa.ci95)]
-        for d in comparison.ranks
-    ]  # fmt: skip
-    if rows:
-        heads = ["tower", "K", "common samples", "ranks changed", "agreement", "95 %", "kappa", "95 %"]
-        table(heads, rows, "Rank on common samples, second minus first")
+    levels = {
+        "tower": "tower", "channel": "channel", "common samples": "samples", "RMSE first dB": "rmse.other_rmse_db:.3f",
+        "second": "rmse.rmse_db:.3f", "change": "rmse.difference_db:+.3f", "95 %": "rmse.difference_ci95_db:+.3f",
+        "second is": "rmse.verdict", "offset": "offset_db.difference:+.1f", "replay": "simulated_max_db:.3f",
+    }  # fmt: skip
+    title = "RSS on common samples, second minus first; offset and replay: change, largest change in dB"
+    records(comparison.levels, levels, title)
+    ranks = {
+        "tower": "tower", "K": "k", "common samples": "samples", "ranks changed": "n_changed",
+        "agreement": "agreement.difference:+.3f", "95 % of it": "agreement.ci95:+.3f",
+        "kappa": "kappa.difference:+.3f", "95 % of kappa": "kappa.ci95:+.3f",
+    }  # fmt: skip
+    records(comparison.ranks, ranks, "Rank on common samples, second minus first")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
 from .app import Json, LogsRoot, command
-from .shown import number, print_json, say, table
+from .shown import number, print_json, records, say, table
 
 
 @command(
@@ -49,19 +50,12 @@ def _print(explanation: Any) -> None:
         f"({explanation.time_s:.1f} s)"
     )
     print(f"UAV at {east:.2f} m east, {north:.2f} m north, {up:.2f} m up; {explanation.carrier_hz / 1e9:g} GHz")
-    rows = []
-    for path in explanation.paths:
-        rows.append(
-            [
-                path.words,
-                f"{path.length_m:.2f}",
-                f"{path.delay_ns:.1f}",
-                f"{path.departure_azimuth_deg:.1f} / {path.departure_elevation_deg:.1f}",
-                f"{path.arrival_azimuth_deg:.1f} / {path.arrival_elevation_deg:.1f}",
-                f"{path.level_dbm:.2f}",
-                f"{path.phase_deg:.1f}",
-            ]
-        )
+    rows = [
+        [p.words, f"{p.length_m:.2f}", f"{p.delay_ns:.1f}",
+         f"{p.departure_azimuth_deg:.1f} / {p.departure_elevation_deg:.1f}",
+         f"{p.arrival_azimuth_deg:.1f} / {p.arrival_elevation_deg:.1f}", f"{p.level_dbm:.2f}", f"{p.phase_deg:.1f}"]
+        for p in explanation.paths
+    ]  # fmt: skip
     heads = ["path", "m", "ns", "departure az / el deg", "arrival az / el deg", "dBm", "phase deg"]
     if rows:
         table(heads, rows, f"{len(rows)} paths by engine {explanation.engine}")
@@ -73,13 +67,9 @@ def _print(explanation: Any) -> None:
             for p in explanation.paths
         ]
         table(["path", "transmitted dBm", *(f"{name} dB" for name in names), "level dBm"], terms, "Terms")
-    bounces = [
-        [path.words, b.face, b.material, f"{b.incidence_deg:.1f}", f"{b.te_db:.2f}", f"{b.tm_db:.2f}"]
-        for path in explanation.paths
-        for b in path.bounces
-    ]
-    if bounces:
-        table(["path", "face", "material", "incidence deg", "|TE| dB", "|TM| dB"], bounces, "Reflections")
+    bounces = [{"path": path.words, **asdict(bounce)} for path in explanation.paths for bounce in path.bounces]
+    angle = {"path": "path", "face": "face", "material": "material", "incidence deg": "incidence_deg:.1f"}
+    records(bounces, angle | {"|TE| dB": "te_db:.2f", "|TM| dB": "tm_db:.2f"}, "Reflections")
     levels = [number(level, "{:.2f}") for level in (explanation.level_dbm, explanation.power_sum_dbm)]
     print(f"coherent sum {levels[0]} dBm, sum of powers {levels[1]} dBm")
     if explanation.measured_db is not None:

@@ -11,7 +11,7 @@ import typer
 from ..common.errors import one_line
 from ..jobs.options import RunOptions
 from .app import DryRun, Export, Force, Json, LogsRoot, command
-from .shown import number, print_files, print_json, print_plan, say, table
+from .shown import number, print_files, print_json, print_plan, records, say, table
 
 
 @command(
@@ -111,76 +111,56 @@ _WARNINGS = 10
 
 def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:
     """One line per model; over several channels the range of its errors, which the page has one by one."""
-    models = dict.fromkeys(m["model"] for m in ladder)
     rows = []
-    for model in models:
+    for model in dict.fromkeys(m["model"] for m in ladder):
         mine = [m for m in ladder if m["model"] == model]
         errors = [m["rmse_heldout_db"] for m in mine if m["rmse_heldout_db"] is not None]
-        shown = (
-            f"{min(errors):.2f}" if len(errors) == 1 else f"{min(errors):.2f} .. {max(errors):.2f}" if errors else "-"
-        )
+        ends = (min(errors), max(errors))[: len(errors)] if errors else None
         star = "* " if any(m["recommended"] for m in mine) else ""
-        rows.append([star + model, shown, number(max(m["seconds"] for m in mine), "{:.1f}")])
-    if rows:
-        heads = ["model", "RMSE dB", "s"]
-        table(heads, rows, "Model comparison (cross-validated); * simplest replay within 1 SE of the best")
+        rows.append({"model": star + model, "rmse_db": ends, "seconds": max(m["seconds"] for m in mine)})
+    title = "Model comparison (cross-validated); * simplest replay within 1 SE of the best"
+    records(rows, {"model": "model", "RMSE dB": "rmse_db:.2f", "s": "seconds:.1f"}, title)
 
 
 def _print_forecasts(rank: Mapping[str, Any]) -> None:
     """The forecast of the fitted receivers, where one was scored."""
-    rows = []
-    for tower, m in rank.items():
-        found = m.get("receiver")
-        if found and found.get("kappa") is not None:
-            low, high = found["kappa_ci95"]
-            rows.append([
-                tower, number(found["kappa"], "{:.2f}"), f"{number(low, '{:.2f}')} .. {number(high, '{:.2f}')}",
-                *(number(found[name], "{:.3f}") for name in _FORECAST), str(m["n"]),
-            ])  # fmt: skip
-    if rows:
-        heads = ["tower", "kappa", "95 %", "agreement", "commonest", "log score", "constant", "n"]
-        table(heads, rows, "Rank forecast by the fitted receiver")
-
-
-_FORECAST = ("agreement", "majority_agreement", "log_score", "constant_log_score")
+    known = [{"tower": tower, **(m.get("receiver") or {}), "n": m["n"]} for tower, m in rank.items()]
+    columns = {
+        "tower": "tower", "kappa": "kappa:.2f", "95 %": "kappa_ci95:.2f", "agreement": "agreement:.3f",
+        "commonest": "majority_agreement:.3f", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",
+        "n": "n",
+    }  # fmt: skip
+    known = [forecast for forecast in known if forecast.get("kappa") is not None]
+    records(known, columns, "Rank forecast by the fitted receiver")
 
 
 def _print_report_summary(outcome: Any) -> None:
     from ..compare.memory import FEWEST
     from ..compare.result import BASELINE_TITLE
 
-    rows = []
-    for tower, channels in outcome.metrics["rss"].items():
-        for channel, m in channels.items():
-            ci, many = m.get("rmse_ci95_db") or [None, None], m["n"] >= FEWEST
-            rows.append(
-                [
-                    tower,
-                    channel,
-                    number(m["offset_db"], "{:.1f}"),
-                    number(m["rmse_db"] if many else None, "{:.2f}"),
-                    f"{number(ci[0], '{:.2f}')} .. {number(ci[1], '{:.2f}')}",
-                    *(number(m["baselines"][n]["rmse_db"] if many else None, "{:.2f}") for n in BASELINE_TITLE),
-                    number(m["correlation"], "{:.2f}"),
-                    str(m["n"]),
-                    str(m["n_out_of_coverage"]),
-                ]
-            )
-    if rows:
-        table(
-            ["tower", "channel", "offset dB", "RMSE dB", "95 %", *BASELINE_TITLE.values(), "corr.", "n", "out of cov."],
-            rows,
-            "RSS, measured against replayed",
-        )
+    links = [
+        {
+            **m, "tower": tower, "channel": channel, "ci95_db": m.get("rmse_ci95_db"),
+            **{name: model["rmse_db"] if m["n"] >= FEWEST else None
+               for name, model in {"rmse_db": m, **m["baselines"]}.items()},
+        }
+        for tower, channels in outcome.metrics["rss"].items()
+        for channel, m in channels.items()
+    ]  # fmt: skip
+    columns = {
+        "tower": "tower", "channel": "channel", "offset dB": "offset_db:.1f", "RMSE dB": "rmse_db:.2f",
+        "95 %": "ci95_db:.2f", **{title: f"{name}:.2f" for name, title in BASELINE_TITLE.items()},
+        "corr.": "correlation:.2f", "n": "n", "out of cov.": "n_out_of_coverage",
+    }  # fmt: skip
+    records(links, columns, "RSS, measured against replayed")
     _print_ladder(outcome.metrics.get("ladder", ()))
-    rows = []
-    for tower, m in outcome.metrics["rank"].items():
-        for k, s in m["simulated"].items():
-            rows.append(
-                [tower, k, number(s["agreement"], "{:.3f}"), number(s["total_variation"], "{:.3f}"), str(m["n"])]
-            )
-    if rows:
-        table(["tower", "K", "agreement", "total variation", "n"], rows, "Rank, measured against replayed")
+    thresholds = [
+        {"tower": tower, "k": k, **fit, "n": m["n"]}
+        for tower, m in outcome.metrics["rank"].items()
+        for k, fit in m["simulated"].items()
+    ]
+    columns = {"tower": "tower", "K": "k", "agreement": "agreement:.3f", "total variation": "total_variation:.3f"}
+    records(thresholds, {**columns, "n": "n"}, "Rank, measured against replayed")
     _print_forecasts(outcome.metrics["rank"])
     if "against" in outcome.metrics:
         print(outcome.metrics["against"]["sentence"])
@@ -246,17 +226,15 @@ def calibrate(
     if rows:
         heads = ["left out", "RMSE dB", "4 s means dB", *(f"{title} dB" for title in BASELINES.values()), "series"]
         table(heads, rows, "Scores on what was left out, means")
-    rows = [
-        [split.replace("_", " "), one["flight"], one["tower"], number(one["kappa"], "{:.3f}"),
-         number(one["agreement"], "{:.3f}"), number(one["majority_agreement"], "{:.3f}"),
-         number(one["log_score"], "{:.3f}"), number(one["constant_log_score"], "{:.3f}"),
-         number(one["total_variation_expected"], "{:.3f}")]
-        for split, scores in m["rank"].items()
-        for one in scores
+    forecasts = [
+        {**one, "split": split.replace("_", " ")} for split, scores in m["rank"].items() for one in scores
     ]  # fmt: skip
-    if rows:
-        heads = ["left out", "flight", "tower", "kappa", "agree", "commonest", "log score", "constant", "TV"]
-        table(heads, rows, "Rank on what was left out")
+    columns = {
+        "left out": "split", "flight": "flight", "tower": "tower", "kappa": "kappa:.3f", "agree": "agreement:.3f",
+        "commonest": "majority_agreement:.3f", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",
+        "TV": "total_variation_expected:.3f",
+    }  # fmt: skip
+    records(forecasts, columns, "Rank on what was left out")
     for text in [*m["words"], *m["warnings"]]:
         print(text)
     print(outcome.files[0])

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from .app import Force, Json, command
-from .shown import print_json, say, table
+from .shown import print_json, records, say, table
 
 
 @command(
@@ -84,16 +84,9 @@ def formats(as_json: Json = False) -> None:
     from ..logs.readers import catalogue
 
     readers = sorted(catalogue(), key=lambda r: r.name)
+    found = [{"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers]
     if as_json:
-        print_json(
-            {
-                "readers": [
-                    {"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers
-                ]
-            }
-        )
+        print_json({"readers": found})
         return
-    table(
-        ["reader", "what", "streams", "a line of it"],
-        [[r.name, r.title, ", ".join(r.kinds), r.sample] for r in readers],
-    )
+    columns = {"reader": "name", "what": "title", "streams": "kinds", "a line of it": "sample"}
+    records([{**item, "kinds": ", ".join(item["kinds"])} for item in found], columns)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from .app import Json, command
-from .shown import number, print_json, say, table
+from .shown import print_json, records, say
 
 
 @command(
@@ -33,34 +33,16 @@ def bench(
     if as_json:
         print_json(result)
         return
-    rows = []
-    for r in result["replay"]["rows"]:
-        rows.append(
-            [
-                r["engine"],
-                "-" if r["samples"] is None else f"{r['samples']:.0e}",
-                r["arrays"],
-                str(r["depth"]),
-                f"{r['seconds']:.3g}",
-                f"{r['links_per_s']:.3g}",
-                f"{r['peak_mib']:.0f}",
-                "-" if r["missing_paths"] is None else f"{r['missing_paths']} / {r['extra_paths']}",
-                f"{number(r['rss_max_error_db'], '{:.2g}')} / {number(r['rss_rms_error_db'], '{:.2g}')}",
-                ", ".join(f"{k}: {share:.3f}" for k, share in r["rank_disagreement"].items()),
-            ]
-        )
-    header = [
-        "engine",
-        "samples",
-        "arrays",
-        "depth",
-        "s",
-        "links/s",
-        "peak MiB",
-        "missing / extra",
-        "RSS error dB max / rms",
+    rows = [
+        {**row, "ranks": ", ".join(f"{k}: {share:.3f}" for k, share in row["rank_disagreement"].items())}
+        for row in result["replay"]["rows"]
     ]
-    table([*header, "rank disagreement per K"], rows, f"Speed against error ({_conditions(result['conditions'])})")
+    columns = {
+        "engine": "engine", "samples": "samples:.0e", "arrays": "arrays", "depth": "depth", "s": "seconds:.3g",
+        "links/s": "links_per_s:.3g", "peak MiB": "peak_mib:.0f", "missing": "missing_paths", "extra": "extra_paths",
+        "RSS error dB max": "rss_max_error_db:.2g", "rms": "rss_rms_error_db:.2g", "rank disagreement per K": "ranks",
+    }  # fmt: skip
+    records(rows, columns, f"Speed against error ({_conditions(result['conditions'])})")
     for name, ratio in result["ratios"].items():
         print(f"{name}: {ratio:.3g} times")
 
@@ -86,5 +68,5 @@ def doctor(as_json: Json = False) -> int:
     if as_json:
         print_json(doctor_room.as_dict(checks))
     else:
-        table(["check", "status", "found", "remedy"], [[c.name, c.status, c.found, c.remedy or "-"] for c in checks])
+        records(checks, {"check": "name", "status": "status", "found": "found", "remedy": "remedy"})
     return 1 if any(c.status == "fail" for c in checks) else 0

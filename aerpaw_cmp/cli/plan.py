@@ -9,7 +9,7 @@ import typer
 
 from ..jobs.options import RunOptions
 from .app import Flights, Force, Json, LogsRoot, command
-from .shown import print_json, say, table
+from .shown import print_json, records, say
 
 _FENCE = typer.Option(metavar="KML", help="Area that may be flown  [default: the area of the site]")
 _AVOID = typer.Option(metavar="KML", help="No-fly areas; repeatable.")
@@ -76,16 +76,16 @@ def plan(
     print_json(outcome.metrics) if as_json else _print_summary(outcome)
 
 
+def _in_km(one: dict[str, Any]) -> dict[str, Any]:
+    return {**one, "km": one["length_m"] / 1000.0, "flown": one.get("refused") or "yes"}
+
+
 def _print_summary(outcome: Any) -> None:
     m = outcome.metrics
     print(m["sentence"])
-    rows = [
-        [c["name"], f"{c['sd_db']:.2f}", f"{c['length_m'] / 1000:.1f}", f"{c['minutes']:.1f}", c["refused"] or "yes"]
-        for c in m["candidates"]
-    ]
-    table(["route", "SD dB", "km", "min", "may be flown"], rows, "Candidates")
-    lengths = [[f"{p['minutes']:.1f}", f"{p['length_m'] / 1000:.1f}", f"{p['sd_db']:.2f}"] for p in m["length"]]
-    table(["min", "km", "SD dB"], lengths, "What a longer flight buys")
+    length = {"SD dB": "sd_db:.2f", "km": "km:.1f", "min": "minutes:.1f"}
+    records([_in_km(c) for c in m["candidates"]], {"route": "name", **length, "may be flown": "flown"}, "Candidates")
+    records([_in_km(p) for p in m["length"]], length, "What a longer flight buys")
     for text in m["warnings"][:10]:
         say.warn(f"warning: {text}")
     print(f"page: {outcome.folder / 'plan.html'}")

@@ -9,7 +9,7 @@ import typer
 
 from ..jobs.options import RunOptions
 from .app import Flights, Force, Json, LogsRoot, command
-from .shown import number, print_json, say, table
+from .shown import print_json, records, say
 
 
 @command(
@@ -68,13 +68,12 @@ def predict(
 def _print_summary(outcome: Any) -> None:
     m = outcome.metrics
     print(m["sentence"])
-    rows = [
-        [name, one["unit"], number(one["mean_level_db"], "{:.1f}"), number(one["mean_sd_db"], "{:.1f}"),
-         number(one.get("mean_p_above"), "{:.2f}"), f"{100 * one['share_outside_flown']:.0f} %", str(one["points"])]
-        for name, one in m["series"].items()
-    ]  # fmt: skip
-    heads = ["series", "unit", "mean level", "mean SD dB", "P(above)", "outside flown", "points"]
-    table(heads, rows, "Prediction")
+    series = [{"name": name, "mean_p_above": None, **one} for name, one in m["series"].items()]
+    columns = {
+        "series": "name", "unit": "unit", "mean level": "mean_level_db:.1f", "mean SD dB": "mean_sd_db:.1f",
+        "P(above)": "mean_p_above:.2f", "outside flown": "share_outside_flown:.0%", "points": "points",
+    }  # fmt: skip
+    records(series, columns, "Prediction")
     for text in m["warnings"][:10]:
         say.warn(f"warning: {text}")
     print(f"page: {outcome.folder / 'prediction.html'}")

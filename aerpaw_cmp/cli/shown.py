@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -158,3 +159,27 @@ def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, wi
 def number(value: float | None, form: str) -> str:
     """A number as ``form`` says, a dash where there is none."""
     return "-" if value is None else form.format(value)
+
+
+def records(items: Sequence[Any], columns: Mapping[str, str], title: str | None = None) -> None:
+    """A table of records or mappings; nothing without any.
+
+    Parameters
+    ----------
+    items : sequence
+        A row each.
+    columns : mapping of str to str
+        By head, what a cell shows: ``name``, ``name.of.a.part`` or, with a format, ``name:.2f``.
+    title : str, optional
+        Line above the table.
+    """
+    if items:
+        table(list(columns), [[_cell(item, what) for what in columns.values()] for item in items], title)
+
+
+def _cell(item: Any, what: str) -> str:
+    name, _, form = what.partition(":")
+    value = item[name] if isinstance(item, Mapping) else attrgetter(name)(item)
+    if isinstance(value, (tuple, list)):  # an interval
+        return "-" if any(end is None or end != end for end in value) else " .. ".join(format(e, form) for e in value)
+    return "-" if value is None else format(value, form)

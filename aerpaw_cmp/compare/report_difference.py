@@ -42,6 +42,9 @@ class Overlap:
     second: int
     common: int
 
+    def __str__(self) -> str:
+        return f"{self.common} of {self.first}, {self.second}"
+
     @property
     def only_first(self) -> int:
         """Samples that the second report has not."""

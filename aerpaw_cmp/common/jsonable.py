@@ -66,6 +66,11 @@ def _listed(array: AnyArray) -> Any:
     return json_safe(array.tolist() if array.dtype.kind != "M" else array.astype(str).tolist())
 
 
+def named(record: Any, names: str) -> dict[str, Any]:
+    """Some fields of a record by name; ``names`` stand apart by blanks."""
+    return {name: getattr(record, name) for name in names.split()}
+
+
 def fields_of(record: Any) -> dict[str, Any]:
     """Fields of a dataclass by name, without those that are None because they do not exist."""
     return {

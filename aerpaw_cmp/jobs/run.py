@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -480,7 +479,6 @@ def run_map(
     UsageError, InputError
         With what was found, expected, and the likely cause.
     """
-    from ..common.versions import versions
     from ..maps.grid import Grid
     from ..report.maps_html import maps_metrics, write_maps
     from ..site.siteyaml import load_site
@@ -511,19 +509,12 @@ def run_map(
             if flight is not None:
                 outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, options.logs_root)
             mapping.study_maps(outcome, stages)
-        generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
         with output.filling() as part:
             with stages("export"):
-                about = {"site": place.name, "generated": generated, "version": versions()["aerpaw-cmp"]}
-                files = mapping.export_maps(outcome, part, about, progress)
+                files = mapping.export_maps(outcome, part, progress)
             progress("page")
             record = mapping.maps_record(
-                outcome,
-                name=Path(site).stem,
-                generated=generated,
-                versions=versions(),
-                stages_s=stages.seconds,
-                paper=paper_rows(outcome),
+                outcome, name=Path(site).stem, stages_s=stages.seconds, paper=paper_rows(outcome)
             )
             written = write_maps(record, part)
             written.append(part / "paper.md")

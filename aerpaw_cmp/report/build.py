@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from datetime import datetime, timezone
 
 import numpy as np
 
-from ..common.versions import versions
+from ..common.versions import utc_now, versions
 from ..compare.result import APPLIED, NOT_APPLIED, ClockResult, FlightResult, RankResult, RssResult
 from ..flight.data import FlightData
 from ..flight.settings import LogSettings
@@ -60,7 +59,7 @@ def report_data(
         title=settings.report.title or settings.flight.title or settings.flight.name,
         flight=settings.flight.name,
         site=data.site,
-        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        generated=utc_now(),
         versions=versions(),
         inputs=(*inputs_of(settings.logs, data.files), *other_inputs),
         track=track_of(data),

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from ..common.units import FloatArray
+from .made import Made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,11 +36,10 @@ class AntennaMap:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrationData:
+class CalibrationData(Made):
     """The record of a calibration; ``scores`` and ``controls`` hold rows with flight, tower, channel, RMSE."""
 
     name: str
-    generated: str
     flights: Sequence[str]
     trained_on: Sequence[str]
     words: Sequence[str]
@@ -57,5 +57,3 @@ class CalibrationData:
     place: Mapping[str, FloatArray] | None = None
     rank: Mapping[str, Any] | None = None
     settings_text: str = ""
-    versions: Mapping[str, str] = field(default_factory=dict)
-    stages_s: Mapping[str, float] = field(default_factory=dict)

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..common.jsonable import json_object
+from ..common.jsonable import json_object, named
 from ..compare.calibration import BASELINES
 from . import canvas
 from .calibration_data import AntennaMap, CalibrationData
 from .canvas import FigureSpec
-from .export import about
 from .html import write_page
+from .made import about
 from .names import safe_name
 
 SPLIT_TITLE = {
@@ -33,19 +33,11 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
     """The numbers of the page under stable names."""
     return json_object(
         calibration=data.name,
-        flights=data.flights,
-        trained_on=data.trained_on,
-        scores=data.scores,
-        controls=data.controls,
-        mounts=data.mounts,
-        strengths=data.strengths,
-        ground=data.ground,
+        **named(data, "flights trained_on scores controls mounts strengths ground words warnings"),
         learning_curve={"points": data.curve, "one_more_rmse_db": data.one_more_rmse_db},
         antennas=[
             {"name": a.name, "share_of_sphere_seen": share_seen(a), "n_bins": len(a.seen)} for a in data.antennas
         ],
-        words=data.words,
-        warnings=data.warnings,
         rank=data.rank or {},
         **about(data),
     )

@@ -13,6 +13,7 @@ from ..compare.offset import Moments, difference_moments
 from ..compare.passes import Repeated, cell_means
 from ..compare.statistics import Interval
 from ..site.site import Site
+from .made import Made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -348,13 +349,11 @@ class Season:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CampaignData:
+class CampaignData(Made):
     """Everything the page shows. ``settings`` are overrides by label; ``flights`` the names in order."""
 
     name: str
     title: str
-    generated: str
-    versions: Mapping[str, str]
     calibration: str
     flights: tuple[str, ...]
     settings: Mapping[str, Mapping[str, Any]]
@@ -372,7 +371,6 @@ class CampaignData:
     cell_m: float = 20.0
     site: Site | None = None
     synthetic: tuple[str, ...] = ()
-    stages_s: Mapping[str, float] = field(default_factory=dict)
     workers: int = 1
     season: Season = Season()
 

@@ -34,6 +34,7 @@ from .export import json_text, write_file
 from .exports.points import of_campaign
 from .exports.write import write_exports
 from .html import by_section, rendered
+from .made import about
 from .words import pretty
 
 MANY = 200
@@ -62,8 +63,6 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
     result = {
         "campaign": data.name,
         "title": data.title,
-        "generated": data.generated,
-        "versions": dict(sorted(data.versions.items())),
         "flights": [
             {"flight": name, "ok": name not in failed, "synthetic": name in data.synthetic} for name in data.flights
         ],
@@ -95,7 +94,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "cells": 0 if data.season.places is None else len(data.season.places.cells),
         },
         "workers": data.workers,
-        "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
+        **about(data),
     }
     safe: dict[str, Any] = json_safe(result)
     return safe

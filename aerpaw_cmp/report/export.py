@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from ..common.cells import guarded
-from ..common.jsonable import fields_of, json_safe
+from ..common.jsonable import fields_of, json_safe, named
 from ..common.provenance import KEY, union
 from ..common.units import FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult, EngineResult, RankResult, RssResult
 from ..compare.statistics import Interval
 from ..logs.records import has_wall_clock
 from .data import RANKS, ReportData
+from .made import about
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 from .words import audit_summary
 
@@ -38,10 +39,8 @@ def metrics(data: ReportData) -> dict[str, Any]:
     result: dict[str, Any] = {
         "flight": data.flight,
         "title": data.title,
-        "generated": data.generated,
         "synthetic": data.synthetic,
         "site": {"name": data.site.name, "illustrative": data.site.illustrative},
-        "versions": dict(sorted(data.versions.items())),
         "inputs": [
             named(f, "path sha256 reader lines accepted rejected blank role warnings")
             | ({"learned_on": f.learned_on} if f.learned_on else {})
@@ -52,7 +51,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         "rss": rss,
         "rank": {item.tower: _rank_metrics(item) for item in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),
-        "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
+        **about(data),
         "warnings": list(data.warnings),
         **({"ladder": data.ladder} if data.ladder else {}),
         "clock": {name: clock_metrics(clock) for name, clock in data.clocks.items()},
@@ -62,11 +61,6 @@ def metrics(data: ReportData) -> dict[str, Any]:
     safe: dict[str, Any] = json_safe(result)
     merge(safe, json_safe(data.extra_metrics))
     return safe
-
-
-def named(record: Any, names: str) -> dict[str, Any]:
-    """Fields of a record by name."""
-    return {name: getattr(record, name) for name in names.split()}
 
 
 def _rss_metrics(one: RssResult) -> dict[str, Any]:
@@ -305,15 +299,6 @@ def _times(time: Any, part: slice) -> dict[str, Any]:
 def json_text(numbers: Mapping[str, Any], indent: int | None = 2) -> str:
     """Numbers as the text of a file."""
     return json.dumps(numbers, indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def about(page: Any) -> dict[str, Any]:
-    """Record of when and by what a page was made, in metrics.json: ``generated``, ``versions``, ``stages_s``."""
-    return {
-        "generated": page.generated,
-        "versions": dict(sorted(page.versions.items())),
-        "stages": {f"{name}_s": seconds for name, seconds in page.stages_s.items()},
-    }
 
 
 def write_file(path: Path, content: str | bytes | Iterator[str]) -> Path:

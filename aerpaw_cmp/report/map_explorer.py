@@ -6,7 +6,6 @@ What the script shows of a layer (share covered, median, shares of ranks) it com
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from ..common.units import FloatArray
 from .canvas import rank_colour
 from .data import RANKS
 from .explorer import plan_of
-from .maps_data import JOINT, MapLayer, MapsData
+from .maps_data import JOINT, MapLayer, MapsData, RankMap, RssMap, at_height
 from .maps_figures import grouped
 from .names import k_key
 from .packed import NONE, PackedArrays, step_for
@@ -39,64 +38,35 @@ RANK_CLASSES = ("Z", *map(str, RANKS))
 
 def page_layers(data: MapsData) -> list[MapLayer]:
     """Every layer that the page can show, quantities in their order."""
-    layers = [
+    rss = [
         MapLayer(
-            quantity="RSS",
-            unit="dBm",
-            axes={"Tower": item.tower, "Antennas": item.antennas, **_foliage(item.foliage), **_height(item.altitude_m)},
-            values=item.rss_dbm,
+            quantity="RSS", unit="dBm", axes={"Tower": m.tower, "Antennas": m.antennas, **_foliage_height(m)},
+            values=m.rss_dbm,
         )
-        for item in data.rss
-    ]
-    layers += [
-        MapLayer(
-            quantity="Rank",
-            unit="",
-            axes={"Tower": item.tower, "K": k_key(item.k or 0.0), **_foliage(item.foliage), **_height(item.altitude_m)},
-            values=np.where(item.rank > 0, item.rank, np.nan),
-            classes=RANK_CLASSES,
-        )
-        for item in (*data.rank, *data.rank_by_tower)
-    ]
-    layers += [
-        MapLayer(
-            quantity="Rank, raw and corrected",
-            unit="",
-            axes={"Version": f"{'corrected' if item.k is None else 'raw'}, {item.source}", "Tower": item.tower,
-                  **_height(item.altitude_m)},
-            values=np.where(item.rank > 0, item.rank, np.nan),
-            classes=RANK_CLASSES,
-        )
-        for item in data.corrected_rank
+        for m in data.rss
     ]  # fmt: skip
-    layers += [
-        MapLayer(
-            quantity=item.name, unit=_unit(item.label), axes=_height(item.altitude_m), values=item.values,
-            difference=item.difference,
+    traced = [
+        _rank_layer(m, "Rank", {"Tower": m.tower, "K": k_key(m.k or 0.0), **_foliage_height(m)})
+        for m in (*data.rank, *data.rank_by_tower)
+    ]
+    corrected = [
+        _rank_layer(
+            m, "Rank, raw and corrected",
+            {"Version": f"{'corrected' if m.k is None else 'raw'}, {m.source}", "Tower": m.tower,
+             **at_height(m.altitude_m)},
         )
-        for item in data.layers
+        for m in data.corrected_rank
     ]  # fmt: skip
-    return [*layers, *data.further]
+    return [*rss, *traced, *corrected, *data.layers]
 
 
-def _unit(label: str) -> str:
-    """The unit in brackets of a label.
-
-    Examples
-    --------
-    >>> _unit("σ1/σ2 [dB], at most 180"), _unit("rank with minus without foliage")
-    ('dB', '')
-    """
-    bracketed = re.search(r"\[(.+?)\]", label)
-    return bracketed.group(1) if bracketed else ""
+def _rank_layer(m: RankMap, quantity: str, axes: dict[str, str]) -> MapLayer:
+    values = np.where(m.rank > 0, m.rank, np.nan)
+    return MapLayer(quantity=quantity, unit="", axes=axes, values=values, classes=RANK_CLASSES)
 
 
-def _foliage(mode: str) -> dict[str, str]:
-    return {"Foliage": mode} if mode else {}
-
-
-def _height(altitude_m: float) -> dict[str, str]:
-    return {"Height": f"{altitude_m:g} m"}
+def _foliage_height(m: RssMap | RankMap) -> dict[str, str]:
+    return {**({"Foliage": m.foliage} if m.foliage else {}), **at_height(m.altitude_m)}
 
 
 def layer_numbers(layer: MapLayer) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 from ..common.units import FloatArray, IntArray
 from ..compare.statistics import Interval
 from ..site.site import Site
+from .made import Made
 from .names import k_key
 
 JOINT = "joint"
@@ -55,17 +56,6 @@ class RankMap:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Layer:
-    """Any further quantity (rows, columns) at one height; ``difference`` asks for a scale around zero."""
-
-    name: str
-    label: str
-    altitude_m: float
-    values: FloatArray
-    difference: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class MapLayer:
     """One layer that the page can show.
 
@@ -81,6 +71,8 @@ class MapLayer:
         Names of the values 0, 1, ... where the layer holds classes.
     difference : bool
         Its zero means something: a scale around it.
+    label : str
+        Of the colour bar of its figure; layers without one are shown in the linked map alone.
     """
 
     quantity: str
@@ -89,6 +81,12 @@ class MapLayer:
     values: FloatArray = field(repr=False, compare=False)
     classes: tuple[str, ...] = ()
     difference: bool = False
+    label: str = ""
+
+
+def at_height(altitude_m: float) -> dict[str, str]:
+    """The axis of a height, for :class:`MapLayer`."""
+    return {"Height": f"{altitude_m:g} m"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,7 +139,7 @@ class PaperRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MapsData:
+class MapsData(Made):
     """Everything the page of a `map` job shows.
 
     Parameters
@@ -149,8 +147,6 @@ class MapsData:
     title, name : str
         Headline and short name.
     site : Site
-    generated : str
-        UTC, ISO 8601.
     east_m, north_m : (columns,), (rows,)
         Centres of the cells [m].
     borders_m : tuple of (2, 2) arrays
@@ -158,7 +154,7 @@ class MapsData:
     rank : tuple of RankMap
         The nearest tower serving; ``rank_by_tower`` each alone, for the linked map.
     corrected : tuple of RssMap
-        Of each link, raw and corrected by flights (``antennas``): for figures; the linked map has them in ``further``.
+        Of each link, raw and corrected by flights (``antennas``): for figures; the linked map has them in ``layers``.
     corrected_rank : tuple of RankMap
         Of each tower with a learned receiver: the traced ranks of every K and those of the receiver.
     flown_m : tuple of (n, 2)
@@ -167,8 +163,8 @@ class MapsData:
         Share of positions further from those flights than a correction reaches.
     corrected_words : str
         First words of the prediction that corrected the levels.
-    further : tuple of MapLayer
-        Layers of the linked map that have no static figure.
+    layers : tuple of MapLayer
+        Besides RSS and rank.
     metrics : mapping
         Written to ``metrics.json`` after the tables of this page.
     """
@@ -176,7 +172,6 @@ class MapsData:
     title: str
     name: str
     site: Site
-    generated: str
     east_m: FloatArray
     north_m: FloatArray
     borders_m: tuple[FloatArray, ...] = ()
@@ -188,15 +183,12 @@ class MapsData:
     corrected_words: str = ""
     rank: tuple[RankMap, ...] = ()
     rank_by_tower: tuple[RankMap, ...] = ()
-    layers: tuple[Layer, ...] = ()
-    further: tuple[MapLayer, ...] = ()
+    layers: tuple[MapLayer, ...] = ()
     correlation: tuple[Correlation, ...] = ()
     errors: tuple[MapError, ...] = ()
     learning: tuple[LearningCurve, ...] = ()
     paper: tuple[PaperRow, ...] = ()
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    versions: Mapping[str, str] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
-    stages_s: Mapping[str, float] = field(default_factory=dict)
     metrics: Mapping[str, Any] = field(default_factory=dict)

@@ -13,7 +13,7 @@ from ..site.scenes import drawn_buildings
 from ..site.site import Site
 from .canvas import RANK_HATCH, TOWER, FigureSpec, beyond, colour_bar, figure, plain_ticks, rank_colour, spread_out
 from .data import RANKS
-from .maps_data import JOINT, Correlation, LearningCurve, MapError, MapsData, RankMap, RssMap
+from .maps_data import JOINT, Correlation, LearningCurve, MapError, MapLayer, MapsData, RankMap, RssMap
 from .names import k_key, safe_name
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
     return fig
 
 
-def layer_maps(data: MapsData, layers: Sequence[Any]) -> Figure:
+def layer_maps(data: MapsData, layers: Sequence[MapLayer]) -> Figure:
     """One further quantity at every height, on one colour scale."""
     fig, axes = map_axes(data, len(layers))
     finite = np.concatenate([layer.values[np.isfinite(layer.values)] for layer in layers])
@@ -193,7 +193,7 @@ def layer_maps(data: MapsData, layers: Sequence[Any]) -> Figure:
     image = None
     for ax, one in zip(axes, layers, strict=True):
         image = draw_map(ax, data, one.values, **options)
-        ax.set_title(f"{one.altitude_m:g} m", fontsize=9)
+        ax.set_title(one.axes["Height"], fontsize=9)
     bar = colour_bar(fig, image, axes, layers[0].label, beyond(finite, options["vmin"], options["vmax"]))
     if np.array_equal(finite, np.round(finite)):  # ranks: no colour stands for half of one
         from matplotlib.ticker import MaxNLocator
@@ -380,7 +380,7 @@ def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
             "receiver: mean probability of each rank.",
             partial(rank_shares, maps),
         )  # fmt: skip
-    for name, layers in grouped(data.layers, lambda one: one.name).items():
+    for name, layers in grouped((one for one in data.layers if one.label), lambda one: one.quantity).items():
         caption = f"{layers[0].label[0].upper()}{layers[0].label[1:]}. Hatched: no path."
         yield FigureSpec(f"layer_{safe_name(name)}", "layers", name, caption, partial(layer_maps, data, layers))
 

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..common.jsonable import json_object, json_safe
+from ..common.jsonable import json_object, json_safe, named
 from . import canvas, maps_figures
 from .canvas import Picture
 from .data import RANKS
-from .export import about, json_text, merge, write_file
+from .export import json_text, merge, write_file
 from .html import by_section, embedded, rendered
+from .made import about
 from .map_explorer import layer_numbers, page_layers, payload
 from .map_words import first_words, notes, warnings
 from .maps_data import MapError, MapsData
@@ -20,27 +21,23 @@ from .names import k_key
 
 def maps_metrics(data: MapsData) -> dict[str, Any]:
     """The numbers of the page under stable names; ``data.metrics`` is merged in last."""
-
-    def picked(item: Any, *names: str) -> dict[str, Any]:
-        return {name: getattr(item, name) for name in names}
-
     columns, rows = len(data.east_m), len(data.north_m)
     numbers = json_object(
         name=data.name,
         title=data.title,
         site={"name": data.site.name, "illustrative": data.site.illustrative},
         grid={"columns": columns, "rows": rows, "positions": columns * rows},
-        coverage=[picked(m, "tower", "antennas", "foliage", "altitude_m", "coverage") for m in data.rss],
+        coverage=[named(m, "tower antennas foliage altitude_m coverage") for m in data.rss],
         rank=[
             {
-                **picked(m, "k", "foliage", "altitude_m"),
+                **named(m, "k foliage altitude_m"),
                 "share": dict(zip(("Z", *map(str, RANKS)), m.share, strict=True)),
             }
             for m in data.rank
         ],
         layers=[layer_numbers(layer) for layer in page_layers(data)],
-        mae=[picked(e, "evaluation", "method", "k", "altitude_m", "mae", "mae_ci95", "n") for e in data.errors],
-        paper=[picked(p, "where", "what", "paper", "ours") for p in data.paper],
+        mae=[named(e, "evaluation method k altitude_m mae mae_ci95 n") for e in data.errors],
+        paper=[named(p, "where what paper ours") for p in data.paper],
         warnings=warnings(data),
         **about(data),
     )
@@ -76,7 +73,7 @@ def error_tables(
 
 def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page."""
-    linked = payload(data) if data.rss or data.rank or data.layers or data.further else None
+    linked = payload(data) if data.rss or data.rank or data.layers else None
     return rendered(
         "map",
         ("common.js", "map_explorer.js") if linked else (),

@@ -13,16 +13,17 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from ..common.cells import guarded
-from ..common.jsonable import json_object
+from ..common.jsonable import json_object, named
 from ..common.units import FloatArray
 from . import canvas
 from .canvas import FigureSpec
-from .export import about, write_file
+from .export import write_file
 from .html import write_page
+from .made import Made, about
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlanPage:
+class PlanPage(Made):
     """Content of the page of ``plan``.
 
     ``candidates`` and ``curve`` hold rows of metrics.json; ``outline_m`` (k, 2) and ``holes_m`` bound where a route may
@@ -44,22 +45,14 @@ class PlanPage:
     towers: Mapping[str, FloatArray]
     files: Mapping[str, str]
     warnings: Sequence[str]
-    generated: str
-    versions: Mapping[str, str]
-    stages_s: Mapping[str, float]
 
 
 def plan_metrics(data: PlanPage) -> dict[str, Any]:
     """The numbers of the page under stable names."""
     return json_object(
-        target=data.target,
-        sentence=data.sentence,
-        antennas=data.antennas,
-        flights=data.flights,
+        **named(data, "target sentence antennas flights candidates warnings"),
         sd_now_db=float(np.sqrt(np.mean(data.before_db**2))),
-        candidates=data.candidates,
         length=data.curve,
-        warnings=data.warnings,
         **about(data),
     )
 

@@ -15,18 +15,19 @@ from matplotlib.figure import Figure
 from ..common.cells import guarded
 from ..common.cf import dataset, file_attributes, netcdf_bytes
 from ..common.errors import UsageError
-from ..common.jsonable import json_object
+from ..common.jsonable import json_object, named
 from ..site.site import Site
 from . import canvas
 from .canvas import FigureSpec
-from .export import about, write_file
+from .export import write_file
 from .html import write_page
+from .made import Made, about
 from .names import safe_name
 from .prediction_words import FLAGS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PredictionPage:
+class PredictionPage(Made):
     """Content of a page of ``predict``; ``table`` as prediction.csv has it, ``rows`` of candidates and their errors."""
 
     name: str
@@ -45,9 +46,6 @@ class PredictionPage:
     trained_on: Sequence[str]
     threshold_db: float | None
     warnings: Sequence[str]
-    generated: str
-    versions: Mapping[str, str]
-    stages_s: Mapping[str, float]
 
     @property
     def series(self) -> list[tuple[str, pd.DataFrame]]:
@@ -78,20 +76,14 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
     ranks = data.table[data.table["channel"] == "rank"]
     return json_object(
         prediction=data.name,
-        kind=data.kind,
-        flights=data.flights,
-        trained_on=data.trained_on,
+        **named(data, "kind flights trained_on threshold_db chosen candidates warnings"),
         sentence=data.verdict,
-        threshold_db=data.threshold_db,
-        chosen=data.chosen,
-        candidates=data.candidates,
         field=data.model,
         series=series,
         ranks={
             tower: {k: part[f"p_rank{k}"].mean() for k in "1234"}
             for tower, part in ranks.groupby("tower", observed=True)
         },
-        warnings=data.warnings,
         **about(data),
     )
 

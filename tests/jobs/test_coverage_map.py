@@ -324,7 +324,7 @@ def test_one_missing_library_costs_its_own_file_alone(site, tmp_path, monkeypatc
     outcome = mapping.make_maps(site, chosen, Stages())
     monkeypatch.setitem(sys.modules, module, None)
     told = []
-    mapping.export_maps(outcome, tmp_path, {}, lambda text, *_: told.append(text))
+    mapping.export_maps(outcome, tmp_path, lambda text, *_: told.append(text))
     assert {path.name for path in tmp_path.iterdir()} & {"maps.nc", "maps.tif"} == {left}
     assert any(module in text and "aerpaw-cmp[geo]" in text for text in told)
 

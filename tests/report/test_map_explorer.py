@@ -110,8 +110,8 @@ def test_positions_in_degrees(latitude, reach_m):
 
 def test_one_cell_and_absurd_values(maps_data):
     odd = dataclasses.replace(
-        maps_data, rss=(), rank=(), layers=(), east_m=np.array([3.0]), north_m=np.array([7.0]),
-        further=(
+        maps_data, rss=(), rank=(), east_m=np.array([3.0]), north_m=np.array([7.0]),
+        layers=(
             MapLayer(quantity="huge", unit="1", axes={}, values=np.array([[1e30]])),
             MapLayer(quantity="none", unit="", axes={}, values=np.array([[np.nan]])),
             MapLayer(quantity="endless", unit="dB", axes={}, values=np.array([[np.inf]])),

@@ -12,7 +12,6 @@ import urllib.error
 import urllib.request
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from ...common.errors import InputError, OutputError, UsageError
 from ...common.files import atomic_path
 from ...common.outputs import OutputFile, OutputFolder, is_sealed
 from ...common.stages import Progress, silent
+from ...common.versions import utc_now
 from . import entrants
 from .benchmark import (
     BASELINES,
@@ -203,8 +203,7 @@ def _page(bench: Bench, scores: Scores) -> str:
         about = {"title": one.title, "rule": one.rule, "kind": one.kind, "flights": bench.tests(task)}
         tables.append(task_table(task, {**about, "skipped": bench.skipped(task, training=False)}, rows))
     lacking = dict.fromkeys(text for task in bench.manifest.tasks for text in bench.skipped(task, training=True))
-    made = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    return benchmark_page(tables, list(lacking), made, __version__)
+    return benchmark_page(tables, list(lacking), utc_now(), __version__)
 
 
 def score_predictions(

@@ -7,7 +7,6 @@ A campaign.yaml names flight files and, optionally, settings: labels with overri
 from __future__ import annotations
 
 from collections.abc import Mapping
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +14,6 @@ from pydantic import Field
 
 from ...common.errors import InputError, UsageError
 from ...common.stages import Stages
-from ...common.versions import versions
 from ...common.yamlfile import load_yaml
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile, GroupedSettings, load_flight
@@ -124,8 +122,6 @@ def run(
     return CampaignData(
         name=campaign.campaign,
         title=campaign.title or campaign.campaign,
-        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        versions=versions(),
         calibration=campaign.calibration,
         flights=tuple(dict.fromkeys([*files, *(f.flight for f in failures)])),
         settings=settings,

@@ -9,7 +9,6 @@ import time
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import AerpawCmpError
+from ...common.jsonable import named
 from ...common.units import AnyArray, FloatArray
-from ...common.versions import versions
+from ...common.versions import utc_now, versions
 from ...compare import offset
 from ...compare.result import FlightResult, RankResult, RssResult
 from ...flight.data import FlightData, gather, read_logs
@@ -26,7 +26,6 @@ from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile, RssSettings, load_flight
 from ...flight.training import logs_of
 from ...report.campaign_data import Failure, FlownRank, FlownTrack, RankRow, RssRow
-from ...report.export import named
 from ..reporting.flight_run import run_flight
 from ..tasks.outcomes import OutcomeStore, code_digest, task_inputs, task_key
 
@@ -198,7 +197,7 @@ def carry_out(order: Order) -> Done:
         "flight": task.flight, "setting": task.setting, "flight_file": str(task.path),
         "logs_root": None if task.logs_root is None else str(task.logs_root), "overrides": dict(task.overrides),
         "seconds": time.perf_counter() - start, "cpu_s": _cpu_s() - cpu, "host": platform.node(),
-        "process": os.getpid(), "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "process": os.getpid(), "finished": utc_now(),
         "versions": _versions(), "code": code_digest(), "inputs": facts.inputs,
         "settings": facts.settings.model_dump(mode="json"),
     }  # fmt: skip

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from ...common.jsonable import named
 from ...common.units import FloatArray
 from ...compare.offset import Pooling, pooled_moments
 from ...compare.passes import Pass, PassPair, PassTable, Visit
 from ...compare.rank import repeat_rank
 from ...flight.settings import Positive, Settings
 from ...report.campaign_data import FlownRank, PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
-from ...report.export import named
 
 
 class RepeatSettings(Settings):

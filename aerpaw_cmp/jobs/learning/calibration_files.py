@@ -17,7 +17,7 @@ from ...common.errors import UsageError
 from ...common.gaussian import determining, gaussian_kernel
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, IntArray
-from ...common.versions import versions
+from ...common.versions import utc_now
 from ...compare.calibration import Learned, mean_rmse
 from ...compare.direction_gain import directed
 from ...compare.learning_curve import with_one_more
@@ -93,7 +93,6 @@ def antenna_files(
         "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
         f"{KEY}: {' '.join(calibration.trained_on)}",
     )
-    made = datetime.now(timezone.utc).isoformat(timespec="seconds")
     out: dict[str, str | bytes] = {}
     for (antenna, end), one in maps.items():
         stem = safe_name(f"{antenna}.{end}")
@@ -104,7 +103,7 @@ def antenna_files(
         said = {
             "title": f"{antenna}, antenna at the {end}",
             "source": f"learned from the flights {names}",
-            "history": f"{made} written by aerpaw-cmp calibrate, calibration {calibration.settings.calibration}",
+            "history": f"{utc_now()} written by aerpaw-cmp calibrate, calibration {calibration.settings.calibration}",
             "institution": "not stated",
             "references": "https://arxiv.org/abs/2502.10324",
             "comment": "; ".join(notes[1:-1]),
@@ -203,7 +202,6 @@ def record_of(
         }
     return CalibrationData(
         name=calibration.settings.calibration,
-        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         flights=[data.settings.flight.name for data in calibration.flights],
         trained_on=calibration.trained_on,
         words=calibration.words,
@@ -218,7 +216,6 @@ def record_of(
         antennas=tuple(maps.values()),
         place=None if calibration.place is None else _place(calibration, calibration.place),
         settings_text=text,
-        versions=versions(),
         stages_s=stages_s,
     )
 

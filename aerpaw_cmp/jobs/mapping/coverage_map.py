@@ -11,7 +11,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from datetime import datetime, timezone
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from ...common.cf import file_attributes
 from ...common.errors import InputError, UsageError, noting_interrupts
 from ...common.stages import Progress, Stages, share_of
 from ...common.units import THERMAL_NOISE_DBM_HZ, AnyArray, ComplexArray, FloatArray, db_from_power, wavelength_m
-from ...common.versions import versions
+from ...common.versions import utc_now, versions
 from ...compare.rank import singular_values
 from ...maps import export
 from ...maps import grid as cells
@@ -515,8 +514,7 @@ def _write_tiles(
 ) -> None:
     """Compute the tiles that a store lacks, write each as it comes, and read some positions of all for the page."""
     empty, tiling = channels.empty(store.tiling.grid_of(0)), store.tiling
-    generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    missing = store.begin(empty, outcome.site.frame, about_maps(outcome.site.name, generated, versions()["aerpaw-cmp"]))
+    missing = store.begin(empty, outcome.site.frame, about_maps(outcome.site.name))
     if len(missing) < len(tiling):
         progress(f"{len(tiling) - len(missing)} of {len(tiling)} tiles were computed before")
     lost: list[str] = []
@@ -615,8 +613,6 @@ def maps_record(
     outcome: MapOutcome,
     *,
     name: str,
-    generated: str,
-    versions: Mapping[str, str],
     stages_s: Mapping[str, float],
     paper: Iterable[page.PaperRow] = (),
 ) -> page.MapsData:
@@ -625,9 +621,8 @@ def maps_record(
     Parameters
     ----------
     outcome : MapOutcome
-    name, generated : str
-        Of the maps; UTC, ISO 8601.
-    versions : mapping of str to str
+    name : str
+        Of the maps.
     stages_s : mapping of str to float
         Seconds per stage.
     paper : iterable of PaperRow
@@ -646,7 +641,6 @@ def maps_record(
         title=f"Coverage and rank maps, {outcome.site.name}",
         name=name,
         site=outcome.site,
-        generated=generated,
         east_m=result.grid.east_m,
         north_m=result.grid.north_m,
         borders_m=tuple(border.line_m for border in result.borders),
@@ -658,15 +652,17 @@ def maps_record(
         corrected_words="" if flown is None else flown.prediction.verdict,
         rank=rank,
         rank_by_tower=tuple(by_tower),
-        layers=tuple(_further_layers(outcome)),
-        further=(*(() if flown is None else flown.page_layers(result.grid)), *_linked_layers(outcome)),
+        layers=(
+            *_further_layers(outcome),
+            *(() if flown is None else flown.page_layers(result.grid)),
+            *_linked_layers(outcome),
+        ),
         correlation=tuple(_correlation_panels(outcome)),
         errors=tuple(_errors(outcome)),
         learning=tuple(_learning(outcome)),
         paper=tuple(paper),
         warnings=() if flown is None else tuple(flown.prediction.warnings),
         notes=_notes(outcome),
-        versions=versions,
         settings=asdict(s),
         stages_s=dict(stages_s),
         metrics=_metrics(outcome),
@@ -721,7 +717,7 @@ def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
             each = np.isfinite(result.rss_mimo_dbm if antennas == "mimo" else result.rss_siso_dbm)
             for row, height in enumerate(result.rss_altitudes_m):
                 yield page.MapLayer(
-                    quantity="Towers in coverage", unit="towers", axes={**axes, "Height": f"{height:g} m"},
+                    quantity="Towers in coverage", unit="towers", axes={**axes, **page.at_height(height)},
                     values=raster(each[row].sum(axis=0).astype(np.float64)),
                 )  # fmt: skip
             for tower in (None, *result.tower_names) if len(result.rss_altitudes_m) > 1 else ():
@@ -738,7 +734,7 @@ def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
         )  # fmt: skip
 
 
-def _further_layers(outcome: MapOutcome) -> Iterator[page.Layer]:
+def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
     """Singular-value spread and condition number, then what foliage changes."""
     result, s = outcome.shown, outcome.settings
     raster = result.grid.raster
@@ -749,24 +745,30 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.Layer]:
         joint = values[..., result.serving, np.arange(len(result.grid))]
         for row, height in enumerate(result.rank_altitudes_m):
             shown = raster(np.minimum(joint[row], RATIO_LIMIT_DB))
-            yield page.Layer(name=f"{name}, foliage {s.shown}", label=label, altitude_m=height, values=shown)
+            yield page.MapLayer(
+                quantity=f"{name}, foliage {s.shown}",
+                label=label,
+                unit="dB",
+                axes=page.at_height(height),
+                values=shown,
+            )
     clear = outcome.maps.get("none")
     for mode, maps in outcome.ordered():
         if clear is None or mode == "none":
             continue
         change = foliage_difference(clear, maps)
         for row, height in enumerate(maps.rss_altitudes_m):
-            yield page.Layer(
-                name=f"RSS lost by foliage, {mode}", label="RSS without minus with foliage [dB], arrays",
-                altitude_m=height, values=raster(change.rss_loss_db[row]), difference=True,
+            yield page.MapLayer(
+                quantity=f"RSS lost by foliage, {mode}", label="RSS without minus with foliage [dB], arrays",
+                unit="dB", axes=page.at_height(height), values=raster(change.rss_loss_db[row]), difference=True,
             )  # fmt: skip
         for column, k in enumerate(maps.ks if mode == s.shown else ()):
             for row, height in enumerate(maps.rank_altitudes_m):
                 seen = maps.ranks()[row, column] > 0
-                yield page.Layer(
-                    name=f"Rank change by foliage, {mode}, K = {k:g}", label="rank with minus without foliage",
-                    altitude_m=height, values=raster(np.where(seen, change.rank_change[row, column], np.nan)),
-                    difference=True,
+                yield page.MapLayer(
+                    quantity=f"Rank change by foliage, {mode}, K = {k:g}", label="rank with minus without foliage",
+                    unit="", axes=page.at_height(height), difference=True,
+                    values=raster(np.where(seen, change.rank_change[row, column], np.nan)),
                 )  # fmt: skip
 
 
@@ -899,23 +901,10 @@ def _mean(values: AnyArray) -> float:
 # --- files beside the page -----------------------------------------------------------------------------------------
 
 
-def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], progress: Progress) -> list[Path]:
+def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[Path]:
     """layers.csv, layers.geojson, maps.json and maps.kmz; maps.nc and maps.tif where the libraries are installed.
 
-    Parameters
-    ----------
-    outcome : MapOutcome
-    folder : Path
-        Made when missing.
-    summary : mapping
-        Free entries of maps.json.
-    progress : Progress
-        Told of files that are left out, and why.
-
-    Returns
-    -------
-    list of Path
-        The files written.
+    ``progress`` is told of files that are left out, and why.
     """
     site, grid = outcome.site, outcome.shown.grid
     flown = [] if outcome.corrected is None else outcome.corrected.layers()
@@ -931,13 +920,12 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
     written = [
         export.write_csv(folder / "layers.csv", every_layer),
         export.write_geojson(folder / "layers.geojson", levels_and_ranks),
-        export.write_json(folder / "maps.json", all_joint, summary),
+        export.write_json(folder / "maps.json", all_joint, {"site": site.name, **_made()}),
         export.write_kmz(folder / "maps.kmz", levels_and_ranks, title=site.name),
     ]
-    about = about_maps(site.name, str(summary.get("generated", "")), str(summary.get("version", "")))
     maps = dict(outcome.ordered())
     writers: tuple[Callable[[], Path], ...] = (
-        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, about, flown),
+        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, about_maps(site.name), flown),
         lambda: export.write_geotiff(folder / "maps.tif", all_joint),
     )
     for write in writers:
@@ -948,13 +936,16 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
     return written
 
 
-def about_maps(title: str, generated: str, version: str) -> dict[str, str]:
+def _made() -> dict[str, str]:
+    return {"generated": utc_now(), "version": versions()["aerpaw-cmp"]}
+
+
+def about_maps(title: str) -> dict[str, str]:
     """Attributes of maps.nc and of a store of tiles."""
     return file_attributes(
         title=title,
         source="ray tracing",
-        generated=generated,
-        version=version,
+        **_made(),
         comment="A missing level has no path or lies below the threshold. A rank of 0 is a code: no path.",
     )
 

@@ -64,7 +64,7 @@ class CorrectedMaps:
     def page_layers(self, grid: Grid) -> Iterator[page.MapLayer]:
         """For the linked map: raw and corrected level, standard deviation."""
         for item in self.levels:
-            axes = {"Link": item.link, "Height": f"{item.height_m:g} m"}
+            axes = {"Link": item.link, **page.at_height(item.height_m)}
             for version, values in (("corrected", item.corrected_dbm), ("raw", item.raw_dbm)):
                 yield page.MapLayer(quantity="RSS, raw and corrected", unit="dBm", axes={"Version": version, **axes},
                                     values=grid.raster(values))  # fmt: skip

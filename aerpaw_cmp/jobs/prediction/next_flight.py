@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timezone
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ import shapely
 from ...common.errors import InputError, UsageError
 from ...common.stages import Stages
 from ...common.units import FloatArray
-from ...common.versions import versions
 from ...compare.correction import choose
 from ...compare.direction_gain import GainModel, LinkSamples
 from ...compare.next_flight import Known, rms_db
@@ -187,8 +185,6 @@ def plan_flight(
             "route.csv": waypoints_csv(ways, site.frame),
         },
         warnings=said,
-        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        versions=versions(),
         stages_s=stages.seconds,
     )
 

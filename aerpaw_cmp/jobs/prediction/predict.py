@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import datetime, timezone
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from ...common.errors import InputError, UsageError
 from ...common.provenance import union
 from ...common.stages import Progress, Stages
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
-from ...common.versions import versions
 from ...compare.correction import OFF, Base, by_degree, choose, fixed_base
 from ...compare.direction_gain import LinkSamples
 from ...compare.spread import BAND
@@ -141,8 +139,6 @@ def predict(
         flown={f"{s.flight} {s.antenna}": track_m(s).T for one in sources.values() for s in one.samples},
         threshold_db=threshold_db,
         warnings=(*said, *targets.remarks),
-        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        versions=versions(),
         stages_s=stages.seconds,
         **_about(model, known, [receiver.trained_on for receiver, _, _ in receivers.values()], table),
     )

@@ -5,9 +5,10 @@ from __future__ import annotations
 import ctypes
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Protocol
 
 from .interrupts import look
@@ -83,6 +84,20 @@ class Stages:
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
             give_memory_back()
+
+
+def begin_peak() -> None:
+    """Let the high-water mark of this process's memory begin anew, where the system can (proc(5))."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
+def peak_mib() -> float:
+    """High-water mark of this process's memory [MiB]; NaN where the system has none."""
+    try:
+        return float(Path("/proc/self/status").read_text(encoding="ascii").split("VmHWM:")[1].split()[0]) / 1024.0
+    except (OSError, IndexError):
+        return float("nan")
 
 
 def give_memory_back() -> None:

@@ -69,12 +69,12 @@ class Replayed:
         return site.towers[tower].position_m[None, :]
 
     def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
-        """Values per replayed pose, put back at their samples (n,)."""
+        """Values per replayed pose, put back at their samples (n, ...)."""
         return _spread(self.valid, values, fill)
 
 
 def _spread(valid: BoolArray, values: FloatArray, fill: float = np.nan) -> FloatArray:
-    out = np.full(len(valid), fill, dtype=np.result_type(values.dtype, np.float64))
+    out = np.full((len(valid), *values.shape[1:]), fill, dtype=np.result_type(values.dtype, np.float64))
     out[valid] = values
     return out
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -17,7 +15,7 @@ from shapely import affinity
 from shapely.geometry import Point, box
 
 from ..common.geodesy import SiteFrame
-from ..common.stages import Progress, silent
+from ..common.stages import Progress, begin_peak, peak_mib, silent
 from ..common.units import ComplexArray, FloatArray, IntArray, wavelength_m
 from ..compare.rank import channel_rank
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
@@ -226,18 +224,11 @@ class _Case:
 
 
 def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:
-    """The result, its wall seconds and the peak of resident memory [MiB] meanwhile."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")  # proc(5): the high-water mark VmHWM begins anew
+    """Result, seconds, and the peak of the process's memory meanwhile [MiB]."""
+    begin_peak()
     started = time.perf_counter()
     result = action()
-    seconds = time.perf_counter() - started
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        lines = []
-    peak = next((int(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM")), 0.0)
-    return result, {"seconds": seconds, "peak_mib": peak}
+    return result, {"seconds": time.perf_counter() - started, "peak_mib": peak_mib()}
 
 
 def _take(poses: Poses, chosen: Any) -> Poses:

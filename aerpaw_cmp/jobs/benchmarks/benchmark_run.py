@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import hashlib
 import http.client
@@ -21,7 +20,7 @@ from ...common.cells import guarded
 from ...common.errors import InputError, OutputError, UsageError
 from ...common.files import atomic_path
 from ...common.outputs import OutputFile, OutputFolder, is_sealed
-from ...common.stages import Progress, silent
+from ...common.stages import Progress, begin_peak, peak_mib, silent
 from ...common.versions import utc_now
 from . import entrants
 from .benchmark import (
@@ -110,9 +109,10 @@ def run_benchmark(
         runnable = [t for t in wanted if t not in skipped and bench.tests(t)]
         for task, name in ((task, name) for task in runnable for name in names):
             progress(f"{task}: {name}")
-            started = _started()
+            begin_peak()
+            started = time.process_time()
             frame = _predicted(bench, task, name)
-            cost[task, name] = {"seconds": time.process_time() - started, "peak_mib": _peak_mib()}
+            cost[task, name] = {"seconds": time.process_time() - started, "peak_mib": peak_mib()}
             if frame is not None:
                 written[name].append(frame)
         with output.filling() as folder:
@@ -144,22 +144,6 @@ def _entry_text(name: str, frames: Sequence[Any]) -> str:
 
     text = guarded(pd.concat(frames)).to_csv(index=False, float_format="%.4f", lineterminator="\n")
     return f"# entrant: {name}\n# who: aerpaw-cmp {__version__}\n{text}"
-
-
-def _started() -> float:
-    """Processor time now [s]; the peak of the memory counts from here where the system can do that (Linux)."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    return time.process_time()
-
-
-def _peak_mib() -> float:
-    """Largest resident memory of this process since :func:`_started` [MiB], the package itself included."""
-    try:
-        status = Path("/proc/self/status").read_text(encoding="ascii")
-        return float(status.split("VmHWM:")[1].split()[0]) / 1024.0
-    except (OSError, IndexError):
-        return float("nan")
 
 
 def _score_all(bench: Bench, entries: dict[str, Entry], cost: dict[tuple[str, str], dict[str, float]]) -> Scores:

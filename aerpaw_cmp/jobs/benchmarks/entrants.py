@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -13,14 +13,15 @@ import pandas as pd
 from ...common.units import BoolArray, FloatArray
 from ...compare import calibration
 from ...compare.calibration import Observed
-from ...compare.correction import BIN_S, Base, Predictor, choose, fixed_base
+from ...compare.correction import BIN_S, Base, choose, fixed_base
 from ...compare.direction_gain import LinkSamples
 from ...compare.forecast import constant_forecast
 from ...compare.spread import fading_of
-from ...flight.data import FlightData
+from ...flight.data import FlightData, RssSeries
 from ...flight.replay import attitude_rotation
 from ...propagation.arrays import Poses
 from ...propagation.field.baselines import p1411_loss_db, tr36777_loss_db, two_ray_dbm
+from ...propagation.options import Engine
 from ...propagation.trace import trace
 from ..learning.calibrate import learned_antennas
 from ..learning.calibrate_rank import RankFitSettings, Tried
@@ -57,14 +58,6 @@ def _same(first: Observed, second: Observed) -> bool:
     return (first.samples.flight, first.samples.antenna) == (second.samples.flight, second.samples.antenna)
 
 
-def _free_space(question: Question, _: Bench) -> list[Answer]:
-    return anchored(question, lambda o: np.zeros(len(o.samples)))
-
-
-def _constant(question: Question, _: Bench) -> list[Answer]:
-    return anchored(question, lambda o: -o.free_space_db)
-
-
 def _log_distance(question: Question, _: Bench) -> list[Answer]:
     """A slope per antenna, fitted on what is known; offsets of each series are free."""
     slopes: dict[str, float] = {}
@@ -76,86 +69,64 @@ def _log_distance(question: Question, _: Bench) -> list[Answer]:
     return anchored(question, lambda o: slopes[o.samples.antenna] * o.free_space_db)
 
 
-def _two_ray(question: Question, bench: Bench) -> list[Answer]:
-    def gain(o: Observed) -> FloatArray:
-        data = bench.data(o.samples.flight)
-        tower = data.site.towers[o.samples.tower]
-        carrier, place = _carrier(data, o), tower.position_m[None, :]
-        level = two_ray_dbm(
-            place, o.samples.position_m, carrier, ground_material=data.site.ground_material, ground_m=tower.ground_m
-        )[:, 0]
-        return np.asarray(level - _free(o, tower.position_m, carrier))
+def _by_gain(gain: Callable[[Observed, FlightData, RssSeries], FloatArray]) -> Entrant:
+    """Entrant of a gain that needs the flight and the series of the samples."""
 
-    return anchored(question, gain)
+    def answer(question: Question, bench: Bench) -> list[Answer]:
+        def of(o: Observed) -> FloatArray:
+            data, end = bench.data(o.samples.flight), (o.samples.tower, o.samples.channel)
+            return gain(o, data, next(s for s in data.rss if (s.tower, s.channel) == end))
+
+        return anchored(question, of)
+
+    return answer
+
+
+def _two_ray(o: Observed, data: FlightData, series: RssSeries) -> FloatArray:
+    tower, link = data.site.towers[o.samples.tower], series.link
+    level = two_ray_dbm(
+        tower.position_m[None, :], o.samples.position_m, link.carrier_hz, link.transmit_power_dbm,
+        ground_material=data.site.ground_material, ground_m=tower.ground_m,
+    )[:, 0]  # fmt: skip
+    return np.asarray(level - o.free_space_db)
 
 
 Loss = Callable[[FloatArray, FloatArray, float], FloatArray]
 """Loss (n,) [dB] at distances and heights (n,) [m] and a carrier [Hz]."""
 
 
-def _standard(loss_db: Loss) -> Entrant:
-    def answer(question: Question, bench: Bench) -> list[Answer]:
-        def gain(o: Observed) -> FloatArray:
-            data = bench.data(o.samples.flight)
-            tower, carrier = data.site.towers[o.samples.tower].position_m, _carrier(data, o)
-            distance = np.linalg.norm(o.samples.position_m - tower, axis=1)
-            return np.asarray(-loss_db(distance, o.samples.position_m[:, 2], carrier) - _free(o, tower, carrier))
-
-        return anchored(question, gain)
-
-    return answer
+def _standard(loss_db: Loss, o: Observed, data: FlightData, series: RssSeries) -> FloatArray:
+    """Gain of a standard that gives a loss by distance and height."""
+    distance = np.linalg.norm(o.samples.position_m - data.site.towers[o.samples.tower].position_m, axis=1)
+    loss = loss_db(distance, o.samples.position_m[:, 2], series.link.carrier_hz)
+    return np.asarray(series.link.transmit_power_dbm - loss - o.free_space_db)
 
 
-def _carrier(data: FlightData, o: Observed) -> float:
-    return next(s.link.carrier_hz for s in data.rss if (s.tower, s.channel) == (o.samples.tower, o.samples.channel))
-
-
-def _free(o: Observed, tower_m: FloatArray, carrier_hz: float) -> FloatArray:
-    """Free space of 0 dBm (n,): the samples' own level differs by the transmit power, a constant."""
-    distance = np.linalg.norm(o.samples.position_m - tower_m, axis=1)
-    return np.asarray(20.0 * np.log10(299_792_458.0 / carrier_hz / (4.0 * np.pi * distance)))
-
-
-def _replay(level: str, engine: str = "image", **options: Any) -> Entrant:
-    """Ray tracing with the flight's own arrays; ``level`` is the field of the replay that counts."""
-
-    def answer(question: Question, bench: Bench) -> list[Answer]:
-        def gain(o: Observed) -> FloatArray:
-            data = bench.data(o.samples.flight)
-            series = next(s for s in data.rss if (s.tower, s.channel) == (o.samples.tower, o.samples.channel))
-            time = np.array([t.removesuffix("Z") for t in utc_texts(o.start, o.samples.time_s)], "datetime64[ns]")
-            pose = data.poses_at(time)
-            poses = Poses(pose.position_m, attitude_rotation(pose, data.settings.rt.attitude))
-            link = series.link.build([series.tower], data.folder)
-            replayed = trace(data.site, link, poses, engine, **options)  # type: ignore[arg-type]
-            found = getattr(replayed, level)[:, 0]
-            gain_db = found - o.free_space_db
-            return np.asarray(np.where(np.isfinite(gain_db), gain_db, np.nanmean(gain_db)))
-
-        return anchored(question, gain)
-
-    return answer
+def _replay(
+    level: str, engine: Engine, options: Mapping[str, Any], o: Observed, data: FlightData, series: RssSeries
+) -> FloatArray:
+    """Gain by ray tracing from the poses of the samples; where no path arrives, the mean of the others."""
+    time = np.array([t.removesuffix("Z") for t in utc_texts(o.start, o.samples.time_s)], "datetime64[ns]")
+    pose = data.poses_at(time)
+    poses = Poses(pose.position_m, attitude_rotation(pose, data.settings.rt.attitude))
+    replayed = trace(data.site, series.link.build([series.tower], data.folder), poses, engine, **options)
+    gain_db = getattr(replayed, level)[:, 0] - o.free_space_db
+    return np.asarray(np.where(np.isfinite(gain_db), gain_db, np.nanmean(gain_db)))
 
 
 _FITS: dict[tuple[int, ...], calibration.Learned] = {}
 
 
-def learned_base(train: Sequence[LinkSamples]) -> Predictor:
-    """Antennas learned on these samples, as a base of a correction; each fit is made once."""
+def _fit(train: Sequence[LinkSamples]) -> calibration.Learned:
+    """Learned antennas of some samples, kept: entrants of one question share them."""
     key = tuple(hash(s.residual_db.tobytes()) for s in train)
     if key not in _FITS:
         _FITS[key] = learned_antennas(train)
-    return _FITS[key].predict
-
-
-def _fit(train: Sequence[Observed]) -> calibration.Learned:
-    samples = [o.samples for o in train]
-    learned_base(samples)
-    return _FITS[tuple(hash(s.residual_db.tobytes()) for s in samples)]
+    return _FITS[key]
 
 
 def _learned(question: Question, _: Bench) -> list[Answer]:
-    fit = _fit(question.train)
+    fit = _fit([o.samples for o in question.train])
     answers = anchored(question, lambda o: fit.mean(o.samples))
     return [
         (level, fit.spread(one.samples.antenna).total_db(fit.predict(one.samples)[1]))
@@ -165,9 +136,8 @@ def _learned(question: Question, _: Bench) -> list[Answer]:
 
 def _learned_residual(question: Question, _: Bench) -> list[Answer]:
     """Learned antennas, and the residual field on what they leave where it helps inside the training flights."""
-    return _corrected(
-        question, [o.samples for o in question.train], learned_base, [o.free_space_db for o in question.asked]
-    )
+    samples = [o.samples for o in question.train]
+    return _corrected(question, samples, lambda train: _fit(train).predict, [o.free_space_db for o in question.asked])
 
 
 def _kriging(question: Question, _: Bench) -> list[Answer]:
@@ -220,17 +190,17 @@ def _trees(question: Question, _: Bench) -> list[Answer]:
 
 
 LEVEL: dict[str, Entrant] = {
-    "free_space": _free_space,
-    "constant": _constant,
+    "free_space": lambda question, _: anchored(question, lambda o: np.zeros(len(o.samples))),
+    "constant": lambda question, _: anchored(question, lambda o: -o.free_space_db),
     "log_distance": _log_distance,
-    "two_ray": _two_ray,
-    "tr36777_rma_av": _standard(partial(tr36777_loss_db, "RMa-AV")),
-    "tr36777_uma_av": _standard(partial(tr36777_loss_db, "UMa-AV")),
-    "p1411": _standard(lambda distance_m, _, carrier_hz: p1411_loss_db(distance_m, carrier_hz)),
+    "two_ray": _by_gain(_two_ray),
+    "tr36777_rma_av": _by_gain(partial(_standard, partial(tr36777_loss_db, "RMa-AV"))),
+    "tr36777_uma_av": _by_gain(partial(_standard, partial(tr36777_loss_db, "UMa-AV"))),
+    "p1411": _by_gain(partial(_standard, lambda distance_m, _, carrier_hz: p1411_loss_db(distance_m, carrier_hz))),
     "kriging": _kriging,
-    "replay_paper": _replay("rss_dbm", max_depth=2),
-    "replay_drafted": _replay("rss_power_dbm", max_depth=1),
-    "replay_sionna": _replay("rss_power_dbm", "sionna", max_depth=1, samples=10_000),
+    "replay_paper": _by_gain(partial(_replay, "rss_dbm", "image", {"max_depth": 2})),
+    "replay_drafted": _by_gain(partial(_replay, "rss_power_dbm", "image", {"max_depth": 1})),
+    "replay_sionna": _by_gain(partial(_replay, "rss_power_dbm", "sionna", {"max_depth": 1, "samples": 10_000})),
     "learned": _learned,
     "learned_residual": _learned_residual,
     "boosted_trees": _trees,

@@ -307,18 +307,11 @@ def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudi
     for index in used:
         roll, pitch, yaw = (float(x) for x in angles[rows[index]])
         expected = np.array(aircraft(*((roll, pitch) if mode == "logged" else (0.0, 0.0)), yaw))
-        worst = max(worst, _angle(expected, rotation[index]))
-    failures = (f"rotations differ from the logged attitude by {worst:.2g} rad",) if worst > _tolerance() else ()
+        worst = max(worst, float(np.abs(expected - rotation[index]).max()))
+    failures = (
+        (f"rotations differ from the logged attitude by {worst:.2g} rad",) if worst > ATTITUDE_TOLERANCE_RAD else ()
+    )
     return FieldAudit(attitude_rows=len(used), attitude_max_rad=worst, failures=failures)
-
-
-def _tolerance() -> float:
-    return ATTITUDE_TOLERANCE_RAD
-
-
-def _angle(first: FloatArray, second: FloatArray) -> float:
-    """Largest difference of two rotations' entries [rad]."""
-    return float(np.abs(first - second).max())
 
 
 def _logged_attitudes(files: Sequence[IngestedFile]) -> tuple[AnyArray, FloatArray]:

@@ -189,7 +189,7 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
         name: at_samples(series, replayed, level, settings)
         for name, level in baseline_levels(data.site, series.tower, replayed).items()
     }
-    position = _positions(replayed)
+    position = replayed.spread(replayed.poses.position_m)
     simple |= _fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
     return _Case(
         data=data,
@@ -488,20 +488,9 @@ def _has_direct(replayed: Replayed) -> BoolArray:
     return direct
 
 
-def _positions(replayed: Replayed) -> FloatArray:
-    """Positions at the samples (n, 3); NaN without a pose."""
-    position = np.full((len(replayed.valid), 3), np.nan)
-    position[replayed.valid] = replayed.poses.position_m
-    return position
-
-
 def tower_places(replayed: Replayed) -> FloatArray | None:
-    """Places (n, 3) [m] of a tower that moves at the samples, NaN where not known; None of one that stands."""
-    if replayed.tower_m is None:
-        return None
-    place = np.full((len(replayed.valid), 3), np.nan)
-    place[replayed.valid] = replayed.tower_m
-    return place
+    """Place of a tower that moves at every sample (n, 3) [m]; None of one that stands."""
+    return None if replayed.tower_m is None else replayed.spread(replayed.tower_m)
 
 
 def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) -> dict[str, FloatArray]:
@@ -571,7 +560,7 @@ def _worst(
 def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed) -> RankResult:
     """Measured against simulated rank for each K."""
     settings = data.settings.rank
-    position = _positions(replayed)
+    position = replayed.spread(replayed.poses.position_m)
     keep = replayed.valid.copy()
     if settings.minimum_height_m is not None:
         with np.errstate(invalid="ignore"):

@@ -25,14 +25,17 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from ...common.errors import InputError, UsageError
 from ...common.stages import Progress, silent
 from .outcomes import code_digest
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
+Task = Callable[[Any], Any]
+"""What is done with an item; it can be pickled."""
+
+Done = Callable[[int, Any], None]
+"""Gets the number of an item and the result of its task, or :class:`Lost`."""
 
 TRIES = 2
 """A task in work when a worker is lost is tried again; after so many tries once more, alone."""
@@ -65,12 +68,7 @@ class Workers(Protocol):
     def count(self) -> int:
         """Tasks at a time."""
 
-    def run(
-        self,
-        function: Callable[[Item], Result],
-        items: Sequence[Item],
-        done: Callable[[int, Result | Lost], None],
-    ) -> None:
+    def run(self, function: Task, items: Sequence[Any], done: Done) -> None:
         """``function`` of every item, in any order; ``done`` gets number and result as they come."""
 
 
@@ -79,12 +77,7 @@ class Here:
 
     count = 1
 
-    def run(  # noqa: D102
-        self,
-        function: Callable[[Item], Result],
-        items: Sequence[Item],
-        done: Callable[[int, Result | Lost], None],
-    ) -> None:
+    def run(self, function: Task, items: Sequence[Any], done: Done) -> None:  # noqa: D102
         for number, item in enumerate(items):
             done(number, function(item))
 
@@ -98,12 +91,7 @@ class Processes:
     def __init__(self, count: int) -> None:
         self.count = count
 
-    def run(  # noqa: D102
-        self,
-        function: Callable[[Item], Result],
-        items: Sequence[Item],
-        done: Callable[[int, Result | Lost], None],
-    ) -> None:
+    def run(self, function: Task, items: Sequence[Any], done: Done) -> None:  # noqa: D102
         with contextlib.ExitStack() as stack:
             crew = [stack.enter_context(_Worker(function)) for _ in range(min(self.count, len(items)))]
             tries: Counter[int] = Counter()
@@ -114,11 +102,7 @@ class Processes:
 
 
 def _through(
-    crew: Sequence[_Worker],
-    items: Sequence[Any],
-    waiting: deque[int],
-    tries: Counter[int],
-    done: Callable[[int, Any], None],
+    crew: Sequence[_Worker], items: Sequence[Any], waiting: deque[int], tries: Counter[int], done: Done
 ) -> list[int]:
     """Run some tasks; gives those that lost their worker too often."""
     killed: list[int] = []
@@ -145,7 +129,7 @@ def _through(
 class _Worker:
     """A process that runs a function of what it is sent, as a context; killed where the block is left by an error."""
 
-    def __init__(self, function: Callable[[Any], Any]) -> None:
+    def __init__(self, function: Task) -> None:
         self._function = function
         self._start()
 
@@ -181,7 +165,7 @@ class _Worker:
         self.pipe.close()
 
 
-def _serve(pipe: Connection, function: Callable[[Any], Any]) -> None:
+def _serve(pipe: Connection, function: Task) -> None:
     """Answer until the pipe says no more, or is closed: the process that holds its other end is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the first process
     for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
@@ -225,24 +209,13 @@ class Cluster:
         """Threads of all workers that are there now."""
         return max(1, int(sum(self._client.nthreads().values())))
 
-    def run(  # noqa: D102
-        self,
-        function: Callable[[Item], Result],
-        items: Sequence[Item],
-        done: Callable[[int, Result | Lost], None],
-    ) -> None:
+    def run(self, function: Task, items: Sequence[Any], done: Done) -> None:  # noqa: D102
         killed = self._through(function, items, range(len(items)), done)
         for number in killed:  # a last time, so that none pays for its neighbour
             if self._through(function, items, [number], done):
                 done(number, ENDED)
 
-    def _through(
-        self,
-        function: Callable[[Item], Result],
-        items: Sequence[Item],
-        numbers: Iterable[int],
-        done: Callable[[int, Result | Lost], None],
-    ) -> list[int]:
+    def _through(self, function: Task, items: Sequence[Any], numbers: Iterable[int], done: Done) -> list[int]:
         """Run some; gives those that lost their worker too often, as Dask counts."""
         killed: list[int] = []
         active = {self._client.submit(function, items[number], pure=False): number for number in numbers}

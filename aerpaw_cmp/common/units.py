@@ -77,3 +77,27 @@ def amplitude_from_db(level_db: ArrayLike) -> FloatArray:
 def wrap_degrees(angle_deg: ArrayLike) -> FloatArray:
     """Angle wrapped to [-180, 180) degrees."""
     return np.asarray((np.asarray(angle_deg, dtype=np.float64) + 180.0) % 360.0 - 180.0)
+
+
+def finite_mean(values: ArrayLike) -> float:
+    """Mean of the finite values; NaN without any.
+
+    Examples
+    --------
+    >>> finite_mean([1.0, 3.0, np.nan]), finite_mean([])
+    (2.0, nan)
+    """
+    array = np.asarray(values, dtype=np.float64)
+    finite = array[np.isfinite(array)]
+    return float(finite.mean()) if finite.size else float("nan")
+
+
+def spread_out(count: int, most: int) -> IntArray:
+    """Indices of at most ``most`` of ``count`` items, evenly apart, the first and the last among them.
+
+    Examples
+    --------
+    >>> spread_out(9, 3).tolist(), spread_out(2, 5).tolist(), spread_out(0, 3).tolist()
+    ([0, 4, 8], [0, 1], [])
+    """
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64) if count else np.zeros(0, np.int64)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..common.errors import InputError
-from ..common.units import BoolArray, FloatArray, IntArray
+from ..common.units import BoolArray, FloatArray, IntArray, spread_out
 from .detection import floored_fit
 from .direction_gain import GainFit, GainModel, LinkSamples, Term, chosen_fit, fit_gain
 from .ladder import log_distance_level_db
@@ -355,7 +355,7 @@ def _scored_with(o: Observed, learned: Learned, offset_db: float, *, spread: boo
     if fitted is None:
         return None
     if spread and learned.fit is not None:
-        some = np.unique(np.linspace(0, len(gain) - 1, min(len(gain), SPREAD_SAMPLES)).round().astype(np.int64))
+        some = spread_out(len(gain), SPREAD_SAMPLES)
         stated = StatedSpread(
             gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
         )

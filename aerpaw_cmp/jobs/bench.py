@@ -16,7 +16,7 @@ from shapely.geometry import Point, box
 
 from ..common.geodesy import SiteFrame
 from ..common.stages import Progress, begin_peak, peak_mib, silent
-from ..common.units import ComplexArray, FloatArray, IntArray, wavelength_m
+from ..common.units import ComplexArray, FloatArray, IntArray, spread_out, wavelength_m
 from ..compare.rank import channel_rank
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from ..propagation.check.audit import RANK_K, Difference, compare
@@ -136,7 +136,6 @@ def speed_against_error(
         and ``rank_disagreement`` by K.
     """
     case = _Case(site, link, poses, replay(site, link, poses, Search(max_depth=DEPTH)))
-    every = np.arange(len(poses))
     rows = []
     for depth in depths:
         progress(f"image engine, depth {depth}")
@@ -144,8 +143,7 @@ def speed_against_error(
     for count in samples:
         for kind in ("synthetic", "explicit"):
             progress(f"sionna, {count} samples, its own {kind} arrays")
-            share = len(every) if kind == "synthetic" else min(explicit_poses, len(every))
-            chosen = np.unique(np.linspace(0, len(every) - 1, share).round().astype(np.int64))
+            chosen = spread_out(len(poses), len(poses) if kind == "synthetic" else explicit_poses)
             rows.append(case.own_arrays(count, kind, chosen))
         progress(f"sionna, {count} samples")
         rows.append(case.replayed(Search("sionna", max_depth=DEPTH, samples=count, batch=BATCH)))

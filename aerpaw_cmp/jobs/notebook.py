@@ -425,14 +425,14 @@ class Comparison:
         return axes
 
     def __repr__(self) -> str:
-        """The tables as text."""
-        tables = [table for table in (self.to_frame(), self.rank_to_frame()) if len(table)]
-        return "\n\n".join(table.round(2).to_string(index=False) for table in tables) or "Comparison: no series"
+        texts = [table.to_string(index=False) for table in self._tables()]
+        return "\n\n".join(texts) or "Comparison: no series"
 
     def _repr_html_(self) -> str:
-        """The tables for notebooks."""
-        tables = [table for table in (self.to_frame(), self.rank_to_frame()) if len(table)]
-        return "".join(table.round(2).to_html(index=False, border=0) for table in tables)
+        return "".join(table.to_html(index=False, border=0) for table in self._tables())
+
+    def _tables(self) -> list[pd.DataFrame]:
+        return [table.round(2) for table in (self.to_frame(), self.rank_to_frame()) if len(table)]
 
 
 def _node(series: Series) -> str:

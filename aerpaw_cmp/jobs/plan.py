@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..common.stages import Stages
+from ..common.units import spread_out
 from ..flight.data import FlightData
 from ..flight.settings import FlightFile, RtSettings
 from ..propagation.arrays import Link, Poses
@@ -214,7 +215,7 @@ def _tiles(site: Site, settings: Any, tiling: Any) -> PlannedStage:
     from .mapping.coverage_map import SiteChannels, TileOrder
 
     channels = SiteChannels(site, settings)
-    some = np.unique(np.linspace(0, len(tiling) - 1, TRIED_TILES).round().astype(int)).tolist()
+    some = spread_out(len(tiling), TRIED_TILES).tolist()
     orders = [TileOrder(site="", settings=settings, cells=tiling.cells, number=number) for number in some]
     seconds = _cpu_seconds(lambda: [channels.tile(order) for order in orders]) * len(tiling) / len(some)
     return PlannedStage("maps in tiles", f"{len(tiling)} tiles of {tiling.cells} x {tiling.cells} positions", seconds)

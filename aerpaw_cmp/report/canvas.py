@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..common.stages import Progress, silent
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, spread_out
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site, Trees
@@ -341,17 +341,6 @@ def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) ->
     """
     rows = keep_extremes([values], limit)
     return at[rows], values[rows]
-
-
-def spread_out(count: int, most: int) -> AnyArray:
-    """At most ``most`` indices of ``count``, evenly spread, both ends included.
-
-    Examples
-    --------
-    >>> spread_out(9, 3).tolist(), spread_out(2, 5).tolist(), spread_out(0, 3).tolist()
-    ([0, 4, 8], [0, 1], [])
-    """
-    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64) if count else np.zeros(0, np.int64)
 
 
 def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from ..common.units import BoolArray, IntArray
+from ..common.units import BoolArray, IntArray, spread_out
 from ..compare.result import ModelLevel, RankResult, RssResult
 from ..compare.rss import RssComparison
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site
-from .canvas import keep_extremes, seconds_since, spread_out, start_of
+from .canvas import keep_extremes, seconds_since, start_of
 from .data import GEOMETRY, PosePaths, ReportData, Source
 from .names import k_key
 from .packed import PackedArrays

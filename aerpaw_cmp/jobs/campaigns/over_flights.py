@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...common.jsonable import named
-from ...common.units import FloatArray
+from ...common.units import FloatArray, finite_mean
 from ...compare.offset import Pooling, pooled_moments
 from ...compare.passes import Pass, PassPair, PassTable, Visit
 from ...compare.rank import repeat_rank
@@ -76,16 +76,11 @@ def _pooled(setting: str, name: str, rows: list[RssRow], fits: Mapping[Any, Any]
         offset_db=rows[0].pooled_offset_db,
         spread_db=float(own.std(ddof=1)) if len(own) > 1 else nan,
         range_db=(float(own.min()), float(own.max())) if len(own) else (nan, nan),
-        own_rmse_db=_mean(row.rmse_db for row in rows),
-        pooled_rmse_db=_mean(row.pooled_rmse_db for row in rows),
+        own_rmse_db=finite_mean([row.rmse_db for row in rows]),
+        pooled_rmse_db=finite_mean([row.pooled_rmse_db for row in rows]),
         at_search_edge=any(fits[row.key].at_edge for row in rows),
         units=tuple(dict.fromkeys(row.unit for row in rows)),
     )
-
-
-def _mean(values: Any) -> float:
-    known = [v for v in values if np.isfinite(v)]
-    return float(np.mean(known)) if known else float("nan")
 
 
 def repeats(rows: Sequence[RssRow], settings: RepeatSettings) -> list[Repeat]:
@@ -168,7 +163,7 @@ def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
             common = [k for k in own if others and all(k in at for at in others)]
             if not common:
                 continue
-            chosen = min(common, key=lambda k: _mean(at[k].total_variation for at in others))
+            chosen = min(common, key=lambda k: finite_mean([at[k].total_variation for at in others]))
             best = min(own, key=lambda k: own[k].total_variation)
             out.append(
                 RankTransfer(

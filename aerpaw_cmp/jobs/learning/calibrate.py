@@ -500,12 +500,10 @@ def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple
 
 
 def mount_warnings(learned: Learned) -> list[str]:
-    """Mounts that the data do not fix."""
-    out = []
-    for name, mount in learned.mounts.items():
-        if not mount.identified:
-            out.append(
-                f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is likeliest, with a standard "
-                f"deviation of {mount.azimuth_sd_deg:.0f} deg"
-            )
-    return out
+    """A sentence for every mount that the data do not tell."""
+    return [
+        f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is likeliest, with a standard deviation of "
+        f"{mount.azimuth_sd_deg:.0f} deg"
+        for name, mount in learned.mounts.items()
+        if not mount.identified
+    ]

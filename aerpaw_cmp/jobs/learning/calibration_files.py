@@ -16,7 +16,7 @@ import numpy as np
 from ...common.errors import UsageError
 from ...common.gaussian import determining, gaussian_kernel
 from ...common.provenance import KEY, union
-from ...common.units import FloatArray, IntArray
+from ...common.units import FloatArray, spread_out
 from ...common.versions import utc_now
 from ...compare.calibration import Learned, mean_rmse
 from ...compare.direction_gain import directed
@@ -322,7 +322,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
             tables[files[end]] = sphere_csv(one.gain_dbi, one.sd_db, notes, decimals=2).encode()
         own = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
         first = next((data, s) for data in calibration.flights for s in data.rss if f"{s.tower}.{s.channel}" == antenna)
-        seen = np.concatenate([calibration.learned.predict(o.part(_spread_rows(len(o))))[1] for o in own])
+        seen = np.concatenate([calibration.learned.predict(o.part(spread_out(len(o), SD_SAMPLES)))[1] for o in own])
         series.append(
             LearnedSeries(
                 tower=own[0].tower,
@@ -346,6 +346,9 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
         tables,
     )
 
+
+SD_SAMPLES = 200
+"""Of a series: their standard deviations stand for its mean."""
 
 OFFSET_SD_DB = 1.5
 """Between flights, before any was left out: counts as two flights."""
@@ -418,10 +421,6 @@ def receiver_entry(
 def reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:
     """Reader of the log that holds a series."""
     return data.files[int(series.log[0]) if len(series.log) else 0].result.reader
-
-
-def _spread_rows(count: int) -> IntArray:
-    return np.unique(np.linspace(0, count - 1, min(count, 200)).round().astype(np.int64))
 
 
 def _provenance(settings: CalibrationFile, flights: Sequence[FlightData], command: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import InputError, UsageError
-from ...common.units import FloatArray
+from ...common.units import FloatArray, spread_out
 from ...compare.rank import channel_rank
 from ...compare.rolling import RouteAhead
 from ...flight.data import choose_site
@@ -134,7 +134,7 @@ class LiveTwin:
         columns = columns[np.isfinite(columns).all(axis=1)]
         if not len(columns):
             return None
-        shown = columns[np.unique(np.linspace(0, len(columns) - 1, ROUTE_SHOWN).round().astype(int))].round(1)
+        shown = columns[spread_out(len(columns), ROUTE_SHOWN)].round(1)
         median, least, most = columns[:, 2:].mean(axis=0).round(1).tolist()
         return {"trend": rest.trend, "level_dbm": median, "interval_dbm": [least, most], "points": shown.tolist()}
 

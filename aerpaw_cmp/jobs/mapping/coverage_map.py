@@ -20,7 +20,7 @@ import numpy as np
 from ...common.cf import file_attributes
 from ...common.errors import InputError, UsageError, noting_interrupts
 from ...common.stages import Progress, Stages, share_of
-from ...common.units import THERMAL_NOISE_DBM_HZ, AnyArray, ComplexArray, FloatArray, db_from_power, wavelength_m
+from ...common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray, db_from_power, finite_mean, wavelength_m
 from ...common.versions import utc_now, versions
 from ...compare.rank import singular_values
 from ...maps import export
@@ -833,7 +833,7 @@ def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
         return
     sizes = np.array(outcome.held_out.learning_sizes)
     for name, mae in {"Kriging": outcome.held_out.learning_mae, **outcome.learning}.items():
-        mean = np.array([_mean(row) for row in mae.reshape(len(sizes), -1)])
+        mean = np.array([finite_mean(row) for row in mae.reshape(len(sizes), -1)])
         yield page.LearningCurve(method=f"{name}, mean over heights and K", samples=sizes, mae=mean)
 
 
@@ -878,8 +878,8 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
             continue
         change = foliage_difference(clear, maps)
         result.setdefault("foliage", {})[mode] = [
-            {"altitude_m": h, "mean_rss_loss_db": _mean(change.rss_loss_db[i]), "lost": float(change.lost[i].mean())}
-            for i, h in enumerate(maps.rss_altitudes_m)
+            {"altitude_m": height, "mean_rss_loss_db": finite_mean(loss_db), "lost": float(lost.mean())}
+            for height, loss_db, lost in zip(maps.rss_altitudes_m, change.rss_loss_db, change.lost, strict=True)
         ]
     return result
 
@@ -891,11 +891,6 @@ def _interval_metrics(intervals: IntervalCoverage) -> dict[str, Any]:
         "standardised_variance": intervals.standardised_variance,
         "n": intervals.n,
     }
-
-
-def _mean(values: AnyArray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else float("nan")
 
 
 # --- files beside the page -----------------------------------------------------------------------------------------

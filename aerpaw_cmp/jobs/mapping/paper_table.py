@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ...common.units import power_from_db
+from ...common.units import finite_mean, power_from_db
 from ...maps.job import Antennas
 from ...maps.study import rank_fields
 from ...report.maps_data import PaperRow
@@ -145,11 +145,6 @@ def _correlation(outcome: MapOutcome) -> dict[str, str]:
     return ours | {"model": each(lambda fit: ", ".join(f"{v:.3f}" for v in fit(at)))}
 
 
-def _mean(values: Any) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else float("nan")
-
-
 def _interpolation(outcome: MapOutcome) -> dict[str, str]:
     s, (heights, _), ks = outcome.settings, rank_fields(outcome.shown), outcome.shown.ks
     names = ("Kriging", "makima", "spline")
@@ -157,13 +152,13 @@ def _interpolation(outcome: MapOutcome) -> dict[str, str]:
     for key in ("random", "zero"):
         scores = outcome.studies[key].scores
         for measure in ("mae", "rmse"):
-            means = [f"{name} {_mean(getattr(scores[name], measure)):.3f}" for name in names]
+            means = [f"{name} {finite_mean(getattr(scores[name], measure)):.3f}" for name in names]
             ours[f"{measure}_{key}"] = ", ".join(means)
         kriging, makima, spline = (scores[name].mae for name in names)
         ours[f"wins_{key}"] = f"{int(((kriging <= makima) & (kriging <= spline)).sum())} of {kriging.size}"
     mae = outcome.studies["random"].scores["Kriging"].mae
     worst = np.nan_to_num(mae, nan=-1.0).argmax(axis=0)
-    ours["mae_by_k"] = _by_k(ks, [_mean(column) for column in mae.T], "{:.3f}")
+    ours["mae_by_k"] = _by_k(ks, [finite_mean(column) for column in mae.T], "{:.3f}")
     ours["worst_height"] = _by_k(ks, [heights[i] for i in worst], "{:g} m")
     return ours
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ...common.stages import Progress, silent
-from ...common.units import AnyArray, FloatArray
+from ...common.units import AnyArray, FloatArray, spread_out
 from ...compare.field_difference import FieldAudit
 from ...compare.result import AuditResult, EngineResult, RssResult
 from ...flight.data import FlightData
@@ -192,7 +192,7 @@ def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Si
             continue
         (tower,) = replayed.link.tower_arrays
         count = len(replayed.poses)
-        for at in np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(np.int64)).tolist():
+        for at in spread_out(count, MOMENTS).tolist():
             pose = Poses(replayed.poses.position_m[at : at + 1], replayed.poses.rotation[at : at + 1])
             moment = dataclasses.replace(
                 replayed,
@@ -299,7 +299,7 @@ def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudi
     times, angles = _logged_attitudes(data.files)
     if not len(times):
         return FieldAudit(not_covered=("the attitude: the telemetry has none",))
-    rows = np.unique(np.linspace(0, len(times) - 1, min(len(times), ATTITUDE_ROWS)).round().astype(int))
+    rows = spread_out(len(times), ATTITUDE_ROWS)
     at = data.track.pose_at(times[rows])
     used = np.flatnonzero(at.valid & at.attitude_known)
     rotation = attitude_rotation(at, mode)

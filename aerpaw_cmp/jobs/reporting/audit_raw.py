@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ...common.units import FloatArray, IntArray
+from ...common.units import FloatArray, IntArray, spread_out
 from ...compare.field_difference import FieldAudit
 from ...compare.result import APPLIED, GIVEN, RssResult
 from ...flight.data import FlightData, RankSeries, RssSeries
@@ -284,7 +284,7 @@ def _pose_checked(pose: Pose, place: FloatArray, turn: FloatArray | None, where:
 def _spread(replayed: Replayed, path: RawPath | None, series: RssSeries, count: int) -> IntArray:
     """Samples with a pose, evenly spread, of each two neighbours the one that lies further from telemetry rows."""
     rows = np.flatnonzero(replayed.valid)
-    picked = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(np.int64))]
+    picked = rows[spread_out(len(rows), count)]
     if path is None or not len(picked):
         return np.asarray(picked)
     times = np.asarray(path.times_us, dtype=np.float64)
@@ -412,7 +412,7 @@ class _Series:
         if abs(ahead) < LEAST_AHEAD_S:
             return
         known = np.flatnonzero(self.replayed.valid & np.isfinite(self.series.measured_db))
-        rows = known[np.unique(np.linspace(0, len(known) - 1, min(CLOCK_SAMPLES, len(known))).round().astype(np.int64))]
+        rows = known[spread_out(len(known), CLOCK_SAMPLES)]
         spreads = []
         for sign in (-1.0, 1.0):
             error = [self._residual_db(reference, row, sign * ahead) for row in rows.tolist()]
@@ -492,7 +492,7 @@ def _rank_checked(
         readings = {} if log is None else {reading.time_us: reading for reading in log.readings.values()}
         rows = np.flatnonzero(series.log == number)
         stamps = series.time[rows].astype("datetime64[us]").astype(np.int64)
-        some = np.unique(np.linspace(0, len(rows) - 1, SAMPLES // 4).round().astype(np.int64))
+        some = spread_out(len(rows), SAMPLES // 4)
         names = [name for name in ("nr ri", "lte ri", "ri", "pdsch_rank") if readings and name in _names(log)]
         if not names or settings.ri_base == "zero":
             account.leave(f"ranks of {settings.path}")

@@ -13,6 +13,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from ...common.errors import UsageError
+from ...common.jsonable import fields_of, json_object
 from ...common.stages import Progress, silent
 from ...common.units import FloatArray
 from ...flight.data import FlightData, RankSeries, RssSeries, Times, load_data, rank_positions
@@ -67,14 +68,9 @@ class Explanation:
     notes: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        result = {name: getattr(self, name) for name in self.__slots__}
-        result["paths"] = [path.as_dict() for path in self.paths]
-        result["absent"] = [{"path": path, "reason": reason} for path, reason in self.absent]
-        for name in ("level_dbm", "power_sum_dbm", "measured_db"):
-            if result[name] is not None and not np.isfinite(result[name]):
-                result[name] = None
-        return result
+        """Plain values for JSON; what is not finite is None."""
+        absent = [{"path": path, "reason": reason} for path, reason in self.absent]
+        return json_object(**(fields_of(self) | {"paths": [path.as_dict() for path in self.paths], "absent": absent}))
 
 
 def run_explain(

@@ -7,11 +7,12 @@ the level whatever the arrays are; with one element at both ends they are the ga
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from ...common.jsonable import fields_of, json_safe
 from ...common.units import (
     SPEED_OF_LIGHT_MPS,
     AnyArray,
@@ -83,15 +84,7 @@ class ExplainedPath:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON; what is infinite (no field at all) becomes None."""
-        return {"path": self.words, **_finite({k: v for k, v in asdict(self).items() if k != "planes"})}
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+        return {"path": self.words, **json_safe({k: v for k, v in fields_of(self).items() if k != "planes"})}
 
 
 def explain_paths(

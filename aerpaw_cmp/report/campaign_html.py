@@ -15,9 +15,9 @@ from ..common.jsonable import fields_of, json_safe
 from ..common.stages import Progress, silent
 from ..compare.passes import Repeated
 from . import campaign_figures, canvas
-from .campaign_data import CampaignData, RankRow, RssRow
+from .campaign_data import CampaignData, RssRow
 from .campaign_pairs import TABLE as PAIR_TABLE
-from .campaign_pairs import by_link, pair_frame, telling
+from .campaign_pairs import by_link, cells, pair_frame, telling
 from .campaign_words import (
     FEW,
     beside_baselines,
@@ -102,11 +102,13 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
 
 def campaign_frame(data: CampaignData) -> pd.DataFrame:
     """One row per flight, setting, tower and channel (``kind`` rss) or K (``kind`` rank), and per failure."""
-    rows: list[dict[str, Any]] = [_rss_line(row) for row in data.rss]
-    rows += [_rank_line(row) for row in data.rank]
-    rows += [
-        {"kind": "failed", "flight": f.flight, "setting": f.setting, "message": f.message} for f in data.failures
+    rows = [
+        {"kind": "rss", **cells(row), **{f"{name}_rmse_db": error for name, error in row.baselines.items()},
+         "fitted": " ".join(row.fitted)}
+        for row in data.rss
     ]  # fmt: skip
+    rows += [{"kind": "rank", **cells(row)} for row in data.rank]
+    rows += [{"kind": "failed", **cells(failure)} for failure in data.failures]
     frame: pd.DataFrame = pd.DataFrame(rows, columns=CSV_COLUMNS)
     return frame
 
@@ -119,41 +121,6 @@ CSV_COLUMNS = [
     "fitted", "total_variation", "total_variation_low", "total_variation_high", "agreement", "agreement_low",
     "agreement_high", "kappa", "wasserstein", "best_k", "message",
 ]  # fmt: skip
-
-
-def _bounds(name: str, value: tuple[float, float] | None, end: str = "") -> dict[str, float]:
-    low, high = value or (float("nan"), float("nan"))
-    return {f"{name}_low{end}": low, f"{name}_high{end}": high}
-
-
-def _rss_line(row: RssRow) -> dict[str, Any]:
-    names = (
-        "flight", "setting", "tower", "channel", "offset_db", "rmse_db", "pooled_offset_db", "pooled_rmse_db",
-        "held_out_offset_db", "held_out_rmse_db", "n", "n_out_of_coverage", "correlation", "at_search_edge", "lag_s",
-        "lag_verdict",
-    )  # fmt: skip
-    return {
-        "kind": "rss",
-        **{name: getattr(row, name) for name in names},
-        **_bounds("offset", row.offset_ci95_db, "_db"),
-        **_bounds("rmse", row.rmse_ci95_db, "_db"),
-        **_bounds("correlation", row.correlation_ci95),
-        **{f"{name}_rmse_db": value for name, value in row.baselines.items()},
-        "fitted": " ".join(row.fitted),
-    }
-
-
-def _rank_line(row: RankRow) -> dict[str, Any]:
-    names = (
-        "flight", "setting", "tower", "k", "n", "n_out_of_coverage", "total_variation", "agreement", "kappa",
-        "wasserstein", "best_k",
-    )  # fmt: skip
-    return {
-        "kind": "rank",
-        **{name: getattr(row, name) for name in names},
-        **_bounds("total_variation", row.total_variation_ci95),
-        **_bounds("agreement", row.agreement_ci95),
-    }
 
 
 def repeatability_beside(data: CampaignData) -> list[tuple[Any, float, float]]:

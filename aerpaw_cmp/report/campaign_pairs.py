@@ -53,22 +53,19 @@ def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
 
 def pair_frame(data: CampaignData) -> pd.DataFrame:
     """One row per pair of flights, tower and channel (``kind`` rss), or tower (``kind`` rank)."""
-    rss = _columns(data.repeats, Repeat, {"rmse_ci95_db": ("rmse_low_db", "rmse_high_db")})
-    rank = _columns(data.rank_repeats, RankPairing, {"kappa_ci95": ("kappa_low", "kappa_high")})
-    frames = [pd.DataFrame({"kind": kind, **columns}) for kind, columns in (("rss", rss), ("rank", rank)) if columns]
-    filled = [frame for frame in frames if len(frame)]
-    table: pd.DataFrame = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
+    kinds: dict[str, Sequence[Any]] = {"rss": data.repeats, "rank": data.rank_repeats}
+    table: pd.DataFrame = pd.DataFrame([{"kind": kind, **cells(p)} for kind, pairs in kinds.items() for p in pairs])
     return table
 
 
-def _columns(items: Sequence[Any], kind: type, bounds: dict[str, tuple[str, str]]) -> dict[str, Any]:
-    """Fields of records as columns; an interval becomes two."""
-    columns: dict[str, Any] = {}
-    for name in (field.name for field in dataclasses.fields(kind)):
-        values = [getattr(item, name) for item in items]
-        if name in bounds:
-            for end, column in enumerate(bounds[name]):
-                columns[column] = [float("nan") if value is None else value[end] for value in values]
+def cells(record: Any) -> dict[str, Any]:
+    """Fields of a record as cells of a table; an interval ``x_ci95`` becomes ``x_low`` and ``x_high``."""
+    out: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if "ci95" in field.name:
+            low, high = value or (float("nan"), float("nan"))
+            out |= {field.name.replace("ci95", "low"): low, field.name.replace("ci95", "high"): high}
         else:
-            columns[name] = values
-    return columns
+            out[field.name] = value
+    return out

@@ -9,26 +9,11 @@ from functools import partial
 import numpy as np
 
 from ..compare.result import RankResult, RssResult
+from . import rank_figures, rss_figures
 from .against_figures import against_specs
 from .canvas import POINTS_PER_CLOUD, FigureSpec
 from .data import ReportData, Track
 from .names import safe_name
-from .rank_figures import (
-    agreement_curve,
-    confusion,
-    rank_forecast,
-    rank_histograms,
-    rank_maps,
-    rank_over_time,
-)
-from .rss_figures import (
-    altitude,
-    detection_reliability,
-    ladder,
-    overview,
-    rss_over_time,
-    trajectory,
-)
 from .serving_figures import serving_spec
 from .words import count, learned_on
 
@@ -50,7 +35,7 @@ def _figures(data: ReportData) -> Iterator[FigureSpec]:
             "overview", "overview", "Where and when the prediction fails",
             f"{scored[0].name}. Left: the flight coloured by the residual, measured minus ray tracing after the "
             "offset. Right: level over time.",
-            partial(overview, data, scored[0]),
+            partial(rss_figures.overview, data, scored[0]),
         )  # fmt: skip
     if data.track is not None and len(data.track.time):
         yield from _track_specs(data, data.track)
@@ -62,7 +47,7 @@ def _figures(data: ReportData) -> Iterator[FigureSpec]:
             "ladder", "ladder", "Models from the simplest to the richest",
             "RMSE on held-out segments, a line per tower and channel. Whiskers: 95 % interval of the difference to the "
             "best model on the same samples. Filled: the recommended model.",
-            partial(ladder, data.ladder),
+            partial(rss_figures.ladder, data.ladder),
         )  # fmt: skip
     if data.serving is not None and data.serving.n:
         yield serving_spec(data.serving)
@@ -83,13 +68,13 @@ def _track_specs(data: ReportData, track: Track) -> Iterator[FigureSpec]:
     yield FigureSpec(
         "trajectory", "flight", "Where the UAV flew",
         f"Left: the site with its towers. Right: the flight, coloured by height.{invented}",
-        partial(trajectory, data, track),
+        partial(rss_figures.trajectory, data, track),
     )  # fmt: skip
     dotted = " Dotted lines are waypoints." if data.waypoints else ""
     yield FigureSpec(
         "altitude", "flight", "Height over time",
         f"Height of the UAV above the ground at the site origin.{dotted}",
-        partial(altitude, data, track),
+        partial(rss_figures.altitude, data, track),
     )  # fmt: skip
 
 
@@ -126,7 +111,7 @@ def _rss_specs(data: ReportData, panel: RssResult) -> Iterator[FigureSpec]:
         "best fit. " + _HATCHED * bool(panel.simulated_out_of_coverage.any())
         + "Bottom: residual; dashed lines are plus and minus one RMSE." + _band_words(panel)
         + drawn * (len(panel.time) > POINTS_PER_CLOUD),
-        partial(rss_over_time, data, panel),
+        partial(rss_figures.rss_over_time, data, panel),
     )  # fmt: skip
     score = panel.further.detection
     if score is not None and score.reliability:
@@ -135,7 +120,7 @@ def _rss_specs(data: ReportData, panel: RssResult) -> Iterator[FigureSpec]:
             "Fifths of the predicted probability against the share that the receiver detected; on the diagonal the "
             f"forecast is calibrated. Brier score {score.brier:.3f}, constant forecast {score.constant_brier:.3f}; log "
             f"score {score.log_score:.3f}, constant {score.constant_log_score:.3f} ({learned_on(score)}).",
-            partial(detection_reliability, score),
+            partial(rss_figures.detection_reliability, score),
         )  # fmt: skip
 
 
@@ -146,30 +131,30 @@ def _rank_specs(data: ReportData, panel: RankResult) -> Iterator[FigureSpec]:
         yield FigureSpec(
             f"rank_forecast_{stem}", "forecast", f"{panel.tower}: rank forecast along the flight",
             "Probability of each rank by the fitted receiver (means), above the reported ranks.",
-            partial(rank_forecast, data, panel),
+            partial(rank_figures.rank_forecast, data, panel),
         )  # fmt: skip
     yield FigureSpec(
         f"rank_histogram_{stem}", section, f"{panel.tower}: how often each rank",
         "Shares of rank 1 to 4 among samples in coverage, measured beside every K. Whiskers: 95 % intervals.",
-        partial(rank_histograms, panel),
+        partial(rank_figures.rank_histograms, panel),
     )  # fmt: skip
     yield FigureSpec(
         f"rank_map_{stem}", section, f"{panel.tower}: rank along the flight",
         "Rank at every sample. Colour and marker give the rank; crosses marked Z had no path in the simulation.",
-        partial(rank_maps, data, panel),
+        partial(rank_figures.rank_maps, data, panel),
         page=False,
     )  # fmt: skip
     yield FigureSpec(
         f"rank_time_{stem}", section, f"{panel.tower}: rank over time",
         "Each row is one source. The lowest plot shows the singular values that decide the rank.",
-        partial(rank_over_time, data, panel),
+        partial(rank_figures.rank_over_time, data, panel),
     )  # fmt: skip
     if panel.score.simulated:
         yield FigureSpec(
             f"rank_confusion_{stem}", section, f"{panel.tower}: which ranks are mistaken for which",
             "Counts; colour is the share of each measured rank (rows). Frames: equal ranks. Z: no path in the "
             "simulation.",
-            partial(confusion, panel),
+            partial(rank_figures.confusion, panel),
             page=False,
         )  # fmt: skip
     if np.isfinite(panel.score.curve.agreement).any():
@@ -177,6 +162,6 @@ def _rank_specs(data: ReportData, panel: RankResult) -> Iterator[FigureSpec]:
             f"rank_k_{stem}", section, f"{panel.tower}: which K explains the modem",
             "Agreement by pose and distance between the histograms as the threshold K varies. The best K is the one of "
             "the highest agreement.",
-            partial(agreement_curve, panel),
+            partial(rank_figures.agreement_curve, panel),
             page=False,
         )  # fmt: skip

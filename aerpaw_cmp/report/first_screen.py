@@ -6,13 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from ..common.provenance import union
 from ..compare.forecast import ForecastScore
 from ..compare.memory import FEWEST
 from ..compare.result import AuditResult, RankResult, RssResult
-from ..compare.statistics import PairedDifference
+from ..compare.statistics import Interval, PairedDifference
 from .data import ReportData
 from .words import (
     NOTHING_COMPARED,
@@ -27,6 +25,7 @@ from .words import (
     lock_sentence,
     nearest_k,
     next_step,
+    pooled_db,
     pretty,
     training_sentence,
     trust,
@@ -83,12 +82,6 @@ def _baseline_sentence(panels: Sequence[RssResult]) -> str:
 
 def _scored(panels: Sequence[RssResult]) -> list[RssResult]:
     return [panel for panel in panels if panel.score.n >= FEWEST and math.isfinite(panel.score.rmse_db)]
-
-
-def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
-    """Root of the mean square error over all samples of several series, each after its own offset [dB]."""
-    weight = np.asarray(n, dtype=np.float64)
-    return float(np.sqrt((weight * np.asarray(rmse_db) ** 2).sum() / weight.sum()))
 
 
 def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
@@ -185,11 +178,10 @@ def _log_score(score: ForecastScore) -> str:
 
 
 def _forecast_card(panel: RankResult, score: ForecastScore) -> Headline:
-    low, high = score.kappa_ci95
     return Headline(
         label=f"Rank forecast at {panel.tower}",
         value=f"kappa {score.kappa:.2f}",
-        interval=f"95 %: {low:.2f} to {high:.2f}" if math.isfinite(low) and math.isfinite(high) else NO_INTERVAL,
+        interval=_interval(score.kappa_ci95, ".2f"),
         beside=_log_score(score),
     )
 
@@ -280,10 +272,15 @@ def _error(panels: Sequence[RssResult]) -> Headline:
     )
 
 
+def _interval(ends: Interval, form: str, unit: str = "") -> str:
+    if not all(map(math.isfinite, ends)):
+        return NO_INTERVAL
+    return "95 %: " + " to ".join(format(end, form).replace("-", "−") for end in ends) + unit
+
+
 def _ends(panels: Sequence[RssResult]) -> str:
     if len(panels) == 1:
-        low, high = panels[0].score.rmse_ci95_db
-        return f"95 %: {low:.1f} to {high:.1f} dB" if math.isfinite(low) and math.isfinite(high) else NO_INTERVAL
+        return _interval(panels[0].score.rmse_ci95_db, ".1f", " dB")
     errors = [panel.score.rmse_db for panel in panels]
     return f"channels: {min(errors):.1f} to {max(errors):.1f} dB"
 
@@ -297,15 +294,11 @@ def _difference(panels: Sequence[RssResult]) -> list[Headline]:
     words = [entry.verdict for entry in paired]
     undecided = len(words) - words.count("better") - words.count("worse")
     if len(paired) == 1:
-        low, high = paired[0].difference_ci95_db
-        known = math.isfinite(low) and math.isfinite(high)
         return [
             Headline(
                 label=f"Against {pretty(name)}, same samples",
                 value=f"{paired[0].difference_db:+.1f} dB".replace("-", "−"),
-                interval=f"95 %: {low:+.1f} to {high:+.1f} dB".replace("-", "−")
-                if known
-                else "no interval can be given",
+                interval=_interval(paired[0].difference_ci95_db, "+.1f", " dB"),
                 beside="negative: smaller error of ray tracing",
             )
         ]

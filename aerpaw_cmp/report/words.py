@@ -352,6 +352,12 @@ def verdicts(rss: Sequence[RssResult], rank: Sequence[RankResult]) -> list[str]:
     return [rss_verdict(panel) for panel in rss] + [rank_verdict(panel) for panel in rank]
 
 
+def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
+    """Root of the mean square error over all samples of several series, each after its own offset [dB]."""
+    weight = np.asarray(n, dtype=np.float64)
+    return float(np.sqrt((weight * np.asarray(rmse_db) ** 2).sum() / weight.sum()))
+
+
 def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
     """Cross-validated errors of this replay, of the baselines and of the recommended model."""
     rows = [row for row in ladder if math.isfinite(row.rmse_heldout_db)]
@@ -359,7 +365,8 @@ def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
     if best is None:
         return ""
     chosen = best.model
-    error = {row.model: _pooled([r for r in rows if r.model == row.model]) for row in rows}
+    mine = {row.model: [r for r in rows if r.model == row.model] for row in rows}
+    error = {model: pooled_db([r.rmse_heldout_db for r in of], [r.n for r in of]) for model, of in mine.items()}
     beside = [f"{name} {error[name]:.1f} dB" for name in (AS_SET, *BASELINE_TITLE.values()) if name in error]
     least = min(error, key=lambda name: error[name])
     text = f"Cross-validated RMSE: {', '.join(beside)}."
@@ -374,12 +381,6 @@ def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
         f"{text} \u201c{chosen}\u201d is {how}: {error[chosen]:.1f} dB. "
         "Next: report --recommend FILE writes its settings."
     )
-
-
-def _pooled(rows: Sequence[LadderRow]) -> float:
-    """RMSE over all towers and channels."""
-    n = sum(row.n for row in rows)
-    return math.sqrt(sum(row.n * row.rmse_heldout_db**2 for row in rows) / n) if n else float("nan")
 
 
 def training_sentence(names: Sequence[str], what: str, digests: Sequence[str]) -> str:

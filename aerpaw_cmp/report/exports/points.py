@@ -21,7 +21,7 @@ from ...site.site import Site
 from ..campaign_data import CampaignData, FlownRank, RssRow
 from ..data import ReportData
 from ..export import DECIMALS, rank_tables, rss_tables
-from ..names import k_key
+from ..names import RANK_COLUMNS, RSS_COLUMNS, k_key
 
 DEGREE_DECIMALS = 8
 """1 mm."""
@@ -31,7 +31,7 @@ RANK_FLAGS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
 YES_NO = ("no", "yes")
 
 _UNITS = (
-    (r"_dbm$", DBM, "dBm"),
+    (r"_dbm$|^calibrated_db$", DBM, "dBm"),
     (r"_db$", DB, "dB"),
     (r"_deg$", "degree", "deg"),
     (r"_m$", "m", "m"),
@@ -170,38 +170,19 @@ class Export:
 
 # --- columns --------------------------------------------------------------------------------------------------------
 
-_RSS_MEANINGS = {
-    "measured_db": "level as logged",
-    "calibrated_db": "level as logged plus the fitted offset of the link",
-    "simulated_dbm": "level by ray tracing",
-    "residual_db": "calibrated minus simulated level",
-    "measured_out_of_coverage": "whether the log has no signal here",
-    "simulated_out_of_coverage": "whether the ray tracing has no path here",
-}
-
 
 def column(name: str, unit: str | None = None) -> Column:
-    """The column of a name: its unit from the name's end, its meaning from what is known of it."""
-    meaning = _RSS_MEANINGS.get(name, name.replace("_", " "))
+    """The column of a name: its unit from the name's end, its meaning as rss.csv and rank.csv have it."""
+    meaning = (RANK_COLUMNS | RSS_COLUMNS).get(name, name.replace("_", " "))
     if name.endswith("out_of_coverage"):
         return Column(name=name, meaning=meaning, flags=YES_NO)
-    if name == "measured_rank":
-        return Column(name=name, meaning="rank reported by the modem, missing where it reported none", flags=RANK_FLAGS)
-    if re.match(r"(simulated_)?rank_", name):
-        k = name.rsplit("_k", 1)[-1]
-        what = name.removeprefix("simulated_").removeprefix("rank_").rsplit("k" + k, 1)[0].strip("_").replace("_", " ")
-        return Column(
-            name=name, meaning=f"rank by ray tracing, K = {k}" + (f", {what}" if what else ""), flags=RANK_FLAGS
-        )
-    if name == "calibrated_db":
-        return Column(name=name, unit=DBM, shown_unit="dBm", meaning=meaning)
+    if name == "measured_rank" or name.startswith("simulated_rank_k"):
+        k = name.removeprefix("simulated_rank_k")
+        return Column(name=name, meaning=meaning if k == name else f"rank by ray tracing, K = {k}", flags=RANK_FLAGS)
     if name == "measured_db":
-        known = (DBM, "dBm") if unit == "dBm" else (DB, unit or "dB")
-        return Column(name=name, unit=known[0], shown_unit=known[1], meaning=meaning)
-    for end, udunits, shown in _UNITS:
-        if re.search(end, name):
-            return Column(name=name, unit=udunits, shown_unit=shown, meaning=meaning)
-    return Column(name=name, meaning=meaning)
+        return Column(name=name, unit=DBM if unit == "dBm" else DB, shown_unit=unit or "dB", meaning=meaning)
+    _, udunits, shown = next((known for known in _UNITS if re.search(known[0], name)), ("", "1", ""))
+    return Column(name=name, unit=udunits, shown_unit=shown, meaning=meaning)
 
 
 def points_table(kind: str, links: Iterable[Mapping[str, Any]], frame: SiteFrame) -> tuple[Points, ...]:

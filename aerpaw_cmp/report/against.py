@@ -9,21 +9,18 @@ from typing import Any
 import numpy as np
 
 from ..common.units import FloatArray
+from ..compare.entries import LevelSeries, level_scores
 from ..compare.forecast import ForecastScore
 from ..compare.verdicts import Verdict, stated_errors
 from .prediction_words import after_flight, rank_after_flight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AgainstSeries:
-    """Samples (n,) of one tower and channel that were predicted; levels in the unit of the log [dB]."""
+class AgainstSeries(LevelSeries):
+    """Samples (n,) of one tower and channel that were predicted, offset and all; levels in the unit of the log [dB]."""
 
-    tower: str
-    channel: str
-    time_s: FloatArray
-    measured_db: FloatArray
-    level_db: FloatArray
     sd_db: FloatArray
+    own_offset: bool = False
     low_db: FloatArray
     high_db: FloatArray
     share_near: float
@@ -35,29 +32,46 @@ class AgainstSeries:
     @property
     def stated(self) -> Verdict:
         """True if the errors are as large as was stated."""
-        found = stated_errors(self.measured_db - self.level_db, self.sd_db, self.common_db)
-        return replace(found, where=f"{self.tower} {self.channel}")
+        return replace(stated_errors(self.error_db, self.sd_db, self.common_db), where=self.name)
 
     def coverage(self, share: float) -> float:
         """Share of samples inside the interval that is to hold so many."""
         from scipy.special import ndtri
 
         half = float(ndtri(0.5 + 0.5 * share)) * self.sd_db
-        return float(np.mean(np.abs(self.measured_db - self.level_db) <= half))
+        return float(np.mean(np.abs(self.error_db) <= half))
+
+    @property
+    def scores(self) -> dict[str, float]:
+        """Scores as predicted; ``own_offset_rmse_db`` about the mean of the flight."""
+        return {
+            **level_scores([self]),
+            "bias_db": self.bias_db,
+            "own_offset_rmse_db": float(self.error_db.std()),
+            "coverage_50": self.coverage(0.5),
+            "coverage_90": float(np.mean((self.measured_db >= self.low_db) & (self.measured_db <= self.high_db))),
+            "coverage_95": self.coverage(0.95),
+            "mean_sd_db": float(self.sd_db.mean()),
+            "share_near": self.share_near,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Against:
-    """A prediction and the flight that followed; ``scores`` by ``tower channel``."""
+    """A prediction and the flight that followed."""
 
     folder: str
     sentence: str
     generated: str
     flights: tuple[str, ...]
     series: tuple[AgainstSeries, ...]
-    scores: Mapping[str, Mapping[str, float]]
     ranks: Mapping[str, ForecastScore] = field(default_factory=dict)
     """By tower."""
+
+    @property
+    def scores(self) -> dict[str, dict[str, float]]:
+        """Scores by ``tower channel``."""
+        return {series.name: series.scores for series in self.series}
 
     @property
     def words(self) -> str:
@@ -72,6 +86,6 @@ class Against:
             "generated": self.generated,
             "flights": list(self.flights),
             "sentence": self.words,
-            "scores": {name: dict(row) for name, row in self.scores.items()},
+            "scores": self.scores,
             "rank": {tower: score.as_dict() for tower, score in self.ranks.items()},
         }

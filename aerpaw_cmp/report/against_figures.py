@@ -24,8 +24,8 @@ def against_specs(against: Against) -> Iterator[FigureSpec]:
     """Levels over time with their intervals, then reliability and sharpness."""
     for s in against.series:
         yield FigureSpec(
-            f"against_{safe_name(s.tower)}_{safe_name(s.channel)}", "against",
-            f"{s.tower} {s.channel}: predicted before this flight",
+            f"against_{safe_name(s.name)}", "against",
+            f"{s.name}: predicted before this flight",
             "Band: 90 % interval of one sample as it was predicted. Nothing of this flight was used.",
             partial(_over_time, s),
         )  # fmt: skip
@@ -56,9 +56,8 @@ def _reliability(against: Against) -> Figure:
     left, right = fig.subplots(1, 2)
     left.plot([0, 100], [0, 100], color="0.6", linewidth=1)
     for s in against.series:
-        name = f"{s.tower} {s.channel}"
-        left.plot(100 * SHARES, [100 * s.coverage(share) for share in SHARES], "o-", markersize=3, label=name)
-        right.hist(s.sd_db, bins=30, histtype="step", label=name)
+        left.plot(100 * SHARES, [100 * s.coverage(share) for share in SHARES], "o-", markersize=3, label=s.name)
+        right.hist(s.sd_db, bins=30, histtype="step", label=s.name)
     left.set_xlabel("nominal [%]")
     left.set_ylabel("observed [%]")
     left.legend(fontsize=8)

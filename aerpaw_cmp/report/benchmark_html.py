@@ -61,13 +61,10 @@ class Bar:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskTable:
-    """A task on the page; ``bars`` from the best to the worst."""
+    """A task on the page; ``about`` with title, rule, flights and skipped, ``bars`` from the best to the worst."""
 
     name: str
-    title: str
-    rule: str
-    flights: Sequence[str]
-    skipped: Sequence[str]
+    about: Mapping[str, Any]
     columns: Mapping[str, tuple[str, str]]
     bars: Sequence[Bar]
     scores: Mapping[str, Mapping[str, Any]]
@@ -101,10 +98,7 @@ def task_table(name: str, about: Mapping[str, Any], scores: Mapping[str, Mapping
         bars.append(Bar(title=TITLES.get(entrant, entrant), scores=scores[entrant], at=at, low=start, high=stop))
     return TaskTable(
         name=name,
-        title=about["title"],
-        rule=about["rule"],
-        flights=about["flights"],
-        skipped=about["skipped"],
+        about=about,
         columns=columns,
         bars=bars,
         scores=scores,
@@ -140,7 +134,7 @@ def _first_words(tables: Sequence[TaskTable]) -> str:
     """On how many tasks a model without ray tracing and learning is as good as any."""
     simple = {TITLES[n] for n in ("free_space", "log_distance", "two_ray", "tr36777_rma_av", "tr36777_uma_av", "p1411")}
     simple |= {"constant", TITLES["kriging"]}
-    won = [item.title for item in tables if item.bars and item.bars[0].title in simple]
+    won = [item.about["title"] for item in tables if item.bars and item.bars[0].title in simple]
     text = f"{len(tables)} tasks were scored. "
     if not won:
         return text + "On none of them is a baseline the best model."

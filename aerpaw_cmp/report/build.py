@@ -100,16 +100,15 @@ def clock_warning(clock: ClockResult) -> str:
 
 
 def rss_warnings(result: RssResult) -> tuple[str, ...]:
-    """Warnings that the reader must know of one tower and channel before believing its numbers."""
-    out = []
+    """A channel that could not be compared, or whose offset is no result."""
     if result.score.n == 0:
-        out.append(f"{result.name}: no sample could be compared; its numbers are missing, not zero.")
-    elif result.score.at_edge:
-        out.append(
+        return (f"{result.name}: no sample could be compared; its numbers are missing, not zero.",)
+    if result.score.at_edge:
+        return (
             f"{result.name}: the best offset lies at the edge of the searched span, so it and its RMSE are no result. "
-            "Widen rss.span_db, and check the transmit power and the unit of the log."
+            "Widen rss.span_db, and check the transmit power and the unit of the log.",
         )
-    return tuple(out)
+    return ()
 
 
 def rank_warnings(result: RankResult) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import AerpawCmpError
+from ...common.jsonable import named
 from ...common.stages import Progress
 from ...report.campaign_data import Failure, FlownTrack
 from ..tasks.outcomes import OutcomeStore
@@ -64,21 +65,15 @@ class CampaignStatus:
 
     def metrics(self) -> dict[str, Any]:
         """For ``--json``."""
+        waiting = [state for state in self.states if not state.kept]
         return {
             "campaign": self.name,
-            "keep": self.keep,
             "tasks": len(self.states),
-            "kept": self.kept,
-            "failed": self.failed,
-            "to_do": self.to_do,
-            "estimate_s": self.estimate_s,
-            "workers": self.workers,
+            **named(self, "keep kept failed to_do estimate_s workers"),
             "to_do_tasks": [
-                {"flight": s.task.flight, "setting": s.task.setting, "last_failure": s.failure or s.trouble or None}
-                for s in self.states
-                if not s.kept
+                {**named(s.task, "flight setting"), "last_failure": s.failure or s.trouble or None} for s in waiting
             ],
-            "failures": [{"flight": f.flight, "setting": f.setting, "message": f.message} for f in self.failures],
+            "failures": [named(failure, "flight setting message") for failure in self.failures],
         }
 
 

@@ -13,7 +13,6 @@ from ...common.errors import InputError, UsageError
 from ...common.provenance import KEY
 from ...common.units import FloatArray, IntArray
 from ...compare.calibration import Observed
-from ...compare.entries import LevelSeries, level_scores
 from ...compare.forecast import ForecastScore, score_forecast
 from ...flight.data import FlightData
 from ...flight.training import common, flight_logs
@@ -81,7 +80,6 @@ def score_against(data: FlightData, folder: Path) -> Against:
         generated=str(about.get("generated", "")),
         flights=tuple(map(str, about.get("flights", ()))),
         series=tuple(series),
-        scores={f"{s.tower} {s.channel}": _scores(s) for s in series},
         ranks=ranks,
     )
 
@@ -95,8 +93,7 @@ def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
         return None
     said, s = part.iloc[index[near]], one.samples.part(near)
     return AgainstSeries(
-        tower=s.tower,
-        channel=s.channel,
+        name=f"{s.tower} {s.channel}",
         time_s=s.time_s,
         measured_db=s.residual_db + one.free_space_db[near],
         level_db=said["level_db"].to_numpy(np.float64),
@@ -137,26 +134,3 @@ def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame
     heading = heading_deg if part["yaw_deg"].notna().all() else np.full(len(heading_deg), np.nan)
     away, index = cKDTree(points).query(coordinates(position_m, heading))
     return np.asarray(index), away <= np.sqrt(2.0)
-
-
-def _scores(s: AgainstSeries) -> dict[str, float]:
-    """Scores as predicted, offset and all; ``own_offset_rmse_db`` about the mean of the flight."""
-    one = LevelSeries(
-        name=s.channel,
-        time_s=s.time_s,
-        measured_db=s.measured_db,
-        level_db=s.level_db,
-        sd_db=s.sd_db,
-        own_offset=False,
-    )
-    error = s.measured_db - s.level_db
-    return {
-        **level_scores([one]),
-        "bias_db": one.bias_db,
-        "own_offset_rmse_db": float(error.std()),
-        "coverage_50": s.coverage(0.5),
-        "coverage_90": float(np.mean((s.measured_db >= s.low_db) & (s.measured_db <= s.high_db))),
-        "coverage_95": s.coverage(0.95),
-        "mean_sd_db": float(s.sd_db.mean()),
-        "share_near": s.share_near,
-    }

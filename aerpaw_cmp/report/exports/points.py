@@ -15,11 +15,12 @@ import numpy as np
 
 from ...common.cf import DB, DBM
 from ...common.geodesy import SiteFrame
+from ...common.jsonable import fields_of
 from ...common.units import AnyArray, FloatArray
 from ...logs.records import has_wall_clock
 from ...site.site import Site
 from ..campaign_data import CampaignData, FlownRank, RssRow
-from ..data import ReportData
+from ..data import ReportData, Track
 from ..export import DECIMALS, rank_tables, rss_tables
 from ..names import RANK_COLUMNS, RSS_COLUMNS, k_key
 
@@ -106,14 +107,10 @@ class Points:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Line:
-    """A flown line (n,): instants and positions in the site frame [m]."""
+class Line(Track):
+    """The track of a flight."""
 
     flight: str
-    time: AnyArray
-    east_m: FloatArray
-    north_m: FloatArray
-    up_m: FloatArray
 
     @property
     def known(self) -> AnyArray:
@@ -247,9 +244,7 @@ def of_report(data: ReportData) -> Export:
             kind, ({"time": time, "flight": data.flight, **columns} for time, columns in links), data.site.frame
         )
     ]
-    track = data.track
-    places = {} if track is None else {name: getattr(track, name) for name in ("time", "east_m", "north_m", "up_m")}
-    lines = [Line(flight=data.flight, **places)] if places else []
+    lines = [] if data.track is None else [Line(flight=data.flight, **fields_of(data.track))]
     return Export(
         name=data.flight,
         title=data.title,

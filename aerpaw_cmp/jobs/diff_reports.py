@@ -26,7 +26,7 @@ from ..compare.report_difference import (
     rank_difference,
 )
 from ..report.diff_data import Entry, InputEntry, ReportDiff, ReportSide
-from ..report.names import RANK_COLUMNS, RSS_COLUMNS
+from ..report.names import RANK_COLUMNS, RSS_COLUMNS, links_of
 
 TOLERANCE_DB = 0.01
 """Differences up to this count as none: the tables hold four decimals, offsets one."""
@@ -224,11 +224,10 @@ def _against_metrics(metrics: Mapping[str, Any], rss: Any, folder: Path) -> list
     """Links whose table does not have the samples that metrics.json counts."""
     wrong = []
     scored = rss["residual_db"].notna().groupby([rss["tower"], rss["channel"]]).sum() if len(rss) else {}
-    for tower, channels in metrics["rss"].items():
-        for channel, numbers in channels.items():
-            n = int(scored.get((tower, channel), 0))
-            if n != numbers.get("n") and not numbers.get(KEY):
-                wrong.append(f"{tower} {channel} ({n} against {numbers.get('n')})")
+    for link, numbers in links_of(metrics["rss"]).items():
+        n = int(scored.get(link, 0))
+        if n != numbers.get("n") and not numbers.get(KEY):
+            wrong.append(f"{' '.join(link)} ({n} against {numbers.get('n')})")
     if not wrong:
         return []
     return [f"{folder}: rss.csv and metrics.json do not have the same number of scored samples: {', '.join(wrong)}."]
@@ -277,9 +276,8 @@ def compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float =
 def _learned_here(first: ReadReport, second: ReadReport) -> Iterator[str]:
     """Links whose model was learned from this very log in one of the reports."""
     for side in (first, second):
-        for tower, channels in side.metrics["rss"].items():
-            if names := [f"{tower} {channel}".strip() for channel, one in channels.items() if one.get(KEY)]:
-                yield f"{side.place}: {', '.join(names)}: learned from this flight's own log; no error is compared."
+        if names := [" ".join(link).strip() for link, n in links_of(side.metrics["rss"]).items() if n.get(KEY)]:
+            yield f"{side.place}: {', '.join(names)}: learned from this flight's own log; no error is compared."
 
 
 def _side(side: ReadReport) -> ReportSide:
@@ -293,7 +291,7 @@ def _side(side: ReadReport) -> ReportSide:
 
 
 def _links(side: ReadReport) -> set[str]:
-    rss = {f"{tower} {channel}".strip() for tower, channels in side.metrics["rss"].items() for channel in channels}
+    rss = {" ".join(link).strip() for link in links_of(side.metrics["rss"])}
     return rss | {f"{tower} rank" for tower in side.metrics["rank"]}
 
 
@@ -324,7 +322,7 @@ def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterat
         a, b = first_inputs.get(key), second_inputs.get(key)
         if a is not None and b is not None and a.get("sha256") == b.get("sha256"):
             continue
-        here = a or b or {}
+        here, mine, theirs = a or b or {}, a or {}, b or {}
         if a is None or b is None:
             others = first if a is None else second
             if any(i.get("sha256") == here.get("sha256") and i.get("role") == here.get("role") for i in others):
@@ -333,10 +331,10 @@ def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterat
             role=key[0],
             path=key[1],
             what="added" if a is None else "removed" if b is None else "changed",
-            first_sha256=None if a is None else a.get("sha256"),
-            second_sha256=None if b is None else b.get("sha256"),
-            first_lines=None if a is None else a.get("lines"),
-            second_lines=None if b is None else b.get("lines"),
+            first_sha256=mine.get("sha256"),
+            second_sha256=theirs.get("sha256"),
+            first_lines=mine.get("lines"),
+            second_lines=theirs.get("lines"),
         )
 
 
@@ -405,23 +403,22 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[LevelDifference]
     differences: list[LevelDifference] = []
     residuals: list[_Residuals] = []
     names = ("measured_db", "simulated_dbm", "residual_db")
-    for tower, channels in mine.metrics["rss"].items():
-        for channel, numbers in channels.items():
-            other = theirs.metrics["rss"].get(tower, {}).get(channel)
-            if other is None or numbers.get(KEY) or other.get(KEY):
-                continue  # no error of a model is compared on a log that it was learned from
-            tables = [s.rss[(s.rss["tower"] == tower) & (s.rss["channel"] == channel)] for s in (mine, theirs)]
-            overlap, a, b = _matched(*tables)
-            first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))
-            offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, other)]
-            scored = [int(table["residual_db"].notna().sum()) for table in tables]
-            residuals.append((_instants(a), first[2], second[2]))
-            differences.append(
-                level_difference(
-                    tower, channel, overlap, first, second,
-                    scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]),
-                )
-            )  # fmt: skip
+    for (tower, channel), numbers in links_of(mine.metrics["rss"]).items():
+        other = theirs.metrics["rss"].get(tower, {}).get(channel)
+        if other is None or numbers.get(KEY) or other.get(KEY):
+            continue  # no error of a model is compared on a log that it was learned from
+        tables = [s.rss[(s.rss["tower"] == tower) & (s.rss["channel"] == channel)] for s in (mine, theirs)]
+        overlap, a, b = _matched(*tables)
+        first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))
+        offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, other)]
+        scored = [int(table["residual_db"].notna().sum()) for table in tables]
+        residuals.append((_instants(a), first[2], second[2]))
+        differences.append(
+            level_difference(
+                tower, channel, overlap, first, second,
+                scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]),
+            )
+        )  # fmt: skip
     return differences, residuals
 
 

@@ -314,9 +314,11 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
     """Checks that the report states and that did not hold."""
-    links = {f"{tower} {name}": m for tower, channels in metrics["rss"].items() for name, m in channels.items()}
+    from ..report.names import links_of
+
     failed = []
-    for link, m in links.items():
+    for (tower, channel), m in links_of(metrics["rss"]).items():
+        link = f"{tower} {channel}"
         if m["n"] == 0:
             failed.append(f"{link}: no sample could be compared")
         elif m["at_search_edge"]:

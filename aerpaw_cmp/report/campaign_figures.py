@@ -28,14 +28,12 @@ from .canvas import (
 )
 from .maps_figures import COLOURS, LINES, MARKERS, grouped
 from .names import k_key, safe_name
-from .rss_figures import running_levels
 from .words import count, pretty
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-DISTANCE_BINS = 30
 
 MAPS_PER_ROW = 3
 
@@ -55,35 +53,6 @@ TALLEST = 40.0
 def look(number: int) -> dict[str, Any]:
     """Colour and line style of the flight with this number, told apart in grey by the dashes."""
     return {"color": COLOURS[number % len(COLOURS)], "linestyle": LINES[(number + number // len(COLOURS)) % len(LINES)]}
-
-
-def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
-    """RSS after the offset against distance, and its difference to the simulation below, all flights on one axis."""
-    fig = figure((9.2, 6.4))
-    top, low = fig.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
-    reach = max((float(np.nanmax(r.distance_m)) for r in rows if np.isfinite(r.distance_m).any()), default=1.0)
-
-    def binned(row: RssRow, values: FloatArray) -> FloatArray:
-        levels = running_levels(row.distance_m, values, DISTANCE_BINS, (0.0, reach))
-        return levels[np.isfinite(levels[:, 0])]
-
-    for row in rows:
-        style = look(numbers[row.flight])
-        for ax, values in ((top, row.measured_db + row.offset_db), (low, row.residual_db)):
-            middle, low_level, median, high_level = binned(row, values).T
-            ax.fill_between(middle, low_level, high_level, color=style["color"], alpha=0.15, linewidth=0)
-            ax.plot(middle, median, linewidth=1.8, label=f"{row.flight}, measured + offset ({count(row.n)})", **style)
-        middle, _, median, _ = binned(row, np.where(np.isfinite(row.measured_db), row.simulated_dbm, np.nan)).T
-        top.plot(
-            middle, median, linestyle="none", marker=MARKERS[numbers[row.flight] % len(MARKERS)], markersize=4.5,
-            markerfacecolor="white", color=style["color"], label=f"{row.flight}, ray tracing",
-        )  # fmt: skip
-    low.axhline(0.0, color="black", linewidth=0.8)
-    top.set_ylabel("RSS [dBm]")
-    low.set_ylabel("Measured − simulated [dB]")
-    low.set_xlabel("Distance tower to UAV [m]")
-    fig.legend(*top.get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    return fig
 
 
 def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
@@ -292,7 +261,7 @@ def settings_rmse(data: CampaignData) -> Figure:
     for index, (at, ((flight, link), rows)) in enumerate(zip(places, groups.items(), strict=True)):
         ends = [at[0] - 0.6, at[-1] + 0.6]
         for name, value in rows[0].baselines.items():
-            colour, line = BASELINE.get(name, ("#777777", ":"))
+            colour, line = BASELINE[name]
             label = None if index else f"{pretty(name)} (own offset)"
             ax.plot([value, value], ends, color=colour, linestyle=line, linewidth=1.5, label=label)
         floors = [r for r in data.repeats if flight in (r.first, r.second) and f"{r.tower} {r.channel}".strip() == link]
@@ -372,12 +341,6 @@ def _flight_specs(data: CampaignData) -> Iterator[FigureSpec]:
     for link, rows in grouped(data.reference_rows, lambda r: r.link).items():
         scored = [row for row in rows if row.n > 0]
         if scored and len(scored) <= MOST_FLIGHTS:
-            yield FigureSpec(
-                f"distance_{safe_name(link)}", "overlay", f"{link}: RSS against distance, all flights",
-                f"Setting: {data.reference}. Lines: medians of {DISTANCE_BINS} bins of distance; bands: 10 % to 90 %. "
-                "Open markers: medians of the simulation at the same samples. Each flight has its own offset.",
-                partial(against_distance, scored, numbers),
-            )  # fmt: skip
             yield FigureSpec(
                 f"places_{safe_name(link)}", "overlay", f"{link}: where the simulation errs, flight by flight",
                 f"Mean residual in cells of {data.cell_m:g} m, all heights together, one colour scale. A pattern that "

@@ -39,7 +39,6 @@ BASELINE = {
     "log_distance": ("#CC79A7", (0, (6, 2, 1, 2))),
     "constant": ("#0072B2", (0, (8, 3))),
 }
-OTHER_BASELINES = (("#E69F00", (0, (6, 2, 1, 2))), ("#7F7F7F", (0, (8, 3))))
 OUT_OF_COVERAGE = "#BBBBBB"
 TOWER = "#C1121F"
 BUILDING = "#8A8A8A"
@@ -495,11 +494,6 @@ def legend_below(ax: Axes, columns: int = 4) -> None:
         ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, borderaxespad=0.0)
 
 
-def baseline_style(name: str, number: int) -> tuple[str, Any]:
-    """Colour and line style of a baseline."""
-    return BASELINE.get(name, OTHER_BASELINES[number % len(OTHER_BASELINES)])
-
-
 def rank_colour(rank: int) -> Any:
     """Colour of rank 1 to 4, from dark to light in even steps; black for the crosses of 0."""
     from matplotlib import colormaps
@@ -510,7 +504,7 @@ def rank_colour(rank: int) -> Any:
 # --- site ---------------------------------------------------------------------------------------
 
 
-def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None, names: bool = True) -> None:
+def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None) -> None:
     """Forests, trees, buildings, geofences and towers on a plan (east, north) [m].
 
     Parameters
@@ -519,8 +513,6 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None, name
     site : Site
     towers : sequence of str, optional
         Only these towers; by default all.
-    names : bool
-        Write the names of the towers.
     """
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline
@@ -554,12 +546,11 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None, name
             tower.east_m, tower.north_m, marker="^", markersize=9, color=TOWER, markeredgecolor="black",
             linestyle="none", zorder=5, label="tower" if number == 0 else None,
         )  # fmt: skip
-        if names:
-            ax.annotate(
-                tower.name, (tower.east_m, tower.north_m), xytext=(6, 4), textcoords="offset points", zorder=6,
-                fontsize=8, fontweight="bold", annotation_clip=True,
-                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
-            )  # fmt: skip
+        ax.annotate(
+            tower.name, (tower.east_m, tower.north_m), xytext=(6, 4), textcoords="offset points", zorder=6,
+            fontsize=8, fontweight="bold", annotation_clip=True,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
+        )  # fmt: skip
     plan_axes(ax)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -62,3 +63,8 @@ def safe_name(text: str) -> str:
     ('LW1_USRP1', 'a_b', '_')
     """
     return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("._")[:80] or "_"
+
+
+def links_of(by_tower: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], Any]:
+    """Numbers by tower and channel, of ``rss`` in metrics.json."""
+    return {(tower, name): numbers for tower, channels in by_tower.items() for name, numbers in channels.items()}

@@ -7,17 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..common.units import FloatArray
 from ..compare.detection import DetectionScore
 from ..compare.ladder import LadderRow
 from ..compare.result import RankResult, RssResult
 from .canvas import (
+    BASELINE,
     MEASURED,
     POINTS_PER_LINE,
     SIMULATED,
     TOWER,
     WAYPOINT,
-    baseline_style,
     cloud,
     colour_bar,
     dots,
@@ -156,8 +155,8 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     calibrated, residual = panel.calibrated_db, panel.residual_db
     label = f"measured, {_offset(score.offset_db)} ({count(score.n)} scored)"
     dots(ax, seconds, calibrated, 2.5, color=MEASURED, label=label, zorder=3.5)
-    for number, (name, baseline) in enumerate(panel.baselines.items()):
-        colour, dashes = baseline_style(name, number)
+    for name, baseline in panel.baselines.items():
+        colour, dashes = BASELINE[name]
         # each model is drawn where its own best offset puts it against the same calibrated points
         level = baseline.level_dbm + (score.offset_db - baseline.offset_db)
         ax.plot(
@@ -216,50 +215,6 @@ def detection_reliability(score: DetectionScore) -> Figure:
     ax.set_ylim(0, 100)
     ax.legend(loc="upper left")
     return fig
-
-
-FEWEST_PER_BIN = 8
-"""Samples that a bin needs: no line is drawn over what was not flown."""
-
-
-def running_levels(
-    quantity: FloatArray, values: FloatArray, bins: int = 20, span: tuple[float, float] | None = None
-) -> FloatArray:
-    """Mean quantity and 10, 50, 90 % points of the values in bins of equal width.
-
-    Parameters
-    ----------
-    quantity, values : (n,)
-        Pairs with a NaN do not count.
-    bins : int
-    span : (low, high), optional
-        Of the bins; by default that of the quantity.
-
-    Returns
-    -------
-    (bins, 4)
-        Mean quantity, then the 10, 50 and 90 % points of the values; NaN below :data:`FEWEST_PER_BIN` samples.
-
-    Examples
-    --------
-    >>> at = np.concatenate([np.arange(40.0), 360.0 + np.arange(41.0)])
-    >>> levels = running_levels(at, at)
-    >>> np.flatnonzero(np.isfinite(levels[:, 2])).tolist(), levels[0].round(3).tolist()
-    ([0, 1, 18, 19], [9.5, 1.9, 9.5, 17.1])
-    """
-    good = np.isfinite(quantity) & np.isfinite(values)
-    quantity, values = quantity[good], values[good]
-    levels = np.full((bins, 4), np.nan)
-    if not len(quantity):
-        return levels
-    low, high = span or (float(quantity.min()), float(quantity.max()))
-    edges = np.linspace(low, high, bins + 1)
-    which = np.clip(np.searchsorted(edges, quantity, side="right") - 1, 0, bins - 1)
-    for number in range(bins):
-        inside = which == number
-        if inside.sum() >= FEWEST_PER_BIN:
-            levels[number] = quantity[inside].mean(), *np.percentile(values[inside], [10, 50, 90])
-    return levels
 
 
 def ladder(rows: Sequence[LadderRow]) -> Figure:

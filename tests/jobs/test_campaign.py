@@ -199,7 +199,7 @@ def test_broken_flights_are_rows_with_their_message(whole: dict[str, Any], folde
 def test_every_figure_is_there_and_old_ones_are_not(whole: dict[str, Any], folder: Path) -> None:
     figures = folder / "whole_out" / "figures"
     expected = {
-        "settings_rmse", "tracks", "distance_LW1_USRP1", "distance_LW1_USRP2", "places_LW1_USRP1", "places_LW1_USRP2",
+        "settings_rmse", "tracks", "places_LW1_USRP1", "places_LW1_USRP2",
         "season_errors", "season_drift", "season_places",
     }  # fmt: skip
     assert {p.stem for p in figures.glob("*.svg")} == {p.stem for p in figures.glob("*.png")} == expected

@@ -158,19 +158,9 @@ def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
             into[key] = value
 
 
-def rss_frame(series: Sequence[RssResult]) -> Any:
-    """All RSS samples as one table with the columns of :data:`RSS_COLUMNS` and one per baseline."""
-    return _whole(rss_tables(series), RSS_COLUMNS)
-
-
 def rss_csv(series: Sequence[RssResult]) -> Iterator[str]:
     """The text of :func:`rss_frame` in pieces of bounded size."""
     return _text(rss_tables(series), RSS_COLUMNS)
-
-
-def rank_frame(series: Sequence[RankResult]) -> Any:
-    """All rank samples as one table with the columns of :data:`RANK_COLUMNS` and one per K."""
-    return _whole(rank_tables(series), RANK_COLUMNS)
 
 
 def rank_csv(series: Sequence[RankResult]) -> Iterator[str]:
@@ -255,7 +245,7 @@ def _number_columns(one: RankResult) -> dict[str, FloatArray]:
     return {name: np.where(np.isfinite(values), values, np.nan) for name, values in columns.items()}
 
 
-def _whole(tables: Iterator[_Table], columns: Iterable[str]) -> Any:
+def whole(tables: Iterator[_Table], columns: Iterable[str]) -> Any:
     """Tables below each other, rounded; without any, the bare columns."""
     import pandas as pd
 
@@ -272,7 +262,7 @@ def _text(tables: Iterator[_Table], columns: Iterable[str]) -> Iterator[str]:
             yield rows.to_csv(index=False, header=head, lineterminator="\n")
             head = False
     if head:
-        yield _whole(iter(()), columns).to_csv(index=False, lineterminator="\n")
+        yield whole(iter(()), columns).to_csv(index=False, lineterminator="\n")
 
 
 def _rows(table: _Table, part: slice) -> Any:

@@ -1,4 +1,4 @@
-"""When and by which programs a page was made."""
+"""Instant and programs of the making of a page."""
 
 from __future__ import annotations
 

@@ -308,7 +308,6 @@ def row(flight: str, channel: str, measured: Any, simulated: Any, **keys: Any) -
         "correlation_ci95": None, "n_effective": nan, "lag_s": nan, "lag_verdict": "", "fitted": (), "baselines": {},
         "step_db": 0.1, "span_db": (-50.0, 50.0), "time_s": np.arange(n) * 1.0,
         "position_m": np.stack([np.arange(n) * 3.0, np.zeros(n), np.full(n, 40.0)], axis=-1),
-        "distance_m": np.arange(n) * 3.0,
     }  # fmt: skip
     return RssRow(
         flight=flight, setting="s", tower="LW1", channel=channel, measured_db=measured, simulated_dbm=simulated,

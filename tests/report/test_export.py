@@ -12,6 +12,14 @@ from aerpaw_cmp.report import export, names
 from benchmarks.fabricated import with_numbers
 
 
+def rss_frame(series):
+    return export.whole(export.rss_tables(series), names.RSS_COLUMNS)
+
+
+def rank_frame(series):
+    return export.whole(export.rank_tables(series), names.RANK_COLUMNS)
+
+
 def test_metrics_hold_the_contract(report_data):
     m = json.loads(json.dumps(export.metrics(report_data), allow_nan=False))
     for key in ("flight", "versions", "inputs", "rss", "rank", "rt", "stages"):
@@ -70,7 +78,7 @@ def test_key_order_does_not_depend_on_the_order_of_versions(report_data):
 
 def test_rss_csv_comes_back_as_it_went(report_data, tmp_path):
     path = tmp_path / "rss.csv"
-    export.rss_frame(report_data.rss).to_csv(path, index=False)
+    rss_frame(report_data.rss).to_csv(path, index=False)
     back = pd.read_csv(path, parse_dates=["time_utc"])
     assert [c for c in names.RSS_COLUMNS if c not in back.columns] == []
     for panel in report_data.rss:
@@ -102,19 +110,19 @@ def test_tables_written_in_pieces_are_the_tables(report_data, rows, monkeypatch)
 
     bare = [dataclasses.replace(few(p, 9), time=p.time[:9] - p.time[0]) for p in report_data.rss]
     for panels in ([], bare, [few(report_data.rss[0], 0), *bare], list(report_data.rss[:1]) if rows > 1 else bare):
-        whole = export.rss_frame(panels).to_csv(index=False, lineterminator="\n")
+        whole = rss_frame(panels).to_csv(index=False, lineterminator="\n")
         assert "".join(export.rss_csv(panels)) == whole
     rank = report_data.rank[0]
     one, two = few(rank, 11), dataclasses.replace(few(rank, 5), probability=np.full((5, 4), 0.25))
     for ranks in ([], [one, two], [two, one]):
-        whole = export.rank_frame(ranks).to_csv(index=False, lineterminator="\n")
+        whole = rank_frame(ranks).to_csv(index=False, lineterminator="\n")
         assert "".join(export.rank_csv(ranks)) == whole
 
 
 def test_relative_times_are_no_times_of_day(report_data):
     panel = report_data.rss[0]
     start = panel.time[0] - np.datetime64("1969-12-31T23:57:00", "ns")
-    table = export.rss_frame([dataclasses.replace(panel, time=panel.time - start), panel])
+    table = rss_frame([dataclasses.replace(panel, time=panel.time - start), panel])
     relative, absolute = table[: len(panel.time)], table[len(panel.time) :]
     assert (relative.time_utc == "").all()
     assert absolute.time_utc.str.startswith("20").all()
@@ -126,7 +134,7 @@ def test_relative_times_are_no_times_of_day(report_data):
 
 def test_rank_csv_keeps_no_csi_apart_from_no_path(report_data, tmp_path):
     path = tmp_path / "rank.csv"
-    export.rank_frame(report_data.rank).to_csv(path, index=False)
+    rank_frame(report_data.rank).to_csv(path, index=False)
     assert ".0," not in path.read_text().splitlines()[1].split(",", 5)[5], "ranks are integers in the file"
     back = pd.read_csv(path)
     panel = report_data.rank[0]
@@ -136,13 +144,13 @@ def test_rank_csv_keeps_no_csi_apart_from_no_path(report_data, tmp_path):
 
 
 def test_tables_without_rows_have_their_columns():
-    assert list(export.rss_frame([]).columns) == list(names.RSS_COLUMNS)
-    assert list(export.rank_frame([]).columns) == list(names.RANK_COLUMNS)
+    assert list(rss_frame([]).columns) == list(names.RSS_COLUMNS)
+    assert list(rank_frame([]).columns) == list(names.RANK_COLUMNS)
 
 
 def test_panels_with_different_baselines_share_one_table(report_data):
     bare = dataclasses.replace(report_data.rss[0], baselines={}, channel="bare")
-    frame = export.rss_frame([bare, report_data.rss[1]])
+    frame = rss_frame([bare, report_data.rss[1]])
     assert frame[frame.channel == "bare"].free_space_dbm.isna().all()
     assert frame[frame.channel == "USRP2"].free_space_dbm.notna().all()
 
@@ -172,7 +180,7 @@ def test_rank_csv_holds_what_a_receiver_decides_by(report_data):
     level, sigma = np.full(len(panel.time), -80.0), np.tile([1.0, 10**-0.625], (len(panel.time), 1))
     level[1], sigma[2, 1] = np.nan, 0.0
     with np.errstate(divide="ignore"):
-        table = export.rank_frame([dataclasses.replace(panel, level_dbm=level, sigma=sigma)])
+        table = rank_frame([dataclasses.replace(panel, level_dbm=level, sigma=sigma)])
     assert table["level_dbm"].isna().to_numpy().nonzero()[0].tolist() == [1]
     assert table["sigma2_over_sigma1_db"].isna().to_numpy().nonzero()[0].tolist() == [2]
     assert table["sigma2_over_sigma1_db"][0] == -12.5

@@ -16,7 +16,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.compare.spread import NO_SPREAD, StatedSpread
 from aerpaw_cmp.flight.settings import ReportSettings
-from aerpaw_cmp.report.export import rank_frame, rss_frame
+from aerpaw_cmp.report import export
 from aerpaw_cmp.report.exports import formats, kmz, points, write
 
 ODD = 'LW<4> & "ö"'
@@ -59,9 +59,9 @@ def data(report_data):
 def frames(data, tmp_path_factory):
     """rss.csv and rank.csv as a user reads them, with where each sample is."""
     found = {}
-    for kind, frame in (("rss", rss_frame(data.rss)), ("rank", rank_frame(data.rank))):
+    for kind, tables in (("rss", export.rss_tables(data.rss)), ("rank", export.rank_tables(data.rank))):
         path = tmp_path_factory.mktemp("csv") / f"{kind}.csv"
-        frame.to_csv(path, index=False)
+        export.whole(tables, ()).to_csv(path, index=False)
         table = pd.read_csv(path)
         table["time"] = pd.to_datetime(table["time_utc"]).astype("datetime64[ns, UTC]")
         found[kind] = table

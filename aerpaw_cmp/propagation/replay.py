@@ -249,13 +249,10 @@ def _shaped_ground(
     if site.dem is None or scene.surfaces is not None or not paths.faces.shape[1]:
         return scene, paths, paths.select(slice(0, 0)), []
     found = on_terrain(site.dem, scene.faces, scene.links_to(poses), paths, wavelength_m(link.carrier_hz))
-    notes = [
-        (found.unknown, "links over ground that the elevation model does not know: level ground reflects there"),
-        (found.dropped, "paths with two reflections off the ground: they are not followed over terrain"),
-    ]
+    words = "links over ground that the elevation model does not know: level ground reflects there"
     more = np.zeros((len(scene.usable), len(found.faces) - len(scene.faces)), dtype=np.bool_)
     scene = replace(scene, faces=found.faces, usable=np.concatenate([scene.usable, more], axis=1))
-    return scene, found.level, found.shaped, [f"{count} {what}" for count, what in notes if count]
+    return scene, found.level, found.shaped, [f"{found.unknown} {words}"] if found.unknown else []
 
 
 def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:

@@ -7,9 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from aerpaw_cmp.compare.field_difference import FieldAudit
 from aerpaw_cmp.propagation.arrays import Isotropic, Link, Poses, rotation_from_yaw_pitch_roll, single_element
+from aerpaw_cmp.propagation.check import audit as audit_module
 from aerpaw_cmp.propagation.check import explain, reference
-from aerpaw_cmp.propagation.check.audit import Audit, _spread, compare, extra_rows
+from aerpaw_cmp.propagation.check.audit import Audit, Second, _spread, compare, extra_rows
 from aerpaw_cmp.propagation.check.field_audit import (
     Expected,
     _another_rank,
@@ -180,6 +182,51 @@ def test_two_replays_differ_by_what_was_planted() -> None:
     numbers = dict.fromkeys(("seconds", "reference_seconds"), 1.0) | dataclasses.asdict(none)
     words = Audit(engine="image", reference="sionna", links=3, **numbers).as_dict()
     assert (words["rss_max_error_db"], words["missing_paths"], words["field"]) == (None, 2, None)
+
+
+@pytest.mark.parametrize(("samples", "rays"), [("auto", 100_000), (5_000, 5_000), (300_000, 100_000)])
+def test_an_audit_adds_up_its_checks(monkeypatch: pytest.MonkeyPatch, samples: object, rays: int) -> None:
+    """The image engine by itself, two poses by the second implementation, and what Sionna would be asked."""
+    spots = np.array([[120.0, 60, 40], [40, -90, 25], [-200, 90, 60], [60, 10, 30], [90, 0, 50]])
+    poses, asked = Poses(spots, np.tile(np.eye(3), (5, 1, 1))), []
+    search = Search("image", max_depth=1)
+    clean = replay(SITE, LINK, poses, search)
+
+    def sionna(*given, **named) -> FieldAudit:
+        asked.append((given[4].tolist(), given[6].samples, named["complete"]))
+        return FieldAudit(paths=7)
+
+    monkeypatch.setattr(audit_module, "against_sionna", sionna)
+    second = Second(reference="image", links=3, expected=Expected.of(LINK), reference_links=2)
+    wanted = dataclasses.replace(search, samples=samples)
+    found = audit_module.audit(SITE, LINK, poses, clean, wanted, second=second)
+    assert (found.engine, found.reference, found.links, found.missing_paths, found.extra_paths) == (
+        "image",
+        "image",
+        3,
+        0,
+        0,
+    )
+    assert found.field is not None
+    assert (found.field.paths, found.field.reference_links, found.field.failures) == (7, 2, ())
+    assert asked == [([0, 2, 4], rays, True)]
+    assert found.seconds == clean.seconds
+    faces, row = clean.paths.faces.copy(), int(np.flatnonzero((clean.paths.depth == 1) & (clean.paths.pose == 2))[0])
+    source = SITE.towers["LW1"].position_m
+    faces[row, 0] = np.flatnonzero((clean.faces.solid >= 0) & (clean.faces.normal @ source < clean.faces.offset_m - 1))[
+        0
+    ]
+    planted = dataclasses.replace(clean, paths=dataclasses.replace(clean.paths, faces=faces))
+    seen = audit_module.audit(SITE, LINK, poses, planted, wanted, second=dataclasses.replace(second, reference_links=0))
+    assert seen.field is not None
+    assert (seen.missing_paths, seen.extra_paths, seen.field.phantom_paths) == (1, 1, 1)
+    few = replay(SITE, LINK, Poses(spots[::2], np.tile(np.eye(3), (3, 1, 1))), search)
+    monkeypatch.setattr(audit_module, "run_replay", lambda *_: few)
+    mesh = audit_module.audit(dataclasses.replace(SITE, scene=object()), LINK, poses, planted, wanted, second=second)
+    assert mesh.field is not None
+    assert (mesh.field.reference_links, mesh.field.phantom_paths, len(mesh.field.not_covered)) == (0, 0, 1)
+    bare = audit_module.audit(SITE, LINK, poses, clean, wanted, second=dataclasses.replace(second, expected=None))
+    assert bare.field is None
 
 
 def test_audited_poses_are_spread_or_taken_for_the_kinds_of_their_paths() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,17 +14,21 @@ from shapely.geometry import LineString, Point, Polygon, box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.bench import random_scene
-from aerpaw_cmp.propagation.arrays import Array, Link, Poses, single_element
+from aerpaw_cmp.propagation.arrays import Array, Isotropic, Link, Poses, single_element
+from aerpaw_cmp.propagation.check.bent import _cotangent
 from aerpaw_cmp.propagation.check.explain import edge_path_lines
 from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
+from aerpaw_cmp.propagation.check.reference import element_wave, fresnel, permittivity, turned
 from aerpaw_cmp.propagation.edges import Edges
 from aerpaw_cmp.propagation.faces import site_faces, triangles
+from aerpaw_cmp.propagation.field.edges import Tables, amplitudes
 from aerpaw_cmp.propagation.options import Search
-from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.replay import edges_of, replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search.edges import _below
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.propagation.trace import trace
+from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
 from aerpaw_cmp.site.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building, Site, Tower
 
@@ -49,15 +54,21 @@ BARN = Building("barn", box(40, -15, 52, 25), 8.0)
 # --- a second way: plain loops, the shortest way over each edge by a search, Kouyoumjian and Pathak's own formula ----
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_paths_and_field_by_plain_loops(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("seed", "patterns"), [(1, (Isotropic(),) * 3), (2, (TR38901(), Isotropic(), Isotropic())),
+                           (3, (HalfWaveDipole(), TR38901(), HalfWaveDipole()))],
+)  # fmt: skip
+def test_paths_and_field_by_plain_loops(seed: int, patterns: tuple) -> None:
     """Slanted arrays at both ends, H with the reflections: the audit's second implementation."""
-    site, link, flown = random_scene(40, buildings=5, seed=seed)
+    site, link, flown = random_scene(40, buildings=5, seed=seed, towers=1 + (seed == 3))
     flown.position_m[::2, 2], flown.position_m[1::2, 2] = 2.0, 25.0
+    arrays = dict(zip(link.tower_arrays, patterns, strict=False))
+    arrays = {name: replace(link.tower_arrays[name], patterns=(pattern,)) for name, pattern in arrays.items()}
+    link = replace(link, tower_arrays=arrays, uav_array=replace(link.uav_array, patterns=patterns[2:]))
     ours = replay(site, link, flown, Search(diffraction="edges"))
     assert ours.edge_paths is not None
     assert len(ours.edge_paths) > 300
-    chosen = np.arange(0, 40, 3)
+    chosen = np.arange(0, 40, 3 * len(arrays))
     found = against_reference(site, flown, ours, chosen, Expected.of(link), ks=(10.0, 1000.0), max_depth=2)
     assert found.failures == ()
     assert found.doubtful <= 3
@@ -66,12 +77,20 @@ def test_paths_and_field_by_plain_loops(seed: int) -> None:
 
 def test_the_audit_sees_a_path_over_an_edge_that_is_not_there() -> None:
     where = poses((70.0, 3.0, 2.0), (60.0, -40.0, 9.0))
-    ours = trace(place(BARN), LINK, where, diffraction="edges")
+    barn, array = place(BARN), Array(np.array([[0.0, 0.3, 0.1]]), np.array([0.4]))
+    link = Link(HZ, {"T": array}, array)
+    ours = trace(barn, link, where, diffraction="edges")
     assert ours.edge_paths is not None
     few = ours.edge_paths.select(np.arange(1, len(ours.edge_paths)))
-    for planted in (replace(ours, edge_paths=few), replace(ours, h=0.99 * ours.h)):
-        found = against_reference(place(BARN), where, planted, np.arange(2), Expected.of(LINK), ks=(10.0,), max_depth=2)
-        assert found.failures
+    assert {tuple(row) for row in (ours.edge_paths.ground >= 0).tolist()} == {
+        (False, False),
+        (False, True),
+        (True, False),
+    }
+    for planted in (ours, replace(ours, edge_paths=few), replace(ours, h=0.9999 * ours.h)):
+        found = against_reference(barn, where, planted, np.arange(2), Expected.of(link), ks=(10.0,), max_depth=2)
+        assert bool(found.failures) == (planted is not ours)
+        assert found.doubtful == 0
 
 
 NEAR_A_CORNER_M = 1.0
@@ -284,7 +303,7 @@ def test_edges_of_a_box_and_of_a_hole() -> None:
     edges = Edges.of(site_faces(place(ell)))
     assert len(edges) == 6 + 5  # six rims, and no edge in the inner corner
     assert np.allclose(edges.exterior, 1.5)
-    assert np.allclose(np.cross(edges.face_axis, edges.normal), edges.along)
+    right_handed(edges)
 
 
 def test_a_face_that_another_building_covers_has_no_edge() -> None:
@@ -412,6 +431,166 @@ def test_the_border_of_a_sheet_is_a_half_plane() -> None:
     assert ((at[:, 2] == 6.0) & (np.abs(at[:, 1]) < 39.0)).sum() == 1
 
 
+def half_a_wedge(edges: Edges, edge: int, shared: int, end: np.ndarray, s_end: float, s: float, way: np.ndarray):
+    """Of one of two edges, by Fresnel integrals: sine with the ray, H, and S by a difference at the shared face."""
+    n, e = edges.exterior[edge], edges.along[edge]
+    sine = math.sqrt(1 - float(way @ e) ** 2)
+    kl = K * s_end * s * sine**2 / (s_end + s)
+    apart = end - edges.start_m[edge]
+    angle = math.atan2(apart @ edges.normal[edge], apart @ edges.face_axis[edge]) % (2 * math.pi)
+    angle = n * math.pi - angle if shared else angle
+
+    def both(less: float) -> complex:
+        return _cotangent(less, 1, n, kl) + _cotangent(less, -1, n, kl)
+
+    scale = -np.exp(-0.25j * np.pi) / (2 * n * math.sqrt(2 * math.pi))
+    depth = 2 * kl * math.sin((math.pi - angle) / 2) ** 2
+    slope = (both(1e-5 - angle) - both(1e-5 + angle)) / 1e-5
+    return sine, scale * both(angle) * depth / (1 + depth), scale * slope / sine
+
+
+@pytest.mark.parametrize("material", ["concrete", "metal", "medium_dry_ground"])
+def test_field_over_two_edges_a_second_time(material: str) -> None:
+    """The sum in the notes of ``over_two`` from polylines, shortest ways of each pair of elements, impedances at 0 deg."""
+    pytest.importorskip("numba")
+    barn, where = place(replace(BARN, material=material), tower=(0.0, 0.0, 5.0)), poses(
+        (70.0, 4.0, 2.0), (66.0, 41.0, 3.0), (47.0, 60.0, 9.0), (75.0, -20.0, 7.0)
+    )  # fmt: skip
+    array = Array(
+        np.array([[0.0, 0.2, 0.1], [0.0, -0.3, 0.2]]), np.array([0.0, np.pi / 3]), mount=np.array(turned(30, 10, 5))
+    )
+    link = Link(HZ, {"T": array}, array)
+    source, expected = np.array([0.0, 0.0, 5.0]), Expected.of(link).link.uav
+    result = trace(barn, link, where, diffraction="all")
+    every, edges = result.edge_paths, edges_of(result)
+    assert every is not None
+    paths = every.select((every.edge[:, 1] >= 0) & (every.ground < 0).all(axis=1))
+    ours = amplitudes(paths, Tables.of(edges, result.faces, source[None], where, link), link)
+    eta = permittivity(material, HZ)
+    impedance = [2e-7 / (1 + r) for r in fresnel(1e-7, *eta, WAVELENGTH)]
+    hero = ByForce.hero
+    seen = set()
+    for row in range(len(paths)):
+        e, h = paths.edge[row]
+        line = np.array([source, *paths.vertices_m[row, 1:3], where.position_m[paths.pose[row]]])
+        legs = np.diff(line, axis=0)
+        s = np.linalg.norm(legs, axis=1)
+        rays = legs / s[:, None]
+        one = half_a_wedge(edges, e, paths.shared[row, 0], line[0], s[0], s[1], rays[1])
+        two = half_a_wedge(edges, h, paths.shared[row, 1], line[3], s[2], s[1], rays[1])
+        out = edges.normal_n[e] if paths.shared[row, 0] else edges.normal[e]
+        joined = []
+        for z in impedance:
+            q = K * s[1] * z**2 / 2
+            w = 1 / (1 + np.sqrt(1j * np.pi * q) + 2j * q)
+            x = 2 * np.sqrt(1j * K * s[1] * w)
+            joined.append(np.prod([slope * (1 - abs(w)) + x * hard for _, hard, slope in (one, two)]) / (2j * K * s[1]))
+        # along the face and out of it, carried from the ray between the edges to the rays at both ends
+        unit = [np.cross(out, rays[1]), out]
+        turns = []
+        for ray, edge in ((rays[0], edges.along[e]), (rays[2], edges.along[h])):
+            basis = [np.cross(edge, r) / np.linalg.norm(np.cross(edge, r)) for r in (rays[1], ray)]
+            flat = [np.cross(r, b) for r, b in zip((rays[1], ray), basis, strict=True)]
+            turns.append([(u @ basis[0]) * basis[1] + (u @ flat[0]) * flat[1] for u in unit])
+        sent = [np.array(element_wave(expected, k, expected.mount, tuple(rays[0]))) for k in (0, 1)]
+        got = [np.array(element_wave(expected, k, expected.mount, tuple(-rays[2]))) for k in (0, 1)]
+        for u, t in itertools.product((0, 1), repeat=2):
+            a, b = line[0] + array.mount @ array.positions_m[t], line[3] + array.mount @ array.positions_m[u]
+            p, g = line[1:2], line[2:3]
+            for _ in range(200):
+                p = hero(SimpleNamespace(edges=edges), np.array([e]), a[None], g)
+                g = hero(SimpleNamespace(edges=edges), np.array([h]), p, b[None])
+            total = float(np.linalg.norm(a - p) + np.linalg.norm(p - g) + np.linalg.norm(g - b))
+            coupling = sum(d * (got[u] @ v) * (sent[t] @ w) for d, w, v in zip(joined, *turns, strict=True))
+            value = coupling / (2 * K**2 * one[0] * two[0] * np.sqrt(s.prod() * total)) * np.exp(-1j * K * total)
+            assert ours[row, u, t] == pytest.approx(value, abs=2e-5 * np.abs(ours[row]).max())
+        seen.add(tuple(paths.shared[row].tolist()))
+    assert len(paths) >= 12
+    assert seen == {(0, 1), (1, 0), (1, 1)}
+
+
+def right_handed(edges: Edges) -> None:
+    """Face n lies at the exterior angle from face 0, through air, and its normal points back into that air."""
+    assert np.allclose(np.cross(edges.face_axis, edges.normal), edges.along)
+    assert np.allclose(np.linalg.norm(edges.end_m - edges.start_m, axis=1), edges.length_m)
+    assert np.allclose(edges.start_m + edges.length_m[:, None] * edges.along, edges.end_m)
+    turn = np.pi * edges.exterior[:, None]
+    assert np.allclose(edges.normal_n, np.sin(turn) * edges.face_axis - np.cos(turn) * edges.normal)
+
+
+def fan(angles_deg: list[float], shift_m: float = 0.0, long_m: float = 5.0) -> SimpleNamespace:
+    """Sheets of two triangles that meet in a line along north, 10 m up, each at an angle from east; turned anyhow."""
+    rng, corners, normals = np.random.default_rng(int(sum(angles_deg))), [], []
+    for number, angle in enumerate(np.radians(angles_deg)):
+        out = np.array([np.cos(angle), 0.0, np.sin(angle)])
+        foot = np.array([0.0, 0.0, 10.0]) + number * shift_m * np.array([1.0, 0.0, 1.0])
+        a, b = foot - np.array([0, long_m, 0]), foot + np.array([0, long_m, 0])
+        quad = [a, b, b + 4 * out, a + 4 * out]
+        corners += [rng.permutation([quad[k] for k in rows]) for rows in ((0, 1, 2), (0, 2, 3))]
+        normals.append(np.cross(out, [0.0, 1.0, 0.0]))
+    face = np.repeat(np.arange(len(angles_deg)), 2)
+    return SimpleNamespace(corners_m=np.array(corners), face=face, faces=SimpleNamespace(normal=np.array(normals)))
+
+
+@pytest.mark.parametrize(
+    ("angles_deg", "more", "expected"),
+    [
+        ([30], {}, [2.0]), ([20, 110], {}, [1.5]), ([20, 60, 120], {}, [260 / 180]), ([-60, 60], {}, [240 / 180]),
+        ([20, 200], {}, []), ([20, 199], {}, []), ([20, 197], {}, [183 / 180]), ([20, 110, 200], {}, []),
+        ([20, 110], {"shift_m": 4e-5}, [1.5]), ([20, 110], {"shift_m": 1e-3}, [2.0, 2.0]), ([30, 31], {}, [359 / 180]),
+        ([20, 110], {"long_m": 0.0049}, []), ([20, 110], {"long_m": 0.0052}, [1.5]),
+    ],
+)  # fmt: skip
+def test_sheets_that_meet_bend_round_their_widest_gap(angles_deg, more, expected) -> None:
+    edges = Edges.of_surfaces(fan(angles_deg, **more))
+    right_handed(edges)
+    ends = np.stack([edges.start_m, edges.end_m])
+    common = (np.abs(ends[..., [0, 2]] - [0.0, 10.0]) < 0.01).all(axis=(0, 2))
+    assert sorted(edges.exterior[common].tolist()) == pytest.approx(expected)
+    for face, exterior in zip(edges.face[common], edges.exterior[common], strict=True):
+        assert (face[0] == face[1]) == (exterior == 2.0)
+    far = edges.exterior[~common]
+    assert (far == 2.0).all()
+    if not more:
+        assert len(far) == 3 * len(angles_deg)
+
+
+def test_level_ground_has_no_outer_border_but_a_plate_over_it_has() -> None:
+    def level(east: float, north: float, half: float, up: float) -> np.ndarray:
+        x, y = np.array([-half, half, half, -half]) + east, np.array([-half, -half, half, half]) + north
+        quad = np.column_stack([x, y, np.full(4, up)])
+        return quad[[[0, 1, 2], [0, 2, 3]]]
+
+    up = SimpleNamespace(normal=np.tile([0.0, 0.0, 1.0], (3, 1)))
+    ground, plate = level(0, 0, 50, 0), level(20, 5, 3, 4)
+    for parts, count in (([ground], 0), ([ground, plate], 4), ([ground, plate, plate], 0)):
+        surfaces = SimpleNamespace(corners_m=np.concatenate(parts), faces=up, face=np.repeat(range(len(parts)), 2))
+        if len(parts) == 3:
+            surfaces.face = np.array([0, 0, 1, 1, 1, 1])  # each triangle of a face twice: no air between them
+        edges = Edges.of_surfaces(surfaces)
+        right_handed(edges)
+        assert len(edges) == count
+    tilted = SimpleNamespace(normal=np.array([[0.0, -np.sin(0.2), np.cos(0.2)]]))
+    slope = np.einsum("ij,tkj->tki", [[1, 0, 0], [0, np.cos(0.2), 0], [0, np.sin(0.2), 1]], level(0, 0, 50, 0))
+    assert len(Edges.of_surfaces(SimpleNamespace(corners_m=slope, faces=tilted, face=np.zeros(2, int)))) == 4
+
+
+@pytest.mark.parametrize(("sides", "ground_m", "uprights"), [(3, 0.0, 3), (6, 1.0, 6), (5, 7.9, 5), (4, 8.0, 0)])
+def test_edges_of_a_regular_prism(sides: int, ground_m: float, uprights: int) -> None:
+    """Uprights turn by a whole turn over the number of sides and begin at the ground; what it buries is no edge."""
+    angle = 2 * np.pi * np.arange(sides) / sides
+    tower = Building("tower", Polygon(np.column_stack([50 + 9 * np.cos(angle), 9 * np.sin(angle)])), 8.0)
+    edges = Edges.of(site_faces(place(tower)), ground_m)
+    right_handed(edges)
+    upright = np.abs(edges.along[:, 2]) == 1.0
+    assert (upright.sum(), (~upright).sum()) == (uprights, sides if ground_m < 8.0 else 0)
+    assert edges.exterior[~upright] == pytest.approx(1.5)
+    assert edges.exterior[upright] == pytest.approx(1 + 2 / sides)
+    assert edges.start_m[upright, 2] == pytest.approx(ground_m)
+    assert (edges.end_m[:, 2] == 8.0).all()
+    assert edges.length_m[~upright] == pytest.approx(18 * np.sin(np.pi / sides))
+
+
 def test_paths_over_edges_are_explained_by_their_levels() -> None:
     where = poses((70.0, 3.0, 2.0))
     result = trace(place(BARN), LINK, where, diffraction="edges")
@@ -420,4 +599,9 @@ def test_paths_over_edges_are_explained_by_their_levels() -> None:
     assert len(lines) == len(result.edge_paths) == 2
     assert all("edge of barn wall" in line for line in lines)
     levels = [float(line.split()[2]) for line in lines]
+    assert levels == sorted(levels, reverse=True)
+    heights = sorted(float(line.split(" m")[-2].rsplit(", ", 1)[1]) for line in lines)
+    assert heights == pytest.approx(sorted(result.edge_paths.vertices_m[:, 1, 2]), abs=0.051)
+    ground = (result.edge_paths.ground >= 0).any(axis=1).sum()
+    assert sum(line.endswith(", ground") or "dBm: ground, " in line for line in lines) == ground == 1
     assert 10 * math.log10(sum(10 ** (v / 10) for v in levels)) == pytest.approx(result.rss_power_dbm[0, 0], abs=0.02)

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import pytest
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.propagation.check.explain import why_not
+from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.propagation.arrays import single_element
+from aerpaw_cmp.propagation.check import reference
+from aerpaw_cmp.propagation.check.explain import (
+    explain_paths,
+    power_sum_dbm,
+    simple_paths,
+    wall_path_lines,
+    why_not,
+)
+from aerpaw_cmp.propagation.check.field_audit import Expected
 from aerpaw_cmp.propagation.faces import site_faces
+from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.paths import Links
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search.mirror import find_paths
+from aerpaw_cmp.site.antennas import HalfWaveDipole
 from aerpaw_cmp.site.site import Building
 
 
@@ -42,3 +58,89 @@ def test_a_scene_of_triangles_is_no_error(scenes):
     faces = site_faces(scenes.site((Building("barn", box(20, -10, 30, 10), 15.0),)))
     walls = faces.select(np.arange(5))  # the roof is left out
     assert "triangles" in why_not(walls, np.array([0.0, 0, 10]), np.array([60.0, 0, 10]), np.zeros(0, int))
+
+
+def test_terms_and_places_of_paths_by_hand(scenes):
+    """A tower with an upright dipole, ground, a wall 10 m west of it and a UAV to the north-east, 100 m off."""
+    site = scenes.site((Building("hall", box(-20, -50, -10, 200), 60.0),))
+    source, target = np.array([0.0, 0, 10]), np.array([60.0, 80, 40])
+    link, pose = scenes.link(site, single_element(HalfWaveDipole())), scenes.poses(target)
+    result = replay(site, link, pose, Search(max_depth=2))
+    further = {"leaves": np.where(result.paths.depth == 0, 1.5, np.where(result.paths.depth == 2, np.inf, 0.0))}
+    paths = explain_paths(result.paths, result.faces, source, pose, link, further)
+    assert [path.words for path in paths][:1] == ["line of sight"]
+    assert [path.depth for path in paths] == [0, 1, 1, 2]  # the ray to the wall's image reaches the wall first
+    assert np.diff([path.level_dbm for path in paths[:3]]).max() < 0.0
+    known = {path.words: path for path in paths}
+    wall = next(name for name in result.faces.label if name.startswith("hall") and name in known)
+    flat, wide = 100.0, math.hypot(80, 80)  # seen from above: direct, and to the image of the UAV, 80 m west
+    hand = {  # azimuth and elevation at the tower, and where from at the UAV; length
+        "line of sight": (36.8699, math.atan2(30, flat), 216.8699, math.atan2(-30, flat), math.hypot(flat, 30)),
+        "ground": (36.8699, math.atan2(-50, flat), 216.8699, math.atan2(-50, flat), math.hypot(flat, 50)),
+        wall: (315.0, math.atan2(30, wide), 225.0, math.atan2(-30, wide), math.hypot(wide, 30)),
+        f"{wall}, ground": (315.0, math.atan2(-50, wide), 225.0, math.atan2(-50, wide), math.hypot(wide, 50)),
+    }
+    expected = Expected.of(link).link
+    one, wavelength = reference.Reference(site, "LW1", expected), wavelength_m(scenes.carrier_hz)
+    mirrors = {"ground": one.mirrors[0], wall: next(m for m in one.mirrors if m.normal[0] == 1.0)}
+    for name, (away, rise, back, fall, length) in hand.items():
+        path = known[name]
+        assert (path.departure_azimuth_deg, path.arrival_azimuth_deg) == pytest.approx((away, back), abs=1e-4)
+        assert (path.departure_elevation_deg, path.arrival_elevation_deg) == pytest.approx(np.degrees([rise, fall]))
+        assert path.length_m == pytest.approx(length) == pytest.approx(sum(path.segments_m))
+        assert path.delay_ns == pytest.approx(length / 0.299792458)
+        sequence = [mirrors[part] for part in (name.split(", ") if path.depth else [])]
+        h = one.pair(sequence, 0, 0, tuple(target), reference.turned(0, 0, 0))
+        assert np.exp(1j * np.radians(path.phase_deg)) == pytest.approx(h / abs(h), abs=1e-6)
+        terms = dict(path.terms_db)
+        leaves = terms.pop("leaves")
+        assert sum(terms.values()) == pytest.approx(20 * math.log10(abs(h)), abs=1e-9)
+        assert path.level_dbm == pytest.approx(40.0 + sum(terms.values()) + leaves)
+        assert list(terms) == ["tower antenna", *(f"reflection {k + 1}" for k in range(path.depth)), "spreading",
+                               "UAV antenna", "polarisation"]  # fmt: skip
+        assert terms["spreading"] == pytest.approx(20 * math.log10(wavelength / (4 * math.pi * length)))
+        gain = abs(reference.half_wave_dipole(math.pi / 2 - rise, 0.0)[0])
+        assert terms["tower antenna"] == pytest.approx(20 * math.log10(gain))
+        assert terms["UAV antenna"] == 0.0
+        for number, bounce in enumerate(path.bounces):
+            mirror = sequence[number]
+            cosine = 50 / length if mirror is one.mirrors[0] else 80 / length
+            constants = reference.permittivity(bounce.material, scenes.carrier_hz)
+            te, tm = reference.fresnel(cosine, *constants, wavelength)
+            assert (bounce.te_db, bounce.tm_db) == pytest.approx([20 * math.log10(abs(r)) for r in (te, tm)])
+            assert bounce.incidence_deg == pytest.approx(math.degrees(math.acos(cosine)))
+            assert bounce.loss_db == -terms[f"reflection {number + 1}"] > 0.0
+            assert mirror.height((bounce.east_m, bounce.north_m, bounce.up_m)) == pytest.approx(0.0, abs=1e-9)
+        assert path.planes == tuple(result.faces.label.index(part) for part in name.split(", ") if path.depth)
+    assert known["ground"].bounces[0].loss_db == pytest.approx(-known["ground"].bounces[0].tm_db)
+    assert [path.terms_db["leaves"] for path in paths] == [-1.5, 0.0, 0.0, -math.inf]
+    plain = paths[-1].as_dict()
+    assert (plain["level_dbm"], plain["terms_db"]["leaves"], "planes" in plain) == (None, None, False)
+    assert plain["bounces"][1]["material"] == "medium_dry_ground"
+    alone = [10 ** (path.level_dbm / 10) for path in paths[:3]]
+    assert power_sum_dbm(paths[:3]) == pytest.approx(10 * math.log10(sum(alone)))
+    assert [(name, planes.tolist()) for name, planes in simple_paths(result)] == [
+        ("line of sight", []), ("reflection at the ground", [0]),
+    ]  # fmt: skip
+
+
+def test_a_bounce_straight_down_and_paths_through_walls_in_words(scenes):
+    site = scenes.site((Building("hall", box(40, -15, 52, 25), 8.0, material="wood"),))
+    link, pose = scenes.link(site), scenes.poses([0.0, 0.0, 30.0])
+    found = replay(site, link, pose, Search(max_depth=1))
+    (_, ground) = explain_paths(found.paths, found.faces, np.array([0.0, 0, 10]), pose, link, {})
+    assert (ground.bounces[0].incidence_deg, ground.departure_elevation_deg) == pytest.approx((0.0, -90.0))
+    free = 40.0 + 20 * math.log10(wavelength_m(scenes.carrier_hz) / (4 * math.pi * 40.0))
+    assert ground.level_dbm == pytest.approx(free + ground.bounces[0].te_db)
+    assert ground.bounces[0].te_db == pytest.approx(ground.bounces[0].tm_db)
+    there = scenes.poses([70.0, 3.0, 2.0])
+    assert wall_path_lines(found, np.array([0.0, 0, 10]), pose, link) == []
+    lit = replay(site, link, there, Search(max_depth=1, refraction=True))
+    lines = wall_path_lines(lit, np.array([0.0, 0, 10]), there, link)
+    levels = [float(line.split()[1]) for line in lines]
+    assert levels == sorted(levels, reverse=True)
+    assert len(lines) == len(lit.through.paths) >= 2
+    assert 10 * math.log10(sum(10 ** (level / 10) for level in levels)) == pytest.approx(
+        lit.rss_power_dbm[0, 0], abs=0.02
+    )
+    assert lines[0].count("through hall") == 2

@@ -1,14 +1,19 @@
 """Guards of the sionna engine that need no Sionna, and bounds on memory."""
 
+import sys
 import tracemalloc
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import CheckError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.jobs.bench import random_scene, speed_against_error
 from aerpaw_cmp.propagation.arrays import (
+    Array,
     rotation_from_aircraft,
     rotation_from_yaw_pitch_roll,
     tower_comparison_array,
@@ -17,6 +22,7 @@ from aerpaw_cmp.propagation.arrays import (
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search import sionna
+from aerpaw_cmp.site.site import Building
 
 SOURCES = np.array([[0.0, 0.0, 10.0]])
 TARGETS = np.array([[100.0, 0.0, 10.0], [0.0, 50.0, 10.0]])
@@ -37,16 +43,127 @@ def raw(gain_of_line_of_sight=1.0, gain_of_reflection=0.1):
     return {"valid": np.ones((2, 1, 2), dtype=bool), "kind": kind, "gain": gain, "shape": shape, "primitive": primitive}
 
 
-def test_sound_gains_pass():
-    sionna._check_gain(raw(), SOURCES, TARGETS, 3.4e9)
+@pytest.mark.parametrize(
+    ("settings", "near_m", "words"),
+    [
+        ({}, 100.0, None), ({"gain_of_line_of_sight": 1.009}, 100.0, None), ({"gain_of_reflection": 2.0}, 100.0, None),
+        ({"gain_of_line_of_sight": 1.011}, 100.0, "Friis"), ({"gain_of_line_of_sight": 0.989}, 100.0, "Friis"),
+        ({"gain_of_line_of_sight": np.array([1.0, 1.1])}, 100.0, "Friis"), ({"gain_of_reflection": 2.01}, 100.0, "gains"),
+        ({}, 1.02, "Friis"), ({}, 0.99, None),  # the first at another distance than its gain says: judged beyond 1 m
+    ],
+)  # fmt: skip
+def test_a_line_of_sight_unlike_friis_or_a_gain_stops_the_run(settings, near_m, words):
+    targets = TARGETS.copy()
+    targets[0, 0] = near_m
+    with pytest.raises(CheckError, match=words) if words else nullcontext():
+        sionna._check_gain(raw(**settings), SOURCES, targets, 3.4e9)
+    unused = raw(gain_of_reflection=9.0)
+    unused["valid"][:, :, 1] = False
+    sionna._check_gain(unused, SOURCES, TARGETS, 3.4e9)
+
+
+def test_slots_leave_room_and_towers_share_scenes_by_their_ground(scenes):
+    """400 (targets mirrors^2)^2 slots, as a power of two within the limits."""
+    for targets, faces, expected in ((1, [0], 2**20), (100, [5], 2**22), (10, [3, 4, 4], 2**20), (50, [3, 4, 4], 2**24),
+                                     (100, [1, 2], 2**24), (25, [1, 2], 2**22), (100, [], 2**22)):  # fmt: skip
+        built = sionna._Scene(None, {0: np.array(faces[:1], dtype=int), 1: np.array(faces[1:], dtype=int)})
+        assert sionna._slots(built, targets) == expected, (targets, faces)
+    faces = site_faces(scenes.site([Building("b", box(40, -20, 45, 20), 30.0)], ((0, 0, 9), (1, 0, 9, 2), (2, 0, 9))))
+    ground = faces.offset_m[:, None] * (faces.solid < 0)[:, None]
+    usable = ((faces.solid >= 0)[:, None] | (ground == [0.0, 2.0, 0.0])).T
+    usable[2, -1] = False  # a roof that reflects for two towers only still hides from the third
+    groups = {tuple(towers): chosen.tolist() for towers, chosen in sionna._groups(faces, np.zeros((3, 3)), usable)}
+    solid = np.flatnonzero(faces.solid >= 0).tolist()
+    assert groups == {(0,): [0, *solid], (1,): [1, *solid], (2,): [0, *solid]}
+    ((towers, chosen),) = sionna._groups(faces, np.zeros((3, 3)), None)
+    assert (towers.tolist(), len(chosen)) == ([0, 1, 2], len(faces))
+
+
+class Made:
+    """In place of a finder: says for what it was made."""
+
+    batch = 3
+
+    def __init__(self, towers, chosen):
+        self.made = (towers.tolist(), chosen.tolist())
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
+
+
+def test_batches_hold_every_link_that_is_alive_once():
+    alive = np.zeros((3, 9), dtype=bool)
+    alive[0, [0, 2, 3, 7]], alive[1, [2, 8]] = True, True
+    groups = [(np.array([2]), np.array([5])), (np.array([0, 1]), np.array([4]))]
+    batches = [(finder.made, t.tolist(), p.tolist()) for finder, t, p in sionna._each_batch(Made, groups, alive)]
+    assert batches == [(([0, 1], [4]), [0, 1], [0, 2, 3]), (([0, 1], [4]), [0, 1], [7, 8])]
+    ends = sionna._Ends(np.arange(6.0).reshape(2, 3), np.stack([np.eye(3), -np.eye(3)]), np.zeros((1, 3)))
+    assert ends.padded(4).centres_m[:, 0].tolist() == [0.0, 3.0, 3.0, 3.0]
+    assert ends.padded(4).turns[:, 0, 0].tolist() == [1.0, -1.0, -1.0, -1.0]
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"), [({"gain_of_line_of_sight": 1.1}, "Friis"), ({"gain_of_reflection": 3.0}, "gains")]
-)
-def test_a_line_of_sight_unlike_friis_or_a_gain_stops_the_run(settings, words):
-    with pytest.raises(CheckError, match=words):
-        sionna._check_gain(raw(**settings), SOURCES, TARGETS, 3.4e9)
+    ("candidates", "limit", "slots"),
+    [
+        (0, 64, 1024), (32, 64, 1024), (33, 64, 2048), (64, 64, 2048), (65, 128, 4096), (1000, 1024, 32_768),
+        (2**25, 2**25, 2**27), (2**25 + 1, None, None),
+    ],
+)  # fmt: skip
+def test_room_grows_with_the_candidates_of_the_last_batch(monkeypatch, candidates, limit, slots):
+    """A thirty-second of the table, a limit not below the number; two towers share the largest table."""
+    generator = SimpleNamespace(MIN_SPEC_COUNT_SIZE=0)
+    name = "sionna.rt.path_solvers.sb_candidate_generator"
+    monkeypatch.setitem(sys.modules, name, SimpleNamespace(SBCandidateGenerator=generator))
+    finder = object.__new__(sionna._Finder)
+    finder.limit, finder.slots = 64, 1024
+    finder.candidates = SimpleNamespace(numpy=lambda: np.array([0, candidates]))
+    finder.built = SimpleNamespace(scene=SimpleNamespace(transmitters={"a": 1, "b": 2}))
+    if limit is None:
+        with pytest.raises(CheckError, match=f"{candidates} candidates"):
+            finder._more_room()
+        return
+    assert finder._more_room() is ((limit, slots) != (64, 1024))
+    assert (finder.limit, finder.slots) == (limit, slots)
+    assert vars(generator) == {"MIN_SPEC_COUNT_SIZE": 0 if slots == 1024 else slots}
+    assert not finder._more_room()
+
+
+@pytest.mark.parametrize("many", [9, 10])
+def test_a_batch_with_nearly_as_many_paths_as_fit_is_refused(many):
+    """Gains are the root of the power over both slants of both ends; padding is cut off."""
+    valid = np.zeros((3, 2, 30), dtype=bool)  # receivers, towers, paths
+    valid[:, 1, : many // 3] = True
+    valid[0, 1, : many - 2 * (many // 3)] = True
+    a = np.random.default_rng(2).normal(size=(2, 3, 2, 2, 2, 30))
+    as_array = [SimpleNamespace(numpy=lambda part=part: part) for part in a]
+    whole = SimpleNamespace(numpy=lambda: np.zeros((1, 3, 2, 30)))
+    finder = object.__new__(sionna._Finder)
+    finder.limit = 10
+    traced = SimpleNamespace(
+        a=as_array, valid=SimpleNamespace(numpy=lambda: valid), interactions=whole, objects=whole, primitives=whole
+    )
+    finder.trace = lambda *_: traced
+    if many == 10:
+        with pytest.raises(CheckError, match="nearly 10 paths"):
+            finder.searched(TARGETS, 1, 9)
+        return
+    found = finder.searched(TARGETS, 1, 9)
+    assert (found["valid"].shape, found["kind"].shape) == ((2, 2, 30), (1, 2, 2, 30))
+    assert found["gain"][1, 0, 4] == pytest.approx(np.linalg.norm(a[:, 1, :, 0, :, 4]))
+
+
+def test_slanted_elements_take_their_share_of_both_halves():
+    generator = np.random.default_rng(3)
+    uav, tower = (Array(np.zeros((n, 3)), generator.uniform(-2, 2, n)) for n in (2, 3))
+    a = generator.normal(size=(4, 2 * 2, 5, 2 * 3)) + 1j * generator.normal(size=(4, 2 * 2, 5, 2 * 3))
+    found = sionna._slanted(a, uav, tower)
+    for rx, u, tx, t in ((0, 0, 0, 0), (3, 1, 4, 2), (2, 0, 1, 1)):
+        halves = a[rx, [[u], [u + 2]], tx, [t, t + 3]]
+        weights = [np.array([np.cos(s), np.sin(s)]) for s in (uav.slant_rad[u], tower.slant_rad[t])]
+        assert found[rx, u, tx, t] == pytest.approx(weights[0] @ halves @ weights[1])
 
 
 def test_primitives_become_faces_and_other_interactions_are_dropped():
@@ -58,24 +175,20 @@ def test_primitives_become_faces_and_other_interactions_are_dropped():
 
 
 def test_refinement_drops_duplicates_and_points_outside_their_face(scenes):
-    from shapely.geometry import box
-
-    from aerpaw_cmp.site.site import Building
-
     faces = site_faces(scenes.site([Building("b", box(40, -20, 45, 20), 30.0)]))
     wall = int(np.flatnonzero(faces.normal[:, 0] == -1.0)[0])
-    targets = np.array([[20.0, 10.0, 15.0], [20.0, 70.0, 15.0]])  # the second would reflect beside the wall
-    pose, sequence = np.array([0, 0, 1]), np.array([[wall, -1], [wall, -1], [wall, -1]])
-    found = sionna._refine(faces, SOURCES, targets, pose, np.zeros(3, dtype=int), sequence, 1e-9)
-    assert found.pose.tolist() == [0]
+    # the second would reflect beside the wall, the third is where the tower is
+    targets = np.array([[20.0, 10.0, 15.0], [20.0, 70.0, 15.0], SOURCES[0], [0.0, 0.0, -10.0]])
+    pose, sequence = np.array([0, 0, 1, 2, 3, 3]), np.full((6, 2), -1)
+    sequence[:3, 0] = wall
+    found = sionna._refine(faces, SOURCES, targets, pose, np.zeros(6, dtype=int), sequence, 1e-9)
+    assert (found.pose.tolist(), found.depth.tolist()) == ([0, 3], [1, 0])
     assert found.vertices_m[0, 0, 0] == pytest.approx(40.0, abs=1e-12)
+    assert np.isnan(found.vertices_m[1]).all()
+    assert not len(sionna._refine(faces, SOURCES, targets, pose[:0], pose[:0], sequence[:0], 1e-9))
 
 
 def test_reflections_named_on_the_wrong_part_of_a_plane_are_moved(scenes):
-    from shapely.geometry import box
-
-    from aerpaw_cmp.site.site import Building
-
     site = scenes.site([Building("left", box(30, -20, 40, -1), 20.0), Building("right", box(30, 1, 40, 20), 20.0)])
     faces = site_faces(site)
     left, right = np.flatnonzero(faces.normal[:, 0] == -1.0)

@@ -7,7 +7,7 @@ from shapely.geometry import Polygon, box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.faces import inside_solids, site_faces
 from aerpaw_cmp.propagation.paths import Links
-from aerpaw_cmp.propagation.search.mirror import find_paths, images_of, planes_of
+from aerpaw_cmp.propagation.search.mirror import Mirrors, find_paths, images_of, planes_of
 from aerpaw_cmp.site.site import Building
 
 SOURCE = np.array([[0.0, 0.0, 10.0]])
@@ -46,6 +46,26 @@ def test_same_paths_as_brute_force_at_depth_3(scenes):
     }
     assert scenes.keys(paths) == expected
     assert paths.depth.max() == 3
+
+
+def test_mirrors_toward_a_box_are_those_of_all_paths_into_it_and_hardly_more(scenes):
+    """Boxes beside and above buildings; every face of a path over one face into a box, at random places of it."""
+    rng = np.random.default_rng(8)
+    site = scenes.site(scenes.buildings(rng, 9, spread_m=120.0))
+    faces = site_faces(site)
+    mirrors, thinned = Mirrors(faces, np.array([[-200.0, -200, 0], [200, 200, 60]])), 0
+    for _ in range(12):
+        low = rng.uniform([-150, -150, 1], [120, 120, 30])
+        box_m = np.array([low, low + rng.uniform(5, 30, 3)])
+        near = mirrors.toward(SOURCE[0], box_m).tolist()
+        paths = find_paths(faces, Links(SOURCE, rng.uniform(*box_m, (60, 3))), max_depth=1, hidden=False)
+        met = set(paths.faces[paths.depth == 1, 0].tolist())
+        assert met <= set(near)
+        assert len(near) == len(set(near))
+        thinned += len(faces) - len(near)
+    assert thinned > 6 * len(faces)
+    behind = np.array([[-1.0, -1.0, -30.0], [1.0, 1.0, -20.0]])  # under the ground nothing is lit
+    assert not len(Mirrors(site_faces(scenes.site()), behind).toward(SOURCE[0], behind))
 
 
 def test_paths_are_sorted_and_padded(scenes):

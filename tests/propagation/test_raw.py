@@ -1,11 +1,13 @@
 """The audit's own readers, geodesy, attitude and antenna tables against other ways to the same numbers."""
 
+import io
 import math
 from datetime import datetime, timezone
 
 import numpy as np
 import pytest
 from pyproj import Geod
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation, Slerp
 
 from aerpaw_cmp.propagation.check import raw
@@ -79,10 +81,12 @@ def test_a_table_of_gain_is_looked_up_alike_everywhere(tmp_path) -> None:
 
 VEHICLE = b"""1,-78.6962896,35.727488,0.455,"(0.1,-0.2,0.3)","(0.0,0.0,0.01)",44.6,2025-05-24 16:18:34.118984,4,29\r
 broken line\r
+9,-78.6962896,east,0.455,"(0.1,-0.2,0.3)","(0.0,0.0,0.01)",44.6,2025-05-24 16:18:34.518984,4,29\r
 2,-78.6962896,35.727499,1.455,"(0.1,-0.2,0.3)","(0.0,0.0,0.01)",44.6,2025-05-24 16:18:35.118984,4,29\r
 """
 POWER = b"""[2023-12-13 16:15:49.169530] 0000000       -34.86136
 [2023-12-13 16:15:49.199953] *
+[2023-12-13 16:15:49.210000] 0000008       -3x
 [2023-12-13 16:15:49.232708] 0000010       -788.5956
 [2023-12-13 16:15:49.846478] 0255450
 """
@@ -97,9 +101,72 @@ def test_a_line_of_each_format() -> None:
     assert first.angles_deg == pytest.approx([math.degrees(x) for x in (0.3, 0.1, -0.2)])  # roll, pitch, yaw
     assert second.time_us - first.time_us == 1_000_000
     assert {line: dict(reading.values) for line, reading in power.readings.items()} == {
-        1: {"": -34.86136}, 2: {}, 3: {"": -788.5956},
+        1: {"": -34.86136}, 2: {}, 4: {"": -788.5956},
     }  # fmt: skip
     assert raw.read_log(b"Orange;LTE;x", ZONE) is None
+
+
+TABLE = b"""Stamp, Latitude,Longitude,Altitude,Roll,Pitch,Yaw,rsrp
+2024-07-15 11:48:16.5,35.7,-78.6,12.5,0.1,0.2,0.3,-80.5
+no stamp,35.7,-78.6,12.5,0.1,0.2,0.3,-70
+2024-07-15 11:48:17.5,35.7,-78.6,12.5,0.1,0.2,0.3
+2024-07-15 11:48:18.5,35.8,-78.6,13.5,,0.2,0.3,low
+2024-07-15 11:48:19.5,35.9,-78.6,,0.1,0.2,0.3,-60
+"""
+
+
+def test_a_table_and_a_merged_file_have_their_rows_and_readings() -> None:
+    noon = microseconds(2024, 7, 15, 15, 48, 16) + 500_000
+    table = raw.read_log(TABLE, ZONE)
+    assert table is not None
+    one, two = table.rows  # the others have no instant, too few cells or no height
+    assert (one.time_us, one.latitude_deg, one.longitude_deg, one.altitude_m) == (noon, 35.7, -78.6, 12.5)
+    assert one.angles_deg == pytest.approx([math.degrees(x) for x in (0.1, 0.2, 0.3)])
+    assert (two.time_us, two.latitude_deg, two.angles_deg) == (noon + 2_000_000, 35.8, None)
+    assert {line: (reading.time_us - noon, reading.values.get("rsrp")) for line, reading in table.readings.items()} == {
+        2: (0, -80.5), 5: (2_000_000, None), 6: (3_000_000, -60.0),
+    }  # fmt: skip
+    columns = {"mX": [-78.6, -78.7], "mY": [35.7, 35.8], "mZ": [12.5, 13.5], "rsrp": [-80.5, -60.0], "few": [1.0]}
+    turned = {"mRoll": [1.0, 4.0], "mPitch": [2.0, 5.0], "mYaw": [3.0, 6.0]}
+    stamps = {"timestamp_for_csv": np.array(["2024-07-15 11:48:16.5", "2024-07-15 11:48:18.5"])}
+    for more, angles in ((turned, (4.0, 5.0, 6.0)), ({"mRoll": [1.0, 4.0]}, None)):
+        file = io.BytesIO()
+        savemat(file, columns | more | stamps | {"count": np.array([7, 8])})
+        merged = raw.read_log(file.getvalue(), ZONE)
+        assert merged is not None
+        assert merged.rows[1] == raw.Row(noon + 2_000_000, 35.8, -78.7, 13.5, angles)
+        assert (merged.rows[0].time_us, len(merged.rows), set(merged.readings)) == (noon, 2, {1, 2})
+        assert merged.readings[2].time_us == noon + 2_000_000
+        assert merged.readings[2].values.get("rsrp") == -60.0
+        assert not {"few", "count"} & set(merged.readings[2].values)
+    for lacking in (columns, stamps | {"mX": [1.0, 2.0]}):
+        file = io.BytesIO()
+        savemat(file, lacking)
+        assert raw.read_log(file.getvalue(), ZONE) is None
+
+
+def test_a_pose_needs_places_on_the_earth_and_known_turns() -> None:
+    def row(seconds: int, latitude: float = LW1[0], longitude: float = LW1[1], up: float = 9.0, angles=None) -> raw.Row:
+        return raw.Row(seconds * 1_000_000, latitude, longitude, up, angles)
+
+    good = [row(1, 90.0), row(2, -90.0), row(3, 5, 180.0), row(4, 5, -180.0), row(5, 0.0, 5.0), row(6, 5.0, 0.0),
+            row(7, up=-899.0)]  # fmt: skip
+    bad = [row(8, 90.1), row(9, -90.1), row(10, 5, 180.1), row(11, 0.0, 0.0), row(12, up=-900.0), row(13, math.nan)]
+    path = raw.RawPath(good + bad, LW1, 0.0)
+    assert (path.rows, path.out_of_order) == (good, 0)
+    ends = [(10.0, 5.0, 80.0), (20.0, -5.0, 100.0)]
+    for first, known in ((ends[0], True), (None, False), ((0.0, 0.0, 0.0), False), ((math.inf, 1.0, 2.0), False)):
+        pose = raw.RawPath([row(3, angles=first), row(7, angles=ends[1])], LW1, 0.0).pose(4e6)
+        assert pose is not None
+        assert (pose.turn is not None) == known
+        if pose.turn is not None:
+            turns = [Rotation.from_euler("ZYX", [90 - yaw, -pitch, roll], degrees=True) for roll, pitch, yaw in ends]
+            expected = Slerp([0, 4], Rotation.concatenate(turns))(1).as_matrix()
+            assert np.array(pose.turn) == pytest.approx(expected, abs=1e-12)
+    alone = raw.RawPath([row(3, up=0.4)], LW1, 2.0)
+    assert alone.pose(3e6) is not None
+    assert alone.pose(3e6).place_m == pytest.approx((0.0, 0.0, 2.5), abs=1e-6)  # type: ignore[union-attr]
+    assert raw.RawPath([], LW1, 0.0).pose(0) is None
 
 
 def test_rows_out_of_order_are_counted_and_a_gap_is_told() -> None:

@@ -88,12 +88,17 @@ def test_foliage_equals_the_second_implementation(scenes, case, name, in_leaf):
     assert lighter.failures
 
 
+@pytest.mark.parametrize("in_leaf", [True, False])
 @pytest.mark.parametrize("frequency_hz", [60e6, 300e6, 1e9, 2e9, 3.4e9, 28e9])
-def test_p833_a_second_time(frequency_hz):
-    depth = np.array([0.5, 5.0, 50.0])
-    ours = foliage_model("p833", frequency_hz).loss_db(depth)
-    theirs = [reference.foliage_db(reference.ExpectedLoss("p833"), d, frequency_hz) for d in depth]
-    assert theirs == pytest.approx(ours, rel=1e-12)
+def test_foliage_models_a_second_time(frequency_hz, in_leaf):
+    depth = np.array([0.5, 5.0, 14.0, 50.0])
+    for name in ("p833", *(["weissberger"] if frequency_hz > 0.23e9 else [])):
+        ours = foliage_model(name, frequency_hz, in_leaf=in_leaf).loss_db(depth)
+        theirs = [reference.foliage_db(reference.ExpectedLoss(name, in_leaf=in_leaf), d, frequency_hz) for d in depth]
+        assert theirs == pytest.approx(ours, rel=1e-12)
+    given = reference.ExpectedLoss("p833", gamma_db_per_m=0.6, maximum_db=20.0, in_leaf=in_leaf)
+    expected = foliage_model("p833", frequency_hz, gamma_db_per_m=0.6, maximum_db=20.0).loss_db(depth)
+    assert [reference.foliage_db(given, d, frequency_hz) for d in depth] == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", MATERIALS)

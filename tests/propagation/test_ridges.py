@@ -108,6 +108,9 @@ def test_the_loss_has_no_step_at_the_line_of_sight(method: Ridges) -> None:
     assert loss[-1] == 0.0
     grazing = loss[np.abs(up - 38.0).argmin()]
     assert grazing == pytest.approx({"deygout": 6.03, "bullington": 12.4}[method], abs=0.2)
+    moved = replace(dem, west=680.0, south=-320.0, height_m=dem.height_m + 50.0)
+    shift = np.array([700.0, -300.0, 50.0])
+    assert ridge_loss_db(moved, ends[0] + shift, ends[1] + shift, 0.1, method) == pytest.approx(loss, abs=1e-6)
     # a plane, sloped or level, is a mirror and no edge, however low the line
     plane = replace(dem, height_m=np.tile(0.02 * east, (5, 1)))
     low = np.array([[0.0, 0.0, 1.5]]), np.array([[1000.0, 0.0, 21.5]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +18,7 @@ from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.paths import path_lengths
 from aerpaw_cmp.propagation.replay import Replay, replay
-from aerpaw_cmp.propagation.search.terrain import specular_points
+from aerpaw_cmp.propagation.search.terrain import _stationary, _zone_m, specular_points
 from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower
 
@@ -131,6 +132,77 @@ def test_specular_points_of_a_valley_are_those_of_the_smooth_surface(depth_m: fl
     assert np.abs(np.cross(rays[0] + rays[1], normal)).max() < 0.02, "the normal halves the angle"
     assert sorted(found[:, 0]) == pytest.approx(sorted(along[turns]), abs=1.5)
     assert found[:, 2] == pytest.approx(height(found[:, 0], found[:, 1]) - height(0.0, 0.0), abs=0.05)
+
+
+@pytest.mark.parametrize("wavelength", [1e-7, 0.1, 1.0])
+def test_mirrors_along_a_profile_are_the_shortest_ways_of_each_zone(wavelength: float) -> None:
+    """Polylines at random: the image of the source at each piece and the extrema at creases, by hand."""
+    rng, inner, joined = np.random.default_rng(6), 0, 0
+    for _ in range(40):
+        at = np.concatenate([[0.0], np.sort(rng.uniform(5.0, 295.0, 12)), [300.0]])
+        corners = np.column_stack([at, np.cumsum(rng.uniform(-3.0, 3.0, 14))])
+        ends = np.array([0.0, rng.uniform(-20.0, 80.0)]), np.array([300.0, rng.uniform(-20.0, 80.0)])
+
+        def way(p: Any, ends: Any = ends) -> float:
+            return float(sum(np.linalg.norm(p - end) for end in ends))
+
+        turns: list[tuple[float, float, bool]] = []  # place, way, crease
+        for k, (a, b) in enumerate(itertools.pairwise(corners)):
+            along = (b - a) / np.linalg.norm(b - a)
+            over = [(end - a) @ [-along[1], along[0]] for end in ends]
+            feet = [(end - a) @ along for end in ends]
+            spot = a + (feet[0] + (feet[1] - feet[0]) * over[0] / sum(over)) * along
+            beside = [way(b + 1e-6 * (other - b)) - way(b) for other in (a, corners[min(k + 2, 13)])]
+            if a[0] < spot[0] < b[0]:  # between two ends behind the piece the way turns, but nothing reflects
+                turns += [(spot[0], way(spot) if min(over) > 0.0 else np.nan, False)]
+            if k < 12 and beside[0] * beside[1] > 0.0:
+                turns += [(b[0], way(b), True)]
+        turns = [turn for turn in turns if np.isfinite(turn[1])]
+        zones = np.cumsum(np.abs(np.diff([turn[1] for turn in turns], prepend=-np.inf)) >= wavelength / 2.0)
+        expected = [min((t for t, z in zip(turns, zones, strict=True) if z == zone), key=lambda t: t[1])
+                    for zone in np.unique(zones)]  # fmt: skip
+        places = np.array([[0.0, 0.0, 0.0], *([end[0], 7.0, end[1]] for end in ends)])
+        column, found, crease, part = _stationary(
+            np.tile(places[1], (2, 1)), np.tile(places[2], (2, 1)), np.tile(at[:, None] / 300.0, 2),
+            np.tile(corners[:, 1:], 2), wavelength,
+        )  # fmt: skip
+        assert np.array_equal(found[column == 0], found[column == 1])
+        one = column == 0
+        for spot, edge, share in zip(found[one], crease[one], part[one], strict=True):
+            assert any(abs(spot - t[0]) < 1e-9 and edge == t[2] for t in expected)
+            assert share == pytest.approx(1.0) or edge or wavelength > 1e-7
+        if wavelength == 1e-7:
+            assert found[one & ~crease] == pytest.approx([t[0] for t in expected if not t[2]], abs=1e-9)
+        inner, joined = inner + len(found), joined + len(turns) - len(expected)
+    assert inner > 20
+    assert (joined > 5) == (wavelength > 1e-7)
+
+
+def test_a_zone_reaches_to_where_the_way_is_longer_by_half_a_wavelength() -> None:
+    """Sample by sample away from the mirror, straight between samples; unknown ground ends it."""
+    rng = np.random.default_rng(7)
+    along = np.sort(rng.uniform(0.0, 100.0, (9, 60)), axis=0)
+    spot = np.where(np.arange(60) % 3 == 0, along[4], rng.uniform(along[0], along[-1]))
+    excess = np.abs(rng.normal(0.0, 0.04, (9, 60)))
+    excess[rng.random((9, 60)) < 0.1] = np.nan
+    expected = np.zeros(60)
+    for column in range(60):
+        for side in (-1, 1):
+            before = (spot[column], 0.0)
+            for row in np.argsort(side * along[:, column]):
+                here = along[row, column], excess[row, column]
+                if side * (here[0] - spot[column]) <= 0.0:
+                    continue
+                if not here[1] < 0.05:
+                    share = (0.05 - before[1]) / (here[1] - before[1])
+                    expected[column] += np.nan_to_num(share) * abs(here[0] - before[0])
+                    break
+                expected[column] += abs(here[0] - before[0])
+                before = here
+    found = _zone_m(along, spot, excess, 0.1)
+    assert found == pytest.approx(expected, abs=1e-12)
+    assert (found < 20.0).any()
+    assert (found > 60.0).any()
 
 
 def test_a_bump_before_the_specular_point_stops_its_leg_but_not_the_line_of_sight() -> None:

@@ -1,14 +1,22 @@
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.propagation import engines
 from aerpaw_cmp.propagation.arrays import Link, single_element
+from aerpaw_cmp.propagation.cache import PathCache
 from aerpaw_cmp.propagation.check.audit import Second, audit
+from aerpaw_cmp.propagation.compiled import State
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.scene import Scene, within_reach
+from aerpaw_cmp.propagation.search.effort import Estimate
+from aerpaw_cmp.propagation.trace import trace
 
 
 @pytest.fixture
@@ -73,14 +81,103 @@ def test_a_second_replay_searches_nothing(case, tmp_path, monkeypatch):
 
 def test_anything_that_decides_paths_changes_the_key(case, tmp_path, scenes):
     site, link, poses = case
-    replay(site, link, poses, run=Run(cache_dir=tmp_path))
-    moved = scenes.poses(poses.position_m + np.array([0.0, 0.0, 1e-9]))
-    replay(site, link, moved, run=Run(cache_dir=tmp_path))
-    from dataclasses import replace
+    scene, cache = Scene.of(site, link, poses), PathCache(tmp_path)
+    places = poses.position_m
+
+    def key(scene=scene, places=places, carrier_hz=3.4e9, **search):
+        return cache.key(scene, places, carrier_hz, Search(**search))
 
     taller = replace(site, buildings=(replace(site.buildings[0], height_m=99.0), *site.buildings[1:]))
-    replay(taller, link, poses, run=Run(cache_dir=tmp_path))
-    assert len(list(tmp_path.glob("*.npz"))) >= 3
+    metal = replace(site, buildings=(replace(site.buildings[0], material="metal"), *site.buildings[1:]))
+    others = [
+        key(places=places + np.array([0.0, 0.0, 1e-9])), key(places=places[:-1]), key(Scene.of(taller, link, poses)),
+        key(max_depth=1), key(replace(scene, usable=~scene.usable)), key(replace(scene, excluded=~scene.excluded)),
+        key(replace(scene, sources_m=scene.sources_m + 1e-9)), key(engine="sionna"), key(engine="sionna", batch=9),
+        key(engine="sionna", carrier_hz=3.5e9), key(Scene.of(metal, link, poses), engine="sionna"),
+        key(engine="sionna", samples=9), key(engine="sionna", device="cpu"),
+    ]  # fmt: skip
+    assert len({key(), *others}) == 1 + len(others)
+    assert (
+        key() == key(carrier_hz=3.5e9) == key(Scene.of(metal, link, poses)) == key(diffraction="all", refraction=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("engine", "given", "environment", "expected"),
+    [
+        ("image", None, "here", None), ("sionna", None, "here", "here"), ("sionna", None, "", ".cache/aerpaw-cmp"),
+        ("image", "there", "here", "there"), ("sionna", "there", "", "there"), ("sionna", "", "here", None),
+    ],
+)  # fmt: skip
+def test_the_cache_is_where_it_was_asked_for(monkeypatch, tmp_path, engine, given, environment, expected):
+    monkeypatch.setenv("AERPAW_CMP_CACHE", environment)
+    monkeypatch.setattr(engines.Path, "home", lambda: tmp_path)
+    cache = engines.path_cache(Search(engine), Run(cache_dir=given))
+    assert (None if cache is None else cache.folder) == (
+        None if expected is None else tmp_path / expected if expected.startswith(".") else Path(expected)
+    )
+
+
+@pytest.mark.parametrize(
+    ("search", "faces", "worth", "here", "expected"),
+    [
+        ({}, 401, False, True, True), ({}, 400, False, True, False), ({}, 400, True, True, True),
+        ({"max_depth": 1}, 401, True, True, False), ({"engine": "sionna"}, 401, True, True, False),
+        ({}, 401, True, False, False),
+    ],
+)  # fmt: skip
+def test_beams_serve_many_faces_two_deep_and_jobs_that_are_worth_them(
+    monkeypatch, case, search, faces, worth, here, expected
+):
+    scene = Scene.of(*case)
+    few = replace(scene, faces=scene.faces.select(np.resize(np.arange(len(scene.faces)), faces)))
+    monkeypatch.setattr(engines, "beams_for", lambda links, many: worth and (links, many) == (7, faces))
+    monkeypatch.setattr(engines, "beams", lambda: State(object() if here else None, "no reason"))
+    monkeypatch.setattr(engines, "warn_once", lambda _: None)
+    assert engines.by_beams(few, Search(**search), 7) is expected
+    assert engines.by_beams(few, Search(**search)) is (expected and faces > 400)
+    assert engines.by_beams(replace(few, surfaces=object()), Search(**search)) is (search.get("engine") != "sionna")
+
+
+def test_a_long_search_is_a_warning(recwarn):
+    made = {"sources": 1, "first_faces": 3, "sequences": 9, "memory_mib": 0.4}
+    engines._long_search(Estimate(seconds=60.0, **made))
+    assert not recwarn.list
+    with pytest.warns(RuntimeWarning, match=r"takes about 60 s for 1 tower: 3 first faces, some 9 sequences, .* 1 MiB"):
+        engines._long_search(Estimate(seconds=60.1, **made))
+    three = Estimate(seconds=50.0, **made).times(3)
+    assert str(three).startswith("about 150 s for 3 towers: 3 first faces, some 27 sequences")
+    assert str(Estimate(seconds=0.123, **made)).startswith("about 0.12 s")
+
+
+def test_a_trace_of_plain_positions_is_that_of_level_poses(case):
+    site, link, poses = case
+    level = replay(site, link, type(poses)(poses.position_m, np.tile(np.eye(3), (40, 1, 1))))
+    assert np.array_equal(trace(site, link, poses.position_m.tolist()).h, level.h)
+    assert np.array_equal(trace(site, link, poses.position_m[0]).h, level.h[:1])
+    for wrong in ([1.0, 2.0], [[1.0, 2.0, 3.0, 4.0]], np.zeros((2, 2, 3))):
+        with pytest.raises(UsageError, match="metres east, north and up"):
+            trace(site, link, wrong)
+
+
+def test_poses_within_100_km_of_a_tower_count(case, scenes):
+    """By each axis; a flight is decided by its box, or pose by pose, with the same answer."""
+    site, _, _ = case
+    limit = np.array([[100_000.0, 0, 10], [0, -100_000.0, 10], [100_004.0, -3, 20], [0, 0, 100_010.0]])
+    beyond = np.array([[100_004.01, 0, 10], [0, -100_003.01, 10], [0, 0, 100_010.01 + 2.0]])
+    assert within_reach(site, scenes.poses(limit))[1] == []
+    mixed = scenes.poses(np.concatenate([limit, beyond, [[np.nan, 0, 0]]]))
+    mixed.rotation[1] = np.nan
+    poses, notes = within_reach(site, mixed)
+    assert np.isfinite(poses.position_m).all(axis=1).tolist() == [True, False, True, True, False, False, False, False]
+    assert np.array_equal(poses.rotation[1], np.eye(3))
+    assert [note.split(":")[0] for note in notes] == [
+        "3 poses further than 100 km from every tower", "1 poses without a rotation",
+    ]  # fmt: skip
+    mixed.rotation[1] = np.eye(3)
+    assert within_reach(site, scenes.poses([[np.nan, 0, 0]]))[1] == []
+    for one in beyond:
+        assert len(within_reach(site, scenes.poses(one))[1]) == 1
 
 
 def test_damaged_entry_is_searched_again(case, tmp_path):

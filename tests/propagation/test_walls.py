@@ -179,16 +179,25 @@ def test_a_part_of_a_replay_is_the_replay_of_its_poses() -> None:
 
 
 def test_parts_and_moving_towers_keep_the_paths() -> None:
-    whole = run(town(), PLACES, max_depth=1)
-    link = Link(CARRIER, {"T": single_element()}, single_element())
-    poses, search = Poses(PLACES, np.tile(np.eye(3), (len(PLACES), 1, 1))), Search(max_depth=1, refraction=True)
-    parted = replay_in_parts(town(), link, poses, search, Field(), Run(), size=17)
-    moving = replay_moving(town(), link, poses, np.tile([0.0, 0.0, 10.0], (len(PLACES), 1)), search)
+    whole = run(town(), PLACES, max_depth=1, diffraction="edges")
+    link, said = Link(CARRIER, {"T": single_element()}, single_element()), ([], [])
+    search = Search(max_depth=1, refraction=True, diffraction="edges")
+    poses = Poses(PLACES, np.tile(np.eye(3), (len(PLACES), 1, 1)))
+    parted = replay_in_parts(town(), link, poses, search, Field(), Run(progress=said[0].append), size=17)
+    places = np.repeat([[0.0, 0.0, 10.0], [0.0, 0.0, 10.0 + 1e-12]], len(PLACES) // 2, axis=0)
+    moving = replay_moving(town(), link, poses, places, search, run=Run(progress=said[1].append))
+    assert said[0] == pytest.approx([0.25, 0.5, 0.75, 1.0])
+    assert said[1] == [1.0]
     assert whole.through is not None
+    assert whole.edge_paths is not None
     for other in (parted, moving):
-        assert other.h == pytest.approx(whole.h, rel=1e-9)
+        assert other.h == pytest.approx(whole.h, rel=1e-6)
         assert other.through is not None
         assert np.array_equal(np.bincount(other.through.paths.pose), np.bincount(whole.through.paths.pose))
+        assert other.edge_paths is not None
+        assert other.edge_paths.pose.tolist() == whole.edge_paths.pose.tolist()
+        assert other.edge_paths.vertices_m == pytest.approx(whole.edge_paths.vertices_m, abs=1e-9, nan_ok=True)
+    assert replay_in_parts(town(), link, poses, search, Field(), Run(), size=len(PLACES)).seconds > 0.0
 
 
 @pytest.mark.parametrize(("houses", "seen"), [(4, True), (5, False)])

@@ -45,15 +45,12 @@ class OnTerrain:
         With the tangent planes behind those of the scene.
     unknown : int
         Links over ground that the model does not know.
-    dropped : int
-        Paths with two reflections off the ground, which are not followed over terrain.
     """
 
     level: PathSet
     shaped: PathSet
     faces: Faces
     unknown: int
-    dropped: int
 
 
 def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: float) -> OnTerrain:
@@ -74,16 +71,15 @@ def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_
     OnTerrain
     """
     ground = np.append(faces.solid < 0, False)
-    on_ground = ground[paths.faces]
-    count, single = on_ground.sum(axis=1), on_ground.sum(axis=1) == 1
+    once = ground[paths.faces].any(axis=1)  # never twice: no face of a prism looks down
     pose, tower = _linked(links)
     unknown = np.zeros((len(links.targets_m), len(links.sources_m)), dtype=np.bool_)
     for some, _, height in dem.profiles(links.sources_m[tower], links.targets_m[pose]):
         unknown[pose[some], tower[some]] = np.isnan(height).any(axis=0)
     off_model = unknown[paths.pose, paths.tower]
-    stays = (count == 0) | off_model
+    stays = ~once | off_model
     # one candidate for each link, and one for each path of the engine with the ground and something else
-    several = np.flatnonzero(single & (paths.depth > 1) & ~off_model)
+    several = np.flatnonzero(once & (paths.depth > 1) & ~off_model)
     bare = np.flatnonzero(~unknown[pose, tower])
     sequence = np.full((len(bare) + len(several), paths.faces.shape[1]), -1, dtype=np.int64)
     plane = np.full(len(links.sources_m), -1, dtype=np.int64)
@@ -92,7 +88,7 @@ def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_
     plane[at] = face
     sequence[: len(bare), 0], sequence[len(bare) :] = plane[tower[bare]], paths.faces[several]
     own = np.full(unknown.shape, -1, dtype=np.int64)
-    alone = np.flatnonzero(single & (paths.depth == 1))
+    alone = np.flatnonzero(once & (paths.depth == 1))
     own[paths.pose[alone], paths.tower[alone]] = alone
     candidates = _Candidates(
         pose=np.append(pose[bare], paths.pose[several]),
@@ -103,7 +99,7 @@ def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_
     )
     same, shaped, more = candidates.followed(dem, faces, links, wavelength_m)
     stays[same[_clear(dem, faces, links, paths.select(same), wavelength_m)]] = True
-    return OnTerrain(paths.select(stays), shaped, more, int(unknown.sum()), int(((count > 1) & ~off_model).sum()))
+    return OnTerrain(paths.select(stays), shaped, more, int(unknown.sum()))
 
 
 def _linked(links: Links) -> tuple[IntArray, IntArray]:

@@ -146,8 +146,11 @@ class Placer:
         if odds_tower[best] >= TOWER_ODDS:
             return Placement(towers[best].name, None, f"the levels fit {towers[best].name} best: is it this tower?")
         latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
+        apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]
+        near = [t.name for t, d in zip(towers, apart, strict=True) if d <= estimate.radius90_m]
+        decided = f"the levels decide for no tower ({', '.join(near)} possible)" if near else "no tower fits the levels"
         about = (
-            f"no tower fits the levels. They fit this place best, 90 % within {estimate.radius90_m:.0f} m, "
+            f"{decided}. They fit this place best, 90 % within {estimate.radius90_m:.0f} m, "
             f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where did the node stand?"
         )
         place = estimate.place_m

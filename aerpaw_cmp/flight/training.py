@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ..common.provenance import union
+from ..common.units import AnyArray
 from ..propagation.arrays import Link
 from ..site.sphere_pattern import SpherePattern
 from .data import FlightData, RankSeries, RssSeries
@@ -39,7 +40,37 @@ def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, 
     own, patterns = logs_of(data, series), learned_patterns(link)
     if any(not p.trained_on and data.settings.flight.name in p.learned_from for p in patterns):
         return own
+    if learned_of(series, patterns):
+        return own
     return common(own, [data.settings.trained_on, *(p.trained_on for p in patterns)])
+
+
+RUN, MARKS, SHARED = 32, 32, 3
+"""Readings of a run; marks that a learned file keeps of a log; marks that two logs share if one is of the other."""
+
+_WEIGHTS = np.array([pow(0x9E3779B97F4A7C15, j, 2**64) for j in range(1, RUN + 1)], dtype=np.uint64)
+
+
+def marks(series: RssSeries) -> AnyArray:
+    """Hashes of all runs of consecutive levels, sorted: a part of a log has those of the log, in any format or zone."""
+    level = np.concatenate([np.round(10.0 * series.measured_db), np.full(RUN, np.nan)])
+    runs = np.lib.stride_tricks.sliding_window_view(level, RUN)
+    runs = runs[np.isfinite(runs).all(axis=1)]
+    telling = (np.diff(np.sort(runs, axis=1), axis=1) != 0).sum(axis=1) >= RUN // 4
+    return np.unique((runs[telling].astype(np.int64).view(np.uint64) * _WEIGHTS).sum(axis=1, dtype=np.uint64))
+
+
+def marks_note(flights: Sequence[FlightData]) -> str:
+    """Comment of an antenna table: marks of the logs that it was learned from, of all channels: they share a fit."""
+    every = [marks(s)[:MARKS] for data in flights for s in data.rss]
+    return "marks: " + " ".join(f"{mark:016x}" for own in every for mark in own)
+
+
+def learned_of(series: RssSeries, patterns: Iterable[SpherePattern]) -> bool:
+    """Check whether antennas were learned from the readings of a series, whatever its log is now."""
+    lines = [line for p in patterns for line in p.notes.splitlines() if line.startswith("# marks:")]
+    known = np.array([int(mark, 16) for line in lines for mark in line.split()[2:]], dtype=np.uint64)
+    return bool(len(known)) and len(np.intersect1d(known, marks(series))) >= SHARED
 
 
 def common(own: Sequence[str], learned: Iterable[Iterable[str]]) -> tuple[str, ...]:
@@ -56,11 +87,19 @@ def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[
     home: dict[str, str] = {}
     kept: list[FlightData] = []
     said: list[str] = []
+    known: list[tuple[str, AnyArray]] = []
     for data in flights:
         name = data.settings.flight.name
         again = {digest: home[digest] for digest in flight_logs(data) if digest in home}
         for digest, first in again.items():
             said.append(f"{name} holds the same log as {first} (SHA-256 {digest[:12]}...): it is counted once")
+        own = [(s, logs_of(data, s), marks(s)) for s in data.rss]
+        for _, logs, mine in own:
+            earlier = [one for one, held in known if len(np.intersect1d(held, mine)) >= SHARED]
+            if earlier and not set(logs) & set(again):
+                said.append(f"{name} holds readings of {earlier[0]} in another log: they are counted once")
+                again |= dict.fromkeys(logs, earlier[0])
+        known += [(name, mine) for _, _, mine in own]
         rss = tuple(s for s in data.rss if not set(logs_of(data, s)) & set(again))
         rank = tuple(s for s in data.rank if not set(logs_of(data, s)) & set(again))
         if not again:

@@ -125,6 +125,8 @@ def test_packaged_numbers_are_what_the_command_gives(name: str, tmp_path: Path) 
             theta, phi = np.meshgrid(np.radians(np.arange(5.0, 180.0, 10.0)), np.radians(np.arange(0.0, 360.0, 15.0)))
             gains = [table.gain_dbi(theta, phi) for table in tables]
             assert np.abs(gains[0] - gains[1]).max() < 0.05
+            marks = [[line for line in table.notes.splitlines() if "marks:" in line] for table in tables]
+            assert marks[0] == marks[1] != []
 
 
 @pytest.mark.parametrize("name", ["afar", "nr_rank"])

@@ -163,6 +163,26 @@ def test_calibrate_counts_a_copy_once(folder: Path, copy: Callable[[Path], str])
     assert {score.flight for score in three.scores["flight_left_out"]} == {"first", "second"}
 
 
+def test_half_of_a_training_log_in_another_layout_is_known_by_its_readings(folder: Path) -> None:
+    """Another digest: the second half alone, other line ends, fewer decimals, times moved by 0.2 s."""
+    learned = yaml.safe_load((folder / "calibrated.yaml").read_text())
+
+    def half(source: Path) -> str:
+        rows = [line.split() for line in source.read_text().splitlines()[-160:]]
+        moved = [f"{day} {time[:-7]}2{time[-6:]} {place} {float(level):.3f}" for day, time, place, level in rows]
+        source.with_name("half.txt").write_text("\r\n".join(moved))
+        return "first/half.txt"
+
+    metrics, words = report(folder, copy_of(folder, half, link=learned["link"]))
+    assert words.startswith("Training flight: the antennas of LW1 USRP1 were learned from this flight")
+    assert metrics["rss"]["LW1"]["USRP1"]["rmse_db"] is None
+    assert all(row["rmse_heldout_db"] is None for row in metrics["ladder"] if "learned" in row["model"])
+    names = ["first.yaml", copy_of(folder, half).name, "second.yaml", "aside.yaml"]
+    kept, said = counted_once([load_data(load_flight(folder / name), folder) for name in names])
+    assert [data.settings.flight.name for data in kept] == ["first", "second", "aside"]
+    assert said == ["nobody_knows_me holds readings of first in another log: they are counted once"]
+
+
 def test_two_logs_of_one_flight_in_two_flight_files(folder: Path) -> None:
     """Only the series of the log that comes twice is left out; what else the later flight holds counts."""
     both = settings("aside", {"model": "iso"})

@@ -22,7 +22,7 @@ from ...compare.calibration import Learned, mean_rmse
 from ...compare.direction_gain import directed
 from ...compare.learning_curve import with_one_more
 from ...flight.data import FlightData, RankSeries, RssSeries
-from ...flight.training import flight_logs
+from ...flight.training import flight_logs, marks_note
 from ...logs.records import has_wall_clock
 from ...report.calibration_data import AntennaMap, CalibrationData
 from ...report.calibration_html import calibration_metrics, write_calibration
@@ -92,6 +92,7 @@ def antenna_files(
         "gain of the antenna as mounted: UAV in the body frame (x forward, y left, z up), tower in east-north-up",
         "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
         f"{KEY}: {' '.join(calibration.trained_on)}",
+        marks_note(calibration.flights),
     )
     out: dict[str, str | bytes] = {}
     for (antenna, end), one in maps.items():
@@ -106,7 +107,7 @@ def antenna_files(
             "history": f"{utc_now()} written by aerpaw-cmp calibrate, calibration {calibration.settings.calibration}",
             "institution": "not stated",
             "references": "https://arxiv.org/abs/2502.10324",
-            "comment": "; ".join(notes[1:-1]),
+            "comment": "; ".join(notes[1:-2]),
             KEY: " ".join(calibration.trained_on),
         }
         sphere = sphere_netcdf(one.gain_dbi, one.sd_db, said, carrier_hz)
@@ -307,7 +308,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
     """Entry that a site remembers of a calibration, and its tables by name."""
     name, maps = calibration.settings.calibration, antenna_maps(calibration)
     tables: dict[str, bytes] = {}
-    series = []
+    series, marked = [], marks_note(calibration.flights)
     for antenna in calibration.learned.fit.antennas if calibration.learned.fit else ():
         files = {}
         for end in ("tower", "uav"):
@@ -316,6 +317,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
             notes = (
                 f"aerpaw-cmp calibrate: {name}, {antenna} {end}",
                 f"{KEY}: {' '.join(calibration.trained_on)}",
+                marked,
                 calibration.learned.spread(antenna).text(),
                 *pair_notes(calibration, antenna, end),
             )

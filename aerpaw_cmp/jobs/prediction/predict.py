@@ -22,7 +22,7 @@ from ...flight.data import FlightData, choose_site, site_place
 from ...flight.remembered import remembered
 from ...flight.settings import LinkSettings, LinksSettings
 from ...flight.track import body_rotation
-from ...flight.training import common, counted_once, flight_logs, learned_patterns
+from ...flight.training import common, counted_once, flight_logs, learned_of, learned_patterns
 from ...propagation.arrays import Poses
 from ...report.prediction_html import PredictionPage, outside_share
 from ...report.prediction_words import FLAGS, TITLES, first_words, memory_words
@@ -311,7 +311,10 @@ def _bases(
     own = union(*map(flight_logs, known))
     if not common(own, logs["replay"]):
         bases["replay"] = each(lambda source, s: source.replayed_db(s))
-    if len(near) == len(sources) and not common(own, logs["memory"]):
+    every = ((s, (near[name].tower, near[name].uav)) for data in known for s in data.rss
+             if (name := f"{s.tower}.{s.channel}") in near)  # fmt: skip
+    seen = common(own, logs["memory"]) or any(learned_of(s, tables) for s, tables in every)
+    if len(near) == len(sources) and not seen:
         bases["memory"] = lambda _: by_degree(lambda s: near[s.antenna].gain_db(s))
     if len({s.flight for source in sources.values() for s in source.samples}) < 2:
         bases = {"free space": bases.pop("free space"), **bases}

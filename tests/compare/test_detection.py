@@ -8,12 +8,16 @@ from scipy.special import expit
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.compare.detection import (
+    BASE_S,
     DetectionForecast,
     aligned_quality,
+    floored_fit,
     floored_offset,
     learn_detection,
     score_detection,
 )
+from aerpaw_cmp.compare.forecast import constant_forecast
+from aerpaw_cmp.compare.receiver import out_of_group
 
 FLOOR = -15.0
 
@@ -109,3 +113,69 @@ def test_short_logs_keep_their_pairs() -> None:
     quality, shift = aligned_quality(np.arange(10) / 30.0, np.arange(10.0), np.arange(10.0))
     assert shift == 0.0
     assert quality.tolist() == list(range(10))
+
+
+@pytest.mark.parametrize("learned", [True, False])
+def test_every_score_is_that_by_hand(learned: bool) -> None:
+    time, measured, simulated, detected = _flight(n=400)
+    time, free = time + 5.0, simulated + np.cos(time)
+    simulated[7], time[9], measured[11] = np.nan, np.nan, np.nan
+    forecast = DetectionForecast(level_db=-56.0, per_db=0.25, share=0.4) if learned else None
+    score = score_detection(
+        time, measured, simulated, detected, floor_db=FLOOR, free_space_db=free, forecast=forecast
+    )  # fmt: skip
+    assert score is not None
+    ok = np.isfinite(simulated) & np.isfinite(time)
+    seen, level = detected[ok], simulated[ok]
+    if learned:
+        said, constant = 1.0 / (1.0 + np.exp(-0.25 * (level + 56.0))), np.full(398, 0.4)
+    else:  # tenths of the time, each told by the others
+        tenth = np.minimum((time[ok] - 5.0) / 39.9 * 10.0, 9.0).astype(int)
+        p = out_of_group(level[:, None], seen.astype(int) + 1, tenth, 1.0)
+        said = p[:, 1] / (p[:, 0] + p[:, 1])
+        constant = np.array([constant_forecast(seen[tenth != t].astype(int) + 1, 2)[1] for t in tenth])
+    for p, brier, log in (
+        (said, score.brier, score.log_score), (constant, score.constant_brier, score.constant_log_score)
+    ):  # fmt: skip
+        assert brier == pytest.approx(np.mean((p - seen) ** 2))
+        assert log == pytest.approx(-np.mean(np.log(np.where(seen, p, 1.0 - p))))
+    heard = np.maximum(np.nan_to_num(measured[ok], nan=FLOOR), FLOOR)
+    error = heard - np.maximum(level - score.offset_db, FLOOR)
+    assert (score.rmse_db, score.detected_rmse_db) == pytest.approx(
+        (np.sqrt(np.mean(error**2)), np.sqrt(np.mean(error[seen] ** 2)))
+    )
+    assert score.free_space_rmse_db == pytest.approx(floored_fit(heard, free[ok], FLOOR).rmse_db)
+    fifths = [(said >= k / 5) & (said < (k + 1) / 5) for k in range(5)]
+    assert score.reliability == pytest.approx(
+        [pytest.approx((said[g].mean(), seen[g].mean(), g.sum())) for g in fifths if g.any()]
+    )
+
+
+@pytest.mark.parametrize("rare", [49, 50])
+def test_fifty_of_either_outcome_are_enough(rare: int) -> None:
+    level, few = np.linspace(-90.0, -40.0, 300), np.arange(300) >= 300 - rare
+    for detected in (few, ~few):
+        scored = score_detection(np.arange(300.0), level, level, detected, floor_db=-80.0)
+        assert (scored is not None) == (rare == 50)
+    learned = learn_detection([(level, few), (level[:0], few[:0])])
+    assert (learned is not None) == (rare == 50)
+    if learned is not None:  # all is told apart: only the penalty of a thousandth keeps the slope finite
+        slope, unit = learned.per_db * level.std(), (level - level.mean()) / level.std()
+        over = learned.probability(level) - few
+        assert over.mean() == pytest.approx(0.0, abs=1e-4)
+        assert (over * unit).mean() + 2e-3 * slope == pytest.approx(0.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("slow", "by_row"), [(1.4, False), (1.4, True), (1.1, False)])
+def test_a_quality_ahead_of_its_power_is_taken_at_its_own_times(slow: float, by_row: bool) -> None:
+    own = 7.0 + BASE_S * np.arange(300)
+    time = 7.0 + slow * (own - 7.0)
+    power, quality = np.sin(time), np.sin(time if by_row else own)
+    found, shift = aligned_quality(time, power, quality)
+    if by_row or slow == 1.1:  # rows agree, or are a second apart at most
+        assert shift == 0.0
+        assert found is quality
+    else:
+        assert shift == pytest.approx(0.4 * 0.032768 * 299)
+        np.testing.assert_allclose(found[time <= own[-1]], power[time <= own[-1]], atol=1e-3)
+        assert np.isnan(found[time > own[-1]]).all()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from aerpaw_cmp.compare.entries import crps_normal
 from aerpaw_cmp.compare.rolling import KEEP, NONE, RouteAhead
 
 
@@ -79,3 +80,65 @@ def test_a_route_may_be_entered_in_its_middle():
         first = first or ahead.add(now, here, -80.0 + np.sin(now), {})
     assert first is not None
     assert abs(t[first.index[0]] - (60.0 + 2.0 * 8)) <= 4.0
+
+
+def by_hand(length, place, time, value, here, later):
+    """Mean and standard deviation of a Gaussian process about the mean of what is known, its scale estimated."""
+
+    def k(a, b, t, u):
+        across = np.hypot(*(a[:, None] - b)[..., :2].transpose(2, 0, 1))
+        up = np.abs(a[:, None, 2] - b[:, 2])
+        return 100.0**2 + 9.0 * np.exp(-(across + up) / length) + np.exp(-np.abs(t[:, None] - u) / 20.0)
+
+    matrix = k(place, place, time, time) + 1.5**2 * np.eye(len(time))
+    away, across = value - value.mean(), k(here, place, later, time)
+    inside = np.linalg.solve(matrix, across.T)
+    left = k(here[:1], here[:1], later[:1], later[:1])[0, 0] - (across * inside.T).sum(axis=1) + 1.5**2
+    scale = away @ np.linalg.solve(matrix, away) / len(away)
+    return value.mean() + inside.T @ away, np.sqrt(max(scale, 0.01) * left)
+
+
+@pytest.mark.parametrize("ripple_db", [4.0, 0.05])
+def test_each_prediction_is_that_of_the_bins_by_hand(ripple_db):
+    """Bins of two seconds and four samples; the trend with the least discounted score on levels 20 s ahead of what was known."""
+    rng = np.random.default_rng(3)
+    line = np.column_stack([np.arange(200) * 4.0, np.full(200, 3.0), 30.0 + 0.01 * np.arange(200)])
+    trends = {"up": 0.05 * line[:, 0], "down": -0.03 * line[:, 0]}
+    ahead, bins, rows, squares, scores = RouteAhead(line, trends), [], [], [], {}
+    for number in range(4 * 26 + 1):
+        now, here = 0.5 * number, np.array([4.0 * number / 2, 3.0, 30.0])
+        level = -70.0 + 0.05 * here[0] + ripple_db * np.sin(now / 3.0) + rng.normal(0.0, 0.5 * ripple_db)
+        said = {"up": 0.05 * here[0], "down": -0.03 * here[0]}
+        found = ahead.add(now, here, level, said)
+        if number % 4 == 0 and number:
+            of = np.array(rows[-4:]).mean(axis=0)
+            squares.append(((np.array(rows[-4:])[:, 4] - of[4]) ** 2).sum() / 3.0)
+            known = [b for b in bins if b[0] < of[0] - 20.0]
+            if len(known) >= 8:
+                past = np.array(known)
+                for column, name in ((5, "up"), (6, "down"), (7, NONE)):
+                    for length in (30.0, 120.0):
+                        mean, sd = by_hand(length, past[:, 1:4], past[:, 0], past[:, 4] - past[:, column],
+                                           of[None, 1:4], of[:1])  # fmt: skip
+                        score = crps_normal(of[4] - of[column] - mean, sd)[0]
+                        scores.setdefault((name, length), []).append(score)
+            bins.append(of)
+            assert (found is None) == (len(bins) < 8)
+            if found is not None:
+                weight = 0.98 ** np.arange(100)
+                means = {key: np.average(one[::-1], weights=weight[: len(one)]) for key, one in scores.items()}
+                trend, length = min(means, key=means.__getitem__, default=(NONE, 120.0))
+                assert found.trend == trend
+                assert found.index[0] == np.abs(line[:, 0] - here[0]).argmin()
+                past, rest = np.array(bins), line[found.index]
+                later = past[-1, 0] + np.cumsum([np.linalg.norm(rest[0] - here), *np.linalg.norm(np.diff(rest, axis=0), axis=1)]) / 8.0
+                own = {"up": 0.05 * rest[:, 0], "down": -0.03 * rest[:, 0], NONE: np.zeros(len(rest))}[trend]
+                column = {"up": 5, "down": 6, NONE: 7}[trend]
+                mean, sd = by_hand(length, past[:, 1:4], past[:, 0], past[:, 4] - past[:, column], rest, later)
+                np.testing.assert_allclose(found.level_db, own + mean, atol=1e-6)
+                np.testing.assert_allclose(found.sd_db, np.sqrt(sd**2 + np.mean(squares)), rtol=1e-6)
+                np.testing.assert_allclose(np.diff(found.interval_db, axis=0)[0], 2 * 1.645 * found.sd_db)
+        else:
+            assert found is None
+        rows.append((now, *here, level, said["up"], said["down"], 0.0))
+    assert len(scores[NONE, 30.0]) == 8

@@ -86,6 +86,18 @@ def test_the_kurtosis_counts_only_as_far_as_the_expansion_holds() -> None:
         return float(spread.half_width_db(none, 0.95)[0])
 
     assert width(0.0) == pytest.approx(4.0 * 1.95996, rel=1e-4)
+    for share, z in ((0.5, 0.67449), (0.9, 1.644854)):  # Cornish and Fisher (1938), skewness by 0.54 of the kurtosis
+        spread = Spread(own_sd_db=3.0, noise_sd_db=0.0, fading_sd_db=4.0, fading_kurtosis=1.5, bin_s=4.0)
+        k, skew2 = 1.5 * 0.8**4, 0.54 * 1.5 * 0.8**6
+        expected = 5.0 * (z + (z**3 - 3 * z) * k / 24 + (z**5 - 10 * z**3 + 15 * z) * skew2 / 72)
+        assert spread.half_width_db(none, share)[0] == pytest.approx(expected, rel=1e-4)
+    columns = StatedSpread(gain_sd_db=np.array([0.0, np.nan]), spread=spread).columns(np.array([-70.0, -60.0]))
+    assert (columns["simulated_low_dbm"][0], columns["simulated_high_dbm"][0]) == pytest.approx(
+        (-70.0 - expected, -70.0 + expected), rel=1e-5
+    )
+    for name, value in (("simulated_sd_db", 5.0), ("own_sd_db", 3.0), ("noise_sd_db", 0.0), ("fading_sd_db", 4.0)):
+        assert columns[name][0] == value
+        assert np.isnan(columns[name][1])
     assert width(1.0) != width(1.9) != width(2.0) == width(3.0) == width(50.0)
     assert width(-2.0) == width(-9.0) < width(0.0)
 
@@ -98,4 +110,7 @@ def test_fading_is_the_pooled_variance_about_the_means_of_bins() -> None:
     one = dataclasses.replace(samples(np.concatenate(bins)), time_s=time_s)
     several = [part for part in bins if len(part) > 1]
     pooled = sum(len(part) * part.var(ddof=1) for part in several) / sum(map(len, several))
-    assert fading_of([one], 4.0)[0] == pytest.approx(np.sqrt(pooled), rel=1e-12)
+    found = fading_of([samples(np.full(3, np.nan)), one, samples(np.zeros(1))], 4.0)
+    assert found[0] == pytest.approx(np.sqrt(pooled), rel=1e-12)
+    away = np.concatenate([(part - part.mean()) * np.sqrt(len(part) / (len(part) - 1)) for part in several])
+    assert found[1] == pytest.approx(np.mean(away**4) / pooled**2 - 3.0, rel=1e-12)

@@ -1,0 +1,76 @@
+"""Scores of an entry of the benchmark: every number by hand, the interval of a pair from the same draws."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from aerpaw_cmp.compare.entries import LevelSeries, crps_normal, intervals, level_scores, rmse_replicates
+from aerpaw_cmp.compare.statistics import bootstrap_means
+
+RNG = np.random.default_rng(2)
+ONE = LevelSeries(
+    name="one", time_s=np.arange(60) * 2.0, measured_db=RNG.normal(-70, 6, 60), level_db=RNG.normal(-72, 3, 60),
+    sd_db=RNG.uniform(2.0, 9.0, 60),
+)  # fmt: skip
+TWO = LevelSeries(
+    name="two", time_s=np.arange(25) * 1.5, measured_db=RNG.normal(-60, 4, 25), level_db=np.full(25, -61.0)
+)
+
+
+@pytest.mark.parametrize("error", [-3.0, 0.0, 0.7, 9.0])
+def test_the_crps_is_the_area_between_the_forecast_and_the_step(error: float) -> None:
+    below = quad(lambda x: norm.cdf(x, 0, 2.5) ** 2, -60, error)[0]
+    above = quad(lambda x: norm.sf(x, 0, 2.5) ** 2, error, 60)[0]
+    assert crps_normal(np.array([error]), np.array([2.5]))[0] == pytest.approx(below + above, abs=1e-6)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_scores_are_those_by_hand(own: bool) -> None:
+    one = dataclasses.replace(ONE, own_offset=own)
+    found, sd = level_scores([one]), ONE.sd_db
+    assert sd is not None
+    plain = ONE.measured_db - ONE.level_db
+    error = plain - plain.mean() if own else plain
+    assert found["rmse_db"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert found["bias_db"] == pytest.approx(abs(plain.mean()))
+    assert found["crps_db"] == pytest.approx(np.mean(crps_normal(error, sd)))
+    assert found["log_score"] == pytest.approx(-np.mean(norm.logpdf(error, 0.0, sd)))
+    assert found["coverage_90"] == pytest.approx(np.mean(np.abs(error) <= 1.644854 * sd))
+    assert found["n"] == 60.0
+    both = level_scores([one, TWO])
+    assert both["rmse_db"] == pytest.approx((found["rmse_db"] + TWO.error_db.std()) / 2)
+    assert both["n"] == 85.0
+    assert np.isnan(both["crps_db"])
+    fast = np.tile([3.0, -3.0], 400)  # a tenth of a second: gone in the mean of four seconds
+    ripple = LevelSeries(name="r", time_s=np.arange(800) / 10.0, measured_db=fast, level_db=np.zeros(800))
+    assert level_scores([ripple])["rmse_4s_db"] < 0.1
+    assert level_scores([ripple])["rmse_db"] == pytest.approx(3.0)
+    step = dataclasses.replace(ripple, measured_db=np.repeat([2.0, 6.0], 400), own_offset=own)
+    assert level_scores([step])["rmse_4s_db"] == pytest.approx(2.0 if own else np.sqrt(20.0), abs=0.1)
+
+
+def test_intervals_are_those_of_blocks_of_twenty_seconds() -> None:
+    assert (ONE.block, TWO.block) == (10, 13)  # 20 s at 2 s and at 1.5 s a sample
+    assert dataclasses.replace(ONE, time_s=np.zeros(60)).block == 1
+    assert dataclasses.replace(ONE, time_s=np.arange(60) * 0.1).block == 60
+    total = np.zeros(2000)
+    for one, block, own in ((ONE, 10, True), (TWO, 13, True)):
+        error = one.error_db
+        drawn = bootstrap_means(
+            np.column_stack([error, error**2]), block, replicates=2000, seed=20240715 + (one is TWO)
+        )
+        total += np.sqrt(drawn[:, 1] - own * drawn[:, 0] ** 2) / 2
+    np.testing.assert_allclose(rmse_replicates([ONE, TWO]), total)
+    free = dataclasses.replace(ONE, own_offset=False)
+    error = free.error_db
+    drawn = bootstrap_means(error[:, None] ** 2, 10, replicates=2000, seed=20240715)[:, 0]
+    np.testing.assert_allclose(rmse_replicates([free]), np.sqrt(drawn))
+    worse = dataclasses.replace(ONE, level_db=ONE.measured_db + 2.0 * (ONE.level_db - ONE.measured_db))
+    found = intervals([worse], {"base": [ONE]})
+    assert found["rmse_ci95_db"] == pytest.approx(np.quantile(2.0 * rmse_replicates([ONE]), [0.025, 0.975]))
+    assert found["difference_to_base_ci95_db"] == pytest.approx(np.quantile(rmse_replicates([ONE]), [0.025, 0.975]))

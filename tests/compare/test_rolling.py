@@ -131,7 +131,10 @@ def test_each_prediction_is_that_of_the_bins_by_hand(ripple_db):
                 assert found.trend == trend
                 assert found.index[0] == np.abs(line[:, 0] - here[0]).argmin()
                 past, rest = np.array(bins), line[found.index]
-                later = past[-1, 0] + np.cumsum([np.linalg.norm(rest[0] - here), *np.linalg.norm(np.diff(rest, axis=0), axis=1)]) / 8.0
+                later = (
+                    past[-1, 0]
+                    + np.cumsum([np.linalg.norm(rest[0] - here), *np.linalg.norm(np.diff(rest, axis=0), axis=1)]) / 8.0
+                )
                 own = {"up": 0.05 * rest[:, 0], "down": -0.03 * rest[:, 0], NONE: np.zeros(len(rest))}[trend]
                 column = {"up": 5, "down": 6, NONE: 7}[trend]
                 mean, sd = by_hand(length, past[:, 1:4], past[:, 0], past[:, 4] - past[:, column], rest, later)

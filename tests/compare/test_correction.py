@@ -13,16 +13,16 @@ from scipy.stats import norm
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare import correction
-from aerpaw_cmp.compare.correction import BIN_S, BLOCK_M, OFF, Base, Channel, choose, fixed_base
+from aerpaw_cmp.compare.correction import OFF, Base, Channel, by_degree, choose, fixed_base
 from aerpaw_cmp.compare.direction_gain import LinkSamples
-from aerpaw_cmp.compare.field_gp import FieldFit, FieldModel, Rows
+from aerpaw_cmp.compare.field_gp import PARTS, FieldFit, FieldModel, Rows
 
 
 def samples(name: str, residual: FloatArray, place: FloatArray, channel: str = "A") -> LinkSamples:
     """One sample in 4 s, so that bins change nothing."""
     n = len(residual)
     ahead = np.tile([1.0, 0.0, 0.0], (n, 1))
-    return LinkSamples(name, "T", channel, BIN_S * np.arange(n) + 0.5, place, ahead, -ahead, residual)
+    return LinkSamples(name, "T", channel, 4.0 * np.arange(n) + 0.5, place, ahead, -ahead, residual)
 
 
 def lawnmower(n: int, height: float = 40.0) -> FloatArray:
@@ -71,9 +71,9 @@ def test_flights_are_asked_of_others_and_a_single_one_block_by_block() -> None:
         (asked,), (known,) = fold.asked, fold.known
         assert len(asked) + len(known) == 400
         assert sorted([*asked.residual_db, *known.residual_db]) == list(range(400))
-        block = {tuple(row) for row in (asked.position_m[:, :2] // BLOCK_M).tolist()}
+        block = {tuple(row) for row in (asked.position_m[:, :2] // 300.0).tolist()}
         assert len(block) == 1
-        assert block.isdisjoint(map(tuple, (known.position_m[:, :2] // BLOCK_M).tolist()))
+        assert block.isdisjoint(map(tuple, (known.position_m[:, :2] // 300.0).tolist()))
 
 
 def test_blocks_spread_by_their_means() -> None:
@@ -174,3 +174,62 @@ def test_headings_that_count_alike_add_their_spread() -> None:
 def test_nothing_to_learn_from_is_one_message() -> None:
     with pytest.raises(InputError, match="no sample has a level and a pose"):
         choose([samples("a", np.full(9, np.nan), np.zeros((9, 3)))], {"made": fixed_base(gain)})
+
+
+def test_a_single_flight_is_scored_block_by_block_with_its_own_offset() -> None:
+    place = np.random.default_rng(1).uniform([0, 0, 30], [580, 280, 50], (120, 3))
+    alone = samples("a", np.random.default_rng(2).normal(5.0, 2.0, 120), place)
+    found = choose([alone], {"made": fixed_base(gain)})
+    west = place[:, 0] < 300.0
+    fuller = west if west.sum() >= 60 else ~west
+    for title, model in FEW.items():
+        assert model is not None
+        errors = []
+        for inside in (fuller, ~fuller):
+            rows, left = Rows.of(alone, 0), alone.residual_db - gain(alone)
+            mean, sd = FieldFit(model, rows.part(~inside), left[~inside]).predict(rows.part(inside), PARTS)
+            errors.append((left[inside] - mean, np.hypot(sd, model.noise_sd_db)))
+        error, sd = (np.concatenate(parts) for parts in zip(*errors, strict=True))
+        np.testing.assert_allclose(found.held_out["made", title][0], error, atol=1e-9)
+        np.testing.assert_allclose(found.held_out["made", title][1], found.sd_factor * sd, rtol=1e-9)
+
+
+def test_of_many_flights_three_groups_of_six_are_scored_and_scales_are_learned_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fits: list[int] = []
+    monkeypatch.setattr(correction, "fit_field", lambda *given: fits.append(1) or given[1])
+    for count, scored, learned in ((6, 6, 7), (7, 4, 2), (12, 6, 2)):
+        fits.clear()
+        found = choose([flight(str(k), k) for k in range(count)], {"made": fixed_base(gain)})
+        assert len(found.held_out["made", OFF][0]) == 80 * scored
+        assert sum(fits) == (learned - 1) * len(FEW) + 1
+
+
+def test_gains_of_many_directions_are_asked_once_a_degree() -> None:
+    calls: list[int] = []
+
+    def predictor(one: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        calls.append(len(one))
+        return 5.0 * one.at_uav[:, 1] + 7.0 * one.at_tower[:, 2] + len(one.channel), 2.0 + one.at_tower[:, 0]
+
+    generator = np.random.default_rng(4)
+    ray = generator.normal(size=(40, 3)).repeat(126, axis=0) + 1e-4 * generator.normal(size=(5040, 3))
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    other = np.roll(ray, 126, axis=0)
+    many = dataclasses.replace(
+        samples("a", np.zeros(5040), np.zeros((5040, 3))), at_uav=ray, at_tower=other
+    )  # forty pairs of directions, by a hair
+    coarse, (level, sd) = by_degree(predictor), predictor(many)
+    for again in range(2):
+        calls.clear()
+        found, found_sd = coarse(many)
+        np.testing.assert_allclose(found, level, atol=0.25)
+        np.testing.assert_allclose(found_sd, sd, atol=0.05)
+        assert sum(calls) <= (700, 0)[again]  # a direction on the border of a degree counts as up to four
+    longer = dataclasses.replace(many, channel="AAA")
+    np.testing.assert_allclose(coarse(longer)[0], level + 2.0, atol=0.25)
+    turned = dataclasses.replace(many, at_uav=np.roll(ray, 252, axis=0))
+    np.testing.assert_allclose(coarse(turned)[0], predictor(turned)[0], atol=0.25)
+    few = many.part(np.arange(5000))
+    np.testing.assert_array_equal(coarse(few), predictor(few))

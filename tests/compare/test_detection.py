@@ -68,6 +68,9 @@ def test_the_floored_offset_is_that_of_a_search_by_hand(offset_db: float) -> Non
     assert fit.rmse_db == pytest.approx(min(by_hand), abs=1e-9)
     assert fit.offset_db == pytest.approx(grid[int(np.argmin(by_hand))])
     assert fit.at_edge is False
+    free = floored_offset(measured, simulated, floor_db=-500.0, span_db=(-60.0, 40.0), step_db=0.1)
+    assert free.offset_db == pytest.approx(np.mean(simulated - measured), abs=0.051)
+    assert free.rmse_db == pytest.approx(np.sqrt(np.mean((simulated - measured - free.offset_db) ** 2)))
 
 
 def _lock(seed: int, middle_db: float, n: int) -> tuple[FloatArray, BoolArray]:

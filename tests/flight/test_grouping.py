@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.flight import time_origin
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.draft import drafts
 from aerpaw_cmp.flight.grouping import flights
@@ -208,3 +209,38 @@ def test_a_log_that_goes_with_no_flight_is_said_once_beside_the_first(tmp_path: 
     assert len({one.name for one in made}) == len(made) == 2
     said = [[text for text in one.remarks if "it goes with no flight here" in text] for one in made]
     assert said == [["left out: LW2_power_log.txt: it goes with no flight here"], []]
+
+
+@pytest.mark.parametrize(("aside_m", "agrees"), [(0.0, True), (13.2, True), (13.5, False)])
+def test_a_log_may_lie_twelve_metres_beside_the_track(aside_m: float, agrees: bool) -> None:
+    """To the east: of a curved track another instant is nearer, by a tenth here."""
+    flown = track("2025-03-02T15:00:00")
+    log = flown.iloc[40:240].assign(time=lambda f: np.datetime64(0, "ns") + (f["time"] - f["time"].iloc[0]).to_numpy())
+    east = np.degrees(aside_m / (6378137.0 * np.cos(np.radians(flown["latitude_deg"].iloc[0]))))
+    log = log.assign(longitude_deg=log["longitude_deg"] + east, altitude_m=log["altitude_m"] + 200.0)
+    found = origin_of(stream_of(log), stream_of(flown))
+    assert (found is not None) == agrees
+    if found is not None:
+        assert abs(found.time - flown["time"].iloc[40]) <= np.timedelta64(2500, "ms")
+        assert found.distance_m == pytest.approx(0.9 * aside_m, abs=0.3)
+    assert origin_of(stream_of(log.iloc[:19]), stream_of(flown)) is None
+    assert origin_of(stream_of(flown.iloc[40:240]), stream_of(flown)) is None, "its times are times of a day"
+
+
+def test_the_miss_is_the_median_distance_whatever_the_heights_count_from() -> None:
+    time = np.arange(10.0)
+    way = np.column_stack([10.0 * time, 0 * time, 5.0 * time])
+    here = way + np.array([3.0, -4.0, 70.0])
+    assert time_origin._miss(time, here, time, way) == pytest.approx(5.0)
+    assert time_origin._miss(time - 5.0, here, time, way) == pytest.approx(np.hypot(53.0, 4.0))  # half lies inside
+    assert np.isnan(time_origin._miss(time - 5.5, here, time, way))
+    frame = pd.DataFrame({"time": pd.to_datetime(np.arange(500.0), unit="s"), "latitude_deg": 35.0 + 1e-5 * np.arange(500.0),
+                          "longitude_deg": -78.0, "altitude_m": np.nan})  # fmt: skip
+    thin = time_origin._points(frame.sample(frac=1.0, random_state=1), 240)
+    assert thin is not None
+    assert len(thin[0]) == 240
+    assert (thin[0][0], thin[0][-1]) == (np.datetime64(0, "s"), np.datetime64(499, "s"))
+    metres = time_origin._metres(thin[1], thin[1])
+    assert metres[-1] == pytest.approx([0.0, 499 * 1.1132, 0.0])
+    sixty_north = time_origin._metres(np.array([[60.0, 10.001, 7.0]]), np.array([[60.0, 10.0, 0.0]]))
+    assert sixty_north[0] == pytest.approx([55.66, 0.0, 7.0], abs=1e-3)

@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.flight.track import Track, body_rotation
+from aerpaw_cmp.flight import track as tracks
+from aerpaw_cmp.flight.track import Track, body_rotation, good_positions
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft
 
 FRAME = SiteFrame(35.7275, -78.6960)
@@ -83,6 +84,9 @@ def test_gaps_are_not_bridged():
     assert np.isnan(poses.rotation[3]).all()
     assert track.account.gaps == 1
     assert track.account.longest_gap_s == 7.0
+    wide = Track(telemetry([0, 1, 2, 9, 10], 0, 0, 10), FRAME, maximum_gap_s=7)
+    assert wide.account.gaps == 0
+    assert wide.pose_at(at([5.0])).valid.all()
 
 
 def test_low_poses_are_raised_to_half_a_metre():
@@ -214,6 +218,51 @@ def test_attitude_known_in_part():
     poses = Track(telemetry(t, 0, 5 * t, 10, roll_deg=1, pitch_deg=0, yaw_deg=yaw), FRAME).pose_at(at([5, 15]))
     assert poses.attitude_known.tolist() == [True, False]
     np.testing.assert_allclose(poses.heading_deg, [30, 0], atol=0.1)
+
+
+def test_velocities_that_no_log_holds_are_slopes_over_two_seconds_on_either_side():
+    t = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 11.0])
+    frame = telemetry(t, t**2, 0, 10)
+    frame["velocity_east_mps"] = [np.nan, *[0.0] * 7]  # converters write zeros for unknown
+    frame["velocity_north_mps"] = frame["velocity_down_mps"] = 0.0
+    east = Track(frame, FRAME, maximum_gap_s=9.0).pose_at(at(t)).velocity_mps[:, 0]
+    # the row before a gap reaches over it, to the next row
+    np.testing.assert_allclose(
+        east, [4 / 2, 9 / 3, 16 / 4, 24 / 4, 32 / 4, (53 - 9) / 4, (121 - 16) / 7, 85 / 5], atol=1e-3
+    )
+    two = Track(telemetry([0.0, 2.0], [0.0, 6.0], 0, 10), FRAME)
+    np.testing.assert_allclose(two.pose_at(at([1.0])).velocity_mps, [[3.0, 0.0, 0.0]], atol=1e-4)
+    slow = Track(telemetry([0.0, 1.0, 2.0], [0.0, 0.99, 1.98], 0, 10), FRAME)
+    assert slow.pose_at(at([1.0])).heading_deg[0] == pytest.approx(0.0)  # below a metre a second nothing has a course
+    fast = Track(telemetry([0.0, 1.0, 2.0], [0.0, 1.01, 2.02], 0, 10), FRAME)
+    assert fast.pose_at(at([1.0])).heading_deg[0] == pytest.approx(90.0)
+
+
+def test_long_series_of_instants_are_asked_in_parts(monkeypatch):
+    track = Track(telemetry(np.arange(9.0), 5 * np.arange(9.0), 0, 10, roll_deg=1, pitch_deg=0, yaw_deg=20.0), FRAME)
+    instants = at(np.linspace(-1.0, 9.0, 11))
+    whole = track.pose_at(instants)
+    monkeypatch.setattr(tracks, "AT_ONCE", 4)
+    parts = track.pose_at(instants)
+    np.testing.assert_array_equal(parts.position_m, whole.position_m)
+    np.testing.assert_array_equal(parts.reason, whole.reason)
+    some = whole.pick(whole.valid)
+    assert len(some) == 9
+    placed = some.where(np.arange(9) % 2 == 0)
+    assert placed.valid.tolist() == [True, False] * 4 + [True]
+    assert np.isnan(placed.position_m[1::2]).all()
+    assert placed.reason[1] == "no position of the tower"
+    lost = whole.where(np.zeros(11, dtype=bool))
+    assert lost.reason.tolist() == ["before telemetry", *["no position of the tower"] * 9, "after telemetry"]
+
+
+@pytest.mark.parametrize(
+    ("place", "good"),
+    [((90.0, 180.0, 0.0), 1), ((-90.0, -180.0, 0.0), 1), ((90.1, 0.0, 0.0), 0), ((0.0, 180.1, 0.0), 0),
+     ((0.0, 0.0, 30.0), 0), ((0.0, 1.0, 30.0), 1), ((1.0, 0.0, -899.0), 1), ((1.0, 1.0, -900.0), 0), ((1.0, 1.0, np.inf), 0)],
+)  # fmt: skip
+def test_a_position_is_on_earth_and_not_where_a_receiver_without_a_fix_says(place, good):
+    assert good_positions(*(np.array([value]) for value in place)).tolist() == [bool(good)]
 
 
 def test_ground_height_shifts_everything():

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import linregress
+from scipy.stats import t as student
 
 from aerpaw_cmp.compare.offset import grid_offset
 from aerpaw_cmp.compare.season import error_at_offset, left_out_offsets, mean_of_flights, trend, verdict_of
+from aerpaw_cmp.compare.statistics import autocorrelation
 
 
 def test_offset_of_the_others_is_the_search_over_their_samples():
@@ -72,6 +75,25 @@ def test_a_drift_is_found_with_its_interval():
         inside += found.low <= 0.4 <= found.high
     assert 0.91 <= inside / 300 <= 0.985
     assert found.scatter == pytest.approx(0.7, rel=0.3)
+
+
+@pytest.mark.parametrize("n", [3, 19, 20])
+def test_intervals_and_slopes_are_those_of_students_t(n):
+    """The slope by SciPy's regression; of twenty flights that drift, as many count as are independent."""
+    values = np.arange(n) // 4 + np.sin(np.arange(n))
+    found, known = mean_of_flights(values), min(max(autocorrelation(values).n_effective, 3.0), n) if n >= 20 else n
+    reach = student.ppf(0.975, known - 1) * values.std(ddof=1) / np.sqrt(known)
+    assert (found.n, found.low, found.high) == pytest.approx((n, values.mean() - reach, values.mean() + reach))
+    days = np.cumsum(1.0 + np.arange(n) % 3)
+    line, fit = linregress(days / 30.0, values), trend([*days, 5.0], [*values, np.nan])
+    reach = student.ppf(0.975, n - 2) * line.stderr
+    assert (fit.n, fit.slope) == (n, pytest.approx(line.slope))
+    assert (fit.low, fit.high) == pytest.approx((line.slope - reach, line.slope + reach))
+    rest = values - line.intercept - line.slope * days / 30.0
+    assert fit.scatter == pytest.approx(np.sqrt(rest @ rest / (n - 2)))
+    slow = np.cumsum(np.ones(40)) + values[0]
+    drift, width = mean_of_flights(slow), student.ppf(0.975, 2.0) * slow.std(ddof=1) / np.sqrt(3.0)
+    assert drift.high - drift.mean == pytest.approx(width)  # one long drift counts as three flights
 
 
 @pytest.mark.parametrize("days", [[0.0, 1.0], [5.0, 5.0, 5.0], [np.nan, 1.0, np.nan]])

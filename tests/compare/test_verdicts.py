@@ -10,7 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_ind
 
+from aerpaw_cmp.compare import verdicts
 from aerpaw_cmp.compare.report_difference import Overlap, level_difference, pooled_difference
 from aerpaw_cmp.compare.verdicts import (
     Coverage,
@@ -190,6 +192,101 @@ def test_an_unpaired_flight_takes_no_part() -> None:
     )
     assert said.effect == pytest.approx(-2.0)  # -2, -3, -1
     assert said.interval == pytest.approx((-2.0 - 4.302653 / 3**0.5, -2.0 + 4.302653 / 3**0.5), abs=1e-5)
+
+
+def test_two_groups_of_flights_are_compared_by_students_test() -> None:
+    values, inside = np.array([1.0, 2.5, 2.0, 4.0, 3.5, 9.0]), np.array([0, 0, 0, 1, 1, 1], dtype=bool)
+    expected = ttest_ind(values[inside], values[~inside])
+    chance, effect, ends = verdicts._split(values, inside)
+    assert (chance, effect) == pytest.approx((expected.pvalue, values[3:].mean() - values[:3].mean()))
+    assert ends == pytest.approx(tuple(expected.confidence_interval(0.95)))
+    assert np.isfinite(verdicts._split(values[1:], inside[1:])[0])
+    for few in (verdicts._split(values[2:], inside[2:]), verdicts._split(values, inside | ~inside)):
+        assert np.isnan([few[0], few[1], *few[2]]).all()
+
+
+@pytest.mark.parametrize(
+    ("chances", "effect", "cause"),
+    [((0.009, 0.5), 3.0, "gain step"), ((0.0101, 0.5), 3.0, "none"), ((0.009, 0.5), -1.99, "none"),
+     ((0.009, 0.5), -2.01, "gain step"), ((0.006, 0.5, 0.9), 3.0, "gain step"), ((0.0067, 0.5, 0.9), 3.0, "none"),
+     ((0.019, np.nan), 3.0, "gain step"), ((), 0.0, "none")],
+)  # fmt: skip
+def test_chance_is_shared_by_all_that_is_tried_and_two_decibels_are_small(
+    chances: tuple[float, ...], effect: float, cause: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two false alarms in a hundred campaigns, whatever the number of shifts that are tried."""
+    found = [verdicts._Shift(chance, Verdict(cause="gain step", effect=effect)) for chance in chances]
+    monkeypatch.setattr(verdicts, "_shifts", lambda *_: iter(found))
+    assert campaign_verdict({}, {}, []).cause == cause
+
+
+def test_every_shift_of_a_campaign_is_tried() -> None:
+    names = list("ABCDEF")
+    errors = dict(zip(names, (2.0, 2.2, 1.9, 8.0, 2.1, 0.0), strict=True))
+    links = {
+        "LW1": dict(zip(names, (1.0, 2.0, 1.5, 4.0, 5.0, 4.5), strict=True)),
+        "LW2": {"A": 1.0, "B": np.nan, "C": 2.0},
+    }
+    tried = [one.verdict for one in verdicts._shifts(errors, links, names)]
+    assert [one.where for one in tried] == [*"ABCDE", *(f"LW1 from {name}" for name in "CDE"), *names]
+    assert tried[3].effect == pytest.approx(8.0 / (2.0 * 2.2 * 1.9 * 2.1) ** 0.25)
+    assert tried[3].interval[0] < tried[3].effect < tried[3].interval[1]
+    assert tried[6].effect == pytest.approx(4.5 - 1.5)  # from D on
+    a, c = (1.0 - 3.0 - 0.5) / 2, (1.5 - 3.0 + 0.5) / 2  # about the mean of each link, then of the links
+    rest = (c - 1.0 + 1.0 + 2.0 + 1.5) / 5
+    assert tried[8].effect == pytest.approx(a - rest)
+    low = [one.chance for one in verdicts._shifts(errors, {}, names)]
+    assert np.isnan(low).tolist() == [True, True, True, False, True]  # a small error accuses nobody
+
+
+@pytest.mark.parametrize(
+    ("mean", "within", "reach", "cause"),
+    [(2.7, 0.1, 2.0, "biased"), (2.5, 0.1, 2.0, "none"), (-2.7, 0.1, 2.0, "biased"),
+     (0.0, 1.16, 0.1, "narrow"), (0.0, 1.14, 0.1, "none"), (0.0, 0.86, 0.1, "wide"), (0.0, 0.88, 0.1, "none"),
+     (2.7, 4.0, 2.0, "narrow")],
+)  # fmt: skip
+def test_stated_errors_by_their_limits(
+    mean: float, within: float, reach: float, cause: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Errors of a known mean and spread, intervals that are given: 1.3 times its reach for a bias, 15 % for a spread."""
+    error = mean + within * np.tile([1.0, -1.0], 20)
+    monkeypatch.setattr(verdicts, "mean_interval", lambda values: (values.mean() - reach, values.mean() + reach))
+    monkeypatch.setattr(verdicts, "spread_interval", lambda values: (0.99 * values.std(), 1.01 * values.std()))
+    said = stated_errors(np.append(error, [np.nan, 9.0]), np.append(np.ones(40), [1.0, 0.0]))
+    assert said.cause == cause
+    if cause == "biased":
+        assert said.interval == pytest.approx((mean - reach, mean + reach))
+        common = stated_errors(error, np.ones(40), 1.0)  # a shift that all samples share is no bias
+        assert common.cause == "none"
+    assert stated_errors(error[:19], np.ones(19)).cause == "no interval"
+    assert stated_errors(error[:20], np.ones(20)).cause != "no interval"
+
+
+@pytest.mark.parametrize(
+    ("covered", "clear", "reached", "outside", "cause"),
+    [(0.95, 1.0, 1.0, 0.0, "none"), (0.94, 1.0, 0.95, 0.0, "trees"), (0.5, 0.6, 0.9, 0.0, "level"),
+     (0.5, 0.6, 0.55, 0.0, "blocked"), (0.0, 0.0, 0.4, 0.0, "threshold"), (0.0, 0.0, 0.0, 0.0, "no path"),
+     (0.9, 1.0, 1.0, 0.51, "extrapolated"), (0.99, 1.0, 1.0, 0.5, "none"), (0.5, np.nan, np.nan, 0.0, "blocked")],
+)  # fmt: skip
+def test_the_worst_height_says_what_takes_its_coverage(
+    covered: float, clear: float, reached: float, outside: float, cause: str
+) -> None:
+    here = Coverage(height_m=70.0, covered=covered, clear=clear, reached=reached, outside=outside)
+    said = coverage_verdict([Coverage(height_m=30.0, covered=1.0, outside=1.0), here])
+    assert (said.cause, said.effect, said.where) == (cause, covered, "70 m")
+
+
+@pytest.mark.parametrize(
+    ("causes", "said"),
+    [("better better", "antenna"), ("better worse", "place"), ("not_significant", "not separable"),
+     ("no_interval no_interval", "no interval"), ("better no_interval", "not separable")],
+)  # fmt: skip
+def test_an_antenna_beats_every_wrong_frame_and_a_place_loses_to_one(causes: str, said: str) -> None:
+    """The nearest rival stands: of those that win, where one does."""
+    against = [Verdict(cause=c.replace("_", " "), effect=float(k - 2)) for k, c in enumerate(causes.split())]
+    found = antenna_or_place([*against, Verdict(cause="better")])
+    assert (found.cause, found.effect) == (said, float(len(against) - 3))
+    assert antenna_or_place([Verdict(cause="worse", effect=1.0), Verdict(cause="better", effect=9.0)]).effect == 1.0
 
 
 if __name__ == "__main__":

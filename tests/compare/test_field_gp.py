@@ -279,3 +279,18 @@ def test_all_strengths_are_scaled_together():
     np.testing.assert_allclose(field_gp.covariance(twice, rows, rows), 4.0 * field_gp.covariance(MOVING, rows, rows)
                                - 3.0 * field_gp.MEAN_SD_DB**2)  # fmt: skip
     assert twice.noise_sd_db == 2.0 * MOVING.noise_sd_db
+
+
+def test_before_anything_is_learned_a_field_is_two_decibels_over_fifty_metres():
+    """Entries of the covariance of two samples 40 m apart, 9 m in height, 50 degrees of heading and 30 s."""
+    turn = np.radians(50.0)
+    pair = rows_at([[0, 0, 20], [24, 32, 29]], [0.0, 30.0], 0, [[1, 0, 0], [np.cos(turn), np.sin(turn), 0]])
+    chord = 2.0 * np.sin(turn / 2)
+    near = 4.0 * math.exp(-40 / 50 - 9 / 30 - chord**2 / (2 * 0.49))
+    found = field_gp.covariance(FieldModel(), pair, pair)
+    assert found[0, 1] == pytest.approx(100.0**2 + near + 1.5**2 + 1.5**2 * math.exp(-0.5), abs=1e-9)
+    assert found[0, 0] == pytest.approx(100.0**2 + 4.0 + 2 * 1.5**2)
+    assert field_gp.prior_sd_db(FieldModel(), ("place", "drift")) == pytest.approx(2.5)
+    assert field_gp._noisy(FieldModel(), np.zeros((2, 2)))[0].tolist() == [2.25, 0.0]
+    other = rows_at([[0, 0, 20]], [0.0], 1)
+    assert field_gp.covariance(FieldModel(), pair, other)[0, 0] == pytest.approx(100.0**2 + 4.0)

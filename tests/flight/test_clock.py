@@ -19,6 +19,7 @@ from aerpaw_cmp.flight.clock import (
     ClockChannel,
     _averaged,
     _Bins,
+    _finer,
     _gain_features,
     _judged,
     _Memory,
@@ -293,3 +294,74 @@ def test_a_running_mean_moves_nothing_in_time(width: float) -> None:
     """Of a line it is the line: a mean over an even number of rows, half a step early, would shift every clock."""
     line = np.arange(60.0)[:, None] * [1.0, -3.0]
     np.testing.assert_allclose(_averaged(line, width)[8:-8], line[8:-8], atol=1e-9)
+
+
+def small_bins(t: np.ndarray, window_s: float = 5.0, start_s: float = 0.0, rows: int = 30_000) -> _Bins | None:
+    """Bins of levels sin t over tables whose columns are known: a constant, the time, and a level that is the time."""
+    at = start_s + 0.1 * np.arange(rows)
+    table = Along(
+        start_s=start_s, step_s=0.1, predicted_db={"m": at}, distance_m=at + 1.0, directions=np.ones((rows, 6))
+    )
+    one = ClockChannel(name="one", time_s=t, measured_db=np.sin(t), along=table)
+    return _Bins.of(one, (np.column_stack([np.ones(rows), at]), at[:, None]), window_s)
+
+
+def test_bins_are_seconds_or_nine_hundredths_and_eight_instants_of_each_are_asked() -> None:
+    assert small_bins(np.arange(10.0, 69.0)) is None
+    sixty = small_bins(np.arange(10.0, 70.0))
+    assert sixty is not None
+    assert sixty.n == 60
+    long = small_bins(np.arange(0.0, 2700.0, 0.5) + 10.0)
+    assert long is not None
+    assert long.n == pytest.approx(900, abs=1)
+    np.testing.assert_allclose(np.diff(long.mean_s)[1:-1], 3.0, atol=0.26)
+    dense = small_bins(np.arange(20.0, 100.0, 1 / 30.0)[np.random.default_rng(1).permutation(2400)])
+    assert dense is not None
+    np.testing.assert_array_equal(np.diff(np.append(dense.first, len(dense.at_s))), 8)  # every fourth of thirty
+    np.testing.assert_allclose(dense.at_s[:8], 20.0 + np.arange(8) * 4 / 30)
+    features, residual = dense.system(1.5)
+    asked = dense.at_s.reshape(-1, 8).mean(axis=1) - 1.5
+    np.testing.assert_allclose(features[:, 1], dense.mean_s - 1.5, atol=1e-6)
+    expected = dense.mean_db - asked
+    np.testing.assert_allclose(residual[:, 0], expected - expected.mean(), atol=1e-9)
+
+
+@pytest.mark.parametrize(("first", "last", "kept"), [(5.0, 75.0, 71), (4.9, 74.9, 70), (5.0, 93.0, 88)])
+def test_samples_whose_lags_the_telemetry_does_not_reach_take_no_part(first: float, last: float, kept: int) -> None:
+    """Telemetry from 100 s to 197.9 s of its clock: a window of 5 s on either side lies within it, a row beyond it."""
+    bins = small_bins(100.0 + np.arange(first, last + 0.01), start_s=100.0, rows=980)
+    assert bins is not None
+    assert len(bins.at_s) == kept
+
+
+@pytest.mark.parametrize(("bend", "finest"), [(30.0, 0.02), (0.01, 0.5)])
+def test_lags_are_tried_finely_where_one_stands_out(bend: float, finest: float) -> None:
+    lags = np.arange(-30, 31) * 0.5
+
+    def likelihood(some: np.ndarray) -> np.ndarray:
+        return np.stack([-bend * (some - 1.234) ** 2, -bend * (some - 1.234) ** 2 - 50.0])[None]
+
+    tried, own = _finer(lags, likelihood, 15.0)
+    np.testing.assert_array_equal(own, likelihood(tried))
+    assert set(np.round(lags, 6)) <= set(np.round(tried, 6))
+    assert len(np.unique(np.round(tried, 6))) == len(tried)
+    near = tried[np.abs(tried - 1.234) < (0.3 if bend > 1 else 2.0)]
+    assert np.diff(near) == pytest.approx(finest)
+    assert np.abs(tried).max() <= 15.0
+    edge, _ = _finer(lags, lambda some: -30.0 * (some - 15.0)[None, None] ** 2, 15.0)
+    assert (edge.max(), np.diff(edge)[-1]) == (15.0, pytest.approx(0.02))
+
+
+def test_the_parts_of_a_likelihood_are_the_best_of_their_grid() -> None:
+    one = _Bins.of(channel(0.0, 5, t=np.arange(20.0, 120.0, 1.0)), ALONG.tables(), 15.0)
+    assert one is not None
+    features, residual = one.system(0.5)
+    tried = {
+        (memory, white, gain): _Memory(one.mean_s, memory, white).likelihood(features, residual, (gain,))[0, 0]
+        for memory in (2.0, 5.0, 15.0, 40.0) for white in (0.1, 0.3, 0.9) for gain in (0.05, 0.5, 1.0, 2.0)
+    }  # fmt: skip
+    assert one.fitted(0.5) == [_Parts(*max(tried, key=tried.__getitem__))]
+    flat = np.column_stack([np.ones(one.n), np.zeros(one.n)])
+    away = (one.mean_db - one.mean_db.mean())[:, None]
+    constant = [_Memory(one.mean_s, m, w).likelihood(flat, away, (0.0,))[0, 0] for m, w in {key[:2] for key in tried}]
+    assert one.constant() == pytest.approx(max(constant))

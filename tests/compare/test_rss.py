@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from functools import partial
@@ -12,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aerpaw_cmp.compare import rss
 from aerpaw_cmp.compare.rss import (
     averaged_fits,
     bin_residual,
@@ -25,6 +27,7 @@ from aerpaw_cmp.compare.rss import (
     stretch_means_db,
     stretches,
 )
+from aerpaw_cmp.compare.statistics import autocorrelation
 
 NAN = float("nan")
 
@@ -291,30 +294,6 @@ def test_largest_error_spans_are_found_with_their_cause():
     assert error_spans(time, residual, largest=1) == spans[:1] or len(error_spans(time, residual, largest=1)) == 1
 
 
-@pytest.mark.parametrize(
-    ("context", "words"),
-    [
-        ({"height_m": 1.0}, "take-off"),
-        ({"los": 0.0}, "obstruction"),
-        ({"elevation_deg": 80.0}, "elevation"),
-        ({}, "unmodelled"),
-    ],
-)
-def test_causes(context, words):
-    time = np.arange(100.0)
-    residual = np.where((time > 40) & (time < 50), 20.0, 0.0)
-    spans = error_spans(time, residual, context={k: np.full(100, v) for k, v in context.items()})
-    assert words in spans[0].cause
-
-
-def test_a_turn_is_named():
-    time = np.arange(100.0)
-    residual = np.where((time > 40) & (time < 50), -20.0, 0.0)
-    heading = np.where(time < 45, 350.0, 80.0)
-    spans = error_spans(time, residual, context={"heading_deg": heading})
-    assert "turn by 90 deg" in spans[0].cause
-
-
 def test_two_channels_part_where_the_geometry_says():
     rng = np.random.default_rng(7)
     time = np.arange(0, 200, 0.2)
@@ -361,6 +340,100 @@ def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
             found.intervals.autocorrelation.n_effective < 0.05 * found.n
         )  # 0.26 s apart: neighbours repeat each other
         assert found.correlation > 0.5
+
+
+@pytest.mark.parametrize(
+    ("context", "mean_db", "words"),
+    [
+        ({"height_m": 4.9, "los": 0.0}, -1.0, "take-off"),
+        ({"height_m": 5.0, "los": 0.49, "foliage_m": 9.0}, 1.0, "simulated obstruction"),
+        ({"los": 0.49}, -1.0, "deeper than simulated"),
+        ({"los": 0.5, "foliage_m": 1.01, "elevation_deg": 80.0}, 1.0, "less loss"),
+        ({"foliage_m": 1.01}, -1.0, "more loss"),
+        ({"foliage_m": 1.0, "elevation_deg": 50.1}, -1.0, "steep"),
+        ({"elevation_deg": -50.1, "coherent_minus_power_sum_db": -7.0}, 1.0, "steep"),
+        ({"elevation_deg": 50.0, "coherent_minus_power_sum_db": -6.01}, 1.0, "fade"),
+        ({"coherent_minus_power_sum_db": -6.01}, -1.0, "unmodelled loss"),
+        ({"coherent_minus_power_sum_db": -6.0}, 1.0, "unmodelled path"),
+        ({"heading_deg": 45.0}, 1.0, "unmodelled path"),
+        ({"heading_deg": 45.1}, -1.0, "turn by 45"),
+    ],
+)
+def test_causes_in_their_order_and_by_their_limits(context, mean_db, words):
+    """The typical value is the median of the span; a heading goes from 0 to the value."""
+    of_span = {k: np.array([9e9, v, v, np.nan, v, -9e9]) for k, v in context.items()}
+    if "heading_deg" in context:
+        of_span["heading_deg"] = np.array([180.0, 350.0, np.nan, 350.0, 350.0 + context["heading_deg"], 180.0]) % 360.0
+    assert words in rss._likely_cause(of_span, slice(1, 5), mean_db)
+
+
+def test_bins_and_their_intervals_are_those_by_hand():
+    rng = np.random.default_rng(14)
+    quantity, residual = rng.uniform(0.0, 10.0, 200), rng.normal(size=200)
+    residual[1:] += 0.6 * residual[:-1]
+    quantity[:4] = 2.0, 4.0, 10.0, 11.0  # a border belongs to the bin above it, the last one to its own
+    edges = np.array([0.0, 2.0, 4.0, 10.0])
+    found, inside = bin_residual(residual, quantity, edges), quantity <= 10.0
+    known = autocorrelation(residual[inside])
+    rest = 0.0
+    for k, (low, high) in enumerate(itertools.pairwise(edges)):
+        part = residual[(quantity >= low) & ((quantity < high) | ((quantity == 10.0) & (high == 10.0)))]
+        reach = 1.96 * part.std() / np.sqrt(len(part) * known.n_effective / known.n - 1.0)
+        assert found.n[k] == len(part)
+        assert (found.mean_db[k], found.rmse_db[k]) == pytest.approx((part.mean(), np.sqrt(np.mean(part**2))))
+        assert (found.low_db[k], found.high_db[k]) == pytest.approx(
+            (part.mean() - reach, part.mean() + reach), nan_ok=True
+        )
+        rest += np.sum((part - part.mean()) ** 2)
+    assert np.isfinite(found.low_db).any()
+    total = np.sum((residual[inside] - residual[inside].mean()) ** 2)
+    assert found.explained == pytest.approx(1.0 - rest / total)
+    assert bin_residual(residual, quantity).edges == pytest.approx(np.linspace(quantity.min(), 11.0, 13))
+    assert bin_residual([1.0], [3.0], 2).edges.tolist() == [3.0, 3.5, 4.0]
+
+
+def test_spans_are_runs_of_smoothed_errors_of_one_sign():
+    """Smoothed by a loop; cut where the sign changes or a gap is longer than the window."""
+    rng = np.random.default_rng(15)
+    time = np.round(np.cumsum(rng.choice([0.25, 0.5], 400)), 2)
+    time[200:] += 2.25
+    residual = 4.0 * np.sin(time / 6.0) + rng.normal(size=400)
+    place = np.column_stack([time, -time, 0 * time])
+    smooth = np.array([residual[np.abs(time - t) <= 1.0].mean() for t in time])
+    sign = np.sign(smooth) * (np.abs(smooth) > 2.0)
+    runs = [[0]]
+    for i in range(1, 400):
+        if sign[i] != sign[i - 1] or time[i] - time[i - 1] > 2.0:
+            runs.append([])
+        runs[-1].append(i)
+    expected = [run for run in runs if sign[run[0]]]
+    expected.sort(key=lambda run: -abs(residual[run].mean()) * np.sqrt(time[run[-1]] - time[run[0]] + 1e-3))
+    mixed = rng.permutation(400)
+    found = error_spans(
+        time[mixed], residual[mixed], position_m=place[mixed], context={"x": time[mixed]}, threshold_db=2.0, largest=5
+    )
+    assert len(expected) > 5
+    for span, run in zip(found, expected[:5], strict=True):
+        assert (span.start_s, span.end_s, span.n) == (time[run[0]], time[run[-1]], len(run))
+        assert span.mean_db == pytest.approx(residual[run].mean())
+        assert span.worst_db == residual[run][np.abs(residual[run]).argmax()]
+        assert span.position_m == pytest.approx(place[run].mean(axis=0))
+        assert span.geometry["x"] == pytest.approx(np.median(time[run]))
+    assert len(error_spans(np.arange(600.0), np.tile(np.repeat([9.0, -9.0], 10), 30), threshold_db=1.0)) == 10
+    one, two = -60.0 + 12.0 * np.sin(time / 6.0), np.full(400, -62.0)
+    parted, apart = channel_difference(time, one, two), one - one.mean()
+    assert parted.spans == error_spans(time, apart, window_s=1.0, threshold_db=10.0)
+    assert (parted.n, parted.mean_db, parted.std_db) == pytest.approx((400, (one - two).mean(), apart.std()))
+    assert parted.share_parted == pytest.approx(np.mean(np.abs(apart) > 10.0))
+
+
+@pytest.mark.parametrize(("spread_db", "reach_db"), [(10.0, 40.0), (1.0, 20.0)])
+def test_outliers_lie_four_spreads_beyond_the_quartiles_and_twenty_decibels_at_least(spread_db, reach_db):
+    end = spread_db / 2
+    level = np.concatenate([np.repeat([-end, end], 50), [-end - reach_db + 0.1, end + reach_db - 0.1]])
+    assert not outliers(level).any()
+    assert np.flatnonzero(outliers(level + 0.2 * (np.arange(102) == 101))).tolist() == [101]
+    assert np.flatnonzero(outliers(level - 0.2 * (np.arange(102) == 100))).tolist() == [100]
 
 
 def test_outliers_are_far_outside_the_flights_own_levels():

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.flight import data
 from aerpaw_cmp.flight.data import FlightData, choose_site, gather, read_logs
-from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.flight.simulate import FlightSimulator
+from aerpaw_cmp.site.siteyaml import load_site
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
@@ -155,3 +160,86 @@ def test_levels_without_positions_do_not_refuse_ranks_that_have_some(tmp_path: P
     assert [(s.tower, len(s.time)) for s in data.rank] == [("LW1", 40)]
     assert not data.rss
     assert any("have no positions and are left out" in text for text in data.warnings)
+
+
+def _stream(kind: str, name: str, frame: pd.DataFrame, **attributes: str) -> Any:
+    return SimpleNamespace(kind=kind, name=name, frame=frame, attributes=attributes)
+
+
+@pytest.mark.parametrize(("away", "near"), [(29.9, True), (30.1, False), (-29.9, True), (-30.1, False)])
+def test_places_are_near_a_tower_up_to_thirty_kilometres(away: float, near: bool) -> None:
+    """On a map whose degrees are kilometres; the nearest of the places and of the towers counts."""
+    frame: Any = SimpleNamespace(to_local=lambda latitude, longitude: (1000.0 * longitude, 1000.0 * latitude))
+    towers = {
+        "A": SimpleNamespace(position_m=[500.0, 700.0, 9.0]),
+        "B": SimpleNamespace(position_m=[500.0, -700.0, 9.0]),
+    }
+    of: Any = SimpleNamespace(site=SimpleNamespace(frame=frame, towers=towers, name="s"),
+                              settings=SimpleNamespace(logs=[]), files=[])  # fmt: skip
+    places = np.array([[0.7 + 3.0, 0.5 + away], [0.7, 0.5 + away], [91.0, 0.5], [np.nan, 0.5], [0.7, -181.0]])
+    assert data._nearest_m(of.site, places[:, 0], places[:, 1]) == pytest.approx(1000.0 * abs(away))
+    flown = [("a", _stream("telemetry", "x", pd.DataFrame(places, columns=["latitude_deg", "longitude_deg"])))]
+    if near:
+        data._check_place(of, flown)
+    else:
+        with pytest.raises(InputError):
+            data._check_place(of, flown)
+    assert np.isnan(data._nearest_m(of.site, np.array([91.0, np.nan]), np.array([0.0, 1.0])))
+    assert np.isfinite(data._nearest_m(of.site, np.array([90.0]), np.array([-180.0])))
+
+
+@pytest.mark.parametrize(
+    ("turned", "cause"),
+    [(lambda a, o: (o, a), "exchanged"), (lambda a, o: (a, -o), "west"), (lambda a, o: (-a, o), "south"),
+     (lambda a, o: (-o, a), "exchanged and a sign")],
+)  # fmt: skip
+def test_angles_that_are_turned_are_told_from_their_place(turned: Any, cause: str) -> None:
+    site = load_site("lake_wheeler")
+    latitude, longitude = turned(np.array([35.7275, np.nan]), np.array([-78.696, np.nan]))
+    frame = pd.DataFrame({"latitude_deg": latitude, "longitude_deg": longitude})
+    of: Any = SimpleNamespace(site=site, settings=SimpleNamespace(logs=[]), files=[])
+    with pytest.raises(InputError) as raised:
+        data._check_place(of, [("a", _stream("telemetry", "x", frame))])
+    assert cause in str(raised.value)
+
+
+def test_ranks_lie_at_their_own_places_and_on_the_track_where_they_have_none() -> None:
+    position = np.array([[1.0, 2.0, 3.0], [np.nan] * 3, [np.nan] * 3, [4.0, np.nan, 6.0]])
+    there = np.arange(12.0).reshape(4, 3)
+    pose = SimpleNamespace(position_m=there, valid=np.array([True, True, False, True]))
+    track: Any = SimpleNamespace(pose_at=lambda _: pose)
+    own: Any = SimpleNamespace(position_m=position, time=np.zeros(4))
+    without: Any = SimpleNamespace(position_m=None, time=np.zeros(4))
+    place, known = data.rank_positions(own, track)
+    assert known.tolist() == [True, True, False, True]
+    np.testing.assert_array_equal(place[[0, 1, 3]], [position[0], there[1], there[3]])
+    place, known = data.rank_positions(own, None)
+    assert known.tolist() == [True, False, False, False]
+    place, known = data.rank_positions(without, track)
+    np.testing.assert_array_equal(place, there)
+    assert known.tolist() == pose.valid.tolist()
+
+
+@pytest.mark.parametrize(
+    ("given", "noise", "floor"),
+    [({}, None, None), ({"bandwidth_hz": 20e6, "noise_figure_db": 5.0}, -174.0 + 73.01 + 5.0, None),
+     ({"noise_floor_dbm": -99.0}, -99.0, None)],
+)  # fmt: skip
+def test_a_ratio_becomes_a_level_where_its_noise_is_known(
+    given: dict[str, float], noise: float | None, floor: None
+) -> None:
+    link = FlightFile.model_validate(
+        {"flight": "f", "logs": [{"path": "a"}], "link": {"rss": {"carrier_hz": 3e9} | given}}
+    ).link.rss
+    frame = pd.DataFrame({"rss_db": [1.0]})
+    found, left = data._noise(_stream("rss", "snr", frame), link)
+    assert found == (None if noise is None else pytest.approx(noise, abs=0.1))
+    if noise is not None:
+        assert (left.bandwidth_hz, left.noise_floor_dbm) == (None, floor)
+    assert data._noise(_stream("rss", "quality", frame), link) == (None, link)
+    for stream, ratio in (
+        (_stream("rss", "Quality", frame), True), (_stream("rss", "x", frame, channel="SNR"), True),
+        (_stream("rss", "x", frame, quantity="snr"), True), (_stream("rss", "power", frame), False),
+        (_stream("rank", "snr", frame), False),
+    ):  # fmt: skip
+        assert data.is_ratio(stream) is ratio

@@ -5,13 +5,17 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
+from aerpaw_cmp.flight import draft as drafting
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.draft import draft, receiver_floor_db
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
@@ -349,3 +353,90 @@ def test_a_rank_log_with_positions_of_its_own_is_compared_in_flight(logs: Path, 
     (logs / "nemo.csv").write_bytes(nemo_csv(frame, "2025-06-01T14:00:00Z"))
     text, _ = draft(ingest(logs / "nemo.csv"), logs)
     assert parse_yaml(text, FlightFile).rank.minimum_height_m == low_m
+
+
+def stream(kind: str, level: list[float] | np.ndarray, **attributes: object) -> Any:
+    time = np.datetime64("2025-06-01T14:00:00", "ns") + np.arange(len(level)) * np.timedelta64(1, "s")
+    frame = pd.DataFrame({"time": time, "line": 1, "flag": "", "rank" if kind == "rank" else "rss_db": level})
+    return SimpleNamespace(kind=kind, name=str(attributes.pop("name", kind)), frame=frame, attributes=attributes)
+
+
+@pytest.mark.parametrize(
+    ("held", "n", "floor"), [(9, 500, None), (10, 500, -90.0), (14, 1500, None), (15, 1500, -90.0), (500, 500, None)]
+)
+def test_a_floor_is_a_least_level_that_returns(held: int, n: int, floor: float | None) -> None:
+    """Ten times and in one of a hundred samples, among others; of several streams the highest counts."""
+    level = np.where(np.arange(n) < held, -90.0, -80.0 + 1e-3 * np.arange(n))
+    level = np.append(level, np.nan)
+    assert receiver_floor_db([stream("rss", level)]) == floor
+    assert receiver_floor_db([stream("rss", level), stream("rss", level + 7.0)]) == (None if floor is None else -83.0)
+
+
+def test_cells_of_a_scanner_are_the_six_fullest_that_are_no_strays() -> None:
+    sizes = {1: 100, 2: 5, 3: 4, 7: 30, 8: 31, 9: 32, 10: 33, 11: 34}
+    streams = [stream("rss", np.zeros(n), pci=str(pci)) for pci, n in sizes.items()]
+    assert drafting._cells(streams) == [1, 7, 8, 9, 10, 11]
+    assert drafting._cells(streams[:4]) == [1, 2, 7]
+    assert drafting._cells([stream("rss", [1.0])]) == []
+
+
+@pytest.mark.parametrize(
+    ("offsets", "span"),
+    [
+        ([], None),
+        ([30.0], None),
+        ([30.1], [10, 60]),
+        ([-30.0, 30.0], None),
+        ([-30.1], [-60, -10]),
+        ([-41.0, 36.0], [-70, 60]),
+    ],
+)
+def test_a_span_of_offsets_reaches_twenty_decibels_beyond_whole_tens(
+    offsets: list[float], span: list[int] | None
+) -> None:
+    assert drafting._span_of_offsets(offsets) == ({} if span is None else {"span_db": span})
+
+
+def test_of_quantities_of_one_cell_the_power_of_its_signal_leads() -> None:
+    cell = {"node": "LW1", "rat": "lte", "pci": 3, "arfcn": 7}
+    rsrp, rsrq, rssi, other = (
+        stream("rss", [1.0], name=name, quantity=quantity, **(cell | {"pci": pci}))
+        for name, quantity, pci in (("a", "RSRP", 3), ("b", "RSRQ", 3), ("c", "RSSI", 3), ("d", "RSSI", 4))
+    )
+    assert drafting._leading([rssi, rsrq, other, rsrp]) == {"c": "a", "b": "a"}
+    assert drafting._leading([rssi, other, stream("rank", [1.0])]) == {}
+
+
+def test_the_track_is_the_telemetry_that_most_logs_meet_then_the_longest() -> None:
+    def file(*streams: Any) -> Any:
+        return SimpleNamespace(result=SimpleNamespace(streams=list(streams)))
+
+    def moved(one: Any, seconds: float) -> Any:
+        one.frame["time"] += np.timedelta64(round(1e9 * seconds), "ns")
+        return one
+
+    short, long = stream("telemetry", np.zeros(10)), moved(stream("telemetry", np.zeros(500)), 1000.0)
+    level = stream("rss", np.zeros(3))
+    found = drafting._flown([file(long), file(short), file(level)])
+    assert found is not None
+    assert found[0] is short
+    found = drafting._flown([file(long), file(short)])
+    assert found is not None
+    assert found[0] is long
+    assert drafting._flown([file(level)]) is None
+    edge, after = moved(stream("rss", np.zeros(2)), 9.0), moved(stream("rss", np.zeros(2)), 9.5)
+    spans = [drafting.stream_span(one) for one in (short, edge, after)]
+    assert drafting._meet(spans[0], spans[1])
+    assert not drafting._meet(spans[0], spans[2])
+    assert drafting._has_level([file(edge)], (short, spans[0]))
+    assert not drafting._has_level([file(after)], (short, spans[0]))
+    assert drafting._has_level([file(after)], None)
+    assert not drafting._has_level([file(stream("rss", [1.0], name="quality"))], None)
+
+
+@pytest.mark.parametrize(("share", "known"), [(0.5, False), (0.51, True)])
+def test_an_attitude_is_there_where_most_rows_hold_it(share: float, known: bool) -> None:
+    frame = pd.DataFrame(dict.fromkeys(("roll_deg", "pitch_deg"), np.zeros(100)))
+    frame["yaw_deg"] = np.where(np.arange(100) < 100 * share, 1.0, np.nan)
+    assert drafting._has_attitude(frame) is known
+    assert not drafting._has_attitude(frame[["roll_deg", "pitch_deg"]])

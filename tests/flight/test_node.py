@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.common.yamlfile import parse_yaml
+from aerpaw_cmp.compare.locate import NodeEstimate, level_track
+from aerpaw_cmp.flight import node
 from aerpaw_cmp.flight.draft import draft
 from aerpaw_cmp.flight.node import listed_places
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.logs.ingest import IngestedFile, ingest
 from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.records import Stream
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = load_site("lake_wheeler")
@@ -89,3 +94,117 @@ def test_the_span_of_offsets_holds_the_expected_one(tmp_path: Path, level_100_m:
     expected = 40.0 - 82.8 - level_100_m  # Friis over 100 m at 3.3 GHz: -82.8 dB
     assert low + 10.0 < expected < high - 10.0
     assert ((low, high) != (-50.0, 50.0)) is moved
+
+
+def _placer(listed: list[node.ListedPlace] | None = None) -> node.Placer:
+    track = _track()
+    latitude, longitude = SITE.frame.to_geographic(track[:, 0], track[:, 1])
+    time = np.datetime64("2025-06-01T14:00:00", "ns") + np.arange(500) * np.timedelta64(1, "s")
+    frame = pd.DataFrame({"time": time, "line": 1, "flag": "", "latitude_deg": latitude, "longitude_deg": longitude,
+                          "altitude_m": np.where(np.arange(500) < 9, 4.9, track[:, 2])})  # fmt: skip
+    nothing = dict.fromkeys(
+        (
+            "roll_deg",
+            "pitch_deg",
+            "yaw_deg",
+            "velocity_north_mps",
+            "velocity_east_mps",
+            "velocity_down_mps",
+            "fix",
+            "satellites",
+        ),
+        np.nan,
+    )
+    return node.Placer(SITE, Stream("telemetry", "x", frame.assign(**nothing)), listed or [])
+
+
+def _place(at: tuple[float, float], line: int) -> node.ListedPlace:
+    latitude, longitude = SITE.frame.to_geographic(np.array([at[0]]), np.array([at[1]]))
+    return node.ListedPlace("list.txt", line, float(latitude[0]), float(longitude[0]))
+
+
+@pytest.mark.parametrize(
+    ("towers", "listed", "said"),
+    [((2.0, 0.0), (), "LW1"), ((1.9, 0.0), (), "estimate"), ((0.0, 7.0), (), "LW2"), ((2.5, 0.0), (2.4, 0.0), "LW1"),
+     ((2.4, 0.0), (0.0, 2.4), 8), ((-9.0, -9.0), (1.9, 1.0), "estimate"), ((-9.0, -9.0), (2.0, 1.0), 7)],
+)  # fmt: skip
+def test_a_place_wants_odds_of_two_and_a_listed_one_as_many_as_any_tower(
+    towers: tuple[float, ...], listed: tuple[float, ...], said: str | int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Towers by their order; a list is of lines 7, 8 and one 6 km away, of which no odds are asked."""
+    names = list(SITE.towers)
+    placer = _placer(
+        [_place((-100.0, 50.0), 7), _place((250.0, -90.0), 8), _place((6000.0, 0.0), 9)][: 3 * bool(listed)]
+    )
+    odds = np.full(len(names), -20.0)
+    odds[:2] = towers
+    estimate = NodeEstimate(
+        place_m=np.array([30.0, 40.0, 10.0]), radius90_m=77.0, height_m=(1.5, 10.0), slope=3.0, slope_sd=0.2,
+        log_odds=np.array([*odds, *listed]), at_edge=False,
+    )  # fmt: skip
+    asked: list[FloatArray] = []
+    monkeypatch.setattr(node, "locate", lambda _, places: asked.append(places) or estimate)
+    track = level_track(4.0 * np.arange(20), np.zeros((20, 3)), np.zeros(20))
+    found = placer.propose(track)
+    assert found is not None
+    assert len(asked[0]) == len(names) + len(listed)
+    assert placer.propose(level_track(4.0 * np.arange(19), np.zeros((19, 3)), np.zeros(19))) is None
+    if isinstance(said, int):
+        assert found.tower is not None
+        assert (found.node, found.tower["antenna_height_m"], found.radius_m) == ("NODE", 1.5, 0.0)
+        assert f"line {said}" in found.question
+        assert (f"line {15 - said}" in found.question) == (max(listed) - min(listed) < 3.0)
+        np.testing.assert_allclose(asked[0][-2:, :2], [[-100.0, 50.0], [250.0, -90.0]], atol=1e-3)
+    elif said == "estimate":
+        assert found.tower is not None
+        east, north = SITE.frame.to_local(*(np.array([found.tower[f"{k}_deg"]]) for k in ("latitude", "longitude")))
+        assert (east[0], north[0]) == pytest.approx((30.0, 40.0), abs=0.02)
+        assert (found.radius_m, found.tower["antenna_height_m"]) == (77.0, 10.0)
+        again = placer.propose(track)
+        assert again is not None
+        assert (again.node, again.tower) == (found.node, None)  # the same place has one name
+    else:
+        assert (found.node, found.tower) == (names[("LW1", "LW2").index(said)], None)
+
+
+def test_nodes_a_hundred_metres_apart_have_names_of_their_own() -> None:
+    placer = _placer()
+    names = [placer._node(np.array([e, 0.0, 1.5]), 35.0, -78.0, 1.5, "").node for e in (0.0, 99.0, 101.0, 300.0, 102.0)]
+    assert names == ["NODE", "NODE", "NODE2", "NODE3", "NODE2"]
+    for away, near in ((4990.0, True), (5010.0, False)):
+        place = _place((placer.track.pose_at(np.array([placer.track.start_ns], "datetime64[ns]")).position_m[0, 0] + away,
+                        float(_track()[0, 1])), 1)  # fmt: skip
+        assert placer._near(place.latitude_deg, place.longitude_deg) is near
+    assert placer.at_site
+
+
+@pytest.mark.parametrize(("more", "other"), [(7.9, None), (8.1, "LW2")])
+def test_another_tower_is_named_where_its_evidence_is_far_above(
+    more: float, other: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evidence = np.arange(len(SITE.towers)) * -30.0
+    evidence[1] = more
+    monkeypatch.setattr(node, "fit_places", lambda *_: SimpleNamespace(evidence=evidence))
+    track = level_track(4.0 * np.arange(20), np.zeros((20, 3)), np.zeros(20))
+    assert _placer().contradiction(track, "LW1") == other
+    assert _placer().contradiction(track, "LW2") is None
+    assert _placer().contradiction(track, "elsewhere") is None
+    assert _placer().contradiction(level_track([0.0], np.zeros((1, 3)), [1.0]), "LW1") is None
+
+
+def test_levels_are_taken_in_flight_and_their_offset_is_that_to_free_space() -> None:
+    """40 dBm at 3.3 GHz; below five metres nothing counts, and below the floor of the receiver its floor."""
+    placer = _placer()
+    time = np.datetime64("2025-06-01T14:00:00", "ns") + np.arange(400) * np.timedelta64(1, "s")
+    away = np.linalg.norm(_track()[:400] - SITE.towers["LW1"].position_m, axis=1)
+    level = 40.0 - 20.0 * np.log10(4.0 * np.pi * away * 3.3e9 / 299792458.0) - 17.0
+    frame = pd.DataFrame({"time": time, "line": 1, "flag": "", "rss_db": level})
+    track = placer.levels(Stream("rss", "power", frame))
+    assert track.time_s.min() - time[0].astype(np.int64) * 1e-9 > 8.0
+    assert placer.offset_db(track, "LW1") == pytest.approx(17.0, abs=0.2)
+    assert placer.offset_db(track, "nowhere") is None
+    frame.loc[200:, "rss_db"] = np.nan
+    frame.loc[200:299, "flag"] = "out_of_coverage"
+    lost = placer.levels(Stream("rss", "power", frame), -90.0)
+    assert lost.below.sum() == 25
+    assert lost.time_s.max() - time[0].astype(np.int64) * 1e-9 < 300.0

@@ -461,13 +461,13 @@ def over_two(
         dyads.select(on_n, edge_1[7][0], edge_1[6][0]), dyads.select(on_n, edge_1[7][1], edge_1[6][1]),
         dyads.select(on_n, edge_1[7][2], edge_1[6][2]),
     )  # fmt: skip
-    hard_1, slope_1 = at_face(
+    te_1, tm_1, slope_1 = at_face(
         angle_round(here), shared_1 * np.pi * edge_1[5], (1.0 - 2.0 * shared_1) * STEP_RAD, edge_1[5],
-        wave_number * first * gap * sin_1 * sin_1 / (first + gap),
+        wave_number * first * gap * sin_1 * sin_1 / (first + gap), sin_1, material,
     )  # fmt: skip
-    hard_2, slope_2 = at_face(
+    te_2, tm_2, slope_2 = at_face(
         angle_round(there), shared_2 * np.pi * edge_2[5], (1.0 - 2.0 * shared_2) * STEP_RAD, edge_2[5],
-        wave_number * last * gap * sin_2 * sin_2 / (last + gap),
+        wave_number * last * gap * sin_2 * sin_2 / (last + gap), sin_2, material,
     )  # fmt: skip
     # matrices lack one factor 1 / sine each, bases another, and the height of a ray over the face gains one
     spread = 1.0 / (2.0 * wave_number**2 * (sin_1 * sin_2) ** 2 * np.sqrt(first * gap * last))
@@ -476,8 +476,8 @@ def over_two(
     te, tm = along_face(wave_number * gap, material)
     slope_1, slope_2, whole = slope_1 / sin_1, slope_2 / sin_2, 4.0 * wave_number * gap
     soft_te, soft_tm = 1.0 - np.abs(te * te) / whole, 1.0 - np.abs(tm * tm) / whole
-    beta = spread * (slope_1 * soft_te + te * hard_1) * (slope_2 * soft_te + te * hard_2)
-    phi = spread * (slope_1 * soft_tm + tm * hard_1) * (slope_2 * soft_tm + tm * hard_2)
+    beta = spread * (slope_1 * soft_te + te * te_1) * (slope_2 * soft_te + te * te_2)
+    phi = spread * (slope_1 * soft_tm + tm * tm_1) * (slope_2 * soft_tm + tm * tm_2)
     joined = beta, 0.0 * beta, 0.0 * phi, phi
     inward_1, inward_2 = into_face(edge_1, shared_1), into_face(edge_2, shared_2)
     apart = edge_2[0][0] - edge_1[0][0], edge_2[0][1] - edge_1[0][1], edge_2[0][2] - edge_1[0][2]

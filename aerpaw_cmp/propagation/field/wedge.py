@@ -19,7 +19,7 @@ from scipy.special import wofz
 
 from ...common.units import FloatArray
 from .dyads import Number, larger, select, sine_cosine, smaller
-from .fresnel import coefficients, echo, half_space
+from .fresnel import coefficients, echo, half_space, slab
 
 MIDDLE = 2.0
 """Argument of the transition function that the variable of its polynomial has at 0."""
@@ -166,7 +166,9 @@ def matrix(terms: Any, angles: Any, face_0: Any, face_n: Any) -> Any:
     )  # fmt: skip
 
 
-def at_face(angle: Number, top: Number, rise: Number, exterior: Number, distance: Number) -> tuple[Any, Any]:
+def at_face(
+    angle: Number, top: Number, rise: Number, exterior: Number, distance: Number, sine: Number, face: Any
+) -> tuple[Any, Any, Any]:
     """A wedge from an angle to one of its faces: what passes where waves add up, and how it grows where they cancel.
 
     Parameters
@@ -180,11 +182,16 @@ def at_face(angle: Number, top: Number, rise: Number, exterior: Number, distance
     exterior : Number
     distance : Number
         As for :func:`wedge`.
+    sine : Number
+        Of the angle between ray and edge.
+    face : tuple of 3 Number
+        Permittivity and thickness in wavelengths.
 
     Returns
     -------
-    hard : complex
-        ``T(pi + d) + T(pi - d)``, half of a perfectly hard wedge, faded out at the shadow boundary.
+    hard_te, hard_tm : complex
+        ``T(pi + d) + T(pi - d)``, half of a perfectly hard wedge. Above the face the end sees the other edge too; what
+        comes from there holds the wave along the face by the face's reflection, so the jump takes that as a factor.
     slope : complex
         Derivative by the angle above the face of a perfectly soft wedge.
     """
@@ -192,20 +199,33 @@ def at_face(angle: Number, top: Number, rise: Number, exterior: Number, distance
     on_plane = np.abs(np.abs(angle - top) - np.pi) < 4.0 * np.abs(rise)
     angle = select(on_plane, angle + 8.0 * rise, angle)
     scale = -np.exp(-0.25j * np.pi) / (2.0 * np.sqrt(2.0 * np.pi)) / exterior
-    less = top - angle
-    hard = both_ways(less, exterior, distance)
-    near = both_ways(top + rise - angle, exterior, distance)
-    far = both_ways(top + rise + angle, exterior, distance)
-    half, _ = sine_cosine((np.pi - np.abs(top - angle)) / (4.0 * np.pi))
-    depth = 2.0 * distance * half * half
-    return scale * hard * (depth / (1.0 + depth)), scale * (near - far) / np.abs(rise)
+    away = np.abs(top - angle)
+    lit = away < np.pi
+    te, tm = mirror_of(select(lit, sine * np.sin(away), 0.0), face)
+    rest, jump = both_ways(away, exterior, distance)
+    near, near_jump = both_ways(np.abs(top + rise - angle), exterior, distance)
+    far, far_jump = both_ways(np.abs(top + rise + angle), exterior, distance)
+    slope = scale * (near + near_jump - far - far_jump) / np.abs(rise)
+    return scale * (rest + jump * select(lit, te, 1.0)), scale * (rest + jump * select(lit, tm, 1.0)), slope
 
 
-def both_ways(less: Number, exterior: Number, distance: Number) -> Any:
-    """``T(pi + less) + T(pi - less)`` of :func:`wedge` as a complex number."""
-    up_re, up_im, _ = edge_term(np.pi + less, exterior, distance)
-    down_re, down_im, _ = edge_term(np.pi - less, exterior, distance)
-    return up_re + down_re + 1j * (up_im + down_im)
+def mirror_of(cosine: Number, face: Any) -> tuple[Any, Any]:
+    """Reflection coefficients TE and TM of a face of one material, as complex numbers."""
+    eta_re, eta_im, thickness = face
+    te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
+    finite = np.isfinite(thickness)
+    e_re, e_im = echo(select(finite, thickness, 0.0), root_re, root_im)
+    e_re, e_im = select(finite, e_re, 0.0), select(finite, e_im, 0.0)
+    te_re, te_im = slab(te_re, te_im, e_re, e_im)
+    tm_re, tm_im = slab(tm_re, tm_im, e_re, e_im)
+    return te_re + 1j * te_im, tm_re + 1j * tm_im
+
+
+def both_ways(away: Number, exterior: Number, distance: Number) -> tuple[Any, Any]:
+    """``T(pi + away)`` and ``T(pi - away)`` of :func:`wedge` as complex numbers; the second jumps at a boundary."""
+    up_re, up_im, _ = edge_term(np.pi + away, exterior, distance)
+    down_re, down_im, _ = edge_term(np.pi - away, exterior, distance)
+    return up_re + 1j * up_im, down_re + 1j * down_im
 
 
 def along_face(gap: Number, face: Any) -> tuple[Any, Any]:

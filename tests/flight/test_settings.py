@@ -1,0 +1,85 @@
+"""Limits of flight.yaml: the last value that is taken and the first that is not."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from aerpaw_cmp.flight.settings import FlightFile
+
+POINT = {"east_m": 0, "north_m": 0, "height_m": 5}
+PLAN = {"start": "2025-06-01T10:00:00", "waypoints": [POINT, POINT]}
+TINY = 1e-9
+LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
+    "link.rss.uav.elements": ([1, 64], [0, 65]),
+    "link.rss.bandwidth_hz": ([TINY], [0.0]),
+    "logs.height_m": ([-1000, 20_000], [-1000.1, 20_000.1]),
+    "logs.frequency_hz": ([TINY], [0.0]),
+    "flight.plan.waypoints": ([[POINT, POINT]], [[POINT]]),
+    "flight.plan.speed_mps": ([TINY], [0.0]),
+    "flight.plan.climb_mps": ([TINY], [0.0]),
+    "flight.plan.telemetry_interval_s": ([TINY], [0.0]),
+    "flight.plan.rss_interval_s": ([TINY], [0.0]),
+    "flight.plan.rank_interval_s": ([TINY], [0.0]),
+    "flight.plan.fading_db": ([0.0], [-TINY]),
+    "flight.plan.fading_correlation_s": ([TINY], [0.0]),
+    "flight.plan.bad_lines": ([0, 5], [-1]),
+    "flight.plan.rank_k": ([TINY], [0.0]),
+    "flight.plan.rank_error_share": ([0, 1], [-TINY, 1 + TINY]),
+    "flight.plan.no_csi_share": ([0, 1], [-TINY, 1 + TINY]),
+    "flight.name": (["a", "0_.-"], ["", "-a", ".a", "a b"]),
+    "towers.N.latitude_deg": ([-90, 90], [-90.1, 90.1]),
+    "towers.N.longitude_deg": ([-180, 180], [-180.1, 180.1]),
+    "towers.N.antenna_height_m": ([TINY], [0.0]),
+    "rt.advanced.samples": (["auto", 1, 100_000_000], [0, 100_000_001]),
+    "rt.advanced.gamma_db_per_m": ([TINY], [0.0]),
+    "rt.advanced.maximum_loss_db": ([TINY], [0.0]),
+    "rt.advanced.maximum_gap_s": ([TINY], [0.0]),
+    "rt.advanced.threads": ([1, 1024], [0, 1025]),
+    "rt.max_depth": ([0, 3], [-1, 4]),
+    "rt.reflection_loss_db": ([0.0], [-TINY]),
+    "rt.ground_roughness_m": ([0, 10], [-TINY, 10.1]),
+    "rt.audit_links": ([0], [-1]),
+    "rss.advanced.step_db": ([0.001], [0.0]),
+    "rss.advanced.lag_window_s": ([TINY, 3600], [0.0, 3600.1]),
+    "rss.window_s": ([0.0], [-TINY]),
+    "rss.span_db": ([[-1.0, 1.0], [0.0, 100_000.0]], [[1.0, 1.0], [2.0, 1.0], [0.0, 100_000.2]]),
+    "rank.advanced.bootstrap": ([0, 100_000], [-1, 100_001]),
+    "rank.k": ([[1.001], [10.0] * 64], [[], [1.0], [10.0, 0.5], [10.0] * 65]),
+    "trained_on": ([["a" * 64], []], [["a" * 63], ["g" * 64]]),
+    "timezone": (["UTC", None], ["Nowhere/City"]),
+}
+
+
+def flight(key: str, value: Any) -> dict[str, Any]:
+    """A flight file with one key, whatever else it needs beside it."""
+    content: dict[str, Any] = {
+        "flight": {"name": "f", "plan": dict(PLAN)}, "logs": [{"path": "a"}], "link": {"rss": {"carrier_hz": 3e9, "uav": {}}},
+        "towers": {"N": {"latitude_deg": 35.0, "longitude_deg": -78.0}},
+    }  # fmt: skip
+    *way, last = key.split(".")
+    here = content["logs"][0] if way == ["logs"] else reduce(lambda part, name: part.setdefault(name, {}), way, content)
+    here[last] = value
+    return content
+
+
+@pytest.mark.parametrize("key", LIMITS)
+def test_a_key_takes_its_limits_and_nothing_beyond(key: str) -> None:
+    taken, refused = LIMITS[key]
+    for value in taken:
+        FlightFile.model_validate(flight(key, value))
+    for value in refused:
+        with pytest.raises(ValidationError):
+            FlightFile.model_validate(flight(key, value))
+
+
+def test_a_local_mean_wants_a_window() -> None:
+    content = flight("rss.window_s", 0.1)
+    content["rss"]["field"] = "local_mean"
+    FlightFile.model_validate(content)
+    content["rss"]["window_s"] = 0.0
+    with pytest.raises(ValidationError, match="window_s"):
+        FlightFile.model_validate(content)

@@ -8,13 +8,21 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.field_difference import FieldAudit
-from aerpaw_cmp.propagation.arrays import Isotropic, Link, Poses, rotation_from_yaw_pitch_roll, single_element
+from aerpaw_cmp.propagation.arrays import (
+    Isotropic,
+    Link,
+    Poses,
+    linear_array,
+    rotation_from_yaw_pitch_roll,
+    single_element,
+)
 from aerpaw_cmp.propagation.check import audit as audit_module
 from aerpaw_cmp.propagation.check import explain, reference
 from aerpaw_cmp.propagation.check.audit import Audit, Second, _spread, compare, extra_rows
 from aerpaw_cmp.propagation.check.field_audit import (
     Expected,
     _another_rank,
+    _explicit,
     _lacking,
     _level_error,
     _link_error,
@@ -23,6 +31,7 @@ from aerpaw_cmp.propagation.check.field_audit import (
     impossible,
     spread_over_paths,
 )
+from aerpaw_cmp.propagation.drivers.pairs import replay_pairs
 from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.paths import path_lengths
@@ -182,6 +191,47 @@ def test_two_replays_differ_by_what_was_planted() -> None:
     numbers = dict.fromkeys(("seconds", "reference_seconds"), 1.0) | dataclasses.asdict(none)
     words = Audit(engine="image", reference="sionna", links=3, **numbers).as_dict()
     assert (words["rss_max_error_db"], words["missing_paths"], words["field"]) == (None, 2, None)
+    assert set(words["rank_disagreement"]) == {"10", "100", "1000"}
+
+
+@pytest.mark.parametrize(("off", "failed"), [(0.0, False), (0.009, False), (0.011, True)])
+def test_explicit_arrays_are_asked_next_to_the_towers(
+    monkeypatch: pytest.MonkeyPatch, off: float, failed: bool
+) -> None:
+    """The ten nearest poses within 150 m of a tower; the better half of the links decides."""
+    array = linear_array(2, 0.04)
+    link = Link(3.3e9, dict.fromkeys(("LW1", "LW2"), array), array)
+    there = np.stack([SITE.towers[name].position_m for name in ("LW1", "LW2")])
+    away = np.array([20.0, 149.0, 151.0, 40.0, 60.0, 80.0, 90.0, 100.0, 110.0, 120.0, 130.0, 140.0, 145.0])
+    spots = there[np.arange(13) % 2] + np.stack([0.0 * away, 0.6 * away, 0.8 * away], axis=1)
+    poses, asked = Poses(spots, np.tile(np.eye(3), (13, 1, 1))), []
+
+    def own(faces, links, rotation, link, rays, **named) -> np.ndarray:
+        assert named["explicit"]
+        assert len(rotation) == len(links.targets_m)
+        asked.extend(sorted(np.linalg.norm(links.targets_m[:, None] - there, axis=2).min(axis=1).round().tolist()))
+        ours = replay_pairs(SITE, link, Poses(links.targets_m, rotation), Search(max_depth=1)).h
+        wrong = (
+            np.abs(ours).max(axis=(2, 3), keepdims=True)
+            * np.where(np.arange(len(ours)) % 5 < 3, off, 0.5)[:, None, None, None]
+        )
+        return ours + np.where(np.arange(2) == 1, wrong, 0.0)
+
+    monkeypatch.setattr("aerpaw_cmp.propagation.search.sionna.own_channels", own)
+    found = _explicit(SITE, link, poses, 1)
+    assert asked == [20, 40, 60, 80, 90, 100, 110, 120, 130, 140]
+    assert found.explicit_links == 20
+    assert found.explicit_max_error == pytest.approx(off, abs=1e-12)
+    assert bool(found.failures) == failed
+    slanted = dataclasses.replace(array, positions_m=2 * array.positions_m)
+    one = single_element(Isotropic())
+    for other in (
+        dataclasses.replace(link, uav_array=single_element(HalfWaveDipole())),
+        dataclasses.replace(link, tower_arrays={"LW1": array, "LW2": slanted}),
+        dataclasses.replace(link, tower_arrays={"LW1": one, "LW2": one}, uav_array=one),
+    ):
+        assert _explicit(SITE, other, poses, 1).explicit_links == 0
+    assert _explicit(SITE, link, Poses(spots[2:3], np.eye(3)[None]), 1).explicit_links == 0
 
 
 @pytest.mark.parametrize(("samples", "rays"), [("auto", 100_000), (5_000, 5_000), (300_000, 100_000)])

@@ -164,12 +164,13 @@ def test_threads_and_chunks_change_no_bit(monkeypatch, case):
         assert np.array_equal(other.power, found[0].power)
 
 
-def test_no_pose_is_shared_by_two_threads(monkeypatch, case):
+def test_no_pose_is_shared_by_two_threads(case):
     """Two threads adding to one link would lose what the other adds."""
     pose = case[3].pose
     for chunk in (1, 7, 64, 10_000):
-        monkeypatch.setattr(field_sum, "PATHS_PER_PART", chunk)
-        parts = field_sum.parts_between_poses(pose)
+        parts = field_sum.parts_between_poses(pose, chunk)
+        assert max(part.stop - part.start for part in parts) <= chunk - 1 + np.bincount(pose).max()
+        assert min((part.stop - part.start for part in parts[:-1]), default=chunk) >= chunk
         assert [part.start for part in parts] == [0, *(part.stop for part in parts[:-1])]
         assert parts[-1].stop == len(pose)
         assert all(pose[part.stop - 1] != pose[part.stop] for part in parts[:-1])

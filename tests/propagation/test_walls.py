@@ -222,6 +222,7 @@ def test_steps_of_a_path_are_its_walls_in_order_and_roofs_count() -> None:
         depth = int(paths.depth[k])
         faces, points = paths.faces[k, :depth], paths.vertices_m[k, :depth]
         own = faces < len(found.through.faces) // 2
+        assert (paths.faces[k, depth:] == -1).all()
         corners = np.array([[0.0, 0.0, 10.0], *points[own], target])
         expected = []
         for a, b in itertools.pairwise(corners):

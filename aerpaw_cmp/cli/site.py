@@ -230,7 +230,8 @@ def map_(
         print_json(outcome.metrics)
         return
     rows = [[p["where"], p["what"], p["paper"], p["ours"]] for p in outcome.metrics["paper"]]
-    table(["where", "what", "paper", "here"], rows, "What the paper states, and what this run gives")
+    if rows:
+        table(["where", "what", "paper", "here"], rows, "What the paper states, and what this run gives")
     for path in outcome.files:
         if path.parent == outcome.folder:
             print(path)

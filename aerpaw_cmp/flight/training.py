@@ -107,4 +107,4 @@ def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[
         elif rss or rank:
             kept.append(dataclasses.replace(data, rss=rss, rank=rank))
         home |= {digest: name for digest in flight_logs(data) if digest not in home}
-    return kept, said
+    return kept, list(dict.fromkeys(said))

@@ -519,8 +519,9 @@ def run_map(
                 outcome, name=Path(site).stem, stages_s=stages.seconds, paper=paper_rows(outcome)
             )
             written = write_maps(record, part)
-            written.append(part / "paper.md")
-            written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
+            if record.paper:
+                written.append(part / "paper.md")
+                written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
     results = tuple(folder / path.relative_to(part) for path in (*written, *files))
     return JobOutcome(folder=folder, metrics=maps_metrics(record), files=results)
 

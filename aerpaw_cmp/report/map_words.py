@@ -50,7 +50,7 @@ def first_words(data: MapsData) -> str:
         threshold=float(data.settings.get("threshold_dbm", -np.inf)),
     )
     best = max(heights, key=lambda one: one.covered)
-    more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if len(heights) > 1 else ""
+    more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""
     measured = "" if data.corrected else "Nothing here was measured. "
     return f"{measured}{more}{said}"
 

@@ -106,9 +106,11 @@ class Material:
             if band[0] <= frequency_ghz <= band[1]:
                 return band
         ranges = ", ".join(f"{low:g}-{high:g} GHz" for low, high, *_ in self.bands)
+        edge = min((end for band in self.bands for end in band[:2]), key=lambda end: abs(math.log(end / frequency_ghz)))
+        near = stated_name(self.relative_permittivity(edge * 1e9).real, self.conductivity_s_per_m(edge * 1e9), None)
         raise UsageError(
             f"ITU-R P.2040 gives no values for '{self.name}' at {frequency_ghz:g} GHz",
-            expected=ranges,
+            expected=f"{ranges}, or numbers of your own in the site.yaml, '{near}' say (those of {edge:g} GHz)",
             cause="the carrier was given in MHz or GHz where hertz are expected" if frequency_hz < 1e6 else None,
         )
 

@@ -18,6 +18,7 @@ from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs.mapping import coverage_map as mapping
+from aerpaw_cmp.jobs.mapping.paper_table import paper_rows
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import rank_of_singular_values
 from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL
@@ -282,6 +283,11 @@ def test_the_page_shows_every_figure_of_the_paper_rows(made):
     assert {"out of coverage at 3 m", "c1 of the bi-exponential model"} <= what
     states = next(row for row in printed["paper"] if row["what"] == "UAV locations")
     assert (states["paper"], states["ours"]) == ("36 x 71 = 2556", "6 x 11 = 66")
+
+
+def test_another_site_is_not_held_against_the_paper():
+    towers = {"A": None, "LW1": None}
+    assert list(paper_rows(types.SimpleNamespace(site=types.SimpleNamespace(towers=towers)))) == []
 
 
 def test_the_paper_page_has_the_rows_that_a_run_prints(made):

@@ -68,6 +68,8 @@ def test_several_heights_name_the_best_and_the_worst(maps_data: MapsData) -> Non
     text = first_words(maps_data)
     assert f"Best height: {max(joint, key=lambda h: joint[h]):g} m, {100 * max(joint.values()):.1f} %." in text
     assert f"Least coverage: {100 * min(joint.values()):.1f} % of the positions at 30 m" in text
+    alike = tuple(dataclasses.replace(item, coverage=1.0) for item in maps_data.rss)
+    assert "Best height" not in first_words(dataclasses.replace(maps_data, rss=alike))
 
 
 def test_warnings_and_notes_stand_only_under_their_condition(maps_data: MapsData) -> None:

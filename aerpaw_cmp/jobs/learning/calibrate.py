@@ -199,7 +199,7 @@ def calibrate(
     if score:
         with stages("score"):
             others, said = _score_others(score, flights, logs_root, learned, observed)
-        scores, warnings = {**scores, "other_flights": others}, [*warnings, *said]
+        scores, warnings = {**scores, "other_flights": others}, list(dict.fromkeys([*warnings, *said]))
     return Calibration(
         settings=settings,
         flights=tuple(flights),

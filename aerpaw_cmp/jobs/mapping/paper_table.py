@@ -26,7 +26,9 @@ WORDS = {"zero": "Z as rank 0", "missing": "Z left out"}
 
 
 def paper_rows(outcome: MapOutcome) -> Iterator[PaperRow]:
-    """All rows, in the order of the paper; those of the study only when it was made."""
+    """All rows, in the order of the paper, whose towers the site has; those of the study only when it was made."""
+    if not {f"LW{number}" for number in range(1, 6)} <= set(outcome.site.towers):
+        return
     result = outcome.shown
     heights = result.rss_altitudes_m or (0.0,)
     facts = {"low": f"{heights[0]:g}", "high": f"{heights[-1]:g}", "mode": outcome.settings.shown}

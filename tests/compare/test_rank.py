@@ -231,6 +231,30 @@ def test_best_k_is_found_within_its_interval():
 
 def test_the_grid_of_k_holds_the_papers_values():
     assert {10.0, 100.0, 1000.0} <= set(k_grid().tolist())
+    np.testing.assert_allclose(np.log10(k_grid()), np.arange(3, 121) / 24)  # 24 a decade, from the first above 1.25
+
+
+@pytest.mark.parametrize(("repeated", "verdict"), [(11, "fresh"), (12, "held")])
+def test_a_report_is_held_where_fewer_than_nine_tenths_of_the_rows_are_new(repeated, verdict):
+    """A row is new where the rank or a number beside it changes, or where no number stands beside it."""
+    other = np.cumsum(np.arange(100) % 100 >= repeated).astype(float)  # the first rows repeat each other
+    beside = {"sinr_db": other, "cqi": np.full(100, 7.0)}
+    seen = stale_reports(np.arange(100) * 0.5, np.where(np.arange(100) < 60, 2.0, 3.0), beside)
+    assert (seen.verdict, seen.n_reports) == (verdict, 101 - repeated)
+    assert seen.fresh.tolist() == [k == 0 or k >= repeated for k in range(100)]
+    assert seen.hold_s == pytest.approx(0.5)
+    gone = stale_reports(np.arange(100), np.full(100, 2.0), {"sinr_db": np.where(np.arange(100) < 40, np.nan, other)})
+    assert gone.fresh[:40].all()
+    late = stale_reports([0.0, 3.0, 10.0, 11.0], [2.0, np.nan, 3.0, 3.0], {"sinr_db": [1.0, 2.0, 2.0, 2.0]})
+    assert (late.fresh.tolist(), late.hold_s, late.n_reports) == ([True, False, True, False], 10.0, 2)
+
+
+def test_fewer_than_eight_changes_tell_no_period():
+    rank, time = np.repeat(np.arange(9) % 2 + 1.0, 10), np.arange(90) * 1.0
+    held = stale_reports(time, rank)  # eight changes, each ten rows after the last
+    assert (held.verdict, held.hold_s, held.n_reports) == ("held", 10.0, 9)
+    few = stale_reports(time[:80], rank[:80])
+    assert (few.verdict, few.n_reports) == ("fresh", 80)
 
 
 def test_capacity_rank_limits():

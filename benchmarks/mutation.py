@@ -450,8 +450,8 @@ class Trials:
 KINDS = ("killed", "survived", "equivalent", "unclear")
 """Unclear: the test fails without the change too, where it runs alone; such mutants do not count."""
 
-MOST_ANEW = 60
-"""Tests that a change outside functions is tried on, the shortest of each file first."""
+MOST_ANEW = 120
+"""Tests that a change outside functions is tried on, the shortest case of each first."""
 
 
 def near_tests(reach: Reach, path: str, lines: tuple[int, int] | None) -> list[str]:

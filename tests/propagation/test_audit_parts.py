@@ -89,8 +89,12 @@ class OwnPaths:
     length_m: np.ndarray
 
 
-@pytest.mark.parametrize("planted", ["nothing", "level", "phase", "far phase", "weak entry"])
-def test_coefficients_of_paths_are_compared_entry_by_entry(planted: str) -> None:
+@pytest.mark.parametrize(
+    ("planted", "size"),
+    [("nothing", 0.0), ("level", 6.0), ("level", 0.051), ("level", 0.049), ("phase", 0.3), ("phase", 0.0101),
+     ("phase", 0.0099), ("far phase", 0.3), ("weak entry", 0.0)],
+)  # fmt: skip
+def test_coefficients_of_paths_are_compared_entry_by_entry(planted: str, size: float) -> None:
     """Weak entries by their difference as a share of the largest; phases on short paths alone; all else not."""
     generator = np.random.default_rng(3)
     turns = np.array([rotation_from_yaw_pitch_roll(*generator.uniform(-0.4, 0.4, 3)) for _ in range(4)])
@@ -111,11 +115,11 @@ def test_coefficients_of_paths_are_compared_entry_by_entry(planted: str) -> None
     assert share < 0.1  # 20 dB
     power, phase = 0.0, 0.0
     if planted == "level":
-        gain[(k, *strong)] *= 2.0
-        power = 20 * np.log10(2.0)
+        gain[(k, *strong)] *= 10 ** (size / 20)
+        power = size
     elif planted == "phase":
-        gain[(k, *strong)] *= np.exp(0.3j)
-        phase = 0.3
+        gain[(k, *strong)] *= np.exp(1j * size)
+        phase = size
     elif planted == "far phase":
         gain[length > 300.0] *= np.exp(0.3j)
     elif planted == "weak entry":
@@ -132,9 +136,11 @@ def test_coefficients_of_paths_are_compared_entry_by_entry(planted: str) -> None
     assert seen.power_max_db == pytest.approx(power, abs=1e-9)
     assert seen.power_rms_db == pytest.approx(power / np.sqrt(len(paths)), abs=1e-9)
     words = " ".join(seen.failures)
-    assert ("1 paths differ from Sionna's own by up to 6.02 dB" in words) == (planted == "level")
-    assert ("1 paths differ from Sionna's own by up to 0.3 rad" in words) == (planted == "phase")
-    assert ("RSS of a link" in words) == (planted in ("level", "phase"))
+    assert (f"1 paths differ from Sionna's own by up to {size:.3g} dB" in words) == (planted == "level" and size > 0.05)
+    assert (f"1 paths differ from Sionna's own by up to {size:.3g} rad" in words) == (
+        planted == "phase" and size > 0.01
+    )
+    assert ("RSS of a link" in words) == (planted in ("level", "phase") and size > 0.1)
 
 
 def test_a_link_s_error_is_that_of_its_sum_where_all_paths_are_near_and_none_fades() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from shapely.geometry import box
 
-from aerpaw_cmp.common.errors import CheckError
+from aerpaw_cmp.common.errors import CheckError, UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.jobs.bench import random_scene, speed_against_error
 from aerpaw_cmp.propagation.arrays import (
@@ -20,6 +20,7 @@ from aerpaw_cmp.propagation.arrays import (
     uav_comparison_array,
 )
 from aerpaw_cmp.propagation.faces import site_faces
+from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search import sionna
 from aerpaw_cmp.site.site import Building
@@ -197,6 +198,20 @@ def test_reflections_named_on_the_wrong_part_of_a_plane_are_moved(scenes):
         faces, SOURCES, np.array([[10.0, 10.0, 10.0]]), np.zeros(1, int), np.zeros(1, int), sequence, 1e-9
     )
     assert found.faces.tolist() == [[right, -1]]
+
+
+@pytest.mark.parametrize(("batch", "refused"), [(0, True), (1, False), (100, False), (101, True)])
+def test_batches_hold_one_to_a_hundred_poses(scenes, monkeypatch, batch, refused):
+    class LoadedError(Exception):
+        pass
+
+    def load(_):
+        raise LoadedError
+
+    monkeypatch.setattr(sionna, "load_variant", load)
+    links = Links(SOURCES, TARGETS)
+    with pytest.raises(UsageError if refused else LoadedError, match=f"batch {batch}" if refused else None):
+        sionna.find_paths(site_faces(scenes.site()), links, sionna.Rays(batch=batch), carrier_hz=3.4e9)
 
 
 def test_euler_angles_give_the_rotation_back():

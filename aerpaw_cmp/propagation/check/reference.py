@@ -86,7 +86,7 @@ class ExpectedLink:
     uav_transmits: bool
     towers: dict[str, ExpectedArray]
     uav: ExpectedArray
-    noise_floor_dbm: float = -math.inf
+    noise_floor_dbm: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,16 +87,15 @@ def _level_verdict(diff: ReportDiff) -> str:
         though = f", though the replay moved by up to {moved:.2g} dB" if moved > diff.tolerance_db else ""
         return f"RSS errors agree on the common samples{though}."
     pooled = diff.pooled
-    text = (
-        f"RSS over all links: RMSE {pooled.other_rmse_db:.2f} dB in the first, {pooled.rmse_db:.2f} dB in the second. "
-    )
+    both, most = (count(sum(getattr(item.samples, name) for item in scored)) for name in ("common", "first"))
+    text = f"RSS over {both} common samples of {most}: RMSE {pooled.other_rmse_db:.2f} dB in the first, "
+    text += f"{pooled.rmse_db:.2f} dB in the second. "
     text += DIFFERENCE[pooled.verdict].format(
         difference=pooled.difference_db, interval=_bounds(pooled.difference_ci95_db, 2)
     )
     if len(scored) > 1:
-        verdicts = [(word, sum(item.rmse.verdict == word for item in scored)) for word in ("better", "worse")]
-        rest = len(scored) - sum(n for _, n in verdicts)
-        text += f" Links: {verdicts[0][1]} better, {verdicts[1][1]} worse, {rest} not significant."
+        said: list[str] = [item.rmse.verdict for item in scored]
+        text += " Links: " + ", ".join(f"{said.count(word)} {word}" for word in KEEP if said.count(word)) + "."
     return text
 
 

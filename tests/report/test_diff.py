@@ -133,6 +133,17 @@ def test_noise_on_one_link_is_found_there_and_sized(noisy):
     assert hit.measured_max_db == 0.0
     assert {one.rmse.difference_db for one in by_link.values()} == {0.0}
     assert "significantly worse: +" in verdict(found)
+
+
+def test_a_few_common_samples_are_named_and_links_without_interval_are_not_called_alike(noisy):
+    (first, second), _ = noisy
+    change_table(second, "rss", lambda table: table.groupby(["tower", "channel"]).head(4))
+    found = run_diff(first, second)
+    scored = [one for one in found.levels if one.rmse.n]
+    text = verdict(found)
+    assert f"RSS over {4 * len(scored)} common samples of " in text
+    assert f"Links: {len(scored)} no interval." in text
+    assert "not significant" not in text
     assert any("was changed after the report wrote it" in text for text in found.remarks)
 
 

@@ -3,17 +3,22 @@
 1. 5 towers x ``--poses`` poses x 12 buildings, 4 x 4 elements, depth 2: replays without and with edges in turn, on one
    thread, ``--pairs`` times; the ratio is that of what diffraction adds to what the reflections take;
 2. with ``--town``: munich with 200 receivers, depth 2, single diffraction (Sionna RT must be installed: its scene);
-3. with ``--flights``: flight files with the site's buildings, without and with edges: RMSE of levels, kappa of ranks.
+3. with ``--flights``: flight files with the site's buildings, without and with edges: RMSE of levels, kappa of ranks;
+4. with ``--sionna``: Sionna RT's ``edge_diffraction`` behind a metal screen less the exact half-plane (the values that
+   the tests hold), by the polarisation of the elements and the angle of shadow.
 
-Run: python benchmarks/diffraction.py [--poses 10000] [--pairs 3] [--town] [--flights FILE... --logs-root DIR] [--json]
+Run: python benchmarks/diffraction.py [--poses 10000] [--pairs 3] [--town] [--sionna] [--json]
+     python benchmarks/diffraction.py --flights FILE... --logs-root DIR [--json]
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import time
+from pathlib import Path
 
 import numpy as np
 from scenes import ends, shipped  # type: ignore[import-not-found]
@@ -86,11 +91,51 @@ def flight(path: str, logs_root: str | None) -> list[dict[str, object]]:
     ]
 
 
+def screen() -> dict[str, float]:
+    """Sionna RT's level less the exact one [dB], 20 m before and 50 m behind a metal screen, at right angles to it."""
+    import mitsuba
+    from sionna import rt
+
+    exact: dict[str, dict[float, float]] = {"soft": {}, "hard": {}}
+    lines = (Path(__file__).parents[1] / "tests/propagation/halfplane_exact.csv").read_text().splitlines()
+    for row in csv.DictReader(line for line in lines if not line.startswith("#")):
+        place, shadow = (row["r0_m"], row["r_m"], row["phi0_deg"], row["dz_m"]), float(row["shadow_deg"])
+        if place == ("20", "50", "90", "0") and shadow > 0.0:
+            exact[row["case"]][shadow] = float(row["level_db"])
+    scene = rt.load_scene()
+    scene.frequency = 3.4e9
+    mesh = mitsuba.Mesh("screen", vertex_count=4, face_count=2)
+    buffers = mitsuba.traverse(mesh)
+    corners = [-200, 0, 0, 200, 0, 0, 200, 0, -200, -200, 0, -200]
+    buffers["vertex_positions"] = mitsuba.Float([float(value) for value in corners])
+    buffers["faces"] = mitsuba.UInt32([0, 1, 2, 0, 2, 3])
+    buffers.update()
+    metal = rt.ITURadioMaterial("sheet", "metal", thickness=0.01)
+    scene.add(rt.SceneObject(mi_mesh=mesh, name="screen", radio_material=metal))
+    scene.add(rt.Transmitter("tower", [0.0, -20.0, 0.0]))
+    for angle in exact["soft"]:
+        way = np.radians(angle)
+        scene.add(rt.Receiver(f"at {angle:g}", [0.0, float(50 * np.cos(way)), float(-50 * np.sin(way))]))
+    rows: dict[str, float] = {}
+    only = {"los": False, "specular_reflection": False, "refraction": False}
+    for elements, case in (("horizontal", "soft"), ("vertical", "hard")):
+        array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=elements[0].upper())
+        scene.tx_array = scene.rx_array = array
+        paths = rt.PathSolver()(scene, max_depth=1, diffraction=True, edge_diffraction=True, **only)
+        real, imaginary = (np.asarray(part).reshape(len(exact[case]), -1) for part in paths.a)
+        total = np.abs((real + 1j * imaginary).sum(axis=1))
+        level = 20.0 * np.log10(total * 4.0 * np.pi * 70.0 * 3.4e9 / 299_792_458.0)
+        for (angle, known), value in zip(exact[case].items(), level, strict=True):
+            rows[f"{elements}, {angle:g} deg"] = round(float(value - known), 2)
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--poses", type=int, default=10_000)
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--town", action="store_true")
+    parser.add_argument("--sionna", action="store_true")
     parser.add_argument("--flights", nargs="*", default=[])
     parser.add_argument("--logs-root")
     parser.add_argument("--json", action="store_true")
@@ -99,6 +144,8 @@ def main() -> None:
     if options.flights:
         rows = [row for path in options.flights for row in flight(path, options.logs_root)]
         result |= {f"{row['flight']} {row['series']}": row for row in rows}
+    elif options.sionna:
+        result["screen"] = screen()
     else:
         result["boxes"] = boxes(options.poses, options.pairs)
     if options.town:

@@ -221,6 +221,20 @@ def test_a_rung_with_diffraction_states_its_key() -> None:
     assert "diffraction" not in recommended_settings({"rt": {"max_depth": 1, "diffraction": "all"}}, plain)["rt"]
 
 
+def test_the_rung_with_diffraction_is_what_its_settings_replay(tmp_path: Path) -> None:
+    """Free space with edges has no reflection off the ground beside it."""
+    stated = yaml.safe_load(flight(tmp_path).read_text(encoding="utf-8"))
+    stated["site"] = {"file": "lake_wheeler"}
+    model, rungs = Model(buildings=True, diffraction=True), []
+    for content in (stated, recommended_settings(stated, model)):
+        (tmp_path / "flight.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+        settings = load_flight(tmp_path / "flight.yaml")
+        result = run_flight(gather(settings, tmp_path, read_logs(settings, tmp_path)), audit=False, ladder=True).result
+        rungs.append({row.model: row.rmse_heldout_db for row in result.ladder})
+    assert rungs[0][model.name] == pytest.approx(rungs[1]["as set in flight.yaml"], abs=1e-6)
+    assert abs(rungs[0][model.name] - rungs[0]["free space"]) > 1e-6
+
+
 def test_channels_that_share_a_replay_cost_its_seconds_once() -> None:
     """Ten channels of one replay of 5 s, and one of another tower of 2 s: 7 s, not 52 s."""
     rss = [SimpleNamespace(tower="LW1", settings_key="{}")] * 10 + [SimpleNamespace(tower="LW2", settings_key="{}")]

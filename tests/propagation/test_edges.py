@@ -343,6 +343,19 @@ def test_ends_on_an_edge_are_no_numbers_that_are_none() -> None:
     assert above.has_path[0, 0]
 
 
+@pytest.mark.parametrize("apart_m", [0.0, 1e-9, 1e-5])
+@pytest.mark.parametrize("mode", ["edges", "all"])
+def test_a_side_without_length_is_no_edge(apart_m: float, mode: str) -> None:
+    """A corner given twice, or two corners closer than a wave can tell."""
+    twice = Polygon([(40, -15), (52, -15), (52, -15 + apart_m), (52, 25), (40, 25)])
+    where = poses((70.0, 3.0, 2.0), (30.0, 60.0, 1.0), (60.0, -40.0, 9.0), (52.0, -15.0, 4.0))
+    one, other = (
+        trace(place(building), LINK, where, diffraction=mode) for building in (BARN, Building("twice", twice, 8.0))
+    )
+    assert np.isfinite(other.h).all()
+    assert other.rss_dbm == pytest.approx(one.rss_dbm, abs=1e-3, nan_ok=True)
+
+
 def test_what_is_not_modelled_is_said_or_refused() -> None:
     result = trace(place(BARN), LINK, poses((70.0, 3.0, 2.0)), diffraction="edges")
     assert any("two edges" in text for text in result.left_out)

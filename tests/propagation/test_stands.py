@@ -116,6 +116,18 @@ def test_laws() -> None:
     assert 6.0 < grazed < 12.1 < model.loss_db(np.array(75.0))
 
 
+def test_the_reflection_off_the_ground_beneath_loses_what_its_own_way_takes() -> None:
+    """P.833's ground-reflected component: from 4 m over a specular point in the middle it runs between trunks alone."""
+    site, middle = wood(box(100.0, -900.0, 300.0, 900.0)), np.array([[[200.0, 0.0, 0.0]]])
+    ends = np.array([[0.0, 0.0, 4.0]]), np.array([[400.0, 0.0, 4.0]])
+    under = stand_loss_db(site, ends[0], middle, ends[1], WEAK, WAVELENGTH)
+    assert under == pytest.approx(TRUNKS * 200.0 * np.hypot(200.0, 4.0) / 200.0 * 1e-3, rel=1e-4)
+    ends = np.array([[0.0, 0.0, 20.0]]), np.array([[400.0, 0.0, 20.0]])
+    # from 20 m each leg passes 5 m, where the crowns begin, 50 m before the middle: 50 m in crowns, 50 m between trunks
+    mixed = stand_loss_db(site, ends[0], middle, ends[1], WEAK, WAVELENGTH)
+    assert mixed == pytest.approx(2.0 * (50.0 + TRUNKS * 50.0) * np.hypot(200.0, 20.0) / 200.0 * 1e-3, rel=1e-4)
+
+
 def test_a_stand_stands_on_the_terrain() -> None:
     axis = np.arange(-400.0, 401.0, 10.0)
     dem = Dem(np.full((81, 81), 7.0) + 0.05 * (axis + 400.0), -400.0, -400.0, 10.0, 10.0, "local", FRAME)

@@ -314,7 +314,7 @@ class _Climber:
         loss = path_loss(self._data.site, wanted, link.carrier_hz)
         pair = pair_db(link, poses, self._sources(series))
         if model.diffraction:
-            search = Search(max_depth=traced.paths.faces.shape[1], diffraction="edges")
+            search = Search(max_depth=wanted.max_depth, diffraction="edges")
             bent = replay(self._data.site, link, poses, search, Field(loss), Run(cache_dir=""))
             level = bent.rss_power_dbm if model.ground == "power sum" else bent.rss_dbm
             return level[:, 0] + pair, series.step * bent.seconds

@@ -294,6 +294,18 @@ def test_a_running_mean_moves_nothing_in_time(width: float) -> None:
     """Of a line it is the line: a mean over an even number of rows, half a step early, would shift every clock."""
     line = np.arange(60.0)[:, None] * [1.0, -3.0]
     np.testing.assert_allclose(_averaged(line, width)[8:-8], line[8:-8], atol=1e-9)
+    peak = (np.arange(60.0) == 30.0)[:, None] * [1.0, 2.0]
+    share = np.array([np.clip(width / 2 + 0.5 - abs(k - 30), 0.0, 1.0) for k in range(60)])  # of a row that lies within
+    share /= share.sum()
+    np.testing.assert_allclose(_averaged(peak, width), np.outer(share, [1.0, 2.0]), atol=1e-12)
+    line[33] = np.nan
+    around = _averaged(line, width)
+    assert np.isnan(around[33]).all()
+    known = [k for k in range(60) if k != 33]
+    means = [
+        np.average(line[known, 0], weights=np.clip(width / 2 + 0.5 - np.abs(np.array(known) - k), 0, 1)) for k in known
+    ]
+    np.testing.assert_allclose(around[known, 0][8:-8], means[8:-8], atol=1e-9)
 
 
 def small_bins(t: np.ndarray, window_s: float = 5.0, start_s: float = 0.0, rows: int = 30_000) -> _Bins | None:

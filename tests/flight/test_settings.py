@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from aerpaw_cmp.flight.settings import FlightFile
+from aerpaw_cmp.flight.settings import ArraySettings, FlightFile
 
 POINT = {"east_m": 0, "north_m": 0, "height_m": 5}
 PLAN = {"start": "2025-06-01T10:00:00", "waypoints": [POINT, POINT]}
@@ -83,3 +83,31 @@ def test_a_local_mean_wants_a_window() -> None:
     content["rss"]["window_s"] = 0.0
     with pytest.raises(ValidationError, match="window_s"):
         FlightFile.model_validate(content)
+
+
+def test_what_a_flight_file_does_not_say() -> None:
+    """A plan of usual speeds and intervals without any trouble; the paper's arrays for ranks, one element for levels."""
+    said = FlightFile.model_validate({"flight": {"name": "f", "plan": PLAN}, "logs": [{"path": "a"}]})
+    plan = said.flight.plan
+    assert plan is not None
+    assert (plan.speed_mps, plan.climb_mps, plan.seed) == (8.0, 3.0, 1)
+    assert (plan.telemetry_interval_s, plan.rss_interval_s, plan.rank_interval_s) == (1.0, 0.1, 0.5)
+    assert (plan.fading_db, plan.fading_correlation_s, plan.noise_floor_db, plan.bad_lines) == (0.0, 2.0, None, 0)
+    assert (plan.rank_k, plan.rank_error_share, plan.no_csi_share) == (100.0, 0.0, 0.0)
+    assert [point.hold_s for point in plan.waypoints] == [0.0, 0.0]
+    assert (said.flight.synthetic, said.site.without_buildings) == (False, False)
+    assert (said.rank.k, said.rank.advanced.bootstrap) == ([10.0, 100.0, 1000.0], 1000)
+    rss, rank = said.link.rss, said.link.rank
+    assert (rss.carrier_hz, rss.transmit_power_dbm, rss.uav_transmits, rss.uav.layout) == (3.3e9, 40.0, True, "single")
+    assert (rank.carrier_hz, rank.uav_transmits, rank.bandwidth_hz) == (3.4e9, False, 20e6)
+    assert (rank.tower.slant_deg, rank.tower.yaw_deg) == ([45.0, -45.0, 45.0, -45.0], 45.0)
+    assert (rank.uav.slant_deg, rank.uav.yaw_deg, rank.uav.roll_deg) == ([45.0, -45.0, -45.0, 45.0], 315.0, 90.0)
+    assert rss.floor_dbm == pytest.approx(-174.0, abs=0.1)
+    assert rank.floor_dbm == pytest.approx(-174.0 + 73.01, abs=0.1)
+    line = ArraySettings(layout="linear", elements=3).positions(0.1)
+    assert sorted(line.ravel().tolist()) == pytest.approx([-0.05, 0, 0, 0, 0, 0, 0, 0, 0.05])
+    assert ArraySettings().positions(0.1).tolist() == [[0.0, 0.0, 0.0]]
+    floor, figure = {"noise_floor_dbm": -90.0}, {"noise_figure_db": 3.0}
+    for both in (floor | {"bandwidth_hz": 1.0}, figure, floor | figure):
+        with pytest.raises(ValidationError):
+            FlightFile.model_validate(flight("link.rss", {"carrier_hz": 3e9, **both}))

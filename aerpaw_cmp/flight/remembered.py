@@ -125,18 +125,18 @@ def propose(known: Learned, site: str, series: Sequence[SeriesKey], nodes: Nodes
     """
     antennas: dict[str, str] = {}
     about, carrier = "", None
-    fits = {name: _fits(entry, series) for name, entry in known.entries.items()}
+    fits = {name: _fits(entry, series, nodes) for name, entry in known.entries.items()}
     best = max(fits, key=lambda name: fits[name], default=None)
     if best is not None and fits[best] > (0, 0):
         entry = known.entries[best]
         exact = [s for s in entry.series if (s.tower, s.channel, s.reader) in series]
-        alike = exact or [s for s in entry.series if (s.channel, s.reader) in {key[1:] for key in series}]
+        alike = exact or [s for s in entry.series if any(_alike(s, key, nodes) for key in series)]
         antennas = {f"{s.tower}.{s.channel}": f"{site}/{best}_{s.tower}.{s.channel}" for s in exact}
         antennas |= {
             f"{tower}.{channel}": f"{site}/{best}_{s.tower}.{s.channel}"
             for s in alike
             for tower, channel, reader in series
-            if tower in nodes.placed and s.tower not in nodes.fixed and (s.channel, s.reader) == (channel, reader)
+            if _placed(s, tower, nodes) and _alike(s, (tower, channel, reader), nodes)
         }
         alone = "the airframe alone fits: {}, there with its tower antenna"
         about = entry.about() if antennas else alone.format(entry.about())
@@ -223,8 +223,22 @@ def lock_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path)
     return locks[0] if locks else None
 
 
-def _fits(entry: Entry, series: Sequence[SeriesKey]) -> tuple[int, int]:
+SOUNDER = {"flight_mat", "sounder_log"}
+"""Readers of one receiver: merged flights of the sounder hold the readings of its own logs."""
+
+
+def _placed(one: LearnedSeries, tower: str, nodes: Nodes) -> bool:
+    return tower in nodes.placed and one.tower not in nodes.fixed
+
+
+def _alike(one: LearnedSeries, key: SeriesKey, nodes: Nodes) -> bool:
+    """Check whether a series has the channel and the receiver of one that was learned from, whatever its tower."""
+    tower, channel, reader = key
+    same = one.reader == reader or (_placed(one, tower, nodes) and {one.reader, reader} <= SOUNDER)
+    return one.channel == channel and same
+
+
+def _fits(entry: Entry, series: Sequence[SeriesKey], nodes: Nodes) -> tuple[int, int]:
     """Series of an entry that fit exactly, and those of another tower."""
     exact = sum((s.tower, s.channel, s.reader) in series for s in entry.series)
-    alike = sum((s.channel, s.reader) in {key[1:] for key in series} for s in entry.series)
-    return exact, alike
+    return exact, sum(any(_alike(s, key, nodes) for key in series) for s in entry.series)

@@ -1,7 +1,8 @@
 """Any CSV with a header, its columns mapped by the user: ``columns: {time: Time, rss_db: Power}``, ``kind: rss``.
 
-It is never guessed: flight.yaml names it. Times are texts (``YYYY-mm-dd HH:MM:SS[.f][offset]``) or numbers: seconds
-since ``time_origin`` where that is given, else since 1970 in UTC (``clock: local_as_utc`` for wall time stored so).
+It is never guessed: flight.yaml names it. Times are texts (``YYYY-mm-dd HH:MM:SS[.f][offset]``, or as tables of other
+programs have them: ``15.07.2024 11:49:27,231``) or numbers: seconds since ``time_origin`` where that is given, else
+since 1970 in UTC (``clock: local_as_utc`` for wall time stored so).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
 
+from . import _stamps
 from ._sheet import SEPARATORS
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
@@ -119,13 +121,13 @@ def _number(cell: bytes) -> float:
     return np.nan if cell.lower() in _NONE else np.inf
 
 
-def _times(cells: list[str], options: ReadOptions) -> tuple[str, AnyArray]:
-    """Kind of clock and times, as :func:`aerpaw_cmp.logs.rows.times` takes them."""
+def _times(cells: list[str], options: ReadOptions, *, comma: bool) -> tuple[str, AnyArray, list[str]]:
+    """Kind of clock and times, as :func:`aerpaw_cmp.logs.rows.times` takes them, and warnings."""
     texts = [_bare(cell) for cell in cells]
     if not _counts(texts):
-        return "wall", np.array([cell if _TEXT.fullmatch(cell) else b"-" for cell in texts], dtype=np.bytes_)
+        return _stamps.read([text.decode() for text in texts], options, european=comma)
     seconds = np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in texts], dtype=np.float64)
-    return "epoch_s" if options.time_origin is None else "relative_s", seconds
+    return "epoch_s" if options.time_origin is None else "relative_s", seconds, []
 
 
 def _bare(cell: str) -> bytes:
@@ -159,13 +161,14 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     lines = _lines.split(data)
     row, cells, rejected = _cells(lines, first, separator, len(header))
     column = {name: [fields[i] for fields in cells] for name, i in where.items()}
-    clock, time = _times(column.pop("time"), options)
-    # a decimal comma, where the separator leaves room for one
-    numbers = {name: _numbers(texts, comma=separator != ",") for name, texts in column.items()}
+    comma = separator != ","  # a decimal comma, where the separator leaves room for one
+    clock, time, warnings = _times(column.pop("time"), options, comma=comma)
+    numbers = {name: _numbers(texts, comma=comma) for name, texts in column.items()}
     rows = _rows.built(
         lines, row, {"time": time, **numbers}, options, reader="generic_csv", reason=lambda _line: None, clock=clock,
         extra=rejected, markup=np.array([first]),
     )  # fmt: skip
+    rows.warnings += warnings
     if kind == "rss" and options.unit is None:
         rows.warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
     return rows.result([_stream(rows, kind, list(numbers)), _track(rows, kind)])

@@ -416,6 +416,10 @@ def test_generic_columns() -> None:
     assert wall.streams[0].frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5")
     since = read("generic_csv", b"Time,Level\n0.5,-81.5\n")
     assert since.streams[0].frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5")
+    for text in ("02.03.2025 10:00:00,5", "02/03/2025 10:00:00,5", "2025/3/2 10:00:00.5", "2-Mar-2025 10:00:00.5"):
+        european = read("generic_csv", f"Level;Time\n-81,5;{text}\n".encode())
+        assert european.streams[0].frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5"), text
+        assert european.streams[0].frame["rss_db"].iloc[0] == -81.5
 
 
 @pytest.mark.parametrize(

@@ -211,6 +211,8 @@ def test_a_draft_takes_only_what_fits(folder: Path) -> None:
         found = propose(rover, "mine", [("NODE", "A", "flight_mat")], nodes)
         assert found.antennas == {"uav": "mine/r_uav"} | ({"NODE.A": "mine/r_ROVER.A"} if fits else {})
         assert found.antennas_about.startswith("the airframe alone fits") is not fits
+        own = propose(rover, "mine", [("NODE", "A", "sounder_log")], nodes)  # the same receiver's own log
+        assert own.antennas == (found.antennas if fits else {})
     for other in (("LW1", "A", "sounder_log"), ("LW1", "B", "flight_mat"), ("LW1", "rank", "flight_mat")):
         assert propose(known, "mine", [other]).antennas == {}
     receiver = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=3.4e9, file="r.json.gz", kappa=0.4)

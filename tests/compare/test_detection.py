@@ -106,18 +106,6 @@ def test_nothing_is_learned_of_a_receiver_that_keeps_its_lock_or_locks_at_low_le
     assert learn_detection([]) is None
 
 
-def test_one_outcome_alone_is_no_score() -> None:
-    time, measured, simulated, _ = _flight()
-    always = np.ones(len(time), dtype=bool)
-    assert score_detection(time, measured, simulated, always, floor_db=FLOOR) is None
-
-
-def test_short_logs_keep_their_pairs() -> None:
-    quality, shift = aligned_quality(np.arange(10) / 30.0, np.arange(10.0), np.arange(10.0))
-    assert shift == 0.0
-    assert quality.tolist() == list(range(10))
-
-
 @pytest.mark.parametrize("learned", [True, False])
 def test_every_score_is_that_by_hand(learned: bool) -> None:
     time, measured, simulated, detected = _flight(n=400)

@@ -58,32 +58,9 @@ def test_samples_without_report_or_forecast_take_no_part():
     assert score_forecast(rank, np.full((50, 4), np.nan), np.zeros(50), np.full(4, 0.25)).as_dict()["kappa"] is None
 
 
-def test_intervals_of_the_expected_histogram_hold_it():
-    rank = ranks()
-    p = np.random.default_rng(0).dirichlet([2, 5, 3, 1], len(rank))
-    score = score_forecast(rank, p, p.argmax(axis=1) + 1, constant_forecast(rank))
-    for share, (low, high) in zip(score.expected_histogram, score.expected_histogram_ci95, strict=True):
-        assert low <= share <= high
-
-
 def test_lengths_must_match():
     with pytest.raises(ValueError, match="not in pairs"):
         score_forecast([1, 2], np.ones((3, 4)) / 4, [1, 2, 3], np.full(4, 0.25))
-
-
-def test_each_interval_is_that_of_its_own_number():
-    """Losses of two forecasts that differ by a constant: the interval of the difference has no width and lies there."""
-    rank = ranks()
-    constant = np.full(4, 0.25)
-    better = np.full((len(rank), 4), 0.2)
-    better[np.arange(len(rank)), rank - 1] = 0.4
-    score = score_forecast(rank, better, rank, constant)
-    assert score.log_score_difference_ci95 == pytest.approx([np.log(0.25 / 0.4)] * 2)
-    assert score.log_score_ci95 == pytest.approx([-np.log(0.4)] * 2)
-    assert score.brier_score == pytest.approx(0.6**2 + 3 * 0.2**2)
-    assert score.kappa_ci95[1] == pytest.approx(1.0)
-    for low_high, share in zip(score.expected_histogram_ci95, better.mean(axis=0), strict=True):
-        assert low_high[0] <= share <= low_high[1]
 
 
 def test_every_interval_is_that_of_blocks_of_the_longest_memory():

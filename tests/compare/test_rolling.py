@@ -49,19 +49,6 @@ def test_the_rest_begins_where_the_uav_is_and_its_intervals_hold():
     assert np.mean(inside) > 0.7
 
 
-def test_far_ahead_the_trend_and_the_mean_of_what_it_leaves_are_said():
-    """Levels that follow the trend 15 dB above it, but for half a decibel of ripple, go on 15 dB above it."""
-    t, place = route()
-    free = -60.0 * np.log10(np.linalg.norm(place - [400.0, 300.0, 10.0], axis=1))
-    ahead, last = RouteAhead(place, {"free space": free}), None
-    for now in np.arange(0.0, 120.0, 0.1):
-        here = np.array([np.interp(now, t, place[:, i]) for i in range(3)])
-        level = np.interp(now, t, free)
-        last = ahead.add(now, here, level + 15.0 + 0.5 * np.sin(now), {"free space": level}) or last
-    assert last.trend == "free space"
-    np.testing.assert_allclose(last.level_db, free[last.index] + 15.0, atol=0.6)
-
-
 def test_levels_that_are_no_numbers_and_old_ones_take_no_part():
     ahead, last, _ = flown(False, 1)
     before = len(ahead._bins.level)

@@ -27,7 +27,7 @@ from aerpaw_cmp.compare.rss import (
     stretch_means_db,
     stretches,
 )
-from aerpaw_cmp.compare.statistics import autocorrelation
+from aerpaw_cmp.compare.statistics import autocorrelation, error_intervals
 
 NAN = float("nan")
 
@@ -232,19 +232,6 @@ def test_link_geometry_in_the_antenna_frames():
     np.testing.assert_allclose(level["heading_deg"], 30.0)
 
 
-def test_bins_hold_every_pair_once():
-    rng = np.random.default_rng(4)
-    quantity, residual = rng.uniform(0, 100, 1000), rng.normal(size=1000)
-    residual[::7] = NAN
-    bins = bin_residual(residual, quantity, 8)
-    assert bins.n.sum() == np.isfinite(residual).sum()
-    pooled = np.sqrt(np.sum(bins.n * bins.rmse_db**2) / bins.n.sum())
-    assert pooled == pytest.approx(np.sqrt(np.nanmean(residual**2)))
-    assert np.nansum(bins.n * bins.mean_db) == pytest.approx(np.nansum(residual))
-    assert bins.explained < 0.05
-    json.dumps(bins.as_dict(), allow_nan=False)
-
-
 def test_bins_show_what_explains_the_residual():
     rng = np.random.default_rng(5)
     heading = rng.uniform(0, 360, 2000)
@@ -292,21 +279,6 @@ def test_largest_error_spans_are_found_with_their_cause():
     assert second.mean_db > 5
     assert error_spans(time, np.full(len(time), NAN)) == []
     assert error_spans(time, residual, largest=1) == spans[:1] or len(error_spans(time, residual, largest=1)) == 1
-
-
-def test_two_channels_part_where_the_geometry_says():
-    rng = np.random.default_rng(7)
-    time = np.arange(0, 200, 0.2)
-    one = -60 + rng.normal(0, 1, len(time))
-    two = one - 2.0 + rng.normal(0, 1, len(time))
-    two[(time > 100) & (time < 110)] -= 15.0
-    found = channel_difference(time, one, two, position_m=np.column_stack([time] * 3))
-    assert len(found.spans) == 1
-    assert found.spans[0].start_s == pytest.approx(100, abs=1)
-    assert found.share_parted == pytest.approx(0.05, abs=0.005)
-    assert found.interval_std_db[0] < found.std_db < found.interval_std_db[1]
-    json.dumps(found.as_dict(), allow_nan=False)
-    assert channel_difference(time, one, np.full(len(time), NAN)).n == 0
 
 
 @pytest.mark.field
@@ -425,6 +397,8 @@ def test_spans_are_runs_of_smoothed_errors_of_one_sign():
     assert parted.spans == error_spans(time, apart, window_s=1.0, threshold_db=10.0)
     assert (parted.n, parted.mean_db, parted.std_db) == pytest.approx((400, (one - two).mean(), apart.std()))
     assert parted.share_parted == pytest.approx(np.mean(np.abs(apart) > 10.0))
+    assert parted.interval_std_db == error_intervals(two, one).rmse_db
+    assert channel_difference(time, one, np.full(400, NAN)).n == 0
 
 
 @pytest.mark.parametrize(("spread_db", "reach_db"), [(10.0, 40.0), (1.0, 20.0)])

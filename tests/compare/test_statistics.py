@@ -55,21 +55,6 @@ def test_effective_sample_size_of_a_known_process(n, correlation, noise):
     assert np.median(found) == pytest.approx(expected, rel=0.2)
 
 
-def test_white_noise_is_independent():
-    rng = np.random.default_rng(1)
-    found = [autocorrelation(rng.normal(size=500)) for _ in range(40)]
-    assert np.median([m.n_effective for m in found]) > 480
-    assert np.median([m.block_length for m in found]) < 20
-    assert sum(m.enough for m in found) == 40
-
-
-def test_blocks_grow_with_memory_and_stay_a_fifth_of_the_flight():
-    rng = np.random.default_rng(2)
-    lengths = [autocorrelation(shadowing(rng, 5000, s, 1.0)).block_length for s in (1, 5, 25, 100)]
-    assert lengths == sorted(lengths)
-    assert autocorrelation(np.linspace(0, 1, 100)).block_length <= 20
-
-
 def test_degenerate_sequences():
     assert autocorrelation([]).n_effective != autocorrelation([]).n_effective  # NaN
     assert autocorrelation([1.0]).block_length == 1
@@ -199,12 +184,6 @@ def test_resamples_have_the_moments_of_the_circular_block_bootstrap(n, length, c
 
     expected = (whole * sums(length).var(axis=0) + sums(last).var(axis=0)) / n**2
     np.testing.assert_allclose(drawn.var(axis=0).mean(), expected.mean(), rtol=0.08, atol=1e-12)
-
-
-def test_the_same_samples_give_the_same_interval():
-    rng = np.random.default_rng(4)
-    m, s = rng.normal(size=(2, 300))
-    assert error_intervals(m, s) == error_intervals(m, s)
 
 
 @pytest.mark.parametrize("neighbours", [0.0, 0.9, 0.98])

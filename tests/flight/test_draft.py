@@ -317,13 +317,6 @@ def test_attitude_height_and_floor_are_proposed(tmp_path: Path, attitude: bool) 
     assert any("-100.0 dB?" in remark for remark in remarks)
 
 
-def test_a_receiver_above_its_floor_shows_none(tmp_path: Path) -> None:
-    _levels(tmp_path, None)
-    (file,) = ingest([tmp_path / "levels_LW1.csv"], reader="generic_csv", options=ReadOptions(
-        time_origin="2025-06-01T14:00:00Z", kind="rss", columns={"time": "t", "rss_db": "rss_dbm"}))  # fmt: skip
-    assert receiver_floor_db([s for s in file.result.streams if s.kind == "rss"]) is None
-
-
 def test_a_draft_of_a_flight_file_names_logs_in_it_that_came_from_above(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -100,7 +100,7 @@ FLOWN: dict[str, tuple[str, str]] = {
 """The same on the flight that followed."""
 
 
-def first_words(correction: Correction, outside: float) -> str:
+def first_words(correction: Correction, outside: float, expected_db: float) -> str:
     """Expected error, intervals, where the prediction is a guess, model, next step: first line of terminal and page.
 
     Parameters
@@ -108,18 +108,19 @@ def first_words(correction: Correction, outside: float) -> str:
     correction : Correction
     outside : float
         Share of points outside the flown places.
+    expected_db : float
+        Stated standard deviation of a mean over 4 s on a new flight, root mean square over the points [dB].
 
     Returns
     -------
     str
     """
     key, free = (correction.base, correction.title), ("free space", OFF)
-    over = "flights" if len(correction.flights) > 1 else "300 m blocks"
+    over = "flights left out, each about its own mean" if len(correction.flights) > 1 else "300 m blocks left out"
+    beside = f"; free space {correction.rmse_db[free]:.1f} dB" if free in correction.rmse_db else ""
     texts = [
-        f"Expect an RMSE of {correction.rmse_db[key]:.1f} dB over 4 s means ({over} left out; free space "
-        f"{correction.rmse_db[free]:.1f} dB)."
-        if free in correction.rmse_db
-        else f"Expect an RMSE of {correction.rmse_db[key]:.1f} dB over 4 s means ({over} left out)."
+        f"Expect an RMSE of {expected_db:.1f} dB over 4 s means at these points on a new flight.",
+        f"On {over}: {correction.rmse_db[key]:.1f} dB{beside}.",
     ]
     if free in correction.rmse_db and key != free:
         texts.append(said_of(against_free_space(correction), AGAINST_FREE_SPACE))

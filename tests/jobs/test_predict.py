@@ -124,7 +124,8 @@ def test_files_agree_with_each_other(tmp_path, prediction):
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert unlisted("predict", metrics) == []
     assert metrics["trained_on"] == list(prediction.page.trained_on)
-    assert metrics["sentence"].startswith("Expect an RMSE of")
+    expected = np.sqrt((levels["slow_sd_db"] ** 2).mean())
+    assert metrics["sentence"].startswith(f"Expect an RMSE of {expected:.1f} dB over 4 s means")
     assert coded(metrics["sentence"]) in files[0].read_text()
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("netCDF4")

@@ -29,8 +29,11 @@ def correction(key: tuple[str, str], errors: dict[tuple[str, str], float], sd: f
 
 def test_a_model_that_beats_free_space_is_called_better_with_its_interval() -> None:
     errors = {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.1}
-    words = first_words(correction(LEARNED, errors, 3.0), outside=0.1)
-    assert words.startswith("Expect an RMSE of 3.0 dB over 4 s means (flights left out; free space 6.0 dB).")
+    words = first_words(correction(LEARNED, errors, 3.0), outside=0.1, expected_db=4.2)
+    assert words.startswith(
+        "Expect an RMSE of 4.2 dB over 4 s means at these points on a new flight. "  # its offset and places count
+        "On flights left out, each about its own mean: 3.0 dB; free space 6.0 dB."
+    )
     assert "The model is significantly better than free space (\N{MINUS SIGN}" in words
     assert "90 % intervals hold " in words
     assert "too narrow" not in words
@@ -40,7 +43,9 @@ def test_a_model_that_beats_free_space_is_called_better_with_its_interval() -> N
 
 
 def test_equal_models_are_called_neither_better_nor_worse() -> None:
-    words = first_words(correction(LEARNED, {FREE: 3.0, LEARNED: 3.0, WITH_FIELD: 3.0}, 3.0), outside=0.0)
+    words = first_words(
+        correction(LEARNED, {FREE: 3.0, LEARNED: 3.0, WITH_FIELD: 3.0}, 3.0), outside=0.0, expected_db=4.2
+    )
     assert "is not significant (95 %)" in words
     assert "better" not in words
     assert "worse" not in words
@@ -48,12 +53,16 @@ def test_equal_models_are_called_neither_better_nor_worse() -> None:
 
 @pytest.mark.parametrize(("sd", "said"), [(1.5, "too narrow: errors are 2.0 times"), (6.0, "too wide: errors are 0.5")])
 def test_intervals_that_do_not_hold_are_named_with_the_ratio(sd: float, said: str) -> None:
-    words = first_words(correction(LEARNED, {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.0}, sd), outside=0.0)
+    words = first_words(
+        correction(LEARNED, {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.0}, sd), outside=0.0, expected_db=4.2
+    )
     assert said in words
 
 
 def test_a_field_that_helps_is_on_for_a_stated_gain() -> None:
-    words = first_words(correction(WITH_FIELD, {FREE: 6.0, LEARNED: 4.0, WITH_FIELD: 2.0}, 3.0), outside=0.5)
+    words = first_words(
+        correction(WITH_FIELD, {FREE: 6.0, LEARNED: 4.0, WITH_FIELD: 2.0}, 3.0), outside=0.5, expected_db=4.2
+    )
     assert "The residual field is on: it lowers the CRPS by " in words
     assert "50 % of the points lie outside the flown places. Next: `aerpaw-cmp plan`" in words
     assert set(FIELD) == {"better", "worse", "on", "off"}
@@ -61,7 +70,7 @@ def test_a_field_that_helps_is_on_for_a_stated_gain() -> None:
 
 def test_free_space_is_not_compared_with_itself() -> None:
     words = first_words(
-        correction(FREE, {FREE: 3.0, ("free space", "field of 2 dB, 30 m"): 3.2, LEARNED: 4.0}, 3.0), 0.0
+        correction(FREE, {FREE: 3.0, ("free space", "field of 2 dB, 30 m"): 3.2, LEARNED: 4.0}, 3.0), 0.0, 4.2
     )
     assert "than free space" not in words
     assert "Model: free space." in words

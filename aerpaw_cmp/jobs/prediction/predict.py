@@ -163,7 +163,7 @@ def _about(
     correction = model.correction
     key = correction.base, correction.title
     return {
-        "verdict": first_words(correction, guess),
+        "verdict": first_words(correction, guess, float(np.sqrt((table["slow_sd_db"] ** 2).mean()))),
         "flights": [data.settings.flight.name for data in known],
         "trained_on": union(*map(flight_logs, known), *used, *model.logs),
         "candidates": [

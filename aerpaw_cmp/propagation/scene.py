@@ -111,7 +111,7 @@ def surfaces_of(site: Site) -> Surfaces | None:
     scene = site.scene
     for building in site.buildings:
         scene = added(scene, *building_mesh(building), building.name, material(building.material).name)
-    return _merged(scene if site.buildings else site.scene, site.merge_m)
+    return _merged(scene, site.merge_m)
 
 
 @lru_cache(maxsize=2)

@@ -28,6 +28,7 @@ from aerpaw_cmp.propagation.check.field_audit import (
     _link_error,
     _paths_against_sionna,
     _probe,
+    against_sionna,
     impossible,
     spread_over_paths,
 )
@@ -38,6 +39,7 @@ from aerpaw_cmp.propagation.paths import path_lengths
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search.merging import _labels
+from aerpaw_cmp.propagation.search.sionna import Coefficients
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -141,6 +143,41 @@ def test_coefficients_of_paths_are_compared_entry_by_entry(planted: str, size: f
         planted == "phase" and size > 0.01
     )
     assert ("RSS of a link" in words) == (planted in ("level", "phase") and size > 0.1)
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_paths_of_the_asked_poses_are_matched_and_those_that_are_lacking_counted(
+    monkeypatch: pytest.MonkeyPatch, complete: bool
+) -> None:
+    """Sionna is played by the image engine: it has what the replay has, and one path that was taken away there."""
+    spots = np.array([[120.0, 60, 40], [40, -90, 25], [60, 10, 30]])
+    turn = rotation_from_yaw_pitch_roll(0.3, 0.1, -0.2)
+    poses, chosen = Poses(spots, np.tile(turn, (3, 1, 1))), np.array([2, 0])
+    link = dataclasses.replace(LINK, tower_arrays={"LW1": dataclasses.replace(LINK.uav_array, mount=turn)})
+    search = Search("image", max_depth=1)
+
+    def own(faces, links, probe, turns, rays, *, surfaces) -> Coefficients:
+        assert surfaces is None
+        assert (rays.max_depth, turns[0].shape) == (1, (1, 3, 3))
+        assert np.array_equal(turns[1], poses.rotation[chosen])
+        few = Poses(links.targets_m, turns[1])
+        paths = replay(SITE, probe, few, search).paths
+        every = np.arange(len(paths))
+        many = Poses(few.position_m[paths.pose], few.rotation[paths.pose])
+        alone = channel_matrices(dataclasses.replace(paths, pose=every), faces, links.sources_m, many, probe)
+        length = path_lengths(paths, links.sources_m, links.targets_m)
+        return Coefficients(paths, alone.h[every, paths.tower], length)
+
+    monkeypatch.setattr("aerpaw_cmp.propagation.search.sionna.own_coefficients", own)
+    clean = replay(SITE, link, poses, search)
+    asked = int(np.isin(clean.paths.pose, chosen).sum())
+    gone = int(np.flatnonzero((clean.paths.pose == 2) & (clean.paths.depth == 1))[0])
+    fewer = dataclasses.replace(clean, paths=clean.paths.select(np.setdiff1d(np.arange(len(clean.paths)), gone)))
+    for replayed, lacking in ((clean, 0), (fewer, 1)):
+        found = against_sionna(SITE, link, poses, replayed, chosen, Expected.of(link), search, complete=complete)
+        assert (found.paths, found.missing_paths) == (asked - lacking, lacking if complete else 0)
+        assert found.power_max_db < 1e-9
+        assert bool(found.failures) == bool(lacking and complete)
 
 
 def test_a_link_s_error_is_that_of_its_sum_where_all_paths_are_near_and_none_fades() -> None:

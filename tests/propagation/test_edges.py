@@ -19,12 +19,12 @@ from aerpaw_cmp.propagation.check.bent import _cotangent
 from aerpaw_cmp.propagation.check.explain import edge_path_lines
 from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
 from aerpaw_cmp.propagation.check.reference import element_wave, fresnel, permittivity, turned
-from aerpaw_cmp.propagation.edges import Edges
+from aerpaw_cmp.propagation.edges import EdgePaths, Edges
 from aerpaw_cmp.propagation.faces import site_faces, triangles
 from aerpaw_cmp.propagation.field.edges import Tables, amplitudes
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import edges_of, replay
-from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.scene import Scene, surfaces_of
 from aerpaw_cmp.propagation.search.edges import _below
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.propagation.trace import trace
@@ -438,6 +438,9 @@ def test_the_border_of_a_sheet_is_a_half_plane() -> None:
     edges = Edges.of_surfaces(merged(scene))
     assert np.allclose(edges.exterior, 2.0)
     assert sorted(edges.length_m.tolist()) == pytest.approx([6.0, 6.0, 80.0, 80.0])
+    beside = surfaces_of(replace(place(BARN), scene=scene))
+    assert beside is not None
+    assert {label.split()[0] for label in beside.faces.label} == {"sheet", "barn"}
     result = trace(replace(place(), scene=scene), LINK, poses((60.0, 1.0, 2.0)), max_depth=0, diffraction="edges")
     assert result.edge_paths is not None
     at = result.edge_paths.vertices_m[:, 1]
@@ -602,6 +605,17 @@ def test_edges_of_a_regular_prism(sides: int, ground_m: float, uprights: int) ->
     assert edges.start_m[upright, 2] == pytest.approx(ground_m)
     assert (edges.end_m[:, 2] == 8.0).all()
     assert edges.length_m[~upright] == pytest.approx(18 * np.sin(np.pi / sides))
+
+
+def test_polylines_of_paths_over_edges_leave_out_what_is_not_used() -> None:
+    points = np.arange(24.0).reshape(2, 4, 3)
+    points[0, [0, 2]], points[1, 3] = np.nan, np.nan
+    lines = EdgePaths.of(np.zeros((2, 8), np.int64), points).as_path_set()
+    assert lines.depth.tolist() == [2, 3]
+    assert (lines.faces == -1).all()
+    for row, used in ((0, [1, 3]), (1, [0, 1, 2])):
+        assert np.array_equal(lines.vertices_m[row, : len(used)], points[row, used])
+        assert np.isnan(lines.vertices_m[row, len(used) :]).all()
 
 
 def test_paths_over_edges_are_explained_by_their_levels() -> None:

@@ -20,10 +20,10 @@ import numpy as np
 from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..compiled import in_threads, thread_count
-from ..numba_options import kernel
+from ..numba_options import kernel, part
 from ..paths import Links, PathSet
-from ..surfaces import Surfaces
-from .boxtree import box_missed, box_outside, box_tree, within_planes
+from ..surfaces import BoxTree, Surfaces
+from .boxtree import DEEPEST, box_missed, box_outside, box_tree, next_leaf, within_planes
 from .effort import Estimate, Progress, SearchRun
 from .merging import WINDOW
 from .mirror import merge, searched_links
@@ -63,7 +63,15 @@ class _Mirrors(NamedTuple):
     flat: FloatArray
 
 
-class _Rules(NamedTuple):
+class _Solids(NamedTuple):
+    """Surfaces that hide: the tree of faces, triangles (n, 3, 3) and their tree."""
+
+    face_tree: BoxTree
+    corners: FloatArray
+    tree: BoxTree
+
+
+class Rules(NamedTuple):
     """Tolerances and switches of a search."""
 
     depth: int
@@ -154,15 +162,15 @@ def estimate(
     return None
 
 
-def _rules(surfaces: Surfaces, max_depth: int, *, solids: bool, beams: bool = True, shadows: bool = True) -> _Rules:
+def _rules(surfaces: Surfaces, max_depth: int, *, solids: bool, beams: bool = True, shadows: bool = True) -> Rules:
     margin = SOLID_MARGIN if solids else 0.0
-    return _Rules(
+    return Rules(
         depth=max_depth, clearance=2.0 * surfaces.merge_m, end=END_M, margin=margin, side=SIDE_M, beams=beams,
         shadows=shadows,
     )  # fmt: skip
 
 
-def _searches(surfaces: Surfaces, links: Links, rules: _Rules) -> Iterator[tuple[int, IntArray, _Search]]:
+def _searches(surfaces: Surfaces, links: Links, rules: Rules) -> Iterator[tuple[int, IntArray, _Search]]:
     """Tower, poses and search of every tower that has a pose to be searched for."""
     alive = searched_links(links)
     for tower in np.flatnonzero(alive.any(axis=1)).tolist():
@@ -202,23 +210,22 @@ class _Search:
         surfaces: Surfaces,
         source: FloatArray,
         targets: FloatArray,
-        rules: _Rules,
+        rules: Rules,
     ) -> None:
-        self.mirrors, self.source, self.rules = tuple(mirrors), np.ascontiguousarray(source), rules
-        self.targets = np.ascontiguousarray(targets)
-        self.corners, self.tree = surfaces.corners_m, tuple(surfaces.tree)
-        self.face_tree = tuple(surfaces.face_tree)
-        self.target_tree = tuple(box_tree(self.targets, self.targets))
+        self.mirrors, self.source, self.rules = mirrors, np.ascontiguousarray(source), rules
+        self.solids = _Solids(surfaces.face_tree, surfaces.corners_m, surfaces.tree)
+        targets = np.ascontiguousarray(targets)
+        self.targets = targets, box_tree(targets, targets)
 
     def direct(self) -> _Level:
         """Lines of sight."""
-        free = _direct(self.corners, self.tree, self.source, self.targets, tuple(self.rules))
+        free = _direct(self.solids, self.source, self.targets[0], self.rules)
         pose = np.flatnonzero(free)
         return pose, np.zeros((len(pose), 0), np.int64), np.zeros((len(pose), 0, 3))
 
     def first_faces(self) -> IntArray:
         """First faces worth following, in an order whose beginning is a fair sample."""
-        good = _first_faces(self.mirrors, self.face_tree, self.source, tuple(self.rules))
+        good = _first_faces(self.mirrors, self.solids.face_tree, self.source, self.rules)
         return np.random.default_rng(0).permutation(np.flatnonzero(good))
 
     def follow(self, some: IntArray) -> tuple[IntArray, IntArray, FloatArray, int]:
@@ -226,10 +233,8 @@ class _Search:
         return self._follow(some, self.rules.depth)
 
     def _follow(self, some: IntArray, depth: int) -> tuple[IntArray, IntArray, FloatArray, int]:
-        return _follow(  # type: ignore[no-any-return]
-            self.mirrors, self.face_tree, self.corners, self.tree, self.targets, self.target_tree,
-            self.source, some, tuple(self.rules._replace(depth=depth)),
-        )  # fmt: skip
+        rules = self.rules._replace(depth=depth)
+        return _follow(self.mirrors, self.solids, self.targets, self.source, some, rules)  # type: ignore[no-any-return]
 
     def estimate(self, first: IntArray, threads: int) -> Estimate:
         """Estimate the cost of following the faces ``first``; some of them are tried.
@@ -253,7 +258,8 @@ class _Search:
                 break
         share = size.sum() * len(first) / max(1, len(pool))
         sequences, seconds = share * np.mean(tried or [(0.0, 0.0)], axis=0)
-        arrays = (self.corners, self.targets, *self.tree, *self.face_tree, *self.target_tree, *self.mirrors)
+        (face_tree, corners, tree), (targets, target_tree) = self.solids, self.targets
+        arrays = (corners, targets, *tree, *face_tree, *target_tree, *self.mirrors)
         return Estimate(
             seconds=float(seconds) / max(1, threads),
             sources=1,
@@ -276,8 +282,8 @@ class _Search:
         """Follow all sequences that begin with the faces ``first``."""
         levels: list[_Level] = []
         done = 0
-        for part, size in _chunks(first, threads):
-            levels += [(pose, faces, points) for pose, faces, points, _ in in_threads(self.follow, part, threads)]
+        for some, size in _chunks(first, threads):
+            levels += [(pose, faces, points) for pose, faces, points, _ in in_threads(self.follow, some, threads)]
             done += size
             share(done / len(first))
         return levels
@@ -349,7 +355,7 @@ def reflection_points(
     start = np.searchsorted(surfaces.plane[order], np.arange(len(surfaces) + 1))
     sequence = np.ascontiguousarray(sequence).copy()
     vertices, good = _points_of(
-        tuple(_mirrors(surfaces)), order, start, sequence,
+        _mirrors(surfaces), order, start, sequence,
         np.ascontiguousarray(sources_m), np.ascontiguousarray(targets_m), edge_m,
     )  # fmt: skip
     return sequence, vertices, good
@@ -360,7 +366,7 @@ def reflection_points(
 
 @kernel
 def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type: ignore[no-untyped-def]
-    normal, offset, along, across, _, _, plane, _, _, first, flat = mirrors
+    normal, offset = mirrors.normal, mirrors.offset
     count, depth = sequence.shape
     vertices = np.zeros((count, depth, 3))
     good = np.ones(count, np.bool_)
@@ -380,26 +386,33 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
             share = abs(low) / (abs(low) + abs(top))
             vertices[row, step] = images[step + 1] + share * (point - images[step + 1])
             point = vertices[row, step]
-            if in_face(first, flat, along, across, f, point, edge):
-                continue
-            moved = False
-            for k in range(start[plane[f]], start[plane[f] + 1]):
-                if in_face(first, flat, along, across, order[k], point, edge):
-                    sequence[row, step] = order[k]
-                    moved = True
-                    break
-            if not moved:
+            plane = mirrors.plane[f]
+            face = _face_at(mirrors, f, order[start[plane] : start[plane + 1]], point, edge)
+            if face < 0:
                 good[row] = False
                 break
+            sequence[row, step] = face
     return vertices, good
 
 
 @kernel
-def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset, rules):  # type: ignore[no-untyped-def]
+def _face_at(mirrors, f, beside, point, edge):  # type: ignore[no-untyped-def]
+    """The face ``f`` where a point lies in it, else the first of those ``beside`` it in its plane; -1 in none."""
+    _, _, along, across, _, _, _, _, _, first, flat = mirrors
+    if in_face(first, flat, along, across, f, point, edge):
+        return f
+    for other in beside:
+        if in_face(first, flat, along, across, other, point, edge):
+            return other
+    return -1
+
+
+@kernel
+def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-untyped-def]
     """Check whether a triangle cuts the segment ``a`` - ``b``.
 
-    ``before`` and ``after`` are unit normals of mirrors at the ends, zero for an antenna: there a surface within the
-    clearance of the mirror's plane, or of the antenna, cuts nothing. Moeller and Trumbore (1997), edges included.
+    ``before`` and ``after`` are the planes of mirrors at the ends, with a normal of zeros for an antenna: there a
+    surface within the clearance of the mirror's plane, or of the antenna, cuts nothing. Edges included.
 
     Parameters
     ----------
@@ -409,88 +422,82 @@ def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset,
         Over the triangles.
     a, b : (3,)
         Ends of the segment [m].
-    before, after : (3,)
-        Unit normals of the mirrors at ``a`` and ``b``, or zeros.
-    before_offset, after_offset : float
-        Offsets of their planes [m].
-    rules : tuple
-        A ``_Rules``: clearance, reach of an antenna, and the margin with which a triangle has to be met.
+    before, after : ((3,), float)
+        Unit normals and offsets [m] of the mirrors at ``a`` and ``b``.
+    rules : Rules
+        Clearance, reach of an antenna, and the margin with which a triangle has to be met.
 
     Returns
     -------
     bool
-
-    Notes
-    -----
-    Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997), doi:10.1080/10867651.1997.10487468.
     """
-    lower, upper, child, start, count, items = tree
-    clearance, end, margin = rules[1], rules[2], rules[3]
-    edge = margin if margin > 0.0 else -1e-9
-    d0, d1, d2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-    inverse = np.empty(3)
-    inverse[0] = 1.0 / d0 if d0 != 0.0 else 1e300
-    inverse[1] = 1.0 / d1 if d1 != 0.0 else 1e300
-    inverse[2] = 1.0 / d2 if d2 != 0.0 else 1e300
-    mirror_a = before[0] != 0.0 or before[1] != 0.0 or before[2] != 0.0
-    mirror_b = after[0] != 0.0 or after[1] != 0.0 or after[2] != 0.0
-    todo = np.empty(64, np.int64)
+    way = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    length = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
+    inverse = (
+        1.0 / way[0] if way[0] != 0.0 else 1e300,
+        1.0 / way[1] if way[1] != 0.0 else 1e300,
+        1.0 / way[2] if way[2] != 0.0 else 1e300,
+    )
+    lower, upper, child, start, many, items = tree
+    todo = np.empty(DEEPEST, np.int64)
     todo[0] = 0
-    waiting = 1
-    while waiting > 0:
-        waiting -= 1
-        node = todo[waiting]
-        if box_missed(lower, upper, node, a, inverse):
-            continue
-        if child[node] >= 0:
-            todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
-            waiting += 2
-            continue
-        for k in range(start[node], start[node] + count[node]):
-            c = corners[items[k]]
-            e0, e1, e2 = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2]
-            g0, g1, g2 = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2]
-            p0, p1, p2 = d1 * g2 - d2 * g1, d2 * g0 - d0 * g2, d0 * g1 - d1 * g0
-            det = e0 * p0 + e1 * p1 + e2 * p2
-            if abs(det) <= 1e-14 * length:
-                continue
-            if margin > 0.0:  # so near to grazing that a tolerance might decide
-                m0, m1, m2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
-                if abs(det) < 1e-5 * length * np.sqrt(m0 * m0 + m1 * m1 + m2 * m2):
-                    continue
-            s0, s1, s2 = a[0] - c[0, 0], a[1] - c[0, 1], a[2] - c[0, 2]
-            u = (s0 * p0 + s1 * p1 + s2 * p2) / det
-            if u < edge or u > 1.0 - edge:
-                continue
-            q0, q1, q2 = s1 * e2 - s2 * e1, s2 * e0 - s0 * e2, s0 * e1 - s1 * e0
-            v = (d0 * q0 + d1 * q1 + d2 * q2) / det
-            if v < edge or u + v > 1.0 - edge:
-                continue
-            t = (g0 * q0 + g1 * q1 + g2 * q2) / det
+    node, waiting = next_leaf(lower, upper, child, todo, 1, box_missed, (a, inverse))
+    while node >= 0:
+        for k in range(start[node], start[node] + many[node]):
+            t = _share_to(corners[items[k]], a, way, length, rules.margin)
             if t <= 0.0 or t >= 1.0:
                 continue
-            h0, h1, h2 = a[0] + t * d0, a[1] + t * d1, a[2] + t * d2
-            if mirror_a:
-                if abs(before[0] * h0 + before[1] * h1 + before[2] * h2 - before_offset) <= clearance:
-                    continue
-            elif t * length <= end:
-                continue
-            if mirror_b:
-                if abs(after[0] * h0 + after[1] * h1 + after[2] * h2 - after_offset) <= clearance:
-                    continue
-            elif (1.0 - t) * length <= end:
-                continue
-            return True
+            hit = a[0] + t * way[0], a[1] + t * way[1], a[2] + t * way[2]
+            if not (_at_end(before, hit, t * length, rules) or _at_end(after, hit, (1.0 - t) * length, rules)):
+                return True
+        node, waiting = next_leaf(lower, upper, child, todo, waiting, box_missed, (a, inverse))
     return False
 
 
+@part
+def _share_to(corners, a, way, length, margin):  # type: ignore[no-untyped-def]
+    """Share of the way from ``a`` at which it meets a triangle; -1 where it misses it.
+
+    Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997), doi:10.1080/10867651.1997.10487468.
+    """
+    c, (d0, d1, d2) = corners, way
+    edge = margin if margin > 0.0 else -1e-9
+    e0, e1, e2 = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2]
+    g0, g1, g2 = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2]
+    p0, p1, p2 = d1 * g2 - d2 * g1, d2 * g0 - d0 * g2, d0 * g1 - d1 * g0
+    det = e0 * p0 + e1 * p1 + e2 * p2
+    if abs(det) <= 1e-14 * length:
+        return -1.0
+    if margin > 0.0:  # so near to grazing that a tolerance might decide
+        m0, m1, m2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
+        if abs(det) < 1e-5 * length * np.sqrt(m0 * m0 + m1 * m1 + m2 * m2):
+            return -1.0
+    s0, s1, s2 = a[0] - c[0, 0], a[1] - c[0, 1], a[2] - c[0, 2]
+    u = (s0 * p0 + s1 * p1 + s2 * p2) / det
+    if u < edge or u > 1.0 - edge:
+        return -1.0
+    q0, q1, q2 = s1 * e2 - s2 * e1, s2 * e0 - s0 * e2, s0 * e1 - s1 * e0
+    v = (d0 * q0 + d1 * q1 + d2 * q2) / det
+    if v < edge or u + v > 1.0 - edge:
+        return -1.0
+    return (g0 * q0 + g1 * q1 + g2 * q2) / det
+
+
+@part
+def _at_end(mirror, hit, distance, rules):  # type: ignore[no-untyped-def]
+    """Check whether a triangle is met too near an end to cut: in the mirror's plane, or at the antenna."""
+    normal, offset = mirror
+    if normal[0] == 0.0 and normal[1] == 0.0 and normal[2] == 0.0:
+        return distance <= rules.end
+    return abs(normal[0] * hit[0] + normal[1] * hit[1] + normal[2] * hit[2] - offset) <= rules.clearance
+
+
 @kernel
-def _direct(corners, tree, source, targets, rules):  # type: ignore[no-untyped-def]
+def _direct(solids, source, targets, rules):  # type: ignore[no-untyped-def]
     free = np.zeros(len(targets), np.bool_)
-    none = np.zeros(3)
+    antenna = np.zeros(3), 0.0
     for r in range(len(targets)):
-        free[r] = not segment_cut(corners, tree, source, targets[r], none, 0.0, none, 0.0, rules)
+        free[r] = not segment_cut(solids.corners, solids.tree, source, targets[r], antenna, antenna, rules)
     return free
 
 
@@ -502,16 +509,16 @@ def _height(normal, offset, f, p):  # type: ignore[no-untyped-def]
 @kernel
 def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-def]
     """Faces (faces,) that may come first: none that one convex face hides wholly."""
-    normal, offset, _, _, _, _, _, front_only, usable, _, _ = mirrors
+    normal, offset = mirrors.normal, mirrors.offset
     good = np.zeros(len(normal), np.bool_)
-    stack = np.empty(64, np.int64)
-    for f in range(len(normal)):
-        if not usable[f]:
+    stack = np.empty(DEEPEST, np.int64)
+    for f in range(len(good)):
+        if not mirrors.usable[f]:
             continue
         height = _height(normal, offset, f, source)
-        if (abs(height) <= rules[4] and rules[3] == 0.0) or (front_only[f] and height < -rules[4]):
+        if (abs(height) <= rules.side and rules.margin == 0.0) or (mirrors.front_only[f] and height < -rules.side):
             continue
-        good[f] = not (rules[6] and _wholly_hidden(mirrors, face_tree, source, f, -1, 0.0, rules, stack))
+        good[f] = not (rules.shadows and _wholly_hidden(mirrors, face_tree, source, f, -1, 0.0, rules, stack))
     return good
 
 
@@ -521,40 +528,37 @@ def _wholly_hidden(mirrors, face_tree, source, f, before, sign, rules, stack):  
 
     Where the source is an image, it lies as well wholly before the face ``before`` (-1: none), on the side ``sign``.
     """
-    normal, offset, _, _, window, convex, plane, _, _, _, _ = mirrors
-    lower, upper, child, start, count, items = face_tree
-    aim = np.zeros(3)
+    _, _, _, _, window, convex, plane, _, _, _, _ = mirrors
+    lower, upper, child, start, many, items = face_tree
+    aim, inverse = np.zeros(3), np.empty(3)
     for k in range(WINDOW):
         if not np.isfinite(window[f, k, 0]):
             return False
         aim += window[f, k] / WINDOW
-    inverse = np.empty(3)
     for axis in range(3):
         d = aim[axis] - source[axis]
         inverse[axis] = 1.0 / d if d != 0.0 else 1e300
     stack[0] = 0
-    waiting = 1
-    while waiting > 0:
-        waiting -= 1
-        node = stack[waiting]
-        if box_missed(lower, upper, node, source, inverse):
-            continue
-        if child[node] >= 0:
-            stack[waiting], stack[waiting + 1] = child[node], child[node] + 1
-            waiting += 2
-            continue
-        for k in range(start[node], start[node] + count[node]):
+    node, waiting = next_leaf(lower, upper, child, stack, 1, box_missed, (source, inverse))
+    while node >= 0:
+        for k in range(start[node], start[node] + many[node]):
             g = items[k]
             if not convex[g] or plane[g] == plane[f] or g == before:
                 continue
-            between = True
-            for corner in range(WINDOW if before >= 0 else 0):
-                if not sign * _height(normal, offset, before, window[g, corner]) > 10.0 * rules[1]:
-                    between = False
-                    break
-            if between and _hides(mirrors, source, f, g, rules):
+            if _beyond(mirrors, before, sign, g, rules) and _hides(mirrors, source, f, g, rules):
                 return True
+        node, waiting = next_leaf(lower, upper, child, stack, waiting, box_missed, (source, inverse))
     return False
+
+
+@part
+def _beyond(mirrors, before, sign, g, rules):  # type: ignore[no-untyped-def]
+    """Check whether the outline of ``g`` lies wholly before the face ``before``, where there is one."""
+    normal, offset = mirrors.normal, mirrors.offset
+    for corner in range(WINDOW if before >= 0 else 0):
+        if not sign * _height(normal, offset, before, mirrors.window[g, corner]) > 10.0 * rules.clearance:
+            return False
+    return True
 
 
 @kernel
@@ -563,8 +567,8 @@ def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
 
     It must do so well inside its outline: its triangles may lie a merge tolerance off its plane.
     """
-    normal, offset, _, _, window, _, _, _, _, _, _ = mirrors
-    clearance = rules[1]
+    normal, offset = mirrors.normal, mirrors.offset
+    window, clearance = mirrors.window, rules.clearance
     from_source = _height(normal, offset, g, source)
     if abs(from_source) <= 10.0 * clearance:
         return False
@@ -687,32 +691,79 @@ def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-
 
 
 @kernel
-def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, firsts, rules):  # type: ignore[no-untyped-def]
-    """All paths whose first face is one of ``firsts``: a walk, depth first, along beams."""
+def _ahead(normal, offset, f, sign, outline, side):  # type: ignore[no-untyped-def]
+    """Check whether a corner of an outline lies before a face, on the side ``sign`` of it."""
+    for k in range(WINDOW):  # noqa: SIM110 - compiled
+        if sign * _height(normal, offset, f, outline[k]) > -side:
+            return True
+    return False
+
+
+@part
+def _reflects(shapes, level, chain, signs, images, points, target, rules):  # type: ignore[no-untyped-def]
+    """Check whether a path to a target meets each face of the sequence; its ``points`` there."""
+    normal, offset, along, across, first, flat = shapes
+    side, strict, point = rules.side, rules.margin == 0.0, target
+    for step in range(level, -1, -1):
+        g = chain[step]
+        top = signs[step] * _height(normal, offset, g, point)
+        low = signs[step] * _height(normal, offset, g, images[step])
+        if top < -side or low < -side or top + low <= (side if strict else 1e-12):
+            return False
+        if step < level and top <= (side if strict else -side):
+            return False
+        share, behind = low / (low + top), images[step + 1]
+        for axis in range(3):
+            points[step, axis] = behind[axis] + share * (point[axis] - behind[axis])
+        point = points[step]
+        if not in_face(first, flat, along, across, g, point, EDGE_M):
+            return False
+    return True
+
+
+@kernel
+def _hidden(mirrors, solids, chain, source, points, target, rules):  # type: ignore[no-untyped-def]
+    """Check whether a triangle cuts a segment of the path over ``points``."""
+    antenna = np.zeros(3), 0.0
+    start, before = source, antenna
+    for step in range(len(chain)):
+        mirror = mirrors.normal[chain[step]], mirrors.offset[chain[step]]
+        if segment_cut(solids.corners, solids.tree, start, points[step], before, mirror, rules):
+            return True
+        start, before = points[step], mirror
+    return segment_cut(solids.corners, solids.tree, start, target, before, antenna, rules)
+
+
+@kernel
+def _doubled(pose, faces, points):  # type: ignore[no-untyped-def]
+    """Rows with room for as many more."""
+    many, depth = faces.shape
+    pose2, points2 = np.empty(2 * many, np.int64), np.zeros((2 * many, depth, 3))
+    faces2 = np.full((2 * many, depth), -1, np.int64)
+    pose2[:many], faces2[:many], points2[:many] = pose, faces, points
+    return pose2, faces2, points2
+
+
+@kernel
+def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[no-untyped-def]
+    """All paths whose first face is one of ``firsts``: a walk, depth first, along beams.
+
+    One body: a record handed to a part is counted in and out array by array, which costs as much as following a face.
+    """
     normal, offset, along, across, window, _, plane, front_only, usable, first, flat = mirrors
-    t_lower, t_upper, t_child, t_start, t_count, t_items = target_tree
-    max_depth, side, beams = rules[0], rules[4], rules[5]
-    faces_n = len(normal)
-    space = 256
-    out_pose = np.empty(space, np.int64)
-    out_faces = np.full((space, max_depth), -1, np.int64)
-    out_points = np.zeros((space, max_depth, 3))
-    total = 0
-    followed = 0
-    next_faces = np.empty((max_depth + 1, max(faces_n, len(firsts))), np.int64)
-    waiting = np.zeros(max_depth + 2, np.int64)
-    turn = np.zeros(max_depth + 2, np.int64)
-    chain = np.full(max_depth, -1, np.int64)
-    images = np.zeros((max_depth + 1, 3))
-    images[0] = source
-    signs = np.zeros(max_depth + 1)
-    planes = np.zeros((max_depth + 1, (WINDOW + 1) * (max_depth + 1), 4))
-    many = np.zeros(max_depth + 1, np.int64)
-    points = np.zeros((max_depth, 3))
-    stack = np.empty(64, np.int64)
-    none = np.zeros(3)
+    shapes = normal, offset, along, across, first, flat
+    targets, (t_lower, t_upper, t_child, t_start, t_many, t_items) = receivers
+    face_tree = solids.face_tree
+    depth, side, beams = rules.depth, rules.side, rules.beams
+    pose, faces, points = np.empty(256, np.int64), np.full((256, depth), -1, np.int64), np.zeros((256, depth, 3))
+    total = followed = 0
+    next_faces = np.empty((depth + 1, max(len(normal), len(firsts))), np.int64)
+    waiting, turn = np.zeros(depth + 2, np.int64), np.zeros(depth + 2, np.int64)
+    chain, signs, images = np.full(depth, -1, np.int64), np.zeros(depth + 1), np.zeros((depth + 1, 3))
+    planes, many = np.zeros((depth + 1, (WINDOW + 1) * (depth + 1), 4)), np.zeros(depth + 1, np.int64)
+    spots, stack, reached = np.zeros((depth, 3)), np.empty(DEEPEST, np.int64), np.empty(len(targets), np.int64)
     next_faces[0, : len(firsts)] = firsts
-    waiting[0] = len(firsts)
+    images[0], waiting[0] = source, len(firsts)
     level = 0
     while level >= 0:
         if turn[level] >= waiting[level]:
@@ -727,59 +778,41 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
         if level > 0:
             if plane[f] == plane[before] or not usable[f] or (front_only[f] and height < -side):
                 continue
-            if flatwise and rules[3] == 0.0:
+            if flatwise and rules.margin == 0.0:
                 continue
             if beams and _none_within(window[f], planes[level - 1], many[level - 1]):
                 continue
         sign = 1.0 if (height > 0.0 or front_only[f]) else -1.0
         if level > 0 and beams:
-            ahead = False
-            for k in range(WINDOW):
-                if sign * _height(normal, offset, f, window[before, k]) > -side:
-                    ahead = True
-                    break
-            if not ahead:
+            if not _ahead(normal, offset, f, sign, window[before], side):
                 continue
-            asked = rules[6] and level + 1 < max_depth  # of a last face it would cost more than it saves
-            if asked and _wholly_hidden(mirrors, face_tree, here, f, before, signs[level - 1], rules, stack):
+            asked = rules.shadows and level + 1 < depth  # of a last face it would cost more than it saves
+            last = signs[level - 1]
+            if asked and _wholly_hidden(mirrors, face_tree, here, f, before, last, rules, stack):
                 continue
         followed += 1
-        chain[level] = f
-        signs[level] = sign
+        chain[level], signs[level] = f, sign
         n0, n1, n2 = normal[f, 0], normal[f, 1], normal[f, 2]
         image = images[level + 1]
         image[0] = here[0] - 2.0 * height * n0
         image[1] = here[1] - 2.0 * height * n1
         image[2] = here[2] - 2.0 * height * n2
         # planes of the beam: before this face, what earlier faces leave of it, mirrored; and its own sides
-        mine = planes[level]
+        mine, number = planes[level], 1
         mine[0, 0], mine[0, 1], mine[0, 2] = sign * n0, sign * n1, sign * n2
         mine[0, 3] = -sign * offset[f] + side
-        number = 1
-        if beams and level > 0:
-            # plane 0 of the level before is the face itself: behind it nothing is lost, and it is no side of the beam
-            for p in range(1, many[level - 1]):
-                b0, b1, b2, b3 = (
-                    planes[level - 1, p, 0],
-                    planes[level - 1, p, 1],
-                    planes[level - 1, p, 2],
-                    planes[level - 1, p, 3],
-                )
-                dot = b0 * n0 + b1 * n1 + b2 * n2
-                mine[number, 0], mine[number, 1], mine[number, 2] = (
-                    b0 - 2.0 * dot * n0,
-                    b1 - 2.0 * dot * n1,
-                    b2 - 2.0 * dot * n2,
-                )
-                mine[number, 3] = b3 + 2.0 * dot * offset[f]
-                number += 1
-        if beams and not flatwise and (level + 1 < max_depth or not box_outside(t_lower, t_upper, 0, mine, number)):
+        # plane 0 of the level before is the face itself: behind it nothing is lost, and it is no side of the beam
+        for p in range(1, many[level - 1] if beams and level > 0 else 1):
+            b0, b1, b2 = planes[level - 1, p, 0], planes[level - 1, p, 1], planes[level - 1, p, 2]
+            twice = 2.0 * (b0 * n0 + b1 * n1 + b2 * n2)
+            mine[number, 0], mine[number, 1], mine[number, 2] = b0 - twice * n0, b1 - twice * n1, b2 - twice * n2
+            mine[number, 3] = planes[level - 1, p, 3] + twice * offset[f]
+            number += 1
+        if beams and not flatwise and (level + 1 < depth or not box_outside(t_lower, t_upper, 0, mine, number)):
             number = _side_planes(mine, number, image, window[f])
         many[level] = number if beams else 0
-        # receivers
-        stack[0] = 0
-        pending = 1
-        while pending > 0:
+        stack[0], pending, met = 0, 1, 0
+        while pending > 0:  # as within_planes, written out: a call counts every array of the tree in and out
             pending -= 1
             node = stack[pending]
             if beams and box_outside(t_lower, t_upper, node, mine, number):
@@ -788,61 +821,25 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
                 stack[pending], stack[pending + 1] = t_child[node], t_child[node] + 1
                 pending += 2
                 continue
-            for k in range(t_start[node], t_start[node] + t_count[node]):
-                r = t_items[k]
-                point = targets[r]
-                good = True
-                for step in range(level, -1, -1):
-                    g = chain[step]
-                    top = signs[step] * _height(normal, offset, g, point)
-                    low = signs[step] * _height(normal, offset, g, images[step])
-                    if (
-                        top < -side
-                        or low < -side
-                        or top + low <= (side if rules[3] == 0.0 else 1e-12)
-                        or (step < level and top <= (side if rules[3] == 0.0 else -side))
-                    ):
-                        good = False
-                        break
-                    share = low / (low + top)
-                    behind = images[step + 1]
-                    for axis in range(3):
-                        points[step, axis] = behind[axis] + share * (point[axis] - behind[axis])
-                    point = points[step]
-                    if not in_face(first, flat, along, across, g, point, EDGE_M):
-                        good = False
-                        break
-                if not good:
-                    continue
-                start, start_normal, start_offset = source, none, 0.0
-                cut = False
-                for step in range(level + 1):
-                    g = chain[step]
-                    if segment_cut(
-                        corners, tree, start, points[step], start_normal, start_offset, normal[g], offset[g], rules
-                    ):
-                        cut = True
-                        break
-                    start, start_normal, start_offset = points[step], normal[g], offset[g]
-                if cut or segment_cut(corners, tree, start, targets[r], start_normal, start_offset, none, 0.0, rules):
-                    continue
-                if total == space:
-                    space *= 2
-                    pose2 = np.empty(space, np.int64)
-                    faces2 = np.full((space, max_depth), -1, np.int64)
-                    points2 = np.zeros((space, max_depth, 3))
-                    pose2[:total], faces2[:total], points2[:total] = out_pose, out_faces, out_points
-                    out_pose, out_faces, out_points = pose2, faces2, points2
-                out_pose[total] = r
-                for step in range(level + 1):
-                    out_faces[total, step] = chain[step]
-                    out_points[total, step] = points[step]
-                total += 1
-        if level + 1 < max_depth:
-            waiting[level + 1] = within_planes(face_tree, mine, many[level], next_faces[level + 1])
-            turn[level + 1] = 0
+            for k in range(t_start[node], t_start[node] + t_many[node]):
+                reached[met] = t_items[k]
+                met += 1
+        for k in range(met):
+            r = reached[k]
+            if not _reflects(shapes, level, chain, signs, images, spots, targets[r], rules):
+                continue
+            if _hidden(mirrors, solids, chain[: level + 1], source, spots, targets[r], rules):
+                continue
+            if total == len(pose):
+                pose, faces, points = _doubled(pose, faces, points)
+            pose[total] = r
+            faces[total, : level + 1], points[total, : level + 1] = chain[: level + 1], spots[: level + 1]
+            total += 1
+        if level + 1 < depth:
             level += 1
-    return out_pose[:total].copy(), out_faces[:total].copy(), out_points[:total].copy(), followed
+            waiting[level] = within_planes(face_tree, mine, many[level - 1], stack, next_faces[level])
+            turn[level] = 0
+    return pose[:total].copy(), faces[:total].copy(), points[:total].copy(), followed
 
 
 def try_out() -> None:
@@ -854,14 +851,15 @@ def try_out() -> None:
         If it hides anything else.
     """
     triangle = np.array([[[5.0, -9.0, -9.0], [5.0, 9.0, -9.0], [5.0, 0.0, 9.0]]])
-    tree = tuple(box_tree(triangle.min(axis=1), triangle.max(axis=1)))
-    rules = tuple(_Rules(1, 1e-3, END_M, 0.0, SIDE_M, beams=True, shadows=True))
-    free = _direct(triangle, tree, np.zeros(3), np.array([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]]), rules)
+    tree = box_tree(triangle.min(axis=1), triangle.max(axis=1))
+    rules = Rules(1, 1e-3, END_M, 0.0, SIDE_M, beams=True, shadows=True)
+    free = _direct(_Solids(tree, triangle, tree), np.zeros(3), np.array([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]]), rules)
     if free.tolist() != [False, True]:
         raise RuntimeError(f"compiled code sees {free.tolist()} where one of two points is hidden")
 
 
 __all__ = [
+    "Rules",
     "estimate",
     "grow_paths",
     "in_face",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...common.units import FloatArray
-from ..numba_options import kernel
+from ..numba_options import kernel, law, part
 from ..surfaces import BoxTree
 
 DEEPEST = 64
@@ -82,17 +82,56 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
-def _opened(tree, node, todo, waiting, hits, total):  # type: ignore[no-untyped-def]
-    """The children of a node join the nodes that wait, the items of a leaf those found; how many both are then."""
-    _, _, child, start, count, items = tree
-    if child[node] >= 0:
+def next_leaf(lower, upper, child, todo, waiting, missed, region):  # type: ignore[no-untyped-def]
+    """Walk on to the next leaf whose box a region meets.
+
+    Parameters
+    ----------
+    lower, upper, child
+        As of a :class:`BoxTree`; a tuple of all its columns would be counted in and out at every leaf.
+    todo : (DEEPEST,) int
+        Nodes that wait; at the beginning the root, 0.
+    waiting : int
+        How many they are.
+    missed : function
+        ``missed(lower, upper, node, region)``: :func:`box_missed`, or another of this file.
+    region : tuple
+        As that takes it.
+
+    Returns
+    -------
+    node, waiting : int
+        The leaf, -1 after the last; how many nodes still wait.
+    """
+    while waiting > 0:
+        waiting -= 1
+        node = todo[waiting]
+        if missed(lower, upper, node, region):
+            continue
+        if child[node] < 0:
+            return node, waiting
         todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
-        return waiting + 2, total
-    for k in range(start[node], start[node] + count[node]):
-        hits[total] = items[k]
-        total += 1
-    return waiting, total
+        waiting += 2
+    return -1, waiting
+
+
+law(next_leaf)
+
+
+def _collected(tree, missed, region, todo, hits):  # type: ignore[no-untyped-def]
+    """Items of the leaves whose box a region meets, into ``hits``; how many."""
+    lower, upper, child, start, many, items = tree
+    total, todo[0] = 0, 0
+    node, waiting = next_leaf(lower, upper, child, todo, 1, missed, region)
+    while node >= 0:
+        for k in range(start[node], start[node] + many[node]):
+            hits[total] = items[k]
+            total += 1
+        node, waiting = next_leaf(lower, upper, child, todo, waiting, missed, region)
+    return total
+
+
+law(_collected)
 
 
 @kernel
@@ -112,25 +151,11 @@ def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
     int
         How many there are.
     """
-    lower, upper = tree[0], tree[1]
-    todo = np.empty(DEEPEST, np.int64)
-    todo[0] = 0
-    waiting, total = 1, 0
-    while waiting > 0:
-        waiting -= 1
-        node = todo[waiting]
-        out = False
-        for axis in range(3):
-            if lower[node, axis] > high[axis] or upper[node, axis] < low[axis]:
-                out = True
-        if out:
-            continue
-        waiting, total = _opened(tree, node, todo, waiting, hits, total)
-    return total
+    return _collected(tree, _apart, (low, high), np.empty(DEEPEST, np.int64), hits)
 
 
 @kernel
-def within_planes(tree, planes, many, hits):  # type: ignore[no-untyped-def]
+def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-def]
     """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``hits``; how many.
 
     A plane (4,) is ``a x + b y + c z + d >= 0`` inside.
@@ -142,6 +167,8 @@ def within_planes(tree, planes, many, hits):  # type: ignore[no-untyped-def]
         Normals pointing inwards, and offsets [m].
     many : int
         How many of them count.
+    todo : (DEEPEST,) int
+        Room for nodes that wait.
     hits : (items,) int
         Gets the items; has room for all of the tree.
 
@@ -150,17 +177,17 @@ def within_planes(tree, planes, many, hits):  # type: ignore[no-untyped-def]
     int
         How many there are.
     """
-    lower, upper = tree[0], tree[1]
-    todo = np.empty(DEEPEST, np.int64)
-    todo[0] = 0
-    waiting, total = 1, 0
-    while waiting > 0:
-        waiting -= 1
-        node = todo[waiting]
-        if box_outside(lower, upper, node, planes, many):
-            continue
-        waiting, total = _opened(tree, node, todo, waiting, hits, total)
-    return total
+    return _collected(tree, _outside, (planes, many), todo, hits)
+
+
+@part
+def _apart(lower, upper, node, box):  # type: ignore[no-untyped-def]
+    """Check whether a box of the tree lies apart from another, given by its corners (3,)."""
+    low, high = box
+    for axis in range(3):  # noqa: SIM110 - compiled
+        if lower[node, axis] > high[axis] or upper[node, axis] < low[axis]:
+            return True
+    return False
 
 
 @kernel
@@ -194,25 +221,18 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
     return False
 
 
-@kernel
-def box_missed(lower, upper, node, a, inverse):  # type: ignore[no-untyped-def]
-    """Check whether the segment from ``a`` with the component-wise ``inverse`` of its direction misses a box.
+@part
+def _outside(lower, upper, node, within):  # type: ignore[no-untyped-def]
+    return box_outside(lower, upper, node, within[0], within[1])
 
-    Parameters
-    ----------
-    lower, upper : (nodes, 3)
-        Corners of the boxes of a tree [m].
-    node : int
-        Which box.
-    a : (3,)
-        Start of the segment [m].
-    inverse : (3,)
-        One over each component of its vector [1/m]; 1e300 where that is 0.
 
-    Returns
-    -------
-    bool
+@part
+def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
+    """Check whether a segment misses a box of the tree.
+
+    ``segment`` is its start (3,) and one over each component of its vector [1/m], 1e300 where that is 0.
     """
+    a, inverse = segment
     enter, leave = 0.0, 1.0
     for axis in range(3):
         at_lower = (lower[node, axis] - a[axis]) * inverse[axis]

@@ -150,7 +150,7 @@ def _pieces_cut(s, work, a, b, own):  # type: ignore[no-untyped-def]
         waiting -= 1
         node = work[waiting]
         if child[node] >= 0:
-            if not box_missed(lower, upper, node, a, inverse):
+            if not box_missed(lower, upper, node, (a, inverse)):
                 work[waiting], work[waiting + 1] = child[node], child[node] + 1
                 waiting += 2
             continue
@@ -229,11 +229,9 @@ def _own(s, b, own):  # type: ignore[no-untyped-def]
 
 @kernel
 def _triangles_cut(s, m, a, b, f, g):  # type: ignore[no-untyped-def]
-    before, after, none = m.normal[f], m.normal[g], np.zeros(3)
-    return segment_cut(
-        s.corners, s.tree, np.array(a), np.array(b), before if f >= 0 else none, m.offset[f], after if g >= 0 else none,
-        m.offset[g], s.rules,
-    )  # fmt: skip
+    none = np.zeros(3)
+    before, after = (m.normal[f] if f >= 0 else none, m.offset[f]), (m.normal[g] if g >= 0 else none, m.offset[g])
+    return segment_cut(s.corners, s.tree, np.array(a), np.array(b), before, after, s.rules)
 
 
 @part

@@ -219,10 +219,11 @@ def _mirrors(kernels: ModuleType, faces: Faces, surfaces: Surfaces | None) -> An
 
 
 def _solids(kernels: ModuleType, hiding: Occlusion | None, surfaces: Surfaces | None) -> Any:
-    from .beams import END_M, SIDE_M  # compiled
+    from .beams import END_M, SIDE_M, Rules  # compiled
     from .boxtree import box_tree
 
-    rules = (1, 0.0 if surfaces is None else 2.0 * surfaces.merge_m, END_M, 0.0, SIDE_M, True, True)
+    clearance = 0.0 if surfaces is None else 2.0 * surfaces.merge_m
+    rules = Rules(1, clearance, END_M, 0.0, SIDE_M, beams=True, shadows=True)
     if surfaces is not None:
         return kernels.Solids(
             normal=np.zeros((0, 3)),
@@ -232,7 +233,7 @@ def _solids(kernels: ModuleType, hiding: Occlusion | None, surfaces: Surfaces | 
             boxes=np.zeros((0, 6, kernels.LEAF)),
             block=np.zeros(0, np.int64),
             corners=surfaces.corners_m,
-            tree=tuple(surfaces.tree),
+            tree=surfaces.tree,
             rules=rules,
             triangles=True,
         )
@@ -254,7 +255,7 @@ def _solids(kernels: ModuleType, hiding: Occlusion | None, surfaces: Surfaces | 
         boxes=boxes,
         block=block,
         corners=np.zeros((0, 3, 3)),
-        tree=tuple(tree._replace(items=np.arange(len(planes)))),
+        tree=tree._replace(items=np.arange(len(planes))),
         rules=rules,
         triangles=False,
     )

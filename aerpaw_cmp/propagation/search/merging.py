@@ -64,7 +64,7 @@ def merged(scene: TriangleScene, merge_m: float = MERGE_M) -> Surfaces:
     low = np.minimum.reduceat(corners.min(axis=1), first[:-1], axis=0)
     high = np.maximum.reduceat(corners.max(axis=1), first[:-1], axis=0)
     face_tree = box_tree(low - merge_m, high + merge_m)
-    plane = _shared_planes(tuple(face_tree), corners, first, normal, offset, face_area, low, high, merge_m)
+    plane = _shared_planes(face_tree, corners, first, (normal, offset), face_area, (low, high), merge_m)
     normal, offset = normal[plane], offset[plane]
     along, across = _axes(normal)
     owner_axes = np.stack([along[face], across[face]], axis=1)
@@ -149,14 +149,13 @@ def _grown(
     edge = edge.reshape(-1)
     by_edge = np.argsort(edge, kind="stable")
     start = np.searchsorted(edge[by_edge], np.arange(int(edge.max()) + 2))
-    face, leader = _grow(
-        np.argsort(-area, kind="stable"), corners, normal, offset, edge.reshape(-1, 3), by_edge // 3, start, merge_m
-    )
+    neighbours = edge.reshape(-1, 3), by_edge // 3, start
+    face, leader = _grow(np.argsort(-area, kind="stable"), corners, normal, offset, neighbours, merge_m)
     return face, leader
 
 
 @kernel
-def _grow(order, corners, normal, offset, edges, triangle_of, start, merge_m):  # type: ignore[no-untyped-def]
+def _grow(order, corners, normal, offset, neighbours, merge_m):  # type: ignore[no-untyped-def]
     face = np.full(len(corners), -1, np.int64)
     leader = np.empty(len(corners), np.int64)
     todo = np.empty(len(corners), np.int64)
@@ -164,55 +163,56 @@ def _grow(order, corners, normal, offset, edges, triangle_of, start, merge_m):  
     for seed in order:
         if face[seed] >= 0:
             continue
-        leader[count] = seed
-        face[seed] = count
-        todo[0] = seed
-        waiting = 1
+        leader[count], face[seed], todo[0] = seed, count, seed
+        plane, waiting = (normal[seed], offset[seed]), 1
         while waiting > 0:
             waiting -= 1
-            here = todo[waiting]
-            for side in range(3):
-                edge = edges[here, side]
-                for k in range(start[edge], start[edge + 1]):
-                    other = triangle_of[k]
-                    if face[other] < 0 and _lies_in(corners, other, normal[seed], offset[seed], merge_m):
-                        face[other] = count
-                        todo[waiting] = other
-                        waiting += 1
+            waiting += _joining(todo[waiting], count, face, todo[waiting:], corners, plane, neighbours, merge_m)
         count += 1
     return face, leader[:count].copy()
 
 
 @kernel
-def _lies_in(corners, triangle, normal, offset, merge_m):  # type: ignore[no-untyped-def]
-    for k in range(3):
-        p = corners[triangle, k]
+def _joining(here, number, face, todo, corners, plane, neighbours, merge_m):  # type: ignore[no-untyped-def]
+    """Neighbours of a triangle that lie in the plane of its face join that, and wait in ``todo``; how many."""
+    edges, triangle_of, start = neighbours
+    many = 0
+    for edge in edges[here]:
+        for other in triangle_of[start[edge] : start[edge + 1]]:
+            if face[other] < 0 and _lie_in(corners, other, other + 1, plane, merge_m):
+                face[other], todo[many] = number, other
+                many += 1
+    return many
+
+
+@kernel
+def _lie_in(corners, first, after, plane, merge_m):  # type: ignore[no-untyped-def]
+    """Check whether the triangles from ``first`` up to ``after`` lie in a plane."""
+    normal, offset = plane
+    for p in corners[first:after].reshape(-1, 3):
         if abs(normal[0] * p[0] + normal[1] * p[1] + normal[2] * p[2] - offset) > merge_m:
             return False
     return True
 
 
 @kernel
-def _shared_planes(tree, corners, first, normal, offset, area, low, high, merge_m):  # type: ignore[no-untyped-def]
+def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type: ignore[no-untyped-def]
     """Face whose plane each face takes: that of a larger one that it touches and lies in, or its own."""
+    (normal, offset), (low, high) = planes, bounds
     plane = np.arange(len(normal))
     near = np.empty(len(normal), np.int64)
     for f in np.argsort(-area):
         many = overlapping(tree, low[f] - merge_m, high[f] + merge_m, near)
         best = -1
-        for k in range(many):
-            other = near[k]
+        for other in near[:many]:
             if area[other] < area[f] or (area[other] == area[f] and other >= f):
                 continue
             lead = plane[other]
             if abs(np.dot(normal[lead], normal[f])) < 0.7:
                 continue
-            good = True
-            for t in range(first[f], first[f + 1]):
-                if not _lies_in(corners, t, normal[lead], offset[lead], merge_m):
-                    good = False
-                    break
-            if good and (best < 0 or area[lead] > area[best]):
+            if not _lie_in(corners, first[f], first[f + 1], (normal[lead], offset[lead]), merge_m):
+                continue
+            if best < 0 or area[lead] > area[best]:
                 best = lead
         if best >= 0:
             plane[f] = best
@@ -256,20 +256,21 @@ def _hull(points):  # type: ignore[no-untyped-def]
     n = len(order)
     hull = np.empty((2 * n + 1, 2))
     k = 0
-    for turn in range(2):
-        base = k
-        for step in range(n):
-            p = points[order[step] if turn == 0 else order[n - 1 - step]]
-            while k >= base + 2:
-                ax, ay = hull[k - 1, 0] - hull[k - 2, 0], hull[k - 1, 1] - hull[k - 2, 1]
-                bx, by = p[0] - hull[k - 2, 0], p[1] - hull[k - 2, 1]
-                if ax * by - ay * bx > 1e-7 * np.sqrt(bx * bx + by * by):
-                    break
-                k -= 1
-            hull[k] = p
-            k += 1
-        k -= 1
-    return hull[:k].copy()
+    base = 0
+    for step in range(2 * n):
+        if step == n:  # there and back: the lower side, then the upper one
+            k -= 1
+            base = k
+        p = points[order[step] if step < n else order[2 * n - 1 - step]]
+        while k >= base + 2:
+            ax, ay = hull[k - 1, 0] - hull[k - 2, 0], hull[k - 1, 1] - hull[k - 2, 1]
+            bx, by = p[0] - hull[k - 2, 0], p[1] - hull[k - 2, 1]
+            if ax * by - ay * bx > 1e-7 * np.sqrt(bx * bx + by * by):
+                break
+            k -= 1
+        hull[k] = p
+        k += 1
+    return hull[: k - 1].copy()
 
 
 @kernel

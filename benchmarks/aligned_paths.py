@@ -8,11 +8,10 @@ Run: python benchmarks/aligned_paths.py [--links N] [--seed S] [--json]     (20 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
+import sys
 import time
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 from shapely.geometry import box
@@ -23,21 +22,11 @@ from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.mirror import find_paths
 from aerpaw_cmp.site.site import Building, Site, Tower
 
-ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from tests.propagation import exact
 
 
-def reference() -> ModuleType:
-    """The exact paths, kept with the tests."""
-    name = next(iter(ROOT.glob("tests/*/exact.py")))
-    spec = importlib.util.spec_from_file_location("exact", name)
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def wrong(exact: ModuleType, rng: np.random.Generator, boxes: int) -> tuple[int, int, int, int, float]:
+def wrong(rng: np.random.Generator, boxes: int) -> tuple[int, int, int, int, float]:
     """Links, paths, phantom paths, missing paths of one scene, and the seconds of the reference."""
     solids, source, poses = exact.random_scene(rng, boxes)
     buildings = tuple(Building(f"b{k}", box(w, s, e, n), float(top)) for k, (w, e, s, n, top) in enumerate(solids))
@@ -63,10 +52,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    exact, rng = reference(), np.random.default_rng(options.seed)
+    rng = np.random.default_rng(options.seed)
     total = np.zeros(4, dtype=int)
     while total[0] < options.links:
-        total += wrong(exact, rng, int(rng.integers(1, 5)))[:4]
+        total += wrong(rng, int(rng.integers(1, 5)))[:4]
     result = dict(zip(("links", "paths", "phantom", "missing"), total.tolist(), strict=True))
     print(json.dumps(result) if options.json else result)
 

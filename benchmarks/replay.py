@@ -11,7 +11,6 @@ Run: python benchmarks/replay.py [--quick] [--json] [--no-sionna]
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import platform
 import resource
@@ -27,7 +26,7 @@ from aerpaw_cmp.propagation.arrays import Link, Poses
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 
-REFERENCE = Path(__file__).parents[1] / "tests" / "propagation" / "reference.py"
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 
 def digits(links: int) -> dict[str, object]:
@@ -36,10 +35,8 @@ def digits(links: int) -> dict[str, object]:
 
     from aerpaw_cmp.compare.rank import channel_rank
     from aerpaw_cmp.site.materials import material
+    from tests.propagation import reference
 
-    spec = importlib.util.spec_from_file_location("replay_reference", REFERENCE)
-    reference = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(reference)
     mp.mp.dps = reference.DIGITS
     site, link, poses = _digits_case(links)
     result = replay(site, link, poses)

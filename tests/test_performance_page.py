@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
-import importlib.util
 import json
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
+
+from benchmarks import performance
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.skipif(
@@ -17,22 +17,12 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.fixture(scope="module")
-def performance() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("performance", ROOT / "benchmarks" / "performance.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_page_is_made_from_the_history(performance: ModuleType) -> None:
+def test_the_page_is_made_from_the_history() -> None:
     found = performance.runs(performance.HISTORY)
     assert (ROOT / "docs" / "performance.md").read_text(encoding="utf-8") == performance.page(found)
 
 
-def test_every_axis_has_a_title_and_what_was_not_measured_is_said(performance: ModuleType) -> None:
+def test_every_axis_has_a_title_and_what_was_not_measured_is_said() -> None:
     run = performance.last_whole(performance.runs(performance.HISTORY))
     scaling = run["benchmarks"]["scaling"]["result"]
     assert set(scaling) <= set(performance.AXES)
@@ -43,7 +33,7 @@ def test_every_axis_has_a_title_and_what_was_not_measured_is_said(performance: M
             assert row.get("refused", "|") in text
 
 
-def test_the_page_says_what_failed_and_how_far_it_extrapolates(performance: ModuleType, tmp_path: Path) -> None:
+def test_the_page_says_what_failed_and_how_far_it_extrapolates(tmp_path: Path) -> None:
     run: dict[str, Any] = copy.deepcopy(performance.last_whole(performance.runs(performance.HISTORY)))
     rows = [{"size": s, "faces": s, "cpu_s": s**1.5 / 1000, "wall_s": 1.0, "peak_mib": 100.0} for s in (100, 1000)]
     run["benchmarks"]["scaling"]["result"]["faces"] = {"rows": rows, "power_cpu": 1.5, "power_memory": 0.0}

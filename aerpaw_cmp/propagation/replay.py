@@ -20,7 +20,7 @@ from .field.ridges import ridge_loss_db
 from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
 from .options import Field, Run, Search
 from .paths import Faces, PathSet
-from .scene import Scene, buried_towers, within_reach
+from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
 from .search.edges import find_edge_paths
 from .search.terrain import on_terrain
@@ -54,8 +54,8 @@ class Replay:
     search_seconds : float
         Of the path search alone, when it was made: an entry of the cache remembers it.
     engine : str
-    left_out : list of str
-        What was not modelled, for the report.
+    omitted : list of Omission
+        What was not modelled; ``left_out`` says it for the report.
     towers : tuple of str
         Order of the tower axis.
     from_cache : bool
@@ -82,13 +82,18 @@ class Replay:
     search_seconds: float
     engine: str
     towers: tuple[str, ...]
-    left_out: list[str] = field(default_factory=list)
+    omitted: list[Omission] = field(default_factory=list)
     from_cache: bool = False
     samples: int = 0
     samples_reason: str = ""
     surfaces: Surfaces | None = None
     edge_paths: EdgePaths | None = None
     through: ThroughWalls | None = None
+
+    @property
+    def left_out(self) -> list[str]:
+        """What was not modelled, a sentence each."""
+        return [str(item) for item in self.omitted if 0 not in item.counts[:1]]
 
     def __repr__(self) -> str:
         """One line: the arrays are too large to be shown."""
@@ -181,7 +186,7 @@ def replay(
     choice = chosen_samples(scene, link, poses, search, cache)
     search = search if choice is None else replace(search, samples=choice.samples)
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
-    notes += cache.warnings if cache else []
+    notes += map(Omission, cache.warnings) if cache else []
     bent, over, unmodelled = _bent(site, scene, link, poses, search, field, run)
     through, added = _passing(site, scene, link, poses, search, field, run)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
@@ -193,7 +198,7 @@ def replay(
         result,
         seconds=time.perf_counter() - started,
         search_seconds=search_seconds,
-        left_out=notes,
+        omitted=notes,
         from_cache=from_cache,
         samples=int(search.samples) if search.engine == "sionna" else 0,
         samples_reason=choice.reason if choice else "",
@@ -202,7 +207,7 @@ def replay(
 
 def passed(
     site: Site, scene: Scene, link: Link, poses: Poses, paths: PathSet, search: Search
-) -> tuple[Scene, PathSet, list[str]]:
+) -> tuple[Scene, PathSet, list[Omission]]:
     """Paths over terrain that it lets through, with those that bounce off crowns.
 
     Parameters
@@ -217,7 +222,7 @@ def passed(
     scene : Scene
         With the facets of crowns that a path meets.
     paths : PathSet
-    notes : list of str
+    notes : list of Omission
         What was stopped or left out.
     """
     scene, level, shaped, notes = _shaped_ground(site, scene, link, poses, paths)
@@ -228,23 +233,23 @@ def passed(
         level.terrain_db[direct] = ridge_loss_db(site.dem, *ends, wavelength_m(link.carrier_hz), search.ridges)
         clear[direct] = True
     lost = int((~clear).sum())
-    notes += [f"{lost} of {len(level)} paths end at the terrain of the elevation model"] if lost else []
+    notes += [Omission("paths end at the terrain of the elevation model", (lost, len(level)))]
     paths = level.select(clear) if lost else level
     if len(shaped):
         paths = mirror.merge([paths, shaped], search.max_depth, None)
     if search.crowns is None:
         return scene, paths, notes
     if scene.surfaces is not None:
-        return scene, paths, [*notes, "reflections off crowns: they are not searched in a scene of triangles"]
+        return scene, paths, [*notes, Omission("reflections off crowns: they are not searched in a scene of triangles")]
     scene, bounces = scene.with_bounces(site, poses, search.crowns, search.max_depth)
     if search.max_depth > 1:
-        notes = [*notes, "paths over a crown and a building, or over two crowns"]
+        notes.append(Omission("paths over a crown and a building, or over two crowns"))
     return scene, mirror.merge([paths, bounces], search.max_depth, None), notes
 
 
 def _shaped_ground(
     site: Site, scene: Scene, link: Link, poses: Poses, paths: PathSet
-) -> tuple[Scene, PathSet, PathSet, list[str]]:
+) -> tuple[Scene, PathSet, PathSet, list[Omission]]:
     """Scene with tangent planes of the terrain, paths that stay on level ground, paths over the planes, notes."""
     if site.dem is None or scene.surfaces is not None or not paths.faces.shape[1]:
         return scene, paths, paths.select(slice(0, 0)), []
@@ -252,7 +257,7 @@ def _shaped_ground(
     words = "links over ground that the elevation model does not know: level ground reflects there"
     more = np.zeros((len(scene.usable), len(found.faces) - len(scene.faces)), dtype=np.bool_)
     scene = replace(scene, faces=found.faces, usable=np.concatenate([scene.usable, more], axis=1))
-    return scene, found.level, found.shaped, [f"{found.unknown} {words}"] if found.unknown else []
+    return scene, found.level, found.shaped, [Omission(words, (found.unknown,))]
 
 
 def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:
@@ -282,7 +287,7 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
 
 def _bent(
     site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, run: Run
-) -> tuple[EdgePaths | None, Fields | None, list[str]]:
+) -> tuple[EdgePaths | None, Fields | None, list[Omission]]:
     """Paths over edges, what they add, and what of diffraction is not modelled."""
     if search.diffraction == "none":
         return None, None, []
@@ -306,7 +311,8 @@ def _bent(
         paths, loss_db = paths.select(clear), None if loss_db is None else loss_db[clear]
     h, power = edge_channels(paths, edges, scene.faces, scene.sources_m, poses, link, loss_db, threads=run.threads)
     missing = "three edges" if search.diffraction == "all" else "two edges, after a reflection off a wall,"
-    return paths, Fields(h, power, power), [f"diffraction over {missing} and with more than one reflection on a side"]
+    missing = f"diffraction over {missing} and with more than one reflection on a side"
+    return paths, Fields(h, power, power), [Omission(missing)]
 
 
 def _passing(

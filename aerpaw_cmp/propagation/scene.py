@@ -132,7 +132,20 @@ REACH_M = 100_000.0
 """Poses further than this from every tower [m] are no poses of the site."""
 
 
-def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[str]]:
+@dataclass(frozen=True, slots=True)
+class Omission:
+    """One thing that a replay leaves out: ``counts`` is how many, and of how many, where it is counted."""
+
+    what: str
+    counts: tuple[int, ...] = ()
+    tower: str = ""
+
+    def __str__(self) -> str:
+        tower = f"{self.tower}: " if self.tower else ""
+        return tower + " ".join([*([" of ".join(map(str, self.counts))] if self.counts else []), self.what])
+
+
+def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
     """Poses with those that cannot be replayed as unknown (NaN): each alone, so that the others keep their paths.
 
     Tolerances grow with the size of the scene: one pose at 1e12 m would change the paths of all. A pose without a
@@ -157,13 +170,13 @@ def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[str]]:
         (far, f"poses further than {REACH_M / 1000:g} km from every tower"),
         (known & ~far & ~turned, "poses without a rotation"),
     ]
-    lines = [f"{int(mask.sum())} {what}: no path was searched for them" for mask, what in reasons if mask.any()]
+    counted = [(int(mask.sum()), f"{what}: no path was searched for them") for mask, what in reasons]
     position = np.where(bad[:, None], np.nan, poses.position_m)
     rotation = np.where(bad[:, None, None], np.eye(3), poses.rotation)
-    return Poses(position, rotation), lines
+    return Poses(position, rotation), [Omission(what, (count,)) for count, what in counted]
 
 
-def buried_towers(site: Site, link: Link) -> list[str]:
+def buried_towers(site: Site, link: Link) -> list[Omission]:
     """Towers whose antenna is inside a building, said so: a wrong footprint would look like a dead tower."""
     lines = []
     names = list(link.tower_arrays)
@@ -172,5 +185,5 @@ def buried_towers(site: Site, link: Link) -> list[str]:
         name = names[number]
         for building in site.buildings:
             if inside_solids(replace(site, buildings=(building,)), places[number : number + 1]).any():
-                lines.append(f"{name}: its antenna is inside {building.name}, so it has no path at all")
+                lines.append(Omission(f"its antenna is inside {building.name}, so it has no path at all", tower=name))
     return lines

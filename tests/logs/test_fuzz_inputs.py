@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
-import sys
 import warnings
 from dataclasses import replace
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -17,24 +13,12 @@ from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs import limits
 from aerpaw_cmp.logs.readers import by_name, catalogue
 from aerpaw_cmp.logs.records import ReadResult
+from benchmarks import fuzz_inputs as fuzz
 from tests.parsers import samples
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "fuzz_inputs.py"
-
 
 @pytest.fixture(scope="module")
-def fuzz() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fuzz_inputs", PATH)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["fuzz_inputs"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def known(fuzz: ModuleType) -> dict:
+def known() -> dict:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("AERPAW_CMP_FIELD_DATA", raising=False)  # the same inputs everywhere
         with warnings.catch_warnings():
@@ -52,7 +36,7 @@ def test_every_reader_of_the_catalogue_is_a_target_with_seeds(known: dict) -> No
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_short_part_of_the_run_has_no_violation(fuzz: ModuleType, known: dict) -> None:
+def test_a_short_part_of_the_run_has_no_violation(known: dict) -> None:
     found, read = [], 0
     for name, target in known.items():
         for index in range(20):
@@ -64,7 +48,7 @@ def test_a_short_part_of_the_run_has_no_violation(fuzz: ModuleType, known: dict)
     assert read > 50, "most mutations must leave something to read, or nothing is tested behind the first check"
 
 
-def test_an_input_depends_on_seed_target_and_number_alone(fuzz: ModuleType, known: dict) -> None:
+def test_an_input_depends_on_seed_target_and_number_alone(known: dict) -> None:
     target = known["flight.yaml"]
     some = [fuzz.mutated(target, 3, i) for i in range(40)]
     assert some == [fuzz.mutated(target, 3, i) for i in range(40)]
@@ -93,7 +77,7 @@ def eat(_data: bytes, index: int) -> bool:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_planted_faults_are_seen_and_resumed_after(fuzz: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planted_faults_are_seen_and_resumed_after(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fuzz, "LIMIT_S", 0.2)
     target = fuzz.Target("planted", (b"x",), eat)
     told: list[str] = []
@@ -109,7 +93,7 @@ def test_planted_faults_are_seen_and_resumed_after(fuzz: ModuleType, monkeypatch
         assert any(text.startswith(f"planted {index}:") and words in text for text in told), (index, told)
 
 
-def test_a_reader_that_breaks_its_promises_is_seen(fuzz: ModuleType) -> None:
+def test_a_reader_that_breaks_its_promises_is_seen() -> None:
     vehicle = next(reader for reader in catalogue() if reader.name == "vehicle_out")
     from tests.parsers.samples import VEHICLE_10
 
@@ -138,7 +122,7 @@ def test_a_reader_that_breaks_its_promises_is_seen(fuzz: ModuleType) -> None:
     assert fuzz.check_law(limits.check(beyond), VEHICLE_10, False) is None
 
 
-def test_a_reader_that_says_otherwise_in_pieces_is_seen(fuzz: ModuleType) -> None:
+def test_a_reader_that_says_otherwise_in_pieces_is_seen() -> None:
     sounder = by_name("sounder_log")
     data = samples.sounder_log(40)
     assert fuzz._read_log(sounder, False, data, 1)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 from aerpaw_cmp.common.errors import CheckError
 from aerpaw_cmp.machine import llvm
+from tools import setup_llvm as setup
 
 ROOT = Path(__file__).resolve().parents[2]
 ABORTS = (
@@ -25,17 +24,6 @@ ANSWERS = "print('noise'); print('{\"right\": true, \"llvm\": [%d, 1, 7]}')"
 def put(folder: Path, *names: str) -> None:
     for name in names:
         (folder / name).write_bytes(b"\x7fELF")
-
-
-@pytest.fixture
-def setup() -> ModuleType:
-    """The script of ``make setup``, which alone installs anything."""
-    spec = importlib.util.spec_from_file_location("setup_llvm", ROOT / "tools" / "setup_llvm.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
@@ -144,9 +132,7 @@ def test_what_sionna_wants_of_typing_is_there() -> None:
     assert hasattr(typing, "Self")
 
 
-def test_what_drjit_itself_lacks_is_named_and_installed(
-    tmp_path: Path, setup: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_drjit_itself_lacks_is_named_and_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a minimal Debian: the loader's message comes first, an unrelated NameError last."""
     program = (
         "try: raise ImportError('libatomic.so.1: cannot open shared object file: No such file or directory')\n"
@@ -235,7 +221,7 @@ def fake_tool(folder: Path, name: str, script: str) -> None:
 
 
 def test_install_takes_the_newest_and_falls_back_when_its_trial_fails(
-    tmp_path: Path, setup: ModuleType, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """apt is a shell script that puts libraries down; version 22 fails its trial, 19 passes."""
     tools, libraries = tmp_path / "bin", tmp_path / "lib"
@@ -268,7 +254,7 @@ def test_install_takes_the_newest_and_falls_back_when_its_trial_fails(
     ]
 
 
-def test_install_refuses_without_root(setup: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_install_refuses_without_root(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(setup, "root_prefix", lambda: None)
     said: list[str] = []
     assert setup.install(said.append) is None

@@ -1,7 +1,4 @@
-import importlib.util
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import mpmath as mp
 import numpy as np
@@ -27,11 +24,7 @@ from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
 from aerpaw_cmp.propagation.options import Field, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.materials import material
-
-_spec = importlib.util.spec_from_file_location("replay_reference", Path(__file__).with_name("reference.py"))
-reference = importlib.util.module_from_spec(_spec)
-sys.modules["replay_reference"] = reference
-_spec.loader.exec_module(reference)
+from tests.propagation import reference
 
 
 @dataclass(frozen=True)

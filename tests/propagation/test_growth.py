@@ -1,8 +1,6 @@
 """The search among open surfaces: against enumeration of triangles, against the prism engine, in closed form."""
 
 from dataclasses import replace
-from importlib.util import module_from_spec, spec_from_file_location
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,10 +24,7 @@ from aerpaw_cmp.site.export import export_scene
 from aerpaw_cmp.site.mitsuba import read_scene
 from aerpaw_cmp.site.scenes import placed_scene
 from aerpaw_cmp.site.site import Building
-
-_spec = spec_from_file_location("open_surfaces", Path(__file__).with_name("open_surfaces.py"))
-enumerate_ = module_from_spec(_spec)
-_spec.loader.exec_module(enumerate_)
+from tests.propagation import open_surfaces as enumerate_
 
 WAYS = ({}, {"beams": False}, {"shadows": False})
 

@@ -1,9 +1,6 @@
 """The cases that break float32 or careless geometry, each by itself."""
 
 import dataclasses
-import importlib.util
-import sys
-from pathlib import Path
 
 import mpmath as mp
 import numpy as np
@@ -23,12 +20,7 @@ from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.materials import material
 from aerpaw_cmp.site.site import Building
-
-if "replay_reference" not in sys.modules:
-    _spec = importlib.util.spec_from_file_location("replay_reference", Path(__file__).with_name("reference.py"))
-    sys.modules["replay_reference"] = importlib.util.module_from_spec(_spec)
-    _spec.loader.exec_module(sys.modules["replay_reference"])
-reference = sys.modules["replay_reference"]
+from tests.propagation import reference
 
 LAMBDA = wavelength_m(3.4e9)
 VERTICAL = (0.0, 0.0, 0.0, 0.0)

@@ -1,6 +1,3 @@
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 import shapely
@@ -12,10 +9,7 @@ from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search.mirror import find_paths
 from aerpaw_cmp.propagation.search.occlusion import Occlusion, convex_pieces
 from aerpaw_cmp.site.site import Building
-
-_spec = importlib.util.spec_from_file_location("replay_exact", Path(__file__).with_name("exact.py"))
-exact = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(exact)
+from tests.propagation import exact
 
 ELL = Polygon([(0, 0), (20, 0), (20, 10), (10, 10), (10, 20), (0, 20)])
 

@@ -15,7 +15,8 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
-from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.drivers.parts import replay_in_parts
+from aerpaw_cmp.propagation.options import Field, Run, Search
 from aerpaw_cmp.propagation.paths import path_lengths
 from aerpaw_cmp.propagation.replay import Replay, replay
 from aerpaw_cmp.propagation.search.terrain import _stationary, _zone_m, specular_points
@@ -47,6 +48,18 @@ def test_a_pose_behind_the_ridge_has_no_path_and_one_above_it_has(site: Site) ->
     assert levels(site, 900.0, 120.0) == (True, 2)
     assert levels(site, 400.0, 40.0) == (True, 2), "before the ridge nothing changes"
     assert levels(dataclasses.replace(site, dem=None), 900.0, 80.0) == (True, 2)
+
+
+def test_paths_that_terrain_stops_are_counted_of_all_paths_whatever_the_parts(site: Site) -> None:
+    """Lines of sight; the first part loses none, the second all."""
+    link = Link(3.3e9, {"T": single_element()}, single_element())
+    east = np.array([300.0, 320.0, 340.0, 900.0, 910.0, 920.0])
+    poses = Poses(np.column_stack([east, 0 * east, 0 * east + 60.0]), np.tile(np.eye(3), (6, 1, 1)))
+    for size in (3, 6):
+        found = replay_in_parts(site, link, poses, Search(max_depth=0), Field(), Run(), size=size)
+        assert found.left_out == ["3 of 6 paths end at the terrain of the elevation model"]
+    open_air = Poses(poses.position_m[:3], poses.rotation[:3])
+    assert replay(site, link, open_air, Search(max_depth=0)).left_out == []
 
 
 def test_a_wall_can_still_be_seen_when_the_direct_line_is_blocked(site: Site) -> None:

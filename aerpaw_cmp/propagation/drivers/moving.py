@@ -7,7 +7,6 @@ node that stands still is replayed as a fixed tower is, bit by bit.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,7 +20,7 @@ from ..arrays import Link, Poses
 from ..options import Field, Loss, Run, Search, Whole
 from ..paths import PathSet
 from ..replay import PER_LINK, Replay, replay
-from .parts import put_together
+from .parts import in_turn
 
 PLACES_AT_ONCE = 64
 """Places of a node in one block: H of a block has this many times the links that count."""
@@ -130,21 +129,17 @@ def replay_moving(
             cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
         )
     progress, run = run.progress, replace(run, progress=None)
-    parts: list[Replay] = []
     blocks = list(_blocks(sources_m))
     if not blocks:
         return replay(site, link, poses, search, field, run)
     if len(blocks) > 1:
         run = replace(run, whole=_whole(link, poses, sources_m))
-    done = 0
-    for block in blocks:
+
+    def of(block: _Block) -> Replay:
         here, several, some, links = _scene_of(site, link, name, poses, block)
-        part = replay(here, several, some, replace(search, links=links), field, run)
-        parts.append(_of_one_tower(part, name, block))
-        done += len(block.rows)
-        if progress is not None:
-            progress(done / max(len(poses), 1))
-    return put_together(parts, [block.rows for block in blocks])
+        return _of_one_tower(replay(here, several, some, replace(search, links=links), field, run), name, block)
+
+    return in_turn([block.rows for block in blocks], map(of, blocks), progress)
 
 
 def _whole(link: Link, poses: Poses, sources_m: FloatArray) -> Whole:
@@ -191,7 +186,7 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
         through=through,
         edge_paths=None if bent is None else replace(bent, tower=np.zeros_like(bent.tower)),
         towers=(name,),
-        left_out=[re.sub(re.escape(name) + "@[0-9]+", name, text) for text in replayed.left_out],
+        omitted=[replace(item, tower=name if item.tower else "") for item in replayed.omitted],
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -15,6 +15,8 @@ from ..edges import EdgePaths
 from ..options import Field, Run, Search, Whole
 from ..paths import Faces, PathSet, joined
 from ..replay import PER_LINK, Replay, replay
+from ..scene import Omission
+from ..search.effort import Progress
 from ..search.walls import ThroughWalls
 
 
@@ -41,15 +43,26 @@ def replay_in_parts(
     links = len(poses) * len(link.tower_arrays)
     pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
     progress, run = run.progress, replace(run, progress=None, whole=Whole.of(poses.position_m, links, pairs))
-    parts: list[Replay] = []
-    for at in rows:
-        parts.append(replay(site, link, Poses(poses.position_m[at], poses.rotation[at]), search, field, run))
+
+    def of(at: IntArray) -> Replay:
+        return replay(site, link, Poses(poses.position_m[at], poses.rotation[at]), search, field, run)
+
+    return in_turn(rows, map(of, rows), progress)
+
+
+def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | None) -> Replay:
+    """One replay of parts that are made as they are asked for; ``rows`` are their poses."""
+    made: list[Replay] = []
+    done, count = 0, max(1, sum(map(len, rows)))
+    for at, part in zip(rows, parts, strict=True):
+        made.append(part)
+        done += len(at)
         if progress is not None:
-            progress(float(at[-1] + 1) / len(poses))
-    return put_together(parts, rows)
+            progress(done / count)
+    return _put_together(made, rows)
 
 
-def put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
+def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
     """One replay of parts, poses in their order; the parts are taken apart, so that memory holds them once."""
     first, count = parts[0], sum(map(len, rows))
     # faces of crowns and terrain are numbered as they are met: other blocks have others
@@ -59,7 +72,7 @@ def put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
         "faces": faces,
         "seconds": sum(part.seconds for part in parts),
         "search_seconds": sum(part.search_seconds for part in parts),
-        "left_out": _counted(parts),
+        "omitted": _added(parts),
         "through": _through([part.through for part in parts if part.through is not None], rows),
         "edge_paths": None if first.edge_paths is None else _edge_paths([b for b in bent if b is not None], rows),
     }
@@ -114,15 +127,12 @@ def _shared(one: Faces, other: Faces) -> int:
     return count if same.all() else int(np.argmin(same))
 
 
-_COUNT = re.compile(r"(\d+)(?: of (\d+))? (.*)", re.DOTALL)
-
-
-def _counted(parts: list[Replay]) -> list[str]:
-    """Messages on what was left out, each once; counts at the front of a message are added up."""
-    counts: dict[str, list[int]] = {}
-    for text in (text for part in parts for text in part.left_out):
-        match = _COUNT.fullmatch(text)
-        key, numbers = (match[3], [int(n) for n in match.groups()[:2] if n]) if match else (text, [])
-        kept = counts.get(key, [0] * len(numbers))
-        counts[key] = [one + other for one, other in zip(kept, numbers, strict=False)]
-    return [" of ".join(map(str, numbers)) + (" " if numbers else "") + text for text, numbers in counts.items()]
+def _added(parts: list[Replay]) -> list[Omission]:
+    """What the parts leave out, each once, counts added up."""
+    added: dict[tuple[str, str], Omission] = {}
+    for item in (item for part in parts for item in part.omitted):
+        key = item.tower, item.what
+        before = added.get(key)
+        counts = item.counts if before is None else tuple(map(sum, zip(before.counts, item.counts, strict=True)))
+        added[key] = replace(item, counts=counts)
+    return list(added.values())

@@ -6,9 +6,11 @@ tree is conservative; what decides is computed on the items themselves, in float
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from ...common.units import FloatArray
+from ...common.units import FloatArray, IntArray
 from ..numba_options import kernel, law, part
 from ..surfaces import BoxTree
 
@@ -82,7 +84,9 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
     )
 
 
-def next_leaf(lower, upper, child, todo, waiting, missed, region):  # type: ignore[no-untyped-def]
+def next_leaf(
+    lower: FloatArray, upper: FloatArray, child: IntArray, todo: IntArray, waiting: int, missed: Any, region: Any
+) -> tuple[int, int]:
     """Walk on to the next leaf whose box a region meets.
 
     Parameters
@@ -118,7 +122,7 @@ def next_leaf(lower, upper, child, todo, waiting, missed, region):  # type: igno
 law(next_leaf)
 
 
-def _collected(tree, missed, region, todo, hits):  # type: ignore[no-untyped-def]
+def _collected(tree: BoxTree, missed: Any, region: Any, todo: IntArray, hits: IntArray) -> int:
     """Items of the leaves whose box a region meets, into ``hits``; how many."""
     lower, upper, child, start, many, items = tree
     total, todo[0] = 0, 0

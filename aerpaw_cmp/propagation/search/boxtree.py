@@ -232,9 +232,20 @@ def _outside(lower, upper, node, within):  # type: ignore[no-untyped-def]
 
 @part
 def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
-    """Check whether a segment misses a box of the tree.
+    """Check whether a segment misses a box.
 
-    ``segment`` is its start (3,) and one over each component of its vector [1/m], 1e300 where that is 0.
+    Parameters
+    ----------
+    lower, upper : (nodes, 3)
+        Corners of the boxes of a tree [m].
+    node : int
+        Which box.
+    segment : ((3,), (3,))
+        Start [m], and one over each component of its vector [1/m]; 1e300 where that is 0.
+
+    Returns
+    -------
+    bool
     """
     a, inverse = segment
     enter, leave = 0.0, 1.0

@@ -92,7 +92,7 @@ class Replay:
 
     @property
     def left_out(self) -> list[str]:
-        """What was not modelled, a sentence each."""
+        """Sentences on what was not modelled."""
         return [str(item) for item in self.omitted if 0 not in item.counts[:1]]
 
     def __repr__(self) -> str:

@@ -128,7 +128,7 @@ def _shared(one: Faces, other: Faces) -> int:
 
 
 def _added(parts: list[Replay]) -> list[Omission]:
-    """What the parts leave out, each once, counts added up."""
+    """Omissions of the parts, each once, counts added up."""
     added: dict[tuple[str, str], Omission] = {}
     for item in (item for part in parts for item in part.omitted):
         key = item.tower, item.what

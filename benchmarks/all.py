@@ -58,7 +58,7 @@ SMALLEST: dict[str, list[str]] = {
     "ingest": ["--scale", "2000", "--format", "sounder_log"],
     "interval_weights": ["mean", "--sequences", "4"],
     "kriging": ["--quick", "--pairs", "60"],
-    "kriging_field": ["--quick"],
+    "learned_map": ["--quick", "--only", "flights", "lte"],
     "left_out_reports": ["--only", "lte50"],
     "long_flight": ["--hours", "0.3", "--shares", "1"],
     "mutation": ["record", "{folder}/map.json", "--tests", "tests/compare/test_offset.py"],
@@ -83,7 +83,7 @@ SMALLEST: dict[str, list[str]] = {
 }
 """How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards."""
 
-ON_FIELD_DATA = ("kriging_field", "left_out_reports")
+ON_FIELD_DATA = ("learned_map", "left_out_reports")
 
 AXES = ("poses", "towers", "faces", "samples", "report", "flights", "workers")
 

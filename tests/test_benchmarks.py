@@ -32,5 +32,5 @@ def test_what_needs_the_field_data_is_left_out_without(
     every: dict, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("AERPAW_CMP_FIELD_DATA", raising=False)
-    assert every["check"](["kriging_field"]) == 0
+    assert every["check"](["learned_map"]) == 0
     assert "left out: AERPAW_CMP_FIELD_DATA is not set" in capsys.readouterr().out

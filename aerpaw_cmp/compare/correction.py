@@ -2,7 +2,7 @@
 
 A *base* predicts levels above free space: nothing at all (a constant level), free space, a replay, learned antennas. A
 *correction* is the residual field (:mod:`.field_gp`) of a base. Both are chosen by the CRPS of what is left out, and
-the correction stays off unless it lowers it.
+the correction stays off unless a 95 % interval shows that it lowers the CRPS.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from .calibration import MOST_GROUPS, groups_of
 from .direction_gain import LinkSamples
 from .entries import crps_normal
 from .field_gp import NEW_FLIGHT, PARTS, FieldFit, FieldModel, Part, Rows, fit_field
+from .statistics import mean_interval
 
 Predictor = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
 """Level above free space (n,) and its standard deviation (n,) [dB] of samples whose residual is not used."""
@@ -85,7 +86,8 @@ class Correction:
     held_out : mapping of (base, title) to ((n,), (n,))
         Errors on what was left out, in one order for all, and the standard deviations stated for them; NaN: no error.
     sd_factor : float
-        On all standard deviations: makes the errors of what was left out as large as stated.
+        On all standard deviations: makes the errors of what was left out as large as stated. Each candidate of
+        ``held_out`` has its own.
     """
 
     base: str
@@ -270,7 +272,11 @@ def _score_fold(
             tallies[title].append((error, np.sqrt(sd**2 + gain_sd**2 + model.noise_sd_db**2)))
 
 
-def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, beyond: bool = False) -> Correction:
+STATED_FIELDS = tuple(title for title, start in _STARTS.items() if start is not None)
+"""Titles of residual fields without free lengths, which remember places."""
+
+
+def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Sequence[str] = ()) -> Correction:
     """The base and the residual field with the lowest CRPS on what is left out, learned from all that is known.
 
     Parameters
@@ -279,8 +285,8 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, beyond: 
         Measured minus free space of every flight, tower and channel that is known.
     bases : mapping of str to callable
         In order of preference where scores are equal.
-    beyond : bool
-        The targets lie beyond the flown places: free lengths, which remember places, are not tried.
+    titles : sequence of str
+        Of the residual fields that are tried, :data:`OFF` among them; all by default.
 
     Returns
     -------
@@ -294,8 +300,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, beyond: 
     series = [s for s in series if np.isfinite(s.residual_db).any()]
     if not series:
         raise InputError("no sample has a level and a pose", expected="RSS with positions")
-    titles = [title for title, start in _STARTS.items() if start is not None or not beyond]
-    folds = _folds(series)
+    folds, titles = _folds(series), titles or tuple(_STARTS)
     tallies: dict[tuple[str, str], list[HeldOut]] = {(base, title): [] for base in bases for title in titles}
     for name, base in bases.items():
         models: dict[str, FieldModel | None] = dict.fromkeys(titles)
@@ -303,11 +308,12 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, beyond: 
             if fold.known and fold.asked:
                 many = len({s.flight for s in series}) > MOST_GROUPS
                 _score_fold(fold, base, models, {t: tallies[name, t] for t in titles}, keep=many)
-    held_out = {key: _joined(parts) for key, parts in tallies.items() if parts}
+    joined = {key: _joined(parts) for key, parts in tallies.items() if parts}
+    factors = {key: _sd_factor(*one) for key, one in joined.items()}
+    held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
     crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*one)) for key, one in held_out.items()}
-    best = min(crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
-    ratio = _mean(np.square(held_out[best][0] / held_out[best][1])) if held_out else math.inf
-    factor = min(max(math.sqrt(ratio), 0.8), 1.6) if math.isfinite(ratio) else 1.0
+    sure = [key for key in held_out if key[1] == OFF or mean_interval(crps_difference(held_out, key))[1] < 0.0]
+    best = min(sure or crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
     flights = tuple(dict.fromkeys(s.flight for s in series))
     predictor = bases[best[0]](series)
     channels = _channels(series, predictor, flights)
@@ -321,9 +327,21 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], *, beyond: 
         crps_db=crps,
         rmse_db=dict.fromkeys(tallies, math.nan)
         | {key: math.sqrt(_mean(np.square(error))) for key, (error, _) in held_out.items()},
-        held_out={key: (error, factor * sd) for key, (error, sd) in held_out.items()},
-        sd_factor=factor,
+        held_out=held_out,
+        sd_factor=factors.get(best, 1.0),
     )
+
+
+def crps_difference(held_out: Mapping[tuple[str, str], HeldOut], key: tuple[str, str]) -> FloatArray:
+    """CRPS of a base with a residual field minus that of the base alone, where both have an error [dB]."""
+    difference = crps_normal(*held_out[key]) - crps_normal(*held_out[key[0], OFF])
+    return np.asarray(difference[np.isfinite(difference)])
+
+
+def _sd_factor(error: FloatArray, sd: FloatArray) -> float:
+    """Ratio of seen to stated errors, between 0.8 and 1.6; 1 without an error."""
+    ratio = _mean(np.square(error / sd))
+    return min(max(math.sqrt(ratio), 0.8), 1.6) if math.isfinite(ratio) else 1.0
 
 
 def _joined(parts: Sequence[HeldOut]) -> HeldOut:

@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..common.units import FloatArray
-from ..compare.correction import OFF, Correction
-from ..compare.entries import crps_normal
+from ..compare.correction import OFF, Correction, crps_difference
 from ..compare.forecast import ForecastScore
-from ..compare.statistics import mean_interval, paired_difference, paired_verdict
+from ..compare.statistics import mean_interval, paired_difference
 from ..compare.verdicts import Verdict, stated_errors
 from ..site.learned import Entry, LearnedSeries
 from .phrases import filled, said_of
@@ -52,10 +51,9 @@ FIELD = {
         "",
     ),
     "worse": ("The residual field is off: it raises the CRPS by {size:.2f} dB on held-out samples.", ""),
-    "on": ("The residual field is on: it lowers the CRPS by {size:.2f} dB, not significantly.", ""),
     "off": ("The residual field is off: the CRPS differs by {size:.2f} dB, not significantly.", ""),
 }
-"""The residual field, by the interval of the difference of the CRPS; ``on`` and ``off`` where it holds zero."""
+"""The residual field, by the interval of the difference of the CRPS; ``off`` where it holds zero."""
 
 HELD_OUT = "90 % intervals hold {inside:.0f} % of the held-out samples."
 STATED: dict[str, tuple[str, str]] = {
@@ -189,15 +187,10 @@ def field(correction: Correction) -> Verdict:
     """CRPS with the best residual field minus that without one."""
     base = correction.base
     title = min((t for b, t in correction.crps_db if b == base and t != OFF), key=lambda t: correction.crps_db[base, t])
-    each = [crps_normal(*correction.held_out[base, name]) for name in (title, OFF)]
-    difference = each[0] - each[1]
-    difference = difference[np.isfinite(difference)]
+    difference = crps_difference(correction.held_out, (base, title))
     ends = mean_interval(difference)
-    word = paired_verdict(*ends)
-    cause = word if word in ("better", "worse") and (word == "better") == correction.on else ""
-    return Verdict(
-        cause=cause or ("on" if correction.on else "off"), effect=float(difference.mean()), interval=ends, where=title
-    )
+    cause = "better" if correction.on else "worse" if ends[0] > 0.0 else "off"
+    return Verdict(cause=cause, effect=float(difference.mean()), interval=ends, where=title)
 
 
 def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Verdict]) -> str:

@@ -8,13 +8,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import norm, t
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare import correction
 from aerpaw_cmp.compare.correction import OFF, Base, Channel, by_degree, choose, fixed_base
 from aerpaw_cmp.compare.direction_gain import LinkSamples
+from aerpaw_cmp.compare.entries import crps_normal
 from aerpaw_cmp.compare.field_gp import PARTS, FieldFit, FieldModel, Rows
 
 
@@ -120,10 +121,11 @@ def test_what_is_left_out_is_scored_as_by_hand(base: Base) -> None:
     found = choose(series, {"made": base})
     for title, model in FEW.items():
         assert model is not None
-        error, sd = by_hand(series, base, model)
+        error, bare = by_hand(series, base, model)
         got, stated = found.held_out["made", title]
         np.testing.assert_allclose(got, error, atol=1e-9)
-        np.testing.assert_allclose(stated, found.sd_factor * sd, rtol=1e-9)
+        sd = bare * min(max(np.sqrt(np.nanmean((error / bare) ** 2)), 0.8), 1.6)
+        np.testing.assert_allclose(stated, sd, rtol=1e-9)
         good = np.isfinite(error)
         assert good.sum() == 160
         assert found.rmse_db["made", title] == pytest.approx(np.sqrt(np.mean(error[good] ** 2)))
@@ -157,6 +159,19 @@ def test_a_field_is_added_where_one_was_planted_and_the_nearer_base_wins() -> No
     np.testing.assert_allclose(level, fit[0] + waves.predictor(asked)[0], atol=1e-6)
     with pytest.raises(InputError, match=r"no flight has T\.Z"):
         waves.predict(dataclasses.replace(asked, channel="Z"))
+
+
+def test_a_field_that_helps_by_chance_stays_off() -> None:
+    """Weak waves: the difference by block means of 16 samples, whose interval is that of Student."""
+    nothing, lower = fixed_base(lambda one: np.zeros(len(one))), []
+    for seed in (0, 3, 9):
+        found = choose([flight(name, seed + k, field_db=1.5) for k, name in enumerate("abc")], {"made": nothing})
+        field, bare = (crps_normal(*found.held_out["made", title]) for title in ("field", OFF))
+        means = (field - bare).reshape(-1, 16).mean(axis=1)
+        reach = t.ppf(0.975, len(means) - 1) * means.std(ddof=1) / np.sqrt(len(means))
+        assert means.mean() + 0.6 * reach < 0.0 if found.on else means.mean() + 1.6 * reach > 0.0
+        lower.append((bool(means.mean() < 0.0), found.on))
+    assert set(lower) == {(True, True), (True, False)}
 
 
 def test_headings_that_count_alike_add_their_spread() -> None:

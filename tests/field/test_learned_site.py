@@ -136,3 +136,13 @@ def test_packaged_entries_name_the_logs_of_the_field_folder(name: str) -> None:
     entry = read_learned("lake_wheeler").entries[name]
     assert len(entry.trained_on) >= 2
     assert set(entry.trained_on) <= known
+
+
+def test_learned_antennas_need_fewer_samples_than_two_rays() -> None:
+    """LTE at 50 m from 90 m: 50 samples with learned antennas leave less than 200 with two rays and patterns."""
+    script = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "learned_map.py"))
+    bench = script["Bench"](script["load_manifest"](), Path(ROOT))
+    rmse = script["lte_height"](bench, *script["LTE"], repeats=40)
+    learned, two_ray, free = (rmse[name] for name in ("learned", "two-ray + patterns", "free space"))
+    assert learned[0] < min(two_ray[1], free[0])
+    assert all(many < few for few, many in (learned, two_ray, free))

@@ -1,8 +1,6 @@
 """The map job: the engine behind it by physics and by the replay itself, the command by what it writes."""
 
 import json
-import os
-import runpy
 import types
 import zipfile
 from dataclasses import replace
@@ -364,26 +362,6 @@ def test_an_unknown_site_is_one_message(tmp_path):
     with pytest.raises(Exception, match="nowhere") as caught:
         main(["map", "nowhere.yaml", "-o", str(tmp_path)])
     assert isinstance(caught.value, UsageError) or type(caught.value).__name__ == "InputError"
-
-
-# --- real logs -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.field
-def test_kriging_bridges_blocks_of_a_real_flight():
-    """Held-out blocks of 100 m: Kriging beats nearest and the mean, and with the replay under it beats both alone."""
-    folder = os.environ.get("AERPAW_CMP_FIELD_DATA")
-    if not folder:
-        pytest.skip("AERPAW_CMP_FIELD_DATA does not name the folder of the real logs")
-    script = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "kriging_field.py"))
-    for one in script["flights"](Path(folder), ["dataset12_70m"])[:1]:
-        found = script["held_out"](one, 100.0, 25.0, every=4)
-        rmse = {name: row["rmse"] for name, row in found.items() if isinstance(row, dict)}
-        assert found["n"] > 100
-        assert rmse["Kriging"] < 0.8 * rmse["nearest"]
-        assert rmse["Kriging"] < 0.45 * rmse["mean"]
-        assert rmse["replay + Kriging"] < rmse["Kriging"]
-        assert rmse["replay + Kriging"] < 0.6 * rmse["replay + mean"]
 
 
 def test_the_notes_say_where_p833_is_continued():

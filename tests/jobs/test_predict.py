@@ -22,7 +22,7 @@ from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.against import score_against
 from aerpaw_cmp.jobs.prediction.predict_run import write_maps
 from aerpaw_cmp.jobs.prediction.sources import named_flights
-from aerpaw_cmp.jobs.prediction.where import Asked, find_targets
+from aerpaw_cmp.jobs.prediction.where import Asked, Targets, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.against_figures import against_specs
@@ -158,6 +158,24 @@ def test_a_flown_route_is_scored_by_what_was_said(said):
     assert scores["rmse_db"] == pytest.approx(np.sqrt(np.mean(error**2)))
     assert scores["coverage_90"] == np.mean(np.abs(error) <= 4.935)
     assert against.metrics()["sentence"].startswith("Predicted before this flight: RMSE")
+
+
+def test_a_neighbour_stands_for_the_rank_of_a_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As dense as a million points over 640 m x 640 m x 30 m, of which 50 000 are ranked."""
+    site, rng, count = load_site("lake_wheeler"), np.random.default_rng(0), 4000
+    place = np.column_stack([rng.uniform(-25, 25, count), rng.uniform(-175, -125, count), rng.uniform(35, 65, count)])
+    targets = Targets(
+        kind="points", name="", position_m=place, yaw_deg=np.full(count, 90.0), time_s=np.arange(float(count))
+    )
+    receivers = job._receivers([], "lake_wheeler", site)
+    ranks = []
+    for most in (count, count // 13):
+        monkeypatch.setattr(job, "MOST_RANKED", most)
+        ((_, rows, p),) = job._ranks(targets, receivers, site, lambda *_: None)
+        assert rows.tolist() == list(range(count))
+        ranks.append(p)
+    assert 0.0 < np.abs(ranks[0] - ranks[1]).max() < 0.1
+    assert np.mean(ranks[0].argmax(axis=1) != ranks[1].argmax(axis=1)) < 0.05
 
 
 @pytest.mark.parametrize("levels", [True, False])

@@ -15,7 +15,7 @@ from ...common.errors import InputError, UsageError
 from ...common.provenance import union
 from ...common.stages import Progress, Stages
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
-from ...compare.correction import OFF, Base, by_degree, choose, fixed_base
+from ...compare.correction import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
 from ...compare.direction_gain import LinkSamples
 from ...compare.spread import BAND
 from ...flight.data import FlightData, choose_site, site_place
@@ -278,7 +278,7 @@ def _chosen(
     if beyond:
         said.append("Most points lie outside the flown places: models that remember places are left out.")
         bases.pop("none")
-    correction = choose(samples, bases, beyond=beyond)
+    correction = choose(samples, bases, STATED_FIELDS if beyond else ())
     return Flown(correction, sources, logs.get(correction.base, ()))
 
 

@@ -19,15 +19,11 @@ class ClockTrap:
     ----------
     hours : float
         To be added to radio times.
-    overlap_s, shifted_overlap_s : float
-        Overlap with the telemetry before and after the shift [s].
     explanation : str
         What this looks like.
     """
 
     hours: float
-    overlap_s: float
-    shifted_overlap_s: float
     explanation: str
     is_utc: bool = False
     """UTC read as local time explains it."""
@@ -78,7 +74,7 @@ def clock_trap(
         return None
     hours = float(shifts[best])
     explanation, is_utc = _explain_hours(hours, float(telemetry[0]), timezone)
-    return ClockTrap(hours, now, float(shared[best]), explanation, is_utc)
+    return ClockTrap(hours, explanation, is_utc)
 
 
 def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[str, bool]:

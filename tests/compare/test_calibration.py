@@ -55,6 +55,14 @@ def test_an_offset_of_one_flight_shows_only_where_offsets_are_shared() -> None:
     assert found["c"].rmse_shared_offset_db == pytest.approx(np.hypot(found["c"].rmse_db, 6.0), abs=0.3)
     assert found["a"].rmse_shared_offset_db == pytest.approx(np.hypot(found["a"].rmse_db, 3.0), abs=0.3)
     assert all(s.constant_rmse_db == pytest.approx(s.free_space_rmse_db) for s in found.values())  # one distance
+    assert all(np.isnan([s.inside_50, s.inside_95]).all() for s in found.values())  # what nobody asks is not computed
+    kept: dict[str, calibration.Learned] = {}
+    assert all(np.isfinite([s.inside_50, s.inside_95]).all() for s in flight_left_out(flights, RECIPE, kept))
+    series = [o.samples for o in flights]
+    assert (
+        calibration.learn(series, RECIPE, MODEL).model == MODEL
+    )  # strengths that are given are not scaled to the data
+    assert calibration.learn(series, RECIPE).model != MODEL
     level = [dataclasses.replace(o, samples=dataclasses.replace(o.samples)) for o in flights[:2]]
     assert all(s.rmse_shared_offset_db < s.rmse_db + 0.1 for s in flight_left_out(level, RECIPE))
 

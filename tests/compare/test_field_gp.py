@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -294,3 +295,45 @@ def test_before_anything_is_learned_a_field_is_two_decibels_over_fifty_metres():
     assert field_gp._noisy(FieldModel(), np.zeros((2, 2)))[0].tolist() == [2.25, 0.0]
     other = rows_at([[0, 0, 20]], [0.0], 1)
     assert field_gp.covariance(FieldModel(), pair, other)[0, 0] == pytest.approx(100.0**2 + 4.0)
+
+
+def test_scales_are_sought_within_their_limits_from_the_usual_ones_on(monkeypatch):
+    """Decibels to 12, lengths of 10 to 300 m, 5 to 100 m of height, memories of 3 s to 10 minutes."""
+    limits = {"place_sd_db": (0.05, 12), "length_m": (10, 300), "height_m": (5, 100), "turn": (0.2, 5),
+              "drift_sd_db": (0.05, 12), "drift_s": (3, 600), "noise_sd_db": (0.2, 12)}  # fmt: skip
+    asked = []
+    monkeypatch.setattr(
+        "scipy.optimize.minimize",
+        lambda _, first, **how: asked.append((first, how["bounds"])) or SimpleNamespace(x=first),
+    )
+    rows = flights(np.random.default_rng(1), each=20)
+    found = fit_field([(rows, np.zeros(40))], FieldModel(length_m=900.0, noise_sd_db=0.01))
+    ((first, bounds),) = asked[:1]
+    np.testing.assert_allclose(bounds, np.log(list(limits.values())))
+    assert np.exp(first) == pytest.approx([2.0, 300.0, 30.0, 0.7, 1.5, 60.0, 0.2])
+    assert (found.length_m, found.noise_sd_db) == pytest.approx((300.0, 0.2))
+    assert found.offset_sd_db == pytest.approx(
+        1.5 * math.sqrt(2 / 3)
+    )  # two flights without an offset, and two as usual
+    with pytest.raises(InputError, match="fewer than three"):
+        fit_field([(rows.part(slice(0, 2)), np.zeros(2))])
+    fit_field([(rows.part(slice(0, 3)), np.zeros(3))])
+
+
+@pytest.mark.parametrize(("rows", "targets", "exact"), [(3000, 22_222, True), (3000, 22_223, False), (3001, 1, False)])
+def test_an_exact_solution_has_3000_rows_and_2e11_steps_at_most(rows, targets, exact):
+    fit = FieldFit(MOVING, rows_at(np.zeros((rows, 3))))
+    assert fit.fits(targets) is exact
+
+
+def test_targets_of_a_quarter_of_a_scale_go_together_where_they_are_eight():
+    corner = np.array([[0.0, 0.0, 0.0], [0.25, 0.0, 0.0], [-0.25, 0.5, 1.0], [2.0, 2.0, 2.0]])
+    counts = [7, 8, 30, 1]
+    rng = np.random.default_rng(2)
+    cell = rng.permutation(np.repeat(np.arange(4), counts))
+    parts = list(field_gp._cells(corner[cell] + rng.uniform(0.01, 0.24, (46, 3)), 20))
+    assert sorted(i for part, _ in parts for i in part) == list(range(46))
+    together = [cell[part] for part, shared in parts if shared]
+    assert sorted((int(one[0]), len(one)) for one in together) == [(1, 8), (2, 10), (2, 20)]
+    assert all(np.ptp(one) == 0 for one in together)
+    assert sum(len(part) for part, shared in parts if not shared) == 8

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -282,6 +283,15 @@ def kriging(found: list[dict[str, Any]]) -> list[str]:
     return out
 
 
+def imports_of(row: dict[str, Any]) -> str:
+    """The seconds of the imports with and without Sionna, where the run kept them."""
+    if "imports_cpu_s" not in row:
+        return ""
+    both = [sorted(row[key]) for key in ("imports_cpu_s", "imports_light_cpu_s")]
+    text = "; ".join(f"{statistics.median(s):.2f} s, from {s[0]:.2f} to {s[-1]:.2f}" for s in both)
+    return f" of {len(both[0])} times each: {text}"
+
+
 def reports(run: dict[str, Any]) -> list[str]:
     """What users run first: reports as they come, with their audit, and without it, against the imports they need."""
     result = run["benchmarks"].get("report", {}).get("result")
@@ -293,7 +303,8 @@ def reports(run: dict[str, Any]) -> list[str]:
     return [
         "## A report", "",
         f"Two channels ({one['flight']}), as processes, by processor time, against `import sionna.rt, "
-        "matplotlib.pyplot, pandas` and against those without Sionna:", "",
+        f"matplotlib.pyplot, pandas` and against those without Sionna (medians{imports_of(one)}). The first report "
+        "finds no kernel, path, font list or tried LLVM on the disk; only bytecode is compiled:", "",
         "| | seconds | x imports | x imports without Sionna | peak MiB |", "| --- | ---: | ---: | ---: | ---: |",
         *(
             f"| {name} | {row['cpu_s']:.1f} | {row['ratio']:.2f} | {row['ratio_light']:.2f} | {row['peak_mib']:.0f} |"
@@ -323,7 +334,8 @@ def page(found: list[dict[str, Any]]) -> str:
         "stated.", "",
         f"Last run: {run['date']}, version {run['version']}, {machine['processor']}, {machine['cpus']} processors, "
         f"{machine['memory_gib']} GiB, {machine['system']}, Python {machine['python']}; load {run['load_before']} "
-        f"before, {run['seconds'] / 60:.1f} min in all.", "",
+        f"before, {run.get('load_after', '-')} after (the run alone makes 1 to 2), {run['seconds'] / 60:.1f} min in "
+        f"all.{' Kernels of replays were compiled before the first row.' * ('load_after' in run)}", "",
         *([f"Not measured: {'; '.join(beside)}.", ""] if beside else []),
         *reports(run),
         "## Cost against size", "",

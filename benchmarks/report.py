@@ -1,10 +1,13 @@
 """Whole reports as processes: time as a ratio to a peer of the same run, and peak memory.
 
-1. A two-channel flight of 3304 samples, image engine: time over that of importing what it is made of
+1. A two-channel flight of 3304 samples, image engine: processor time over that of importing what it is made of
    (``import sionna.rt, matplotlib.pyplot, pandas``). The real one where AERPAW_CMP_FIELD_DATA is set, else a simulated.
-2. The sample flight: seconds and peak memory; the same without audit.
-   The first and the second report of part 1, as it comes and with ``--audit none``, caches empty before the first:
-   over those imports, and over the imports without Sionna, which such a report does not load.
+2. The sample flight: seconds and peak memory; the same without audit, both with the caches of this machine, which a
+   report that is not counted fills.
+   The first and the next report of part 1, as it comes and with ``--audit none``: every cache of the program, of Dr.Jit
+   and of matplotlib is empty before the first, whose time holds the trial of an LLVM. Bytecode is compiled before.
+   Ratios are to those imports, and to the imports without Sionna, which a report without audit does not load: the
+   median of all that the run measured, one before and one after each report.
 
     python benchmarks/report.py [--quick] [--json]
 """
@@ -48,6 +51,26 @@ def run(command: list[str], **environment: str) -> dict[str, float]:
     return {"wall_s": wall, "cpu_s": used.ru_utime + used.ru_stime, "peak_mib": used.ru_maxrss / 1024}
 
 
+class Imports:
+    """Processor seconds of the imports, with Sionna and without, as they were measured in this run."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, list[float]] = {IMPORTS: [], LIGHT: []}
+
+    def take(self) -> None:
+        """Measure both once more."""
+        for text, taken in self.seconds.items():
+            taken.append(run([sys.executable, "-c", text])["cpu_s"])
+
+    def ratios(self, row: dict[str, float]) -> dict[str, float]:
+        """A report with its ratios to the medians of the imports."""
+        full, light = (row["cpu_s"] / statistics.median(taken) for taken in self.seconds.values())
+        return {**row, "ratio": full, "ratio_light": light}
+
+
+IMPORTED = Imports()
+
+
 def report(flight: Path, out: Path, *options: str) -> list[str]:
     """The command line of a report."""
     return [sys.executable, "-m", "aerpaw_cmp", "report", str(flight), "-o", str(out), *options]
@@ -68,16 +91,16 @@ def two_channels(folder: Path) -> tuple[Path, list[str], str]:
 
 
 def cold_and_warm(flight: Path, options: list[str], folder: Path, repeats: int) -> dict[str, dict[str, float]]:
-    """First (cold) and next (warm) report, by processor time over the imports; medians."""
+    """First (cold) and next (warm) report, medians; the processor time of imports before and after each."""
     found: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
     for number in range(repeats):
         kept = folder / f"kept{number}"
         empty = {key: str(kept / key) for key in ("HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR", "AERPAW_CMP_CACHE")}
         kept.mkdir(parents=True)  # Dr.Jit keeps its kernels in the home folder
         for name, rows in found.items():
-            imports, light = (run([sys.executable, "-c", text])["cpu_s"] for text in (IMPORTS, LIGHT))
-            one = run(report(flight, folder / f"{name}{number}", *options), **empty)
-            rows.append({**one, "ratio": one["cpu_s"] / imports, "ratio_light": one["cpu_s"] / light})
+            IMPORTED.take()
+            rows.append(run(report(flight, folder / f"{name}{number}", *options), **empty))
+            IMPORTED.take()
     return {name: {key: statistics.median(row[key] for row in rows) for key in rows[0]} for name, rows in found.items()}
 
 
@@ -91,12 +114,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         flight, options, source = two_channels(folder)
-        imports, reports = [], []
-        run([sys.executable, "-c", IMPORTS])
-        for number in range(repeats):  # in turns: a machine that slows down slows both
-            imports.append(run([sys.executable, "-c", IMPORTS]))
+        for text in (IMPORTS, LIGHT):  # not counted: bytecode and what the machine has not read from its disk yet
+            run([sys.executable, "-c", text])
+        run(report(flight, folder / "unmeasured", *options))
+        reports = []
+        for number in range(repeats):
+            IMPORTED.take()
             reports.append(run(report(flight, folder / f"r{number}", *options)))
         some = ROOT / "sample_logs" / "flight.yaml"
+        run(report(some, folder / "unmeasured_sample"))
         sample = run(report(some, folder / "sample"))
         sample_later = run(report(some, folder / "sample_later", "--audit", "none"))
         now = cold_and_warm(flight, options, folder / "now", repeats)
@@ -104,29 +130,30 @@ def main() -> None:
     result = {
         "two_channels": {
             "flight": source,
-            "imports_s": statistics.median(r["wall_s"] for r in imports),
             "report_s": statistics.median(r["wall_s"] for r in reports),
-            "ratio": statistics.median(r["wall_s"] / i["wall_s"] for r, i in zip(reports, imports, strict=True)),
-            "ratio_cpu": statistics.median(r["cpu_s"] / i["cpu_s"] for r, i in zip(reports, imports, strict=True)),
+            "imports_cpu_s": IMPORTED.seconds[IMPORTS],
+            "imports_light_cpu_s": IMPORTED.seconds[LIGHT],
+            "ratio_cpu": statistics.median(IMPORTED.ratios(r)["ratio"] for r in reports),
             "peak_mib": max(r["peak_mib"] for r in reports),
         },
         "sample": sample,
         "sample_later": sample_later,
-        "now": now,
-        "later": later,
+        "now": {name: IMPORTED.ratios(row) for name, row in now.items()},
+        "later": {name: IMPORTED.ratios(row) for name, row in later.items()},
     }
     if arguments.json:
         print(json.dumps(result, indent=1))
         return
     one, two = result["two_channels"], result["sample"]
     print(
-        f"report of {one['flight']}: {one['report_s']:.1f} s, "
-        f"{one['ratio']:.2f} x the imports of {one['imports_s']:.1f} s ({one['ratio_cpu']:.2f} x in processor time)"
+        f"report of {one['flight']}: {one['report_s']:.1f} s, {one['ratio_cpu']:.2f} x the imports of "
+        f"{statistics.median(one['imports_cpu_s']):.2f} s in processor time ({len(one['imports_cpu_s'])} times)"
     )
     print(f"sample flight: {two['wall_s']:.1f} s, peak memory {two['peak_mib']:.0f} MiB")
     print(f"sample flight without audit: {sample_later['cpu_s']:.1f} s of processor, "
           f"{sample_later['wall_s']:.1f} s, {sample_later['peak_mib']:.0f} MiB")  # fmt: skip
-    for name, row in {**now, **{f"{key}, --audit none": row for key, row in later.items()}}.items():
+    kinds = {**result["now"], **{f"{key}, --audit none": row for key, row in result["later"].items()}}
+    for name, row in kinds.items():
         print(f"{name}: {row['cpu_s']:.1f} s of processor ({row['wall_s']:.1f} s), {row['ratio']:.2f} x "
               f"the imports, {row['ratio_light']:.2f} x the imports without Sionna")  # fmt: skip
 

@@ -195,12 +195,12 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     if not bins:
         return _nothing(NO_OVERLAP, window_s)
     lags = _symmetric(window_s, _STEP_S)
-    first = np.sum([b.likelihood(lags, _START) for b in bins.values()], axis=0)
+    first = np.sum([b.likelihood(lags, [_START]) for b in bins.values()], axis=0)
     starts = {0.0, *lags[first.argmax(axis=0)].tolist()}  # of each model, and of clocks that agree
     parts = {name: dict.fromkeys(p for lag in starts for p in b.fitted(lag)) for name, b in bins.items()}
 
     def likelihood(some: FloatArray) -> FloatArray:
-        return np.stack([np.max([b.likelihood(some, p) for p in parts[name]], axis=0).T for name, b in bins.items()])
+        return np.stack([b.likelihood(some, list(parts[name])).T for name, b in bins.items()])
 
     tried, own = _finer(lags, likelihood, window_s)
     estimate = _judged(tried, own, tuple(bins), window_s)
@@ -328,32 +328,37 @@ class _Bins:
         share = (place - low)[:, None]
         return np.asarray(table[low] * (1.0 - share) + table[low + 1] * share)
 
-    def system(self, lag: float) -> tuple[FloatArray, FloatArray]:
-        """Features (n, p) of offset, slope and gains, and residuals (n, models) at a lag."""
+    def system(self, lag: float) -> FloatArray:
+        """Features of offset, slope and gains, then residuals of each model, at a lag: (n, p + models)."""
         count = np.diff(np.append(self.first, len(self.at_s)))[:, None]
         predicted = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
         residual = self.mean_db[:, None] - predicted
-        return self._between(self.mean_s - lag, self.features), residual - residual.mean(axis=0)
+        # by columns, as LAPACK wants them: another order is copied at every call
+        columns = np.empty((self.n, self.features.shape[1] + residual.shape[1]), order="F")
+        np.concatenate([self._between(self.mean_s - lag, self.features), residual - residual.mean(axis=0)], 1, columns)
+        return columns
 
-    def likelihood(self, lags: FloatArray, parts: _Parts) -> FloatArray:
-        """Log likelihood (lags, models)."""
-        memory = _Memory(self.mean_s, parts.memory_s, parts.white)
-        return np.stack([memory.likelihood(*self.system(lag), (parts.gain,))[0] for lag in lags])
+    def likelihood(self, lags: FloatArray, parts: Sequence[_Parts]) -> FloatArray:
+        """Log likelihood (lags, models), of the likeliest of some parts."""
+        memories = [(_Memory(self.mean_s, one.memory_s, one.white), (one.gain,)) for one in parts]
+        systems = (self.system(lag) for lag in lags)
+        models = self.levels.shape[1]
+        return np.stack([np.max([m.likelihood(c, models, gain)[0] for m, gain in memories], axis=0) for c in systems])
 
     def fitted(self, lag: float) -> list[_Parts]:
         """The parts of largest likelihood at a lag, of each model."""
-        return [parts for _, parts in self._fitted(*self.system(lag), _GAIN)]
+        return [parts for _, parts in self._fitted(self.system(lag), self.levels.shape[1], _GAIN)]
 
     def constant(self) -> float:
         """Largest log likelihood of a level that depends on no position."""
-        level = np.column_stack([np.ones(self.n), np.zeros(self.n)])
-        return self._fitted(level, (self.mean_db - self.mean_db.mean())[:, None], (0.0,))[0][0]
+        columns = np.column_stack([np.ones(self.n), np.zeros(self.n), self.mean_db - self.mean_db.mean()])
+        return self._fitted(columns, 1, (0.0,))[0][0]
 
-    def _fitted(self, features: FloatArray, residual: FloatArray, gains: Sequence[float]) -> list[tuple[float, _Parts]]:
+    def _fitted(self, columns: FloatArray, models: int, gains: Sequence[float]) -> list[tuple[float, _Parts]]:
         """Largest log likelihood of each model, and the parts that have it."""
         memories = list(product(_MEMORY_S, _WHITE))
-        tried = [_Memory(self.mean_s, *memory).likelihood(features, residual, gains) for memory in memories]
-        values = np.stack(tried).reshape(-1, residual.shape[1])  # the gain varies fastest
+        tried = [_Memory(self.mean_s, *memory).likelihood(columns, models, gains) for memory in memories]
+        values = np.stack(tried).reshape(-1, models)  # the gain varies fastest
         parts = [_Parts(*memory, gain) for memory, gain in product(memories, gains)]
         return [(float(values[best, m]), parts[best]) for m, best in enumerate(values.argmax(axis=0))]
 
@@ -409,15 +414,14 @@ class _Memory:
         self._white = white
         self.log_det = float(np.log(diagonal).sum()) + float(np.log(loses).sum())
 
-    def likelihood(self, features: FloatArray, residual: FloatArray, gains: Sequence[float]) -> FloatArray:
+    def likelihood(self, columns: FloatArray, models: int, gains: Sequence[float]) -> FloatArray:
         """Log likelihood (gains, models), offset, slope and gains integrated out, the scale profiled."""
         from scipy.linalg import solve_triangular
         from scipy.linalg.lapack import dpttrs
 
-        columns = np.column_stack([features, residual])
         gram = columns.T @ (columns - dpttrs(*self._factor, columns)[0]) / self._white**2
-        n, p = features.shape
-        out = np.empty((len(gains), residual.shape[1]))
+        n, p = len(columns), columns.shape[1] - models
+        out = np.empty((len(gains), models))
         for row, gain in enumerate(gains):
             spread = np.full(p, gain)
             spread[:2] = _FREE

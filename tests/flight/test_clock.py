@@ -166,7 +166,7 @@ def test_the_likelihood_is_that_of_a_multivariate_normal():
     y = rng.normal(0, 3, 80)
     memory = _Memory(t, 6.0, 0.4)
     gains = (0.3, 1.7)
-    computed = memory.likelihood(features, y[:, None], gains)[:, 0]
+    computed = memory.likelihood(np.column_stack([features, y]), 1, gains)[:, 0]
     expected = []
     for gain in gains:
         spread = np.array([1e3, 1e3, *[gain] * 9])
@@ -220,11 +220,11 @@ def test_means_of_many_samples_are_those_of_their_seconds():
     assert bins.n == 360
     np.testing.assert_allclose(bins.mean_db[7], np.sin(t[(t >= 47) & (t < 48)]).mean())
     # and what they depend on is averaged over as long a time, half a second before and after
-    seen = bins.system(0.0)[0][7, 1] - bins.system(3.0)[0][7, 1]
+    seen = bins.system(0.0)[7, 1] - bins.system(3.0)[7, 1]
     slope = np.log10(ALONG.distance_m)
     expected = [slope[np.abs(GRID - at) <= 0.5].mean() for at in (bins.mean_s[7], bins.mean_s[7] - 3.0)]
     assert seen == pytest.approx(expected[0] - expected[1], abs=1e-3)
-    assert bins.likelihood(np.array([0.0]), _Parts(5.0, 0.3, 1.0)).shape == (1, 1)
+    assert bins.likelihood(np.array([0.0]), [_Parts(5.0, 0.3, 1.0)]).shape == (1, 1)
 
 
 def test_a_jittering_attitude_makes_no_sharp_optimum():
@@ -237,7 +237,7 @@ def test_a_jittering_attitude_makes_no_sharp_optimum():
     one = channel(0.0, 9, gain_db=12.0, memory_db=0.5, t=t, known=shaken)
     bins = _Bins.of(one, shaken.tables(), 15.0)
     assert bins is not None
-    value = bins.likelihood(np.arange(-0.6, 0.61, 0.1), _Parts(5.0, 0.1, 1.0))[:, 0]
+    value = bins.likelihood(np.arange(-0.6, 0.61, 0.1), [_Parts(5.0, 0.1, 1.0)])[:, 0]
     assert value.max() - value[0] > 4.0  # the lag is seen
     assert np.abs(np.diff(value, 2)).max() < 0.25 * np.ptp(value)  # and no lag stands out from its neighbours
 

@@ -244,8 +244,7 @@ class _OneLink:
             failures.append(f"{self.name}: {phantom} paths that cannot exist")
         if complete and not nowhere:
             for sequence in self.reference.sequences(self.target, max_depth) or ():
-                key = _key(sequence)
-                if key not in keys and self.reference.verdict(sequence, self.target):
+                if self.reference.verdict(sequence, self.target) and (key := _key(sequence)) not in keys:
                     missing += 1
                     keys.add(key)
             if missing:

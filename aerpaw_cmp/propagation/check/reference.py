@@ -444,12 +444,12 @@ class Reference:
         points = _bounces(sequence, self.source, target)
         if points is None:
             return False
-        margins = [m.margin(p) for m, p in zip(sequence, points[1:-1], strict=True)]
-        last = len(sequence) - 1
+        worst, last = math.inf, len(sequence) - 1
         for step, mirror in enumerate(sequence):
             before, after = mirror.height(points[step]), mirror.height(points[step + 2])
-            margins += [before + (margin_m if step == 0 else 0.0), after + (margin_m if step == last else 0.0)]
-        worst = min(margins, default=math.inf)
+            worst = min(worst, before + margin_m * (step == 0), after + margin_m * (step == last))
+        if worst >= -margin_m:  # the edges of faces are dearer to ask
+            worst = min([worst, *(m.margin(p) for m, p in zip(sequence, points[1:-1], strict=True))])
         if worst < -margin_m:
             return False
         strict = loose = False

@@ -127,6 +127,7 @@ def main() -> None:
         sample_later = run(report(some, folder / "sample_later", "--audit", "none"))
         now = cold_and_warm(flight, options, folder / "now", repeats)
         later = cold_and_warm(flight, [*options, "--audit", "none"], folder / "later", repeats)
+    now, later = ({name: IMPORTED.ratios(row) for name, row in rows.items()} for rows in (now, later))
     result = {
         "two_channels": {
             "flight": source,
@@ -138,8 +139,8 @@ def main() -> None:
         },
         "sample": sample,
         "sample_later": sample_later,
-        "now": {name: IMPORTED.ratios(row) for name, row in now.items()},
-        "later": {name: IMPORTED.ratios(row) for name, row in later.items()},
+        "now": now,
+        "later": later,
     }
     if arguments.json:
         print(json.dumps(result, indent=1))
@@ -152,8 +153,7 @@ def main() -> None:
     print(f"sample flight: {two['wall_s']:.1f} s, peak memory {two['peak_mib']:.0f} MiB")
     print(f"sample flight without audit: {sample_later['cpu_s']:.1f} s of processor, "
           f"{sample_later['wall_s']:.1f} s, {sample_later['peak_mib']:.0f} MiB")  # fmt: skip
-    kinds = {**result["now"], **{f"{key}, --audit none": row for key, row in result["later"].items()}}
-    for name, row in kinds.items():
+    for name, row in {**now, **{f"{key}, --audit none": row for key, row in later.items()}}.items():
         print(f"{name}: {row['cpu_s']:.1f} s of processor ({row['wall_s']:.1f} s), {row['ratio']:.2f} x "
               f"the imports, {row['ratio_light']:.2f} x the imports without Sionna")  # fmt: skip
 

@@ -17,6 +17,7 @@ from ..common.errors import InputError
 from ..logs.readers import Reader, ReadOptions, identify
 from .predict import Predict, Prediction
 
+MAX_AGE_S = 2.0
 TAIL_BYTES = 65_536
 """Of a log that is long already, only its end is read."""
 
@@ -122,14 +123,14 @@ class TelemetryFollower:
         """The last sample."""
         return self._samples[-1] if self._samples else None
 
-    def at(self, utc_ns: int, *, max_age_s: float = 2.0) -> TelemetrySample | None:
-        """The sample nearest in time, None if it is further away than ``max_age_s``."""
+    def at(self, utc_ns: int) -> TelemetrySample | None:
+        """The sample nearest in time, None if it is further away than :data:`MAX_AGE_S`."""
         if not self._samples:
             return None
         samples = list(self._samples)
         index = bisect_left(samples, utc_ns, key=lambda sample: sample.utc_ns)
         near = min(samples[max(0, index - 1) : index + 1], key=lambda sample: abs(sample.utc_ns - utc_ns))
-        return near if abs(near.utc_ns - utc_ns) <= max_age_s * 1e9 else None
+        return near if abs(near.utc_ns - utc_ns) <= MAX_AGE_S * 1e9 else None
 
     def _new_lines(self) -> bytes:
         """Complete lines since the last call."""

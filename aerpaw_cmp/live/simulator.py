@@ -303,16 +303,10 @@ def load_recorded(path: Path) -> RecordedModem:
     return modem
 
 
-def load_source(path: Path, options: ReadOptions | None = None) -> FlightModem | RecordedModem:
+def load_source(path: Path) -> FlightModem | RecordedModem:
     """A modem that plays a file: a transcript, a tap log, or the ranks of any log that a reader knows.
 
     So a flight made by ``aerpaw-cmp simulate`` can be flown again against the tap.
-
-    Parameters
-    ----------
-    path : Path
-    options : ReadOptions, optional
-        For the reader; only time differences matter here, so the zone is UTC by default.
 
     Raises
     ------
@@ -324,7 +318,8 @@ def load_source(path: Path, options: ReadOptions | None = None) -> FlightModem |
     except InputError as error:
         if not path.is_file():
             raise
-        ranks = ranks_of(path, options or ReadOptions(timezone="UTC", ri_base="one"))
+        # only time differences matter here
+        ranks = ranks_of(path, ReadOptions(timezone="UTC", ri_base="one"))
         if ranks is None:
             raise error from None
         return FlightModem(ranks)
@@ -432,7 +427,7 @@ class ModemSimulator:
             if old >= 0:
                 os.close(old)
 
-    def replug(self, *, ready_line: bool = True) -> None:
+    def replug(self) -> None:
         """Put the cable back: a new node under another number, the link follows; the modem says RDY."""
         spare = pty.openpty()  # takes the number that became free, so that the modem gets another one
         with self._lock:
@@ -440,7 +435,7 @@ class ModemSimulator:
             self._unplugged.clear()
         for fd in spare:
             os.close(fd)
-        if ready_line and self.settings.kind == "modem":
+        if self.settings.kind == "modem":
             self._write(b"\r\nRDY\r\n")
 
     # inside -----------------------------------------------------------------------------------------------

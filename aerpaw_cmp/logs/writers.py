@@ -56,7 +56,7 @@ def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]
     return texts if digits == 6 else [text[: 20 + digits] if digits else text[:19] for text in texts]
 
 
-def format_vehicle_out(frame: pd.DataFrame, timezone: str, *, volts: float = 48.0) -> bytes:
+def format_vehicle_out(frame: pd.DataFrame, timezone: str) -> bytes:
     """Telemetry as ``vehicleOut``, 10 fields: radians in the order pitch, yaw, roll; CR LF.
 
     Parameters
@@ -65,8 +65,6 @@ def format_vehicle_out(frame: pd.DataFrame, timezone: str, *, volts: float = 48.
         Telemetry records. A row without a position is written as the logger does: -999 and fix 0.
     timezone : str
         Zone of the vehicle's clock.
-    volts : float
-        Battery voltage of every row.
     """
     nowhere = frame[["latitude_deg", "longitude_deg", "altitude_m"]].isna().any(axis=1).to_numpy()
     longitude, latitude, altitude = (
@@ -79,7 +77,7 @@ def format_vehicle_out(frame: pd.DataFrame, timezone: str, *, volts: float = 48.
     satellites = np.where(frame["satellites"] < 0, 12, frame["satellites"])
     lines = [
         f'{i + 1},{_short(lon, 7)},{_short(lat, 7)},{_short(alt, 3)},"({_tuple(angle, 17)})","({_tuple(v, 2)})",'
-        f"{volts:g},{time},{f},{s}\r\n"
+        f"48,{time},{f},{s}\r\n"
         for i, (lon, lat, alt, angle, v, time, f, s) in enumerate(
             zip(
                 longitude.tolist(),
@@ -106,9 +104,7 @@ def _tuple(values: list[float], places: int) -> str:
     return ",".join(repr(round(value, places) + 0.0) for value in values)
 
 
-def format_power_log(
-    times: ArrayLike, rss_db: ArrayLike, timezone: str, *, gain_db: float = RX_GAIN_DB, foot: bool = False
-) -> bytes:
+def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str, *, foot: bool = False) -> bytes:
     """Levels as the sounder's ``power_log``: ``od -f -w4`` through ``ts``.
 
     Parameters
@@ -119,8 +115,6 @@ def format_power_log(
         Levels [dB re full scale], written as float32; NaN (out of coverage) becomes the no-signal floor.
     timezone : str
         Zone of the tower's clock.
-    gain_db : float
-        Receiver gain, which sets the floor.
     foot : bool
         Write od's closing offset, as a sounder that ends by itself does. Always written where the log ends inside
         a run of equal samples, whose length would be lost otherwise.
@@ -140,7 +134,7 @@ def format_power_log(
     Samples equal to the one before are suppressed: one ``*`` for the run, as ``od`` does without ``-v``.
     """
     level = np.asarray(rss_db, dtype=np.float64)
-    level = np.where(np.isnan(level), FLT_MIN_DB - gain_db, level).astype(np.float32)
+    level = np.where(np.isnan(level), FLT_MIN_DB - RX_GAIN_DB, level).astype(np.float32)
     stamps = local_text(times, timezone)
     if len(stamps) != len(level):
         raise ValueError(f"{len(stamps)} times and {len(level)} levels")

@@ -61,6 +61,10 @@ PAPER_BIEXPONENTIAL = BiExponential(0.2932, -0.0508, 0.7057, -0.001, 0.0153)
 """The paper's fit (section VII-C)."""
 
 
+STARTS = 6
+"""Trust-region searches of a fit."""
+
+
 def fit_biexponential(
     distance_m: ArrayLike,
     correlation: ArrayLike,
@@ -68,16 +72,14 @@ def fit_biexponential(
     weights: ArrayLike | None = None,
     amplitude_bounds: tuple[float, float] = (0.0, np.inf),
     greatest_at_zero: float = 1.0,
-    rate_bounds_per_m: tuple[float, float] | None = None,
-    starts: int = 6,
 ) -> BiExponential:
     """Least-squares bi-exponential by variable projection.
 
     Source: arXiv 2502.10324 eq. 14.
 
     For given rates the best amplitudes are a bounded linear problem of two unknowns with a closed form, so only the
-    logarithms of the two rates are searched: a grid over the bounds, then a trust-region search from its ``starts``
-    best cells.
+    logarithms of the two rates are searched: a grid over the bounds, then a trust-region search from its
+    :data:`STARTS` best cells.
 
     Parameters
     ----------
@@ -90,11 +92,6 @@ def fit_biexponential(
     greatest_at_zero : float
         Bound of c1 + c3. A correlation is at most 1; without the bound, data that begin beyond distance 0 let the
         fast exponential shoot up between 0 and the first point. Infinite for a free fit.
-    rate_bounds_per_m : (slowest, fastest), optional
-        Of -c2 and -c4 [1/m], positive. By default from 1e-6 over the largest distance (flat over the data) to 10 over
-        the smallest positive one (gone at the first bin).
-    starts : int
-        Number of trust-region searches.
 
     Returns
     -------
@@ -111,11 +108,11 @@ def fit_biexponential(
     ----------
     .. [1] Golub and Pereyra, Inverse Problems 19 (2003) R1, doi:10.1088/0266-5611/19/2/201
     """
-    problem = _Projection.of(distance_m, correlation, weights, (*amplitude_bounds, greatest_at_zero), rate_bounds_per_m)
+    problem = _Projection.of(distance_m, correlation, weights, (*amplitude_bounds, greatest_at_zero))
     if len(problem.d) < 4:
         single = problem.single()
         return problem.result(single, f"{len(problem.d)} points cannot tell four coefficients")
-    best = problem.double(starts)
+    best = problem.double()
     return problem.judge(best)
 
 
@@ -138,7 +135,6 @@ class _Projection:
         correlation: ArrayLike,
         weights: ArrayLike | None,
         bounds: tuple[float, float, float],
-        rate_bounds_per_m: tuple[float, float] | None,
     ) -> _Projection:
         """The problem of one curve: pairs without a number or a weight take no part.
 
@@ -149,8 +145,6 @@ class _Projection:
             Relative; 1 each without.
         bounds : (low, high, total)
             Of each amplitude, and of their sum.
-        rate_bounds_per_m : (slow, fast), optional
-            Of the rates; by default from the distances.
         """
         d = np.asarray(distance_m, dtype=np.float64).ravel()
         y = np.asarray(correlation, dtype=np.float64).ravel()
@@ -161,10 +155,10 @@ class _Projection:
         d, y, w = d[good], y[good], w[good]
         if len(d) < 2 or not d.max() > 0:
             raise UsageError(f"{len(d)} usable points for a curve", expected="at least two, at different distances")
-        slow, fast = rate_bounds_per_m or (1e-6 / d.max(), 10.0 / d[d > 0].min())
+        slow, fast = 1e-6 / d.max(), 10.0 / d[d > 0].min()  # flat over the data; gone at the first bin
         low, high, total = bounds
-        if not (0 < slow < fast and low < high and total > max(2 * low, low)):
-            raise UsageError(f"bounds {bounds} and {rate_bounds_per_m}", expected="bounds that leave room, rates > 0")
+        if not (low < high and total > max(2 * low, low)):
+            raise UsageError(f"bounds {bounds}", expected="bounds that leave room")
         return cls(
             d=d,
             y=y,
@@ -185,13 +179,13 @@ class _Projection:
         chosen = np.take_along_axis(candidates, pick, axis=-2)[..., 0, :]
         return chosen, np.take_along_axis(residual, pick, axis=-2)[..., 0, :]
 
-    def double(self, starts: int) -> FloatArray:
+    def double(self) -> FloatArray:
         """Logarithms of the two best rates, the faster first."""
         axis = np.linspace(*self.log_rates, 48)
         first, second = np.triu_indices(len(axis), 1)
         grid = np.column_stack([axis[second], axis[first]])
         cost = (self.amplitudes(grid)[1] ** 2).sum(axis=1)
-        refined = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(cost)[:starts]])
+        refined = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(cost)[:STARTS]])
         valley = refined[np.argmin((self.amplitudes(refined)[1] ** 2).sum(axis=1))]
         return np.sort(self._search(valley, 1e-15))[::-1]
 

@@ -302,13 +302,16 @@ def interval_coverage(
     return IntervalCoverage(level, np.asarray(inside), float((z**2).mean()), int(good.sum()))
 
 
+REPEATS = 3
+"""Random orders of a learning curve."""
+
+
 def learning_curve(
     model: Predictor,
     points_m: ArrayLike,
     values: ArrayLike,
     sizes: Sequence[int],
     *,
-    repeats: int = 3,
     seed: int = 0,
 ) -> FloatArray:
     """MAE (sizes, ...) on the positions not sampled, against the number of random samples, mean over repeats.
@@ -322,8 +325,8 @@ def learning_curve(
     values : array_like, (n, ...)
     sizes : sequence of int
         Numbers of samples, each below n.
-    repeats, seed : int
-        Random orders of the positions, and of their generator.
+    seed : int
+        Of the random orders of the positions.
 
     Returns
     -------
@@ -340,8 +343,8 @@ def learning_curve(
     if wrong:
         raise UsageError(f"sample sizes {wrong} for {len(points)} positions", expected="at least one left to predict")
     generator = np.random.default_rng(seed)
-    error = np.empty((repeats, len(sizes), *data.shape[1:]))
-    for repeat in range(repeats):
+    error = np.empty((REPEATS, len(sizes), *data.shape[1:]))
+    for repeat in range(REPEATS):
         order = generator.permutation(len(points))
         for row, size in enumerate(sizes):
             test = np.ones(len(points), dtype=bool)

@@ -18,6 +18,9 @@ from ..common.units import FloatArray, IntArray
 CHUNK = 4096
 """Targets per query; bounds the memory."""
 
+AT_ONCE = 256
+"""Targets per query of all samples within a radius; bounds the memory and does not change a random draw."""
+
 TIE_M = 1e-6
 """Distances closer than this are tied; a sample closer than this to a target is at its place."""
 
@@ -149,11 +152,8 @@ def random_within(
     radius_m: float,
     seed: int,
     skip: IntArray | None = None,
-    chunk: int = 256,
 ) -> Neighbours:
     """M samples drawn without replacement among those within the radius, as the paper's Step 1 may be read.
-
-    Parameters as in :func:`nearest`; ``seed`` fixes the draw, ``chunk`` bounds the memory and does not change it.
 
     Parameters
     ----------
@@ -166,8 +166,6 @@ def random_within(
         Fixes the draw.
     skip : (t,) int, optional
         Sample that is not to be taken for a target (leave-one-out).
-    chunk : int
-        Targets at a time: bounds the memory and does not change the draw.
 
     Returns
     -------
@@ -182,8 +180,8 @@ def random_within(
         return Neighbours(index, distance)
     generator = np.random.default_rng(seed)
     tree = cKDTree(samples_m)
-    for start in range(0, len(targets_m), chunk):
-        part = slice(start, start + chunk)
+    for start in range(0, len(targets_m), AT_ONCE):
+        part = slice(start, start + AT_ONCE)
         pairs = cKDTree(targets_m[part]).sparse_distance_matrix(tree, radius_m + TIE_M, output_type="ndarray")
         pairs = pairs[np.lexsort((pairs["j"], pairs["i"]))]
         target, sample, far = pairs["i"], pairs["j"], pairs["v"]

@@ -48,6 +48,9 @@ BLOCK = 256
 
 PAPER_WIDTH_M = 30.0
 PAPER_MAXIMUM_M = 500.0
+HEIGHT_BIN_M = 10.0
+MINIMUM_COMMON = 3
+"""Fewest components that a pair of positions must share where some are missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +93,6 @@ def vector_correlation(
     width_m: float = PAPER_WIDTH_M,
     maximum_m: float = PAPER_MAXIMUM_M,
     missing: Literal["drop", "pairwise"] = "drop",
-    minimum_common: int = 3,
 ) -> BinnedCorrelation:
     """Pearson correlation of the positions' vectors, binned by horizontal distance (the paper's Steps 1 to 4).
 
@@ -106,8 +108,6 @@ def vector_correlation(
         Bin width (the paper's d_rx) and the largest distance [m].
     missing : {"drop", "pairwise"}
         What NaN does: the position is left out, or each pair uses the components that both positions have.
-    minimum_common : int
-        With "pairwise", the least number of components that a pair must share.
 
     Returns
     -------
@@ -115,7 +115,7 @@ def vector_correlation(
     """
     points, data = _points_and_vectors(points_m, vectors)
     present = np.isfinite(data)
-    lacking = ~present.all(axis=1) if missing == "drop" else present.sum(axis=1) < minimum_common
+    lacking = ~present.all(axis=1) if missing == "drop" else present.sum(axis=1) < MINIMUM_COMMON
     constant = ~lacking & _is_constant(data, present)
     kept = ~(lacking | constant)
     if missing == "drop" or present[kept].all():
@@ -124,7 +124,7 @@ def vector_correlation(
         product = _PairProduct(unit)
         bins = _bin_pairs(points[kept], product, width_m, maximum_m)
     else:
-        bins = _bin_pairs(points[kept], _PairwisePearson(data[kept], minimum_common), width_m, maximum_m)
+        bins = _bin_pairs(points[kept], _PairwisePearson(data[kept], MINIMUM_COMMON), width_m, maximum_m)
     return BinnedCorrelation(*bins, int(kept.sum()), int(constant.sum()), int(lacking.sum()))
 
 
@@ -192,9 +192,7 @@ def semivariance(
     return BinnedCorrelation(*bins, int(kept.sum()), 0, int((~kept).sum()))
 
 
-def vertical_correlation(
-    altitudes_m: ArrayLike, maps: ArrayLike, *, width_m: float = 10.0, maximum_m: float = np.inf
-) -> BinnedCorrelation:
+def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorrelation:
     """Correlation of the maps of two altitudes, binned by their difference in height.
 
     Parameters
@@ -204,8 +202,6 @@ def vertical_correlation(
     maps : (altitudes, n) or (altitudes, fields, n)
         Rank or RSS at the same positions; a field is one K. The Pearson correlation of a pair of altitudes is taken
         over the positions that both have, per field, and averaged over the fields.
-    width_m, maximum_m : float
-        Bin width and largest difference in height [m].
 
     Returns
     -------
@@ -221,8 +217,6 @@ def vertical_correlation(
     levels, fields, _ = data.shape
     first, second = np.triu_indices(levels)
     gap = np.abs(altitudes[first] - altitudes[second])
-    near = gap <= maximum_m
-    first, second, gap = first[near], second[near], gap[near]
     value = np.empty((len(first), fields))
     excluded = 0
     for field in range(fields):
@@ -232,8 +226,8 @@ def vertical_correlation(
         excluded += int((~usable).sum())
         table = _PairwisePearson(np.where(usable[:, None], rows, np.nan), 2)(np.arange(levels), np.arange(levels))
         value[:, field] = table[first, second]
-    n = int(np.floor(gap.max(initial=0.0) / width_m + 0.5)) + 1
-    sums = _Sums(n, width_m)
+    n = int(np.floor(gap.max(initial=0.0) / HEIGHT_BIN_M + 0.5)) + 1
+    sums = _Sums(n, HEIGHT_BIN_M)
     sums.add(np.repeat(gap, fields), value.ravel())
     return BinnedCorrelation(*sums.means(), levels, excluded, 0)
 

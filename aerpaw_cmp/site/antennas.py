@@ -16,7 +16,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,8 +37,6 @@ MINIMUM_EFFICIENCY = 0.01
 
 HIGHEST_DBI = 60.0
 """No element has more gain; a file that says so holds something else."""
-
-Azimuth = Literal["clockwise", "counter-clockwise"]
 
 
 def _zeros(theta_rad: ArrayLike, phi_rad: ArrayLike) -> ComplexArray:
@@ -220,9 +218,7 @@ class _Rows:
     frequency_hz: float | None = None
 
 
-def read_pattern_text(
-    path: str | Path, *, name: str | None = None, azimuth: Azimuth | None = None, polarised: bool = True
-) -> MeasuredPattern:
+def read_pattern_text(path: str | Path, *, polarised: bool = True) -> MeasuredPattern:
     """An AERPAW antenna text file: complex E_phi and E_theta over phi x theta.
 
     Parameters
@@ -230,13 +226,6 @@ def read_pattern_text(
     path : str or Path
         Header lines, then tab-separated phi, theta [rad], total, E_phi, E_theta [dBi], and the phases [rad].
         theta from -pi to pi at phi from 0 to below pi, or theta from 0 to pi at phi from 0 to below 2 pi.
-    name : str, optional
-        The file's name by default.
-    azimuth : {"clockwise", "counter-clockwise"}, optional
-        Sense of phi seen from above. By default told by the poles, where the two components must be one vector seen
-        from all sides: that shows whether E_phi points along increasing phi. Where it points against it, as in
-        AERPAW's files, phi is the angle of a turntable and azimuth is -phi (``rad_pat.mat`` lists the same
-        measurement so). Poles that radiate too little to tell are taken for AERPAW's.
     polarised : bool
         False keeps the total gain only, all of it in E_theta, as the gain grids have it.
 
@@ -248,6 +237,13 @@ def read_pattern_text(
     ------
     InputError
         Missing angles, wrong units, a truncated line, or more power out than in; with the line.
+
+    Notes
+    -----
+    The sense of phi is told by the poles, where the two components must be one vector seen from all sides: that shows
+    whether E_phi points along increasing phi. Where it points against it, as in AERPAW's files, phi is the angle of a
+    turntable and azimuth is -phi (``rad_pat.mat`` lists the same measurement so). Poles that radiate too little to tell
+    are taken for AERPAW's.
     """
     path = Path(path)
     rows = _read_rows(path)
@@ -257,16 +253,13 @@ def read_pattern_text(
     fields = np.moveaxis(amplitude_from_db(amplitude_db) * np.exp(1j * phase), -1, 0)
     e_theta, e_phi = _unfold(fields) if folded else fields
     along = _points_along_phi(e_theta.T, e_phi.T)
-    clockwise = not along if azimuth is None else azimuth == "clockwise"
-    if clockwise:
+    if not along:
         e_theta, e_phi = _mirrored(e_theta), _mirrored(e_phi)
-    if clockwise == along:
-        e_phi = -e_phi
     if polarised:
-        pattern = MeasuredPattern(name or path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
+        pattern = MeasuredPattern(path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
     else:
         total = np.hypot(np.abs(e_theta), np.abs(e_phi)).astype(np.complex128)
-        pattern = MeasuredPattern(name or path.stem, total.T, None, rows.frequency_hz)
+        pattern = MeasuredPattern(path.stem, total.T, None, rows.frequency_hz)
     _check_power(pattern, path)
     return pattern
 
@@ -476,7 +469,7 @@ def _check_power(pattern: MeasuredPattern, path: Path) -> None:
 # ---------------------------------------------------------------- gain grids
 
 
-def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) -> MeasuredPattern:
+def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
     """A gain grid of ``rad_pat.mat``: dBi over elevation x azimuth, without polarisation.
 
     Parameters
@@ -485,8 +478,6 @@ def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) 
         MATLAB file with ``theta2`` (elevation, 90 to -90 deg), ``phi2`` (azimuth, a full circle, deg) and grids.
     variable : str
         Name of the grid.
-    name : str, optional
-        The variable's name by default.
 
     Returns
     -------
@@ -520,7 +511,7 @@ def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) 
         raise InputError(f"'{variable}' reaches {gain.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
     by_azimuth = np.argsort(np.round(azimuth % 360.0, 6) % 360.0)
     gain = gain[np.argsort(-elevation)][:, by_azimuth]
-    pattern = MeasuredPattern(name or variable, np.sqrt(power_from_db(gain)).astype(np.complex128), None)
+    pattern = MeasuredPattern(variable, np.sqrt(power_from_db(gain)).astype(np.complex128), None)
     _check_power(pattern, path)
     return pattern
 

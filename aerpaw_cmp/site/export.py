@@ -26,9 +26,7 @@ HALF_SPACE_THICKNESS_M = 1.0
 """Thickness given to ground in the export: a slab from which no echo of its second face returns."""
 
 
-def export_scene(
-    site: Site, folder: str | Path, *, trees: bool = True, gamma_db_per_m: float = CROWN_ATTENUATION_DB_PER_M
-) -> list[Path]:
+def export_scene(site: Site, folder: str | Path, *, trees: bool = True) -> list[Path]:
     """The site as ``scene.xml`` with ``meshes/*.ply``, which ``sionna.rt.load_scene`` opens.
 
     Parameters
@@ -40,8 +38,6 @@ def export_scene(
     trees : bool
         Crowns and trunks too. Crowns are thin slabs to Sionna, so their loss counts per face, not per metre; the
         replay keeps them out of the scene for that reason.
-    gamma_db_per_m : float
-        Attenuation in crowns, turned into a conductivity.
 
     Returns
     -------
@@ -51,7 +47,7 @@ def export_scene(
     folder = Path(folder)
     parts = _parts(site, trees)
     lines = ['<scene version="2.1.0">', f"<!-- {_comment(site)} -->"]
-    lines += [_bsdf(name, gamma_db_per_m) for name in dict.fromkeys(name for _, name, _ in parts)]
+    lines += [_bsdf(name, CROWN_ATTENUATION_DB_PER_M) for name in dict.fromkeys(name for _, name, _ in parts)]
     written = [folder / "scene.xml"]
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)

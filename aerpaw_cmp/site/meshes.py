@@ -120,11 +120,11 @@ def crown_corners_m(trees: Trees) -> tuple[FloatArray, FloatArray]:
     return corners[:, :CROWN_SIDES], corners[:, CROWN_SIDES]
 
 
-def ground_mesh(site: Site, margin_m: float = GROUND_MARGIN_M) -> tuple[FloatArray, IntArray]:
+def ground_mesh(site: Site) -> tuple[FloatArray, IntArray]:
     """The flat ground, up = 0: two triangles that face upwards."""
     west, east, south, north = site.area_m
     corners = [(west, south), (east, south), (east, north), (west, north)]
-    out = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * margin_m
+    out = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * GROUND_MARGIN_M
     vertices = np.column_stack([np.array(corners) + out, np.zeros(4)])
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
 

@@ -26,16 +26,12 @@ _PHI_CUT = re.compile(r"(?im)^\s*Phi\s*=\s*(-?\d{1,3}(?:\.\d{1,6})?)\s*\(deg\)")
 _GAIN_TABLE = re.compile(r"(?im)^\s*Frequency\s+E ?Total\. ?dB\s*$")
 
 
-def read_pattern_file(
-    path: str | Path, *, name: str | None = None, polarised: bool = True, carrier_hz: float | None = None
-) -> MeasuredPattern:
+def read_pattern_file(path: str | Path, *, polarised: bool = True, carrier_hz: float | None = None) -> MeasuredPattern:
     """An antenna pattern: AERPAW's text over the sphere or along one great circle, MSI Planet (.msi, .pln) or NSMA.
 
     Parameters
     ----------
     path : str or Path
-    name : str, optional
-        The file's name by default.
     polarised : bool
         False keeps the total gain only; cuts have no polarisation.
     carrier_hz : float, optional
@@ -52,7 +48,7 @@ def read_pattern_file(
     """
     path = Path(path)
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
-    name = name or path.stem
+    name = path.stem
     if _PLANET.search(text):
         return _from_cuts(*_planet(text, path), name, path, _megahertz(_FREQUENCY.search(text)))
     if _NSMA.search(text):
@@ -65,7 +61,7 @@ def read_pattern_file(
             expected="a pattern of the same antenna, such as SA-1400-5900_F3300.txt",
             path=path,
         )
-    return read_pattern_text(path, name=name, polarised=polarised)
+    return read_pattern_text(path, polarised=polarised)
 
 
 def _megahertz(found: re.Match[str] | None) -> float | None:

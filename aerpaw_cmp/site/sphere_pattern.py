@@ -158,7 +158,7 @@ def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] =
     return "\n".join(lines) + "\n"
 
 
-def read_sphere_csv(path: str | Path, *, name: str | None = None) -> SpherePattern:
+def read_sphere_csv(path: str | Path) -> SpherePattern:
     """An antenna file of :func:`sphere_csv`; azimuth counter-clockwise from the device's x axis, elevation up.
 
     Raises
@@ -195,7 +195,7 @@ def read_sphere_csv(path: str | Path, *, name: str | None = None) -> SpherePatte
         sd[row, column] = values[:, 3]
     notes = "\n".join(line for line in text.splitlines() if line.startswith("#"))
     return SpherePattern(
-        name or path.stem, gain, sd, learned_from=_flights_in(notes), trained_on=trained_on(notes), notes=notes
+        path.stem, gain, sd, learned_from=_flights_in(notes), trained_on=trained_on(notes), notes=notes
     )
 
 

@@ -92,7 +92,6 @@ def trees_at(
     sizes: TreeSizes | None = None,
     *,
     random: np.random.Generator | None = None,
-    ground_m: FloatArray | float = 0.0,
 ) -> Trees:
     """Trees at given points (n,) [m], with drawn sizes.
 
@@ -104,8 +103,6 @@ def trees_at(
         What is drawn from.
     random : Generator, optional
         By default of seed 0.
-    ground_m : (n,) or float
-        Height of the ground at the trunks [m].
 
     Returns
     -------
@@ -120,7 +117,7 @@ def trees_at(
     return Trees(
         east_m=east,
         north_m=np.asarray(north_m, dtype=np.float64),
-        ground_m=np.broadcast_to(np.asarray(ground_m, dtype=np.float64), (count,)).copy(),
+        ground_m=np.zeros(count),
         height_m=height,
         crown_diameter_m=sizes.crown_diameter_m.draw(count, random),
         crown_base_m=height * sizes.crown_base_fraction,

@@ -447,8 +447,8 @@ def test_the_border_of_a_sheet_is_a_half_plane() -> None:
     assert ((at[:, 2] == 6.0) & (np.abs(at[:, 1]) < 39.0)).sum() == 1
 
 
-def half_a_wedge(edges: Edges, edge: int, shared: int, end: np.ndarray, s_end: float, s: float, way: np.ndarray):
-    """Of one of two edges, by Fresnel integrals: sine with the ray, H, and S by a difference at the shared face."""
+def half_a_wedge(edges: Edges, edge: int, shared: int, end: np.ndarray, s_end: float, s: float, way: np.ndarray, eta):
+    """Of one of two edges, by Fresnel integrals: sine with the ray, H (TE, TM), and S by a difference at the face."""
     n, e = edges.exterior[edge], edges.along[edge]
     sine = math.sqrt(1 - float(way @ e) ** 2)
     kl = K * s_end * s * sine**2 / (s_end + s)
@@ -460,9 +460,10 @@ def half_a_wedge(edges: Edges, edge: int, shared: int, end: np.ndarray, s_end: f
         return _cotangent(less, 1, n, kl) + _cotangent(less, -1, n, kl)
 
     scale = -np.exp(-0.25j * np.pi) / (2 * n * math.sqrt(2 * math.pi))
-    depth = 2 * kl * math.sin((math.pi - angle) / 2) ** 2
+    held = fresnel(sine * math.sin(angle), *eta, WAVELENGTH) if angle < math.pi else (1.0, 1.0)
+    rest, jump = _cotangent(angle, 1, n, kl), _cotangent(angle, -1, n, kl)
     slope = (both(1e-5 - angle) - both(1e-5 + angle)) / 1e-5
-    return sine, scale * both(angle) * depth / (1 + depth), scale * slope / sine
+    return sine, [scale * (rest + factor * jump) for factor in held], scale * slope / sine
 
 
 @pytest.mark.parametrize("material", ["concrete", "metal", "medium_dry_ground"])
@@ -492,15 +493,16 @@ def test_field_over_two_edges_a_second_time(material: str) -> None:
         legs = np.diff(line, axis=0)
         s = np.linalg.norm(legs, axis=1)
         rays = legs / s[:, None]
-        one = half_a_wedge(edges, e, paths.shared[row, 0], line[0], s[0], s[1], rays[1])
-        two = half_a_wedge(edges, h, paths.shared[row, 1], line[3], s[2], s[1], rays[1])
+        one = half_a_wedge(edges, e, paths.shared[row, 0], line[0], s[0], s[1], rays[1], eta)
+        two = half_a_wedge(edges, h, paths.shared[row, 1], line[3], s[2], s[1], rays[1], eta)
         out = edges.normal_n[e] if paths.shared[row, 0] else edges.normal[e]
         joined = []
-        for z in impedance:
+        for pole, z in enumerate(impedance):
             q = K * s[1] * z**2 / 2
             w = 1 / (1 + np.sqrt(1j * np.pi * q) + 2j * q)
             x = 2 * np.sqrt(1j * K * s[1] * w)
-            joined.append(np.prod([slope * (1 - abs(w)) + x * hard for _, hard, slope in (one, two)]) / (2j * K * s[1]))
+            halves = [slope * (1 - abs(w)) + x * hard[pole] for _, hard, slope in (one, two)]
+            joined.append(np.prod(halves) / (2j * K * s[1]))
         # along the face and out of it, carried from the ray between the edges to the rays at both ends
         unit = [np.cross(out, rays[1]), out]
         turns = []

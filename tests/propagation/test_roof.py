@@ -106,7 +106,7 @@ def over_roof(width: float, source: FloatArray, target: FloatArray, face: tuple[
         (corner, (0.0, 0.0, -1.0), wall, east, west, exterior, face, face),
         (other, (0.0, 0.0, 1.0), wall, west, east, exterior, face, face),
     )
-    joined = over_two(here, there, *edges, corner, other, 1.0, 1.0, K)[3]
+    joined = over_two(here, there, *edges, corner, other, (1.0, 1.0), K)[3]
     last = np.linalg.norm(there - other)
     total = np.linalg.norm(here) + width + last
     # the bases of both edges differ by a sign

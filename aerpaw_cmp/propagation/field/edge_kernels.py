@@ -187,7 +187,7 @@ def _over_pairs(w: FloatArray, t: Tables, r: Rows, first: int, many: int) -> Non
         before, after, cosines, joined, turn = edges.over_two(
             taken(w, _SOURCE + p), taken(w, _TARGET + p), _whole(t.edge[r.edge[path, 0]]),
             _whole(t.edge[r.edge[path, 1]]),
-            vector(r.vertices[path, 1]), vector(r.vertices[path, 2]), r.shared[path, 0], r.shared[path, 1],
+            vector(r.vertices[path, 1]), vector(r.vertices[path, 2]), (r.shared[path, 0], r.shared[path, 1]),
             t.wave_number,
         )  # fmt: skip
         put(w, _WAYS + p, before)

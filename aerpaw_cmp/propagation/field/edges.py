@@ -181,7 +181,7 @@ def _alike(paths: EdgePaths, t: Tables, fields: list[FloatArray | None], two: bo
     if two:
         before, after, cosines, joined, turn = over_two(
             here[0], there[0], edge_1, edge_2, parts_of(paths.vertices_m[:, 1]), parts_of(paths.vertices_m[:, 2]),
-            paths.shared[:, 0, None], paths.shared[:, 1, None], t.wave_number,
+            (paths.shared[:, 0, None], paths.shared[:, 1, None]), t.wave_number,
         )  # fmt: skip
     else:
         before, after, cosines, distance, spread, angles = over_one(here[0], there[0], edge_1, t.wave_number)
@@ -414,8 +414,8 @@ STRAIGHT = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def over_two(
-    source: Vector, target: Vector, edge_1: Any, edge_2: Any, point_1: Vector, point_2: Vector, shared_1: Number,
-    shared_2: Number, wave_number: float,
+    source: Vector, target: Vector, edge_1: Any, edge_2: Any, point_1: Vector, point_2: Vector,
+    shared: tuple[Number, Number], wave_number: float,
 ) -> Any:  # fmt: skip
     """A path over two edges of one plane face, along that face between them.
 
@@ -428,7 +428,7 @@ def over_two(
     edge_1, edge_2 : tuple
     point_1, point_2 : Vector
         Where the path meets the edges.
-    shared_1, shared_2 : Number
+    shared : tuple of 2 Number
         Which face of each edge the two share: 0, or 1 for face n.
     wave_number : float
 
@@ -449,7 +449,7 @@ def over_two(
     polarisation, with :func:`at_face` (S and H by the height of the ray over the face) and :func:`along_face`. On a
     perfect conductor that is half of two hard wedges, ``2 H_1 H_2``; on a face where waves cancel the slope carries on.
     """
-    way = unit(point_1, point_2)
+    way, (shared_1, shared_2) = unit(point_1, point_2), shared
     gap = np.sqrt((point_2[0] - point_1[0]) ** 2 + (point_2[1] - point_1[1]) ** 2 + (point_2[2] - point_1[2]) ** 2)
     here, there = round_edge(source, edge_1), round_edge(target, edge_2)
     near, far = np.sqrt(here[1] ** 2 + here[2] ** 2), np.sqrt(there[1] ** 2 + there[2] ** 2)

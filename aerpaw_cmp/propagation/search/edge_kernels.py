@@ -63,7 +63,8 @@ class Mirrors(NamedTuple):
 class Bends(NamedTuple):
     """Edges, pairs of edges of one face, and which faces may bend which legs.
 
-    ``options`` lists faces (-1 first); ``ground_t`` (towers,) and ``ground_p`` (poses,) are the grounds of the ends, -2
+    ``options`` lists faces (-1 first), ``both`` (ways, 2) which of them may bend the legs before and after an edge
+    together; ``ground_t`` (towers,) and ``ground_p`` (poses,) are the grounds of the ends, -2
     for that of the tower; ``wall`` (faces,) are those that bend one leg alone. ``pair`` and ``shared`` (pairs, 2) are
     edges and which of their faces is the common one, ``turn`` (pairs, 6) as in the field.
     """
@@ -77,6 +78,7 @@ class Bends(NamedTuple):
     exterior: FloatArray
     face: IntArray
     options: IntArray
+    both: IntArray
     ground_t: IntArray
     ground_p: IntArray
     wall: BoolArray
@@ -261,9 +263,7 @@ def _covered(s, m, b, e, corner):  # type: ignore[no-untyped-def]
 
 @part
 def _allowed(b, before, after, tower, pose):  # type: ignore[no-untyped-def]
-    """Check whether two faces may bend the legs of a link."""
-    if before >= 0 and after >= 0 and (b.wall[before] or b.wall[after]):
-        return False
+    """Check whether two faces are walls, or the grounds of the ends of a link."""
     if before >= 0 and not b.wall[before] and before != b.ground_t[tower]:
         return False
     ground = b.ground_t[tower] if b.ground_p[pose] == -2 else b.ground_p[pose]
@@ -320,7 +320,7 @@ def search(b, m, s, sources, targets, excluded, poses):  # type: ignore[no-untyp
         for j in range(options):
             _round(b, _mirrored(m, b.options[j], _vector(targets, pose)), a_t[j], r_t[j])
         link = 0
-        while link < towers * options * options:
+        while link < towers * len(b.both):
             if len(index) - total < edges + len(b.pair):
                 index, vertices = _doubled(index, vertices)
             link, total = _links(
@@ -332,13 +332,13 @@ def search(b, m, s, sources, targets, excluded, poses):  # type: ignore[no-untyp
 @part
 def _links(scene, ends, places, space, rows, pose, first):  # type: ignore[no-untyped-def]
     """Paths of the links of a pose from ``first`` on while there is room; the next link, and the rows in use."""
-    (b, m, s), (sources, targets, excluded), (a_s, r_s, a_t, r_t) = scene, ends, places
-    (own, seen, work), (index, vertices, total) = space, rows
-    edges, options, target = len(own), len(b.options), _vector(targets, pose)
-    for link in range(first, len(sources) * options * options):
+    (b, m, _), (sources, targets, excluded), (a_s, r_s, a_t, r_t) = scene, ends, places
+    (own, seen, _), (index, vertices, total) = space, rows
+    edges, ways, target = len(own), len(b.both), _vector(targets, pose)
+    for link in range(first, len(sources) * ways):
         if len(index) - total < edges + len(b.pair):
             return link, total
-        tower, i, j = link // (options * options), link // options % options, link % options
+        tower, i, j = link // ways, b.both[link % ways, 0], b.both[link % ways, 1]
         f, g, source = b.options[i], b.options[j], _vector(sources, tower)
         if excluded[tower, pose] or not _allowed(b, f, g, tower, pose):
             continue
@@ -347,10 +347,10 @@ def _links(scene, ends, places, space, rows, pose, first):  # type: ignore[no-un
         _on_edges(b.length, at, seen)
         walled = (f >= 0 and b.wall[f]) or (g >= 0 and b.wall[g])
         for k in range(edges if walled else edges + len(b.pair)):
-            if (k >= edges or seen[k]) and _free(b, m, s, work, bent, k, own, at, vertices[total]):
+            if (k >= edges or seen[k]) and _free(scene, space, bent, k, at, vertices[total]):
                 _write(b, k, index[total], (pose, tower, f, g))
                 total += 1
-    return len(sources) * options * options, total
+    return len(sources) * ways, total
 
 
 @part
@@ -374,9 +374,9 @@ def _point(b, e, at):  # type: ignore[no-untyped-def]
 
 
 @part
-def _free(b, m, s, work, ends, k, own, places, vertices):  # type: ignore[no-untyped-def]
+def _free(scene, space, ends, k, places, vertices):  # type: ignore[no-untyped-def]
     """Check whether a candidate meets its edges and mirrors and its legs are free; its points into ``vertices``."""
-    a_s, r_s, a_t, r_t = places
+    (b, m, s), (own, _, work), (a_s, r_s, a_t, r_t) = scene, space, places
     two = k - len(own)
     first, last = (k, k) if two < 0 else (b.pair[two, 0], b.pair[two, 1])
     vertices[:] = np.nan

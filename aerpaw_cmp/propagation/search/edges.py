@@ -82,7 +82,7 @@ def find_edge_paths(
     candidates = len(edges) * excluded.size * (len(faces) if every else 4)
     kernels = compiled.edges_for(candidates, needed=every or surfaces is not None) if len(edges) else None
     if kernels is not None:
-        return _compiled(kernels, edges, faces, ends, usable, excluded, surfaces, every, threads)
+        return _compiled(kernels, edges, faces, ends, (usable, excluded), surfaces, every, threads)
     known = targets[np.isfinite(targets).all(axis=1)]
     hiding = Occlusion(faces, scene_tolerance_m(faces, sources, known))
     exposed = _Exposed(faces, edges, hiding)
@@ -90,7 +90,7 @@ def find_edge_paths(
     for tower, source in enumerate(sources):
         grounds = [-1, *np.flatnonzero(usable[tower] & (faces.solid < 0)).tolist()]
         for mirrors in itertools.product(grounds, grounds) if len(edges) else ():
-            pieces += _over_edges(faces, edges, source, targets, ~excluded[tower], mirrors, hiding, exposed, tower)
+            pieces += _over_edges(faces, edges, source, targets, ~excluded[tower], mirrors, exposed, tower)
     return _sorted(pieces)
 
 
@@ -108,13 +108,12 @@ def _compiled(
     edges: Edges,
     faces: Faces,
     ends: tuple[FloatArray, FloatArray],
-    usable: BoolArray,
-    excluded: BoolArray,
+    rules: tuple[BoolArray, BoolArray],
     surfaces: Surfaces | None,
     every: bool,
     threads: int | None,
 ) -> EdgePaths:
-    sources, targets = (np.ascontiguousarray(end) for end in ends)
+    (usable, excluded), (sources, targets) = rules, (np.ascontiguousarray(end) for end in ends)
     poses = np.flatnonzero(np.isfinite(targets).all(axis=1))
     hiding = Occlusion(faces, scene_tolerance_m(faces, sources, targets[poses])) if surfaces is None else None
     bends = _bends(kernels, edges, faces, ends, usable, surfaces, every)
@@ -178,7 +177,7 @@ def _bends(
         wall = np.ones(len(faces), dtype=np.bool_)
         wall[[*ground_t[ground_t >= 0], *ground_p[ground_p >= 0]]] = False
     grounds = np.unique(np.append(ground_t, ground_p))
-    options = np.arange(len(faces)) if every else grounds[grounds >= 0]
+    options = np.append(-1, np.arange(len(faces)) if every else grounds[grounds >= 0])
     pair, shared = edges.pairs() if every else (np.zeros((0, 2), np.int64),) * 2
     inward = np.stack([edges.face_axis, np.cross(edges.along, edges.normal_n)], axis=1)
     (e, g), (side, far) = pair.T, shared.T
@@ -193,7 +192,8 @@ def _bends(
         length=edges.length_m,
         exterior=edges.exterior,
         face=np.ascontiguousarray(edges.face),
-        options=np.append(-1, options),
+        options=options,
+        both=np.argwhere(~((options[:, None] >= 0) & (options >= 0) & (wall[options][:, None] | wall[options]))),
         ground_t=ground_t,
         ground_p=ground_p,
         wall=wall,
@@ -313,7 +313,6 @@ def _over_edges(
     targets_m: FloatArray,
     alive: BoolArray,
     ground: tuple[int, int],
-    hiding: Occlusion,
     exposed: _Exposed,
     tower: int,
 ) -> list[EdgePaths]:
@@ -344,7 +343,7 @@ def _over_edges(
                 good[rows] = inside(faces, np.full(len(rows), index), spot[rows], 0.0)
         good[good] &= exposed.at(edge[good], point[good])
         for leg in _legs(source_m, vertices, targets_m[pose]):
-            good[good] &= ~hiding.segments(leg[0][good], leg[1][good])
+            good[good] &= ~exposed.hiding.segments(leg[0][good], leg[1][good])
         rows = np.zeros((int(good.sum()), 8), dtype=np.int64)
         rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 6:] = pose[good], tower, edge[good], -1, ground
         pieces.append(EdgePaths.of(rows, vertices[good]))

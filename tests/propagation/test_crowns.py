@@ -90,6 +90,7 @@ def test_one_bounce_has_the_length_and_the_fresnel_amplitude_of_the_closed_form(
     element = Array(np.zeros((1, 3)), np.radians([slant_deg]), (Isotropic(),))
     found = opaque_replay(scenes, site, target, element, max_depth=1)
     one = found.paths.select(found.paths.off_crown)
+    assert found.left_out == []
     assert len(one) == 1
     np.testing.assert_allclose(one.vertices_m[0, 0], point, atol=1e-9)
     assert found.faces.label[one.faces[0, 0]] == "crown 1 side 5"
@@ -213,6 +214,7 @@ def test_every_bounce_is_found_and_none_is_invented(scenes, seed, height, kind):
         aimed_positions(rng, site, source, 35),
     ])  # fmt: skip
     found = opaque_replay(scenes, site, position, max_depth=3)
+    assert found.left_out == ["paths over a crown and a building, or over two crowns"]
     off = found.paths.select(found.paths.off_crown)
     ground = found.faces.label.index("ground")
     ours = [set() for _ in position]

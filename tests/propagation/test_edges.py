@@ -77,7 +77,8 @@ def test_paths_and_field_by_plain_loops(seed: int, patterns: tuple) -> None:
 
 def test_the_audit_sees_a_path_over_an_edge_that_is_not_there() -> None:
     where = poses((70.0, 3.0, 2.0), (60.0, -40.0, 9.0))
-    barn, array = place(BARN), Array(np.array([[0.0, 0.3, 0.1]]), np.array([0.4]))
+    raised = Tower("T", 35.7, -78.7, 0.0, 0.0, antenna_height_m=8.5, ground_m=1.5)
+    barn, array = replace(place(BARN), towers={"T": raised}), Array(np.array([[0.0, 0.3, 0.1]]), np.array([0.4]))
     link = Link(HZ, {"T": array}, array)
     ours = trace(barn, link, where, diffraction="edges")
     assert ours.edge_paths is not None

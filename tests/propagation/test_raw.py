@@ -163,6 +163,9 @@ def test_a_pose_needs_places_on_the_earth_and_known_turns() -> None:
             turns = [Rotation.from_euler("ZYX", [90 - yaw, -pitch, roll], degrees=True) for roll, pitch, yaw in ends]
             expected = Slerp([0, 4], Rotation.concatenate(turns))(1).as_matrix()
             assert np.array(pose.turn) == pytest.approx(expected, abs=1e-12)
+    still = raw.RawPath([row(3, angles=ends[0]), row(7, angles=ends[0])], LW1, 0.0).pose(4e6)
+    assert still is not None
+    assert np.array(still.turn) == pytest.approx(np.array(raw.matrix(raw.body_quaternion(*ends[0]))))
     alone = raw.RawPath([row(3, up=0.4)], LW1, 2.0)
     assert alone.pose(3e6) is not None
     assert alone.pose(3e6).place_m == pytest.approx((0.0, 0.0, 2.5), abs=1e-6)  # type: ignore[union-attr]

@@ -69,6 +69,11 @@ class RankSeries:
     log: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """Both as in :class:`RssSeries`."""
 
+    @property
+    def channel(self) -> str:
+        """In the place of a channel's name."""
+        return "rank"
+
 
 @dataclass(frozen=True, slots=True)
 class FlightData:

@@ -274,7 +274,7 @@ class ReplayedFlight:
     @property
     def series(self) -> dict[Series, Replayed]:
         """Every series with what was replayed of it, RSS first."""
-        keys: list[Series] = [(s.tower, s.channel) for s in self.data.rss] + [(s.tower, "rank") for s in self.data.rank]
+        keys = [(s.tower, s.channel) for _, s in self.data.series]
         return dict(zip(keys, self.replays.all, strict=True))
 
     @property
@@ -305,8 +305,7 @@ class ReplayedFlight:
         UsageError
             If xarray is not installed.
         """
-        times = {(s.tower, s.channel): s.time for s in self.data.rss}
-        times |= {(s.tower, "rank"): s.time for s in self.data.rank}
+        times = {(s.tower, s.channel): s.time for _, s in self.data.series}
         nodes = {}
         for key, one in self.series.items():
             data = one.replay.to_xarray().rename(pose="time")

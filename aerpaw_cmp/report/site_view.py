@@ -34,10 +34,8 @@ def view_limits(site: Site, track: Track | None) -> FloatArray:
     for building in drawn_buildings(site):
         for corner in np.asarray(building.footprint.exterior.coords)[:, :2]:
             points.append(np.array([*corner, building.base_m + building.height_m]))
-    for forest in site.forests:
-        points += list(at_height(np.asarray(forest.area.exterior.coords)[:, :2], 0.0))
-    for fence in site.geofences:
-        points += list(at_height(np.asarray(fence.area.exterior.coords)[:, :2], 0.0))
+    for area in (*(forest.area for forest in site.forests), *(fence.area for fence in site.geofences)):
+        points += list(at_height(np.asarray(area.exterior.coords)[:, :2], 0.0))
     if len(trees := site.trees):
         points += list(np.column_stack([trees.east_m, trees.north_m, trees.ground_m + trees.height_m]))
     if track is not None and len(track.time):

@@ -9,7 +9,7 @@ import time
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -198,7 +198,7 @@ def carry_out(order: Order) -> Done:
         "logs_root": None if task.logs_root is None else str(task.logs_root), "overrides": dict(task.overrides),
         "seconds": time.perf_counter() - start, "cpu_s": _cpu_s() - cpu, "host": platform.node(),
         "process": os.getpid(), "finished": utc_now(),
-        "versions": _versions(), "code": code_digest(), "inputs": facts.inputs,
+        "versions": versions(), "code": code_digest(), "inputs": facts.inputs,
         "settings": facts.settings.model_dump(mode="json"),
     }  # fmt: skip
     return Done(outcome=outcome, about=about)
@@ -208,12 +208,6 @@ def _cpu_s() -> float:
     """Processor time of this process and of those that it waited for."""
     spent = os.times()
     return time.process_time() + spent.children_user + spent.children_system
-
-
-@cache
-def _versions() -> dict[str, str]:
-    """Asked once: looking nine packages up costs more than keeping an outcome."""
-    return versions()
 
 
 def _not_the_same(task: Task) -> Outcome:

@@ -86,7 +86,7 @@ def held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
     done = list(rows)
     for members in groups.values():
         mine = [rows[i] for i in members]
-        mean = np.array([mean_difference_db(row) for row in mine])
+        mean = np.array([row.moments.mean_db for row in mine])
         offset = left_out_offsets(
             [row.n if np.isfinite(m) else 0 for row, m in zip(mine, mean, strict=True)],
             mean,
@@ -97,11 +97,6 @@ def held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
         for i, o, e in zip(members, offset, error, strict=True):
             done[i] = dataclasses.replace(rows[i], held_out_offset_db=float(o), held_out_rmse_db=float(e))
     return done
-
-
-def mean_difference_db(row: RssRow) -> float:
-    """Mean of simulated minus measured over the scored samples [dB]; NaN without one."""
-    return row.moments.mean_db
 
 
 def error_of(row: RssRow) -> float:
@@ -178,7 +173,7 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
     for (setting, tower, channel), members in groups.items():
         days = [started.get(row.flight, np.nan) / DAY_NS for row in members]
         # not the offsets themselves: three flights whose rounded offsets lie on a line would have no uncertainty
-        exact = np.array([mean_difference_db(row) for row in members])
+        exact = np.array([row.moments.mean_db for row in members])
         offsets = np.array([row.offset_db for row in members])
         line = trend(days, exact)
         made.append(

@@ -19,6 +19,7 @@ import numpy as np
 
 from ...common.cf import file_attributes
 from ...common.errors import InputError, UsageError, noting_interrupts
+from ...common.jsonable import named
 from ...common.stages import Progress, Stages, share_of
 from ...common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray, db_from_power, finite_mean, wavelength_m
 from ...common.versions import utc_now, versions
@@ -26,7 +27,6 @@ from ...compare.rank import singular_values
 from ...maps import export
 from ...maps import grid as cells
 from ...maps.evaluate import (
-    IntervalCoverage,
     Predictor,
     Score,
     along_trajectory,
@@ -44,6 +44,7 @@ from ...maps.job import (
     Antennas,
     Evaluate,
     Evaluation,
+    FoliageDifference,
     MapResult,
     foliage_difference,
     layers_of,
@@ -77,6 +78,9 @@ FOLIAGE = ("none", "attenuating", "opaque")
 """Modes of the trees, from no loss to total loss; the paper's is the last."""
 
 RATIOS = ("spread", "condition")
+
+INTERPOLATORS = ("Kriging", "makima", "spline")
+"""Those of the paper."""
 
 TILED_ABOVE = 1_000_000
 """Receivers, positions times heights, beyond which a map is written tile by tile."""
@@ -752,11 +756,7 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
                 axes=page.at_height(height),
                 values=shown,
             )
-    clear = outcome.maps.get("none")
-    for mode, maps in outcome.ordered():
-        if clear is None or mode == "none":
-            continue
-        change = foliage_difference(clear, maps)
+    for mode, maps, change in _foliage_changes(outcome):
         for row, height in enumerate(maps.rss_altitudes_m):
             yield page.MapLayer(
                 quantity=f"RSS lost by foliage, {mode}", label="RSS without minus with foliage [dB], arrays",
@@ -772,41 +772,39 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
                 )  # fmt: skip
 
 
+def _foliage_changes(outcome: MapOutcome) -> Iterator[tuple[str, MapResult, FoliageDifference]]:
+    """Effect of each foliage mode, where a map without foliage is there to compare with."""
+    if (clear := outcome.maps.get("none")) is not None:
+        yield from ((mode, maps, foliage_difference(clear, maps)) for mode, maps in outcome.ordered() if mode != "none")
+
+
 def _correlation_panels(outcome: MapOutcome) -> Iterator[page.Correlation]:
     if not outcome.studies:
         return
     distance = np.linspace(0.0, 500.0, 251)
     for key, title in (("zero", "Rank vectors, Z as rank 0"), ("missing", "Rank vectors, Z left out")):
-        study = outcome.studies[key]
-        fit = study.fit
-        yield page.Correlation(
-            title=title,
-            distance_m=study.correlation.distance_m,
-            correlation=study.correlation.correlation,
-            fit_distance_m=distance,
-            fit=fit(distance),
-            fit_label=f"bi-exponential, RMSE {fit.rmse:.4f}",
-            excluded=study.correlation.excluded_constant,
-        )
+        fit, words = outcome.studies[key].fit, f"bi-exponential, RMSE {outcome.studies[key].fit.rmse:.4f}"
+        modelled = {"fit_distance_m": distance, "fit": fit(distance), "fit_label": words}
+        yield _correlation(title, outcome.studies[key].correlation, **modelled)
+    titles = {"horizontal": "Rank, one height", "vertical": "Rank, across heights", "RSS": "RSS, one height"}
     for key, binned in outcome.correlations.items():
-        title = {"horizontal": "Rank, one height", "vertical": "Rank, across heights", "RSS": "RSS, one height"}[key]
-        yield page.Correlation(
-            title=title,
-            distance_m=binned.distance_m,
-            correlation=binned.correlation,
-            excluded=binned.excluded_constant,
-        )
+        yield _correlation(titles[key], binned)
+
+
+def _correlation(title: str, binned: BinnedCorrelation, **modelled: Any) -> page.Correlation:
+    excluded = binned.excluded_constant
+    return page.Correlation(title=title, **named(binned, "distance_m correlation"), excluded=excluded, **modelled)
 
 
 def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
     if not outcome.studies or outcome.held_out is None:
         return
     heights, _ = rank_fields(outcome.shown)
-    held_out = outcome.held_out
+    held_out, chosen = outcome.held_out, outcome.studies["random"].scores
     tables: dict[str, dict[str, Score]] = {
         "leave one out": dict(outcome.studies["missing"].scores),
         "leave one out, Z as rank 0": dict(outcome.studies["zero"].scores),
-        "leave one out, Z as rank 0, random samples": _local(outcome.studies["random"].scores),
+        "leave one out, Z as rank 0, random samples": {name: chosen[name] for name in INTERPOLATORS if name in chosen},
         f"blocks of {outcome.settings.block_m:g} m left out": {"Kriging": held_out.blocked, **outcome.peers["blocks"]},
         "altitude left out": {"Kriging, 3-D": held_out.altitude_held_out, **outcome.peers["altitude"]},
     }
@@ -821,11 +819,6 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
                     evaluation=evaluation, method=method, k=k, altitude_m=height,
                     mae=float(score.mae[row, column]), n=int(score.n[row, column]),
                 )  # fmt: skip
-
-
-def _local(scores: Mapping[str, Score]) -> dict[str, Score]:
-    """The interpolators that draw M samples at random when asked to."""
-    return {name: score for name, score in scores.items() if name in ("Kriging", "makima", "spline")}
 
 
 def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
@@ -853,44 +846,28 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
 def _metrics(outcome: MapOutcome) -> dict[str, Any]:
     """Content of metrics.json beyond the tables of the page."""
     result: dict[str, Any] = {
-        "paths": outcome.paths,
-        "paths_off_crowns": outcome.paths_off_crowns,
+        **named(outcome, "paths paths_off_crowns tiles"),
         "settings": asdict(outcome.settings),
-        "tiles": outcome.tiles,
     }
     for key in ("zero", "missing"):
         if key not in outcome.studies:
             continue
         study = outcome.studies[key]
         result.setdefault("correlation", {})[f"z_{key}"] = {
-            **{c: getattr(study.fit, c) for c in ("c1", "c2", "c3", "c4", "rmse", "degenerate", "message")},
-            "positions": study.correlation.positions,
-            "excluded_constant": study.correlation.excluded_constant,
-            "intervals": _interval_metrics(study.intervals),
-            "intervals_paper_v2": _interval_metrics(study.intervals_paper),
+            **named(study.fit, "c1 c2 c3 c4 rmse degenerate message"),
+            **named(study.correlation, "positions excluded_constant"),
+            "intervals": study.intervals,
+            "intervals_paper_v2": study.intervals_paper,
         }
     if outcome.held_out is not None:
         result["vertical_scale"] = outcome.held_out.vertical_scale
         result["trajectory"] = outcome.trajectory_name
-    clear = outcome.maps.get("none")
-    for mode, maps in outcome.ordered():
-        if clear is None or mode == "none":
-            continue
-        change = foliage_difference(clear, maps)
+    for mode, maps, change in _foliage_changes(outcome):
         result.setdefault("foliage", {})[mode] = [
             {"altitude_m": height, "mean_rss_loss_db": finite_mean(loss_db), "lost": float(lost.mean())}
             for height, loss_db, lost in zip(maps.rss_altitudes_m, change.rss_loss_db, change.lost, strict=True)
         ]
     return result
-
-
-def _interval_metrics(intervals: IntervalCoverage) -> dict[str, Any]:
-    return {
-        "level": intervals.level.tolist(),
-        "observed": intervals.observed.tolist(),
-        "standardised_variance": intervals.standardised_variance,
-        "n": intervals.n,
-    }
 
 
 # --- files beside the page -----------------------------------------------------------------------------------------

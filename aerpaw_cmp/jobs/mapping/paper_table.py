@@ -17,7 +17,7 @@ from ...maps.job import Antennas
 from ...maps.study import rank_fields
 from ...report.maps_data import PaperRow
 from ...report.names import k_key
-from .coverage_map import MapOutcome
+from .coverage_map import INTERPOLATORS, MapOutcome
 
 NEAR_M = 150.0
 """Horizontal distance of "near the tower" in the rows about rank 2."""
@@ -102,8 +102,7 @@ def _percent(share: float) -> str:
 
 
 def _by_height(heights: Any, values: Any, form: str = "") -> str:
-    text = [form.format(v) if form else _percent(v) for v in values]
-    return ", ".join(f"{h:g} m: {t}" for h, t in zip(heights, text, strict=True))
+    return _each((f"{h:g} m" for h in heights), values, form)
 
 
 def _rank(result: Any) -> dict[str, str]:
@@ -131,8 +130,12 @@ def _share_above_one(ranks: Any) -> float:
 
 
 def _by_k(ks: Any, values: Any, form: str = "") -> str:
+    return _each((f"K = {k_key(k)}" for k in ks), values, form)
+
+
+def _each(names: Iterable[str], values: Any, form: str) -> str:
     return ", ".join(
-        f"K = {k_key(k)}: {form.format(v) if form else _percent(v)}" for k, v in zip(ks, values, strict=True)
+        f"{name}: {form.format(v) if form else _percent(v)}" for name, v in zip(names, values, strict=True)
     )
 
 
@@ -149,7 +152,7 @@ def _correlation(outcome: MapOutcome) -> dict[str, str]:
 
 def _interpolation(outcome: MapOutcome) -> dict[str, str]:
     s, (heights, _), ks = outcome.settings, rank_fields(outcome.shown), outcome.shown.ks
-    names = ("Kriging", "makima", "spline")
+    names = INTERPOLATORS
     ours = {"samples": f"{s.neighbours}, {s.reach_m:g} m"}
     for key in ("random", "zero"):
         scores = outcome.studies[key].scores

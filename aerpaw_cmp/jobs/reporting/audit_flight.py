@@ -90,9 +90,7 @@ def audit_replays(
         paths=sum(len(r.replay.paths) for r in replays),
         settings={
             "max_depth": rt.max_depth,
-            "samples": max(r.replay.samples for r in replays) or rt.advanced.samples
-            if replays
-            else rt.advanced.samples,
+            "samples": max((r.replay.samples for r in replays), default=0) or rt.advanced.samples,
             "attitude": rt.attitude,
             "foliage": rt.foliage,
             **_crown_settings(rt, replays),

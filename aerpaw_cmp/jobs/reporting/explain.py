@@ -131,7 +131,7 @@ def run_explain(
     return Explanation(
         flight=settings.flight.name,
         tower=tower,
-        channel=series.channel if isinstance(series, RssSeries) else "rank",
+        channel=series.channel,
         time_utc=str(np.datetime_as_string(series.time[at].astype("datetime64[ms]"))) + "Z",
         time_s=seconds,
         position_m=tuple(float(x) for x in pose.position_m[0]),  # type: ignore[arg-type]
@@ -151,7 +151,7 @@ def run_explain(
 def _series(data: FlightData, tower: str, channel: str | None) -> RssSeries | RankSeries:
     every: list[RssSeries | RankSeries] = [*data.rss, *data.rank]
     towers = list(dict.fromkeys(series.tower for series in every))
-    mine = {_channel(series): series for series in reversed(every) if series.tower == tower}
+    mine = {series.channel: series for series in reversed(every) if series.tower == tower}
     if not mine:
         there = tower in data.site.towers
         raise UsageError(
@@ -164,10 +164,6 @@ def _series(data: FlightData, tower: str, channel: str | None) -> RssSeries | Ra
     if channel not in mine:
         raise UsageError(f"no channel {channel!r} at {tower}", expected="one of " + ", ".join(reversed(mine)))
     return mine[channel]
-
-
-def _channel(series: RssSeries | RankSeries) -> str:
-    return series.channel if isinstance(series, RssSeries) else "rank"
 
 
 def _sample(series: RssSeries | RankSeries, time: str, zone: str | None) -> tuple[int, float]:

@@ -15,6 +15,7 @@ from shapely import affinity
 from shapely.geometry import Point, box
 
 from ..common.geodesy import SiteFrame
+from ..common.jsonable import named
 from ..common.stages import Progress, begin_peak, peak_mib, silent
 from ..common.units import ComplexArray, FloatArray, IntArray, spread_out, wavelength_m
 from ..compare.rank import channel_rank
@@ -279,9 +280,7 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
         "seconds_sionna": theirs.search_seconds,
         "paths_image": difference.reference_paths - difference.missing_paths + difference.extra_paths,
         "paths_sionna": difference.reference_paths,
-        "missing_paths": difference.missing_paths,
-        "extra_paths": difference.extra_paths,
-        "rss_max_error_db": difference.rss_max_error_db,
+        **named(difference, "missing_paths extra_paths rss_max_error_db"),
         "poses": poses,
         "samples": samples,
         "batch": BATCH,

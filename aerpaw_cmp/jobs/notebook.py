@@ -12,6 +12,7 @@ import pandas as pd
 
 from ..common.errors import UsageError
 from ..common.htmltable import html_table
+from ..common.jsonable import named
 from ..common.units import ComplexArray, FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.result import FlightResult
@@ -32,7 +33,7 @@ Series = tuple[str, str]
 """Tower and channel of an RSS series; tower and ``"rank"`` of a rank series."""
 
 
-RANK_NUMBERS = ("agreement", "kappa", "total_variation", "wasserstein")
+RANK_NUMBERS = "agreement kappa total_variation wasserstein"
 
 
 def open_flight(
@@ -340,33 +341,27 @@ class Comparison:
         Columns: ``tower channel n offset_db rmse_db rmse_low_db rmse_high_db correlation at_search_edge`` and
         ``<baseline>_rmse_db``.
         """
-        rows = []
-        for item in self.result.rss:
-            low, high = item.score.rmse_ci95_db
-            rows.append(
-                {
-                    "tower": item.tower,
-                    "channel": item.channel,
-                    "n": item.score.n,
-                    "offset_db": item.score.offset_db,
-                    "rmse_db": item.score.rmse_db,
-                    "rmse_low_db": low,
-                    "rmse_high_db": high,
-                    "correlation": item.score.correlation,
-                    "at_search_edge": item.score.at_edge,
-                    **{f"{name}_rmse_db": fit.rmse_db for name, fit in item.baselines.items()},
-                }
-            )
+        rows = [
+            {
+                **named(item, "tower channel"),
+                **named(item.score, "n offset_db rmse_db"),
+                **dict(zip(("rmse_low_db", "rmse_high_db"), item.score.rmse_ci95_db, strict=True)),
+                "correlation": item.score.correlation,
+                "at_search_edge": item.score.at_edge,
+                **{f"{name}_rmse_db": fit.rmse_db for name, fit in item.baselines.items()},
+            }
+            for item in self.result.rss
+        ]
         table: pd.DataFrame = pd.DataFrame(rows)
         return table
 
     def rank_to_frame(self) -> pd.DataFrame:
         """One row per tower and K: ``tower k n agreement kappa total_variation wasserstein``."""
-        rows = []
-        for item in self.result.rank:
-            for k, fit in item.score.simulated.items():
-                numbers = {name: getattr(fit, name) for name in RANK_NUMBERS}
-                rows.append({"tower": item.tower, "k": k, "n": item.score.n, **numbers})
+        rows = [
+            {"tower": item.tower, "k": k, "n": item.score.n, **named(fit, RANK_NUMBERS)}
+            for item in self.result.rank
+            for k, fit in item.score.simulated.items()
+        ]
         table: pd.DataFrame = pd.DataFrame(rows)
         return table
 

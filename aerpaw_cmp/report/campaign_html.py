@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ..common.cells import guarded
-from ..common.jsonable import fields_of, json_safe
+from ..common.jsonable import fields_of, json_safe, named
 from ..common.stages import Progress, silent
 from ..compare.passes import Repeated
 from . import campaign_figures, canvas
@@ -53,7 +53,7 @@ ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "heading_deg")
 """Fields of a row that are samples, not numbers of a table."""
 
 
-def _entries(items: Iterable[Any], without: Sequence[str] = ()) -> list[dict[str, Any]]:
+def _entries(items: Iterable[Any], without: Sequence[str]) -> list[dict[str, Any]]:
     return [{f.name: getattr(x, f.name) for f in dataclasses.fields(x) if f.name not in without} for x in items]
 
 
@@ -62,38 +62,28 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
     failed = {f.flight for f in data.failures}
     result = {
         "campaign": data.name,
-        "title": data.title,
+        **named(data, "title settings reference rank rank_transfers workers"),
         "flights": [
             {"flight": name, "ok": name not in failed, "synthetic": name in data.synthetic} for name in data.flights
         ],
-        "settings": data.settings,
-        "reference": data.reference,
         "failures": _entries(data.failures, ("traceback",)),
         "mean_rmse_db": mean_rmse(data),
         "likely_cause": fields_of(cause(data)),
         "rss": _entries(data.rss, (*ARRAYS, "difference")),
-        "rank": _entries(data.rank),
-        "rank_transfers": _entries(data.rank_transfers),
-        "calibration": {"per": data.calibration, "groups": _entries(data.pooled)},
+        "calibration": {"per": data.calibration, "groups": data.pooled},
         "repeatability": {
-            "radius_m": data.radius_m,
-            "heading_within_deg": data.heading_within_deg,
-            "cell_m": data.cell_m,
+            **named(data, "radius_m heading_within_deg cell_m"),
             "pairs_total": len(data.repeats),
             "links": by_link(data.repeats),
-            "pairs": _entries(telling(data.repeats)),
+            "pairs": telling(data.repeats),
             "rank_pairs_total": len(data.rank_repeats),
-            "rank_pairs": _entries(telling(data.rank_repeats)),
+            "rank_pairs": telling(data.rank_repeats),
             "table": f"{PAIR_TABLE}.csv" if data.repeats or data.rank_repeats else None,
         },
         "season": {
-            "held_out": data.season.held_out,
-            "started": data.season.started,
-            "ranking": _entries(data.season.ranking),
-            "drift": _entries(data.season.drift),
+            **named(data.season, "held_out started ranking drift"),
             "cells": 0 if data.season.places is None else len(data.season.places.cells),
         },
-        "workers": data.workers,
         **about(data),
     }
     safe: dict[str, Any] = json_safe(result)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.jsonable import named
 from ..common.units import BoolArray, IntArray, spread_out
 from ..compare.result import ModelLevel, RankResult, RssResult
 from ..compare.rss import RssComparison
@@ -91,9 +92,7 @@ def _rss(
         if key in GEOMETRY
     ]
     said = {
-        "name": panel.name,
-        "tower": panel.tower,
-        "unit": panel.unit,
+        **named(panel, "name tower unit"),
         "of": len(panel.time),
         "time": arrays.add(seconds_since(panel.time, start)[pick], "f8"),
         **_place(panel, pick, arrays),

@@ -37,9 +37,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
     for pair in data.pairs:
         pairs.setdefault(pair.tower, {})[f"{pair.first} - {pair.second}"] = pair.score.as_dict()
     result: dict[str, Any] = {
-        "flight": data.flight,
-        "title": data.title,
-        "synthetic": data.synthetic,
+        **named(data, "flight title synthetic settings warnings"),
         "site": {"name": data.site.name, "illustrative": data.site.illustrative},
         "inputs": [
             named(f, "path sha256 reader lines accepted rejected blank role warnings")
@@ -47,12 +45,10 @@ def metrics(data: ReportData) -> dict[str, Any]:
             for f in data.inputs
         ],
         KEY: list(union(*(f.learned_on for f in data.inputs))),
-        "settings": data.settings,
         "rss": rss,
         "rank": {item.tower: _rank_metrics(item) for item in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),
         **about(data),
-        "warnings": list(data.warnings),
         **({"ladder": data.ladder} if data.ladder else {}),
         "clock": {name: clock_metrics(clock) for name, clock in data.clocks.items()},
         **({} if data.serving is None else {"serving": data.serving.as_dict()}),
@@ -184,14 +180,9 @@ def rss_tables(series: Sequence[RssResult]) -> Iterator[_Table]:
         yield (
             one.time,
             {
-                "tower": one.tower,
-                "channel": one.channel,
-                "unit": one.unit,
+                **named(one, "tower channel unit"),
                 **_places(one.position_m),
-                "measured_db": one.measured_db,
-                "calibrated_db": one.calibrated_db,
-                "simulated_dbm": one.simulated_dbm,
-                "residual_db": one.residual_db,
+                **named(one, "measured_db calibrated_db simulated_dbm residual_db"),
                 "measured_out_of_coverage": one.measured_out_of_coverage.astype(int),
                 "simulated_out_of_coverage": one.simulated_out_of_coverage.astype(int),
                 **{f"{m}_dbm": one.baselines[m].level_dbm if m in one.baselines else nowhere for m in models},

@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import cached_property
@@ -310,6 +310,15 @@ def utc_texts(start: np.datetime64 | None, time_s: FloatArray) -> list[str]:
     return [f"{t}Z" for t in np.datetime_as_string(instant, unit="us")]
 
 
+def keys(
+    task: str, flight: str, tower: str, channel: str, start: np.datetime64 | None, time_s: FloatArray
+) -> pd.DataFrame:
+    """What rows are told apart by, a row per sample; ``time_s`` (n,) counts from ``start``."""
+    names = dict(zip(KEY, (task, flight, tower, channel, utc_texts(start, time_s)), strict=True))
+    table: pd.DataFrame = pd.DataFrame(names)
+    return table
+
+
 def truth(bench: Bench, task: str, *, training: bool = False) -> pd.DataFrame:
     """Rows of a task: key, fold, geometry, and ``measured`` (level in dB, or rank).
 
@@ -335,48 +344,36 @@ def _level_rows(bench: Bench, task: str, flight: str) -> Iterator[pd.DataFrame]:
     for o in bench.observed(flight):
         s = o.samples
         series = next(r for r in data.rss if (r.tower, r.channel) == (s.tower, s.channel))
-        times = utc_texts(o.start, s.time_s)
-        rotation = data.poses_at(np.array([t.removesuffix("Z") for t in times], "datetime64[ns]")).rotation
-        frame = _geometry(task, flight, s.tower, s.channel, times, s.position_m, rotation)
-        frame["fold"] = folds_of(split, o)
-        tower = bench.data(flight).site.towers[s.tower].position_m if o.tower_m is None else o.tower_m.T
-        for name, value in zip(("tower_east_m", "tower_north_m", "tower_up_m"), tower, strict=True):
-            frame[name] = np.round(value, 3)
-        for name, column in zip(("body_forward", "body_left", "body_up"), s.at_uav.T, strict=True):
-            frame[name] = column.round(6)
-        frame["carrier_hz"] = series.link.carrier_hz
-        frame["measured"] = s.residual_db + o.free_space_db
-        yield frame
+        frame = keys(task, flight, s.tower, s.channel, o.start, s.time_s)
+        rotation = data.poses_at(np.array([t.removesuffix("Z") for t in frame["time"]], "datetime64[ns]")).rotation
+        tower = data.site.towers[s.tower].position_m if o.tower_m is None else o.tower_m.T
+        yield _geometry(frame, s.position_m, rotation, np.round(tower, 3)).assign(
+            fold=folds_of(split, o),
+            **dict(zip(("body_forward", "body_left", "body_up"), s.at_uav.T.round(6), strict=True)),
+            carrier_hz=series.link.carrier_hz,
+            measured=s.residual_db + o.free_space_db,
+        )
 
 
 def _rank_rows(bench: Bench, task: str, flight: str) -> Iterator[pd.DataFrame]:
     for item in bench.ranks(flight):
-        times = utc_texts(np.datetime64(0, "ns"), item.time_s)
-        frame = _geometry(task, flight, item.tower, "rank", times, item.poses.position_m, item.poses.rotation)
-        frame["fold"] = 0
-        for name, value in zip(("tower_east_m", "tower_north_m", "tower_up_m"), item.tower_m, strict=True):
-            frame[name] = value
-        frame["carrier_hz"] = item.link.carrier_hz
-        frame["measured"] = item.rank.astype(np.int64)
-        yield frame
+        frame = keys(task, flight, item.tower, "rank", np.datetime64(0, "ns"), item.time_s)
+        yield _geometry(frame, item.poses.position_m, item.poses.rotation, item.tower_m).assign(
+            fold=0, carrier_hz=item.link.carrier_hz, measured=item.rank.astype(np.int64)
+        )
 
 
-def _geometry(
-    task: str, flight: str, tower: str, channel: str, time: list[str], position: FloatArray, rotation: FloatArray
-) -> pd.DataFrame:
-    """Key, position and attitude (aircraft: yaw clockwise from north, nose up, right wing down positive)."""
+def _geometry(frame: pd.DataFrame, position: FloatArray, rotation: FloatArray, tower: Iterable[Any]) -> pd.DataFrame:
+    """Add position, attitude (aircraft: yaw clockwise from north, nose up, right wing down positive) and tower."""
     nose, left, up = (rotation[:, :, i] for i in range(3))
-    frame: pd.DataFrame = pd.DataFrame(
-        {
-            **dict(zip(KEY[:4], (task, flight, tower, channel), strict=True)),
-            "time": time,
-            **{name: position[:, i].round(3) for i, name in enumerate(("east_m", "north_m", "up_m"))},
-            "yaw_deg": (np.degrees(np.arctan2(nose[:, 0], nose[:, 1])) % 360.0).round(3),
-            "pitch_deg": np.degrees(np.arcsin(np.clip(nose[:, 2], -1, 1))).round(3),
-            "roll_deg": np.degrees(np.arctan2(left[:, 2], up[:, 2])).round(3),
-        }
+    placed: pd.DataFrame = frame.assign(
+        **{name: position[:, i].round(3) for i, name in enumerate(("east_m", "north_m", "up_m"))},
+        yaw_deg=(np.degrees(np.arctan2(nose[:, 0], nose[:, 1])) % 360.0).round(3),
+        pitch_deg=np.degrees(np.arcsin(np.clip(nose[:, 2], -1, 1))).round(3),
+        roll_deg=np.degrees(np.arctan2(left[:, 2], up[:, 2])).round(3),
+        **dict(zip(("tower_east_m", "tower_north_m", "tower_up_m"), tower, strict=True)),
     )
-    return frame
+    return placed
 
 
 # --- entries -------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -25,7 +25,7 @@ from ...propagation.options import Engine
 from ...propagation.trace import trace
 from ..learning.calibrate import learned_antennas
 from ..learning.calibrate_rank import RankFitSettings, Tried
-from .benchmark import KEY, RANKS, Bench, Question, questions, utc_texts
+from .benchmark import KEY, RANKS, Bench, Question, keys, questions, utc_texts
 
 GainOf = Callable[[Observed], FloatArray]
 """Level above free space (n,) of samples [dB], up to a constant."""
@@ -241,38 +241,28 @@ def predict(bench: Bench, task: str, entrant: str) -> pd.DataFrame | None:
     entrant : str
         A key of :data:`LEVEL` or :data:`RANK`.
     """
-    one = bench.manifest.tasks[task]
-    parts: list[pd.DataFrame] = []
-    if one.kind == "rank":
-        if entrant not in RANK:
-            return None
-        for flight in bench.tests(task):
-            for samples, p in zip(bench.ranks(flight), RANK[entrant](bench, one.train, flight), strict=True):
-                frame = _keys(task, flight, samples.tower, "rank", np.datetime64(0, "ns"), samples.time_s)
-                parts.append(frame.assign(**dict(zip(RANKS, p.T, strict=True))))
-        return _whole(parts)
-    if entrant not in LEVEL:
+    ranked = bench.manifest.tasks[task].kind == "rank"
+    if entrant not in (RANK if ranked else LEVEL):
         return None
-    for flight in bench.tests(task):
-        series = bench.observed(flight)
-        levels = [np.full((2, len(o.samples)), np.nan) for o in series]
-        for question in questions(bench, task, flight):
-            for level, rows, (mean, sd) in zip(levels, question.rows, LEVEL[entrant](question, bench), strict=True):
-                level[:, rows] = mean, sd
-        for o, (mean, sd) in zip(series, levels, strict=True):
-            frame = _keys(task, flight, o.samples.tower, o.samples.channel, o.start, o.samples.time_s)
-            parts.append(frame.assign(level_db=mean, sd_db=sd))
-    return _whole(parts)
-
-
-def _whole(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    of = _rank_answers if ranked else _level_answers
+    parts = (frame for flight in bench.tests(task) for frame in of(bench, task, flight, entrant))
     table: pd.DataFrame = pd.concat(parts).drop_duplicates(KEY)
     return table
 
 
-def _keys(
-    task: str, flight: str, tower: str, channel: str, start: np.datetime64 | None, time_s: FloatArray
-) -> pd.DataFrame:
-    names = dict(zip(KEY, (task, flight, tower, channel, utc_texts(start, time_s)), strict=True))
-    table: pd.DataFrame = pd.DataFrame(names)
-    return table
+def _rank_answers(bench: Bench, task: str, flight: str, entrant: str) -> Iterator[pd.DataFrame]:
+    answers = RANK[entrant](bench, bench.manifest.tasks[task].train, flight)
+    for samples, p in zip(bench.ranks(flight), answers, strict=True):
+        frame = keys(task, flight, samples.tower, "rank", np.datetime64(0, "ns"), samples.time_s)
+        yield frame.assign(**dict(zip(RANKS, p.T, strict=True)))
+
+
+def _level_answers(bench: Bench, task: str, flight: str, entrant: str) -> Iterator[pd.DataFrame]:
+    series = bench.observed(flight)
+    levels = [np.full((2, len(o.samples)), np.nan) for o in series]
+    for question in questions(bench, task, flight):
+        for level, rows, (mean, sd) in zip(levels, question.rows, LEVEL[entrant](question, bench), strict=True):
+            level[:, rows] = mean, sd
+    for o, (mean, sd) in zip(series, levels, strict=True):
+        frame = keys(task, flight, o.samples.tower, o.samples.channel, o.start, o.samples.time_s)
+        yield frame.assign(level_db=mean, sd_db=sd)

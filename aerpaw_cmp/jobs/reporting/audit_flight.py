@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...common.jsonable import named
 from ...common.stages import Progress, silent
 from ...common.units import AnyArray, FloatArray, spread_out
 from ...compare.field_difference import FieldAudit
@@ -89,10 +90,8 @@ def audit_replays(
         seconds=sum(r.replay.seconds for r in replays),
         paths=sum(len(r.replay.paths) for r in replays),
         settings={
-            "max_depth": rt.max_depth,
+            **named(rt, "max_depth attitude foliage"),
             "samples": max((r.replay.samples for r in replays), default=0) or rt.advanced.samples,
-            "attitude": rt.attitude,
-            "foliage": rt.foliage,
             **_crown_settings(rt, replays),
         },
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...common.cf import DB, DBM
 from ...common.geodesy import SiteFrame
-from ...common.jsonable import fields_of
+from ...common.jsonable import fields_of, named
 from ...common.units import AnyArray, FloatArray
 from ...logs.records import has_wall_clock
 from ...site.site import Site
@@ -303,19 +303,16 @@ def _nanoseconds(seconds: FloatArray) -> AnyArray:
 def _flown(one: RssRow | FlownRank) -> dict[str, Any]:
     time = np.datetime64(one.start_ns, "ns") + _nanoseconds(one.time_s)
     places = dict(zip(("east_m", "north_m", "up_m"), one.position_m.T, strict=True))
-    return {"time": time, "flight": one.flight, "tower": one.tower, **places}
+    return {"time": time, **named(one, "flight tower"), **places}
 
 
 def _rss_link(row: RssRow) -> dict[str, Any]:
     placed = np.isfinite(row.position_m).all(axis=1)
     return {
         **_flown(row),
-        "channel": row.channel,
-        "unit": row.unit,
-        "measured_db": row.measured_db,
+        **named(row, "channel unit measured_db"),
         "calibrated_db": row.measured_db + row.offset_db,
-        "simulated_dbm": row.simulated_dbm,
-        "residual_db": row.residual_db,
+        **named(row, "simulated_dbm residual_db"),
         "measured_out_of_coverage": placed & ~np.isfinite(row.measured_db),
         "simulated_out_of_coverage": placed & ~np.isfinite(row.simulated_dbm),
     }

@@ -68,6 +68,11 @@ Quiet = Annotated[
 ]
 
 
+def output(text: str, metavar: str = "DIR") -> Any:
+    """The option of where results go; ``text`` names the default."""
+    return typer.Option("-o", "--out", metavar=metavar, help=text)
+
+
 def command(
     name: str,
     *,

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from ..common.errors import UsageError
-from .app import Force, Json, command
+from .app import Force, Json, command, output
 from .shown import number, print_json, say, table
 
 ACTIONS = ("run", "score", "template", "fetch", "tasks")
@@ -34,12 +34,7 @@ def benchmark(
     data: Annotated[Path, typer.Option(help="Folder of the published logs, whatever the files are called.")] = Path(),
     out: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="DIR",
-            help="Output folder; of template a CSV  [default: reports/benchmark, predictions.csv; of fetch --data]",
-        ),
+        output("Output folder; of template a CSV  [default: reports/benchmark, predictions.csv; of fetch --data]"),
     ] = None,
     task: Annotated[list[str] | None, typer.Option(help="Only this task; repeatable.")] = None,
     entrant: Annotated[list[str] | None, typer.Option(help="Only this model of ours; repeatable.")] = None,

@@ -9,7 +9,7 @@ import typer
 
 from ..common.stages import duration
 from ..jobs.options import RunOptions
-from .app import Export, Force, Json, LogsRoot, Scheduler, Workers, command
+from .app import Export, Force, Json, LogsRoot, Scheduler, Workers, command, output
 from .shown import number, print_json, records, say, table
 
 
@@ -24,9 +24,7 @@ from .shown import number, print_json, records, say, table
 )
 def campaign(
     campaign_yaml: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="campaign.yaml")],
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/<campaign>]")
-    ] = None,
+    out: Annotated[Path | None, output("Output folder  [default: reports/<campaign>]")] = None,
     logs_root: LogsRoot = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,

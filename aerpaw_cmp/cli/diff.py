@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from ..common.errors import one_line
-from .app import Force, Json, command
+from .app import Force, Json, command, output
 from .shown import print_json, records, say
 
 
@@ -23,12 +23,7 @@ from .shown import print_json, records, say
 def diff(
     first: Annotated[Path, typer.Argument(help="Folder of a report.")],
     second: Annotated[Path, typer.Argument(help="The other report of the same flight.")],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", metavar="DIR", help="Folder for diff.html and diff.json  [default: none is written]"
-        ),
-    ] = None,
+    out: Annotated[Path | None, output("Folder for diff.html and diff.json  [default: none is written]")] = None,
     tolerance: Annotated[float, typer.Option(help="Largest difference that counts as equal [dB].")] = 0.01,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a number differs by more than the tolerance.")

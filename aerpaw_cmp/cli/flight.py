@@ -10,7 +10,7 @@ import typer
 
 from ..common.errors import one_line
 from ..jobs.options import RunOptions
-from .app import DryRun, Export, Force, Json, LogsRoot, command
+from .app import DryRun, Export, Force, Json, LogsRoot, command, output
 from .shown import number, print_files, print_json, print_plan, records, say, table
 
 
@@ -29,9 +29,7 @@ from .shown import number, print_files, print_json, print_plan, records, say, ta
 )
 def report(
     flight: Annotated[Path, typer.Argument(help="flight.yaml")],
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/<flight>]")
-    ] = None,
+    out: Annotated[Path | None, output("Output folder  [default: reports/<flight>]")] = None,
     logs_root: LogsRoot = None,
     engine: Annotated[Literal["image", "sionna"] | None, typer.Option(help="Path search  [default: rt.engine]")] = None,
     audit: Annotated[
@@ -186,13 +184,7 @@ def _print_report_summary(outcome: Any) -> None:
 def calibrate(
     calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="FILE",
-            help="File for the learned settings  [default: <calibration>.calibrated.yaml]",
-        ),
+        Path | None, output("File for the learned settings  [default: <calibration>.calibrated.yaml]", "FILE")
     ] = None,
     logs_root: LogsRoot = None,
     into_site: Annotated[
@@ -251,9 +243,7 @@ def calibrate(
 )
 def simulate(
     flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: simulated/<flight>]")
-    ] = None,
+    out: Annotated[Path | None, output("Output folder  [default: simulated/<flight>]")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -271,9 +261,7 @@ def simulate(
     ],
 )
 def sample(
-    out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for flight.yaml and the logs.")
-    ] = Path("sample"),
+    out: Annotated[Path, output("Folder for flight.yaml and the logs.")] = Path("sample"),
     force: Force = False,
     as_json: Json = False,
 ) -> None:

@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperCommand
 
 from ..common.errors import UsageError
-from .app import Force, Json, command
+from .app import Force, Json, command, output
 from .shown import print_files, print_json, say
 
 WEB = "127.0.0.1:8765"
@@ -46,12 +46,9 @@ def tap(
         list[str] | None,
         typer.Argument(help="Serial port, or several  [default: the first AT port of a Quectel modem]"),
     ] = None,
-    out: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--out", metavar="DIR", help="Folder of the log segments; of several ports, a folder in it for each."
-        ),
-    ] = Path("tap"),
+    out: Annotated[Path, output("Folder of the log segments; of several ports, a folder in it for each.")] = Path(
+        "tap"
+    ),
     status: Annotated[bool, typer.Option("--status/--no-status", help="A status line on standard error.")] = True,
     enable_csi: Annotated[
         bool, typer.Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from .app import Force, Json, command
+from .app import Force, Json, command, output
 from .shown import print_json, records, say, table
 
 
@@ -22,10 +22,7 @@ from .shown import print_json, records, say, table
 def ingest(
     paths: Annotated[list[Path], typer.Argument(help="Log files and folders.")],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", metavar="FILE", help="Flight file (HDF5) with every record  [default: none is written]"
-        ),
+        Path | None, output("Flight file (HDF5) with every record  [default: none is written]", "FILE")
     ] = None,
     draft: Annotated[Path | None, typer.Option(help="Also write a first flight.yaml that names these logs.")] = None,
     site: Annotated[

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from ..jobs.options import RunOptions
-from .app import Flights, Force, Json, LogsRoot, command
+from .app import Flights, Force, Json, LogsRoot, command, output
 from .shown import print_json, records, say
 
 _FENCE = typer.Option(metavar="KML", help="Area that may be flown  [default: the area of the site]")
@@ -47,9 +47,7 @@ def plan(
         list[float] | None, typer.Option(help="Height of a target that is a site [m]; repeatable  [default: 40]")
     ] = None,
     tower_distance: Annotated[float, typer.Option(min=0.0, help="Least distance to towers [m].")] = 30.0,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/plan-<TARGET>]")
-    ] = None,
+    out: Annotated[Path | None, output("Output folder  [default: reports/plan-<TARGET>]")] = None,
     logs_root: LogsRoot = None,
     force: Force = False,
     as_json: Json = False,

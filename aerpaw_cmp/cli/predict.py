@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from ..jobs.options import RunOptions
-from .app import Flights, Force, Json, LogsRoot, command
+from .app import Flights, Force, Json, LogsRoot, command, output
 from .shown import print_json, records, say
 
 
@@ -32,10 +32,7 @@ def predict(
     ],
     flights: Flights = None,
     site: Annotated[str | None, typer.Option(help="Site of a route or of points, without --with.")] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/prediction-<WHERE>]"),
-    ] = None,
+    out: Annotated[Path | None, output("Output folder  [default: reports/prediction-<WHERE>]")] = None,
     height: Annotated[
         list[float] | None,
         typer.Option(help="Height of a grid [m], repeatable; of route points without one  [default: 40]"),

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ..jobs.options import RunOptions
-from .app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, command, site_app
+from .app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, command, output, site_app
 from .shown import print_files, print_json, print_plan, say, table
 
 
@@ -24,7 +24,7 @@ from .shown import print_files, print_json, print_plan, say, table
     ],
 )
 def site_import(
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The site.yaml to write.")],
+    out: Annotated[Path, output("The site.yaml to write.", "FILE")],
     files: Annotated[
         list[Path] | None,
         typer.Argument(help="Map files, or one Mitsuba XML  [default: none; with --canopy or --buildings]"),
@@ -116,9 +116,7 @@ def site_show(
     site: Annotated[
         str | None, typer.Argument(help="site.yaml or packaged site  [default: that of --flight, else lake_wheeler]")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/site-<site>]")
-    ] = None,
+    out: Annotated[Path | None, output("Output folder  [default: reports/site-<site>]")] = None,
     flight: Annotated[Path | None, typer.Option(help="Draw the track of this flight.yaml.")] = None,
     logs_root: LogsRoot = None,
     export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
@@ -149,9 +147,7 @@ def site_show(
 )
 def map_(
     site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Output folder  [default: reports/map-<site>]")
-    ] = None,
+    out: Annotated[Path | None, output("Output folder  [default: reports/map-<site>]")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A coarse map in seconds: 120 m, three heights.")] = False,
     foliage: Annotated[
         list[str] | None, typer.Option(help="none, attenuating, opaque or all; repeatable  [default: all]")

@@ -91,6 +91,7 @@ def _row(
         baselines={"free_space": 7.0}, step_db=0.1, span_db=(-50.0, 50.0),
         time_s=np.arange(len(measured)) * 5.0 if reference else empty, measured_db=measured, simulated_dbm=simulated,
         position_m=position if reference else np.zeros((0, 3)),
+        distance_m=np.hypot(*position[:, :2].T) if reference else empty,
         start_ns=start,
     )  # fmt: skip
 

@@ -54,6 +54,7 @@ class RssRow:
     measured_db: FloatArray = field(repr=False)
     simulated_dbm: FloatArray = field(repr=False)
     position_m: FloatArray = field(repr=False)
+    distance_m: FloatArray = field(repr=False)
     heading_deg: FloatArray | None = field(repr=False, default=None)
     start_ns: int = 0
     """Instant of ``time_s`` = 0, nanoseconds after 1970-01-01."""

@@ -35,6 +35,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+DISTANCE_BINS = 30
+
+FEWEST_PER_BIN = 8
+"""Samples that a bin needs: no line is drawn over what was not flown."""
+
 MAPS_PER_ROW = 3
 
 MOST_BARS = 200
@@ -53,6 +58,41 @@ TALLEST = 40.0
 def look(number: int) -> dict[str, Any]:
     """Colour and line style of the flight with this number, told apart in grey by the dashes."""
     return {"color": COLOURS[number % len(COLOURS)], "linestyle": LINES[(number + number // len(COLOURS)) % len(LINES)]}
+
+
+def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
+    """RSS after the offset against distance, and its difference to the simulation below, all flights on one axis."""
+    fig = figure((9.2, 6.4))
+    top, low = fig.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
+    edges = np.linspace(0.0, max(float(np.nanmax(row.distance_m)) for row in rows), DISTANCE_BINS + 1)
+    for row in rows:
+        name, style = row.flight, look(numbers[row.flight])
+        for ax, values in ((top, row.measured_db + row.offset_db), (low, row.residual_db)):
+            at, less, median, more = _binned(row.distance_m, values, edges)
+            ax.fill_between(at, less, more, color=style["color"], alpha=0.15, linewidth=0)
+            ax.plot(at, median, linewidth=1.8, label=f"{name}, measured + offset ({count(row.n)})", **style)
+        simulated = np.where(np.isfinite(row.measured_db), row.simulated_dbm, np.nan)
+        at, _, median, _ = _binned(row.distance_m, simulated, edges)
+        top.plot(
+            at, median, linestyle="none", marker=MARKERS[numbers[name] % len(MARKERS)], markersize=4.5,
+            markerfacecolor="white", color=style["color"], label=f"{name}, ray tracing",
+        )  # fmt: skip
+    low.axhline(0.0, color="black", linewidth=0.8)
+    top.set_ylabel("RSS [dBm]")
+    low.set_ylabel("Measured − simulated [dB]")
+    low.set_xlabel("Distance tower to UAV [m]")
+    fig.legend(*top.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return fig
+
+
+def _binned(at: FloatArray, values: FloatArray, edges: FloatArray) -> list[Any]:
+    """Mean place and the 10, 50 and 90 % points of the values, by bin; a bin with few samples is left out."""
+    import pandas as pd
+
+    known = pd.DataFrame({"at": at, "values": values}).dropna()
+    bins = known.groupby(np.digitize(known["at"], edges[1:-1]))
+    levels = [bins["at"].mean(), *(bins["values"].quantile(q) for q in (0.1, 0.5, 0.9))]
+    return [level[bins.size() >= FEWEST_PER_BIN] for level in levels]
 
 
 def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
@@ -341,6 +381,12 @@ def _flight_specs(data: CampaignData) -> Iterator[FigureSpec]:
     for link, rows in grouped(data.reference_rows, lambda r: r.link).items():
         scored = [row for row in rows if row.n > 0]
         if scored and len(scored) <= MOST_FLIGHTS:
+            yield FigureSpec(
+                f"distance_{safe_name(link)}", "overlay", f"{link}: RSS against distance, all flights",
+                f"Setting: {data.reference}. Lines: medians of {DISTANCE_BINS} bins of distance; bands: 10 % to 90 %. "
+                "Open markers: medians of the simulation at the same samples. Each flight has its own offset.",
+                partial(against_distance, scored, numbers),
+            )  # fmt: skip
             yield FigureSpec(
                 f"places_{safe_name(link)}", "overlay", f"{link}: where the simulation errs, flight by flight",
                 f"Mean residual in cells of {data.cell_m:g} m, all heights together, one colour scale. A pattern that "

@@ -49,7 +49,7 @@ ROWS_SHOWN = 300
 COMPACT_ROWS = 2000
 """From so many rows on campaign.json is written without indentation."""
 
-ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "heading_deg")
+ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
 """Fields of a row that are samples, not numbers of a table."""
 
 

@@ -199,7 +199,7 @@ def test_broken_flights_are_rows_with_their_message(whole: dict[str, Any], folde
 def test_every_figure_is_there_and_old_ones_are_not(whole: dict[str, Any], folder: Path) -> None:
     figures = folder / "whole_out" / "figures"
     expected = {
-        "settings_rmse", "tracks", "places_LW1_USRP1", "places_LW1_USRP2",
+        "settings_rmse", "tracks", "distance_LW1_USRP1", "distance_LW1_USRP2", "places_LW1_USRP1", "places_LW1_USRP2",
         "season_errors", "season_drift", "season_places",
     }  # fmt: skip
     assert {p.stem for p in figures.glob("*.svg")} == {p.stem for p in figures.glob("*.png")} == expected
@@ -307,6 +307,7 @@ def row(flight: str, channel: str, measured: Any, simulated: Any, **keys: Any) -
         "n_out_of_coverage": 0, "at_search_edge": False, "rmse_ci95_db": None, "offset_ci95_db": None,
         "correlation_ci95": None, "n_effective": nan, "lag_s": nan, "lag_verdict": "", "fitted": (), "baselines": {},
         "step_db": 0.1, "span_db": (-50.0, 50.0), "time_s": np.arange(n) * 1.0,
+        "distance_m": np.arange(n) * 3.0,
         "position_m": np.stack([np.arange(n) * 3.0, np.zeros(n), np.full(n, 40.0)], axis=-1),
     }  # fmt: skip
     return RssRow(

@@ -3,7 +3,7 @@
 A command is a function in a module of this package::
 
     @command("diff", examples=["aerpaw-cmp diff reports/a reports/b"])
-    def diff(first: Annotated[Path, typer.Argument(help="...")], as_json: Json = False) -> int:
+    def diff(first: Annotated[Path, Argument(help="...")], as_json: Json = False) -> int:
         from ..jobs.diff import run_diff  # here, so that help and completion load nothing
 
 and a line of :mod:`aerpaw_cmp.common.commands`. What it returns is the exit code; nothing is 0. ``-h``, ``--quiet``
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
+from typer import Option
 from typer.core import TyperCommand
 
 from ..common.commands import COMMANDS
@@ -36,41 +37,41 @@ app = typer.Typer(
 site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(site_app, name="site", help=COMMANDS["site"])
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else there.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace files that this tool did not write; never an input.")]
+Json = Annotated[bool, Option("--json", help="Print one JSON object on standard output and nothing else there.")]
+Force = Annotated[bool, Option("--force", help="Replace files that this tool did not write; never an input.")]
 Export = Annotated[
     list[str] | None,
-    typer.Option(help="Also write the samples as geojson, kmz, netcdf or all; names joined by commas, or repeated."),
+    Option(help="Also write the samples as geojson, kmz, netcdf or all; names joined by commas, or repeated."),
 ]
 LogsRoot = Annotated[
     Path | None,
-    typer.Option("--logs-root", help="Folder against which the paths of the logs resolve."),
+    Option("--logs-root", help="Folder against which the paths of the logs resolve."),
 ]
 
 
-Workers = Annotated[int, typer.Option(min=1, help="Workers of this machine that share the tasks.")]
+Workers = Annotated[int, Option(min=1, help="Workers of this machine that share the tasks.")]
 Scheduler = Annotated[
     str | None,
-    typer.Option("--scheduler", "--cluster", help="Address of a Dask scheduler, instead of local workers."),
+    Option("--scheduler", "--cluster", help="Address of a Dask scheduler, instead of local workers."),
 ]
 Flights = Annotated[
     list[Path] | None,
-    typer.Option(
+    Option(
         "--with",
         metavar="FLIGHT",
         help="Flown flight.yaml to learn from, or calibration.yaml: its flights; repeatable.",
     ),
 ]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Print stages and time estimate; write nothing.")]
+DryRun = Annotated[bool, Option("--dry-run", help="Print stages and time estimate; write nothing.")]
 Quiet = Annotated[
     bool,
-    typer.Option("-q", "--quiet", help="Results, warnings and failures only."),
+    Option("-q", "--quiet", help="Results, warnings and failures only."),
 ]
 
 
 def output(text: str, metavar: str = "DIR") -> Any:
     """The option of where results go; ``text`` names the default."""
-    return typer.Option("-o", "--out", metavar=metavar, help=text)
+    return Option("-o", "--out", metavar=metavar, help=text)
 
 
 def command(

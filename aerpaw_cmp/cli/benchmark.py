@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from ..common.errors import UsageError
 from .app import Force, Json, command, output
-from .shown import number, print_json, say, table
+from .shown import number, print_files, print_json, say, table
 
 ACTIONS = ("run", "score", "template", "fetch", "tasks")
 
@@ -26,24 +26,22 @@ ACTIONS = ("run", "score", "template", "fetch", "tasks")
 def benchmark(
     words: Annotated[
         list[str] | None,
-        typer.Argument(
+        Argument(
             metavar="[run|tasks|template|fetch|score PREDICTIONS]",
             help="run: our own models; tasks: the rules; template: the table to fill; score: a predictions.csv.",
         ),
     ] = None,
-    data: Annotated[Path, typer.Option(help="Folder of the published logs, whatever the files are called.")] = Path(),
+    data: Annotated[Path, Option(help="Folder of the published logs, whatever the files are called.")] = Path(),
     out: Annotated[
         Path | None,
         output("Output folder; of template a CSV  [default: reports/benchmark, predictions.csv; of fetch --data]"),
     ] = None,
-    task: Annotated[list[str] | None, typer.Option(help="Only this task; repeatable.")] = None,
-    entrant: Annotated[list[str] | None, typer.Option(help="Only this model of ours; repeatable.")] = None,
-    leaderboard: Annotated[
-        Path | None, typer.Option(help="leaderboard.json that gets a row for the scored file.")
-    ] = None,
-    manifest: Annotated[Path | None, typer.Option(help="Another manifest [default: the packaged one]")] = None,
+    task: Annotated[list[str] | None, Option(help="Only this task; repeatable.")] = None,
+    entrant: Annotated[list[str] | None, Option(help="Only this model of ours; repeatable.")] = None,
+    leaderboard: Annotated[Path | None, Option(help="leaderboard.json that gets a row for the scored file.")] = None,
+    manifest: Annotated[Path | None, Option(help="Another manifest [default: the packaged one]")] = None,
     accept_levels: Annotated[
-        bool, typer.Option("--accept-levels", help="Score levels whose sign or unit looks wrong.")
+        bool, Option("--accept-levels", help="Score levels whose sign or unit looks wrong.")
     ] = False,
     force: Force = False,
     as_json: Json = False,
@@ -66,7 +64,7 @@ def benchmark(
         return 0
     if action == "template":
         files = job.write_template(data, out or Path("predictions.csv"), tasks=tasks, manifest=manifest, force=force)
-        print_json({"files": [str(p) for p in files]}) if as_json else print("\n".join(map(str, files)))
+        print_files(files, as_json)
         return 0
     if action == "score":
         result = job.score_predictions(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from ..common.stages import duration
 from ..jobs.options import RunOptions
@@ -23,21 +23,19 @@ from .shown import number, print_json, records, say, table
     ],
 )
 def campaign(
-    campaign_yaml: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="campaign.yaml")],
+    campaign_yaml: Annotated[Path, Argument(metavar="CAMPAIGN", help="campaign.yaml")],
     out: Annotated[Path | None, output("Output folder  [default: reports/<campaign>]")] = None,
     logs_root: LogsRoot = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,
     keep: Annotated[
-        Path | None, typer.Option(help="Folder for task outcomes; a rerun computes missing outcomes only.")
+        Path | None, Option(help="Folder for task outcomes; a rerun computes missing outcomes only.")
     ] = None,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Ignore stored outcomes and store none.")] = False,
+    fresh: Annotated[bool, Option("--fresh", help="Ignore stored outcomes and store none.")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="List finished tasks, open tasks and the time estimate; compute nothing.")
+        bool, Option("--dry-run", help="List finished tasks, open tasks and the time estimate; compute nothing.")
     ] = False,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
-    ] = False,
+    strict: Annotated[bool, Option("--strict", help="Exit code 1 when a flight or a stated check failed.")] = False,
     export: Export = None,
     force: Force = False,
     as_json: Json = False,

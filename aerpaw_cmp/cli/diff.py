@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from ..common.errors import one_line
 from .app import Force, Json, command, output
@@ -21,12 +21,12 @@ from .shown import print_json, records, say
     ],
 )
 def diff(
-    first: Annotated[Path, typer.Argument(help="Folder of a report.")],
-    second: Annotated[Path, typer.Argument(help="The other report of the same flight.")],
+    first: Annotated[Path, Argument(help="Folder of a report.")],
+    second: Annotated[Path, Argument(help="The other report of the same flight.")],
     out: Annotated[Path | None, output("Folder for diff.html and diff.json  [default: none is written]")] = None,
-    tolerance: Annotated[float, typer.Option(help="Largest difference that counts as equal [dB].")] = 0.01,
+    tolerance: Annotated[float, Option(help="Largest difference that counts as equal [dB].")] = 0.01,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Exit code 1 when a number differs by more than the tolerance.")
+        bool, Option("--strict", help="Exit code 1 when a number differs by more than the tolerance.")
     ] = False,
     force: Force = False,
     as_json: Json = False,

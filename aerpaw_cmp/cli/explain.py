@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import typer
+from typer import Argument, Option
 
 from .app import Json, LogsRoot, command
 from .shown import number, print_json, records, say, table
@@ -20,13 +20,13 @@ from .shown import number, print_json, records, say, table
     ],
 )
 def explain(
-    flight: Annotated[Path, typer.Argument(help="flight.yaml")],
-    time: Annotated[str, typer.Option(help="Seconds after the first sample, or ISO 8601 (time_utc of rss.csv).")],
-    tower: Annotated[str, typer.Option(help="Tower of the link.")],
+    flight: Annotated[Path, Argument(help="flight.yaml")],
+    time: Annotated[str, Option(help="Seconds after the first sample, or ISO 8601 (time_utc of rss.csv).")],
+    tower: Annotated[str, Option(help="Tower of the link.")],
     channel: Annotated[
-        str | None, typer.Option(help="Channel of the RSS logs, or 'rank'  [default: first log of the tower]")
+        str | None, Option(help="Channel of the RSS logs, or 'rank'  [default: first log of the tower]")
     ] = None,
-    engine: Annotated[Literal["image", "sionna"] | None, typer.Option(help="Path search  [default: rt.engine]")] = None,
+    engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: rt.engine]")] = None,
     logs_root: LogsRoot = None,
     as_json: Json = False,
 ) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import typer
+from typer import Argument, Option
 
 from ..common.errors import one_line
 from ..jobs.options import RunOptions
@@ -28,31 +28,31 @@ from .shown import number, print_files, print_json, print_plan, records, say, ta
     ],
 )
 def report(
-    flight: Annotated[Path, typer.Argument(help="flight.yaml")],
+    flight: Annotated[Path, Argument(help="flight.yaml")],
     out: Annotated[Path | None, output("Output folder  [default: reports/<flight>]")] = None,
     logs_root: LogsRoot = None,
-    engine: Annotated[Literal["image", "sionna"] | None, typer.Option(help="Path search  [default: rt.engine]")] = None,
+    engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: rt.engine]")] = None,
     audit: Annotated[
-        str | None, typer.Option(help="Number of audited links, 'full' or 'none'  [default: rt.audit_links]")
+        str | None, Option(help="Number of audited links, 'full' or 'none'  [default: rt.audit_links]")
     ] = None,
     recommend: Annotated[
-        Path | None, typer.Option("--recommend", help="Write a flight.yaml with the recommended model.")
+        Path | None, Option("--recommend", help="Write a flight.yaml with the recommended model.")
     ] = None,
     learned: Annotated[
         Path | None,
-        typer.Option("--with", metavar="CALIBRATED", help="calibrated.yaml with antennas, ground and receiver."),
+        Option("--with", metavar="CALIBRATED", help="calibrated.yaml with antennas, ground and receiver."),
     ] = None,
     against: Annotated[
         Path | None,
-        typer.Option("--against", metavar="PREDICTION", help="Score what 'predict' said of this flight (its folder)."),
+        Option("--against", metavar="PREDICTION", help="Score what 'predict' said of this flight (its folder)."),
     ] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    strict: Annotated[bool, Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
         Literal["page", "none", "svg", "png", "pdf", "all"],
-        typer.Option(help="Figures to draw: those of the page, none, or all in one format or in every format."),
+        Option(help="Figures to draw: those of the page, none, or all in one format or in every format."),
     ] = "page",
     style: Annotated[
-        Literal["screen", "paper"], typer.Option(help="Figure style: screen, or paper (IEEE width, fonts embedded).")
+        Literal["screen", "paper"], Option(help="Figure style: screen, or paper (IEEE width, fonts embedded).")
     ] = "screen",
     export: Export = None,
     dry_run: DryRun = False,
@@ -182,19 +182,19 @@ def _print_report_summary(outcome: Any) -> None:
     ],
 )
 def calibrate(
-    calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
+    calibration_yaml: Annotated[Path, Argument(metavar="CALIBRATION", help="calibration.yaml")],
     out: Annotated[
         Path | None, output("File for the learned settings  [default: <calibration>.calibrated.yaml]", "FILE")
     ] = None,
     logs_root: LogsRoot = None,
     into_site: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--into-site", metavar="SITE", help="Site that stores the learned antennas; drafts then use them by name."
         ),
     ] = None,
     score: Annotated[
-        list[Path] | None, typer.Option(help="flight.yaml to score with the learned settings; repeatable.")
+        list[Path] | None, Option(help="flight.yaml to score with the learned settings; repeatable.")
     ] = None,
     force: Force = False,
     as_json: Json = False,
@@ -242,7 +242,7 @@ def calibrate(
     ],
 )
 def simulate(
-    flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
+    flight: Annotated[Path, Argument(help="flight.yaml with flight.plan")],
     out: Annotated[Path | None, output("Output folder  [default: simulated/<flight>]")] = None,
     force: Force = False,
     as_json: Json = False,

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import typer
+from typer import Argument, Option
 from typer.core import TyperCommand
 
 from ..common.errors import UsageError
@@ -44,33 +44,31 @@ class WebCommand(TyperCommand):
 def tap(
     port: Annotated[
         list[str] | None,
-        typer.Argument(help="Serial port, or several  [default: the first AT port of a Quectel modem]"),
+        Argument(help="Serial port, or several  [default: the first AT port of a Quectel modem]"),
     ] = None,
     out: Annotated[Path, output("Folder of the log segments; of several ports, a folder in it for each.")] = Path(
         "tap"
     ),
-    status: Annotated[bool, typer.Option("--status/--no-status", help="A status line on standard error.")] = True,
-    enable_csi: Annotated[
-        bool, typer.Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")
-    ] = False,
-    ri_hz: Annotated[float, typer.Option(help="Rate of the rank indicator.")] = 2.0,
-    other_hz: Annotated[float, typer.Option(help="Rate of each other query.")] = 1.0,
-    no_csi_alarm: Annotated[float | None, typer.Option(help="Seconds without CSI until the bell rings.")] = None,
-    no_csi_exit: Annotated[bool, typer.Option("--no-csi-exit", help="Exit with code 1 on that alarm.")] = False,
-    sync_s: Annotated[float, typer.Option(help="Longest time between a record and its sync to disk [s].")] = 1.0,
-    duration: Annotated[float | None, typer.Option(help="Stop after this many seconds.")] = None,
-    wait: Annotated[float, typer.Option(help="Seconds to wait for the port.")] = 0.0,
+    status: Annotated[bool, Option("--status/--no-status", help="A status line on standard error.")] = True,
+    enable_csi: Annotated[bool, Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")] = False,
+    ri_hz: Annotated[float, Option(help="Rate of the rank indicator.")] = 2.0,
+    other_hz: Annotated[float, Option(help="Rate of each other query.")] = 1.0,
+    no_csi_alarm: Annotated[float | None, Option(help="Seconds without CSI until the bell rings.")] = None,
+    no_csi_exit: Annotated[bool, Option("--no-csi-exit", help="Exit with code 1 on that alarm.")] = False,
+    sync_s: Annotated[float, Option(help="Longest time between a record and its sync to disk [s].")] = 1.0,
+    duration: Annotated[float | None, Option(help="Stop after this many seconds.")] = None,
+    wait: Annotated[float, Option(help="Seconds to wait for the port.")] = 0.0,
     web: Annotated[
         str | None,
-        typer.Option(help=f"Also show the flight as a page, at HOST:PORT [default: {WEB}]; 0.0.0.0 asks for a token."),
+        Option(help=f"Also show the flight as a page, at HOST:PORT [default: {WEB}]; 0.0.0.0 asks for a token."),
     ] = None,
     play: Annotated[
-        list[Path] | None, typer.Option(help="Earlier log to show on the page; nothing is tapped; repeatable.")
+        list[Path] | None, Option(help="Earlier log to show on the page; nothing is tapped; repeatable.")
     ] = None,
-    speed: Annotated[float, typer.Option(help="Seconds of the log per second, with --play.")] = 1.0,
-    export: Annotated[Literal["csv"] | None, typer.Option(help="Write the log below OUT as a table and stop.")] = None,
-    flight: Annotated[Path | None, typer.Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
-    telemetry: Annotated[Path | None, typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,
+    speed: Annotated[float, Option(help="Seconds of the log per second, with --play.")] = 1.0,
+    export: Annotated[Literal["csv"] | None, Option(help="Write the log below OUT as a table and stop.")] = None,
+    flight: Annotated[Path | None, Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
+    telemetry: Annotated[Path | None, Option(help="The growing vehicleOut file that --flight follows.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -171,20 +169,16 @@ def _needs_posix(command: str) -> None:
     ],
 )
 def modem_sim(
-    link: Annotated[Path | None, typer.Option(help="Symbolic link to the port, updated when the port changes.")] = None,
-    source: Annotated[
-        Path | None, typer.Option(help="Log to play: a transcript, a tap log, or any log with ranks.")
-    ] = None,
-    kind: Annotated[
-        Literal["modem", "gps", "diag", "silent", "rubbish"], typer.Option(help="Device to imitate.")
-    ] = "modem",
+    link: Annotated[Path | None, Option(help="Symbolic link to the port, updated when the port changes.")] = None,
+    source: Annotated[Path | None, Option(help="Log to play: a transcript, a tap log, or any log with ranks.")] = None,
+    kind: Annotated[Literal["modem", "gps", "diag", "silent", "rubbish"], Option(help="Device to imitate.")] = "modem",
     flight: Annotated[
-        Path | None, typer.Option(help="flight.yaml: fly it again from now on, with its ranks; needs --telemetry.")
+        Path | None, Option(help="flight.yaml: fly it again from now on, with its ranks; needs --telemetry.")
     ] = None,
     telemetry: Annotated[
-        Path | None, typer.Option(help="New telemetry file for --flight; it grows during the flight.")
+        Path | None, Option(help="New telemetry file for --flight; it grows during the flight.")
     ] = None,
-    fault: Annotated[list[str] | None, typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,
+    fault: Annotated[list[str] | None, Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,
     as_json: Json = False,
 ) -> int:
     """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""

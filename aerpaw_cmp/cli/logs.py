@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from .app import Force, Json, command, output
 from .shown import print_json, records, say, table
@@ -20,27 +20,25 @@ from .shown import print_json, records, say, table
     ],
 )
 def ingest(
-    paths: Annotated[list[Path], typer.Argument(help="Log files and folders.")],
+    paths: Annotated[list[Path], Argument(help="Log files and folders.")],
     out: Annotated[
         Path | None, output("Flight file (HDF5) with every record  [default: none is written]", "FILE")
     ] = None,
-    draft: Annotated[Path | None, typer.Option(help="Also write a first flight.yaml that names these logs.")] = None,
+    draft: Annotated[Path | None, Option(help="Also write a first flight.yaml that names these logs.")] = None,
     site: Annotated[
-        str | None, typer.Option(help="Site of the draft; its learned antennas are used  [default: lake_wheeler]")
+        str | None, Option(help="Site of the draft; its learned antennas are used  [default: lake_wheeler]")
     ] = None,
-    reader: Annotated[str | None, typer.Option(help="Reader for all files  [default: detected by content]")] = None,
+    reader: Annotated[str | None, Option(help="Reader for all files  [default: detected by content]")] = None,
     timezone: Annotated[
-        str | None, typer.Option(help="IANA time zone of clocks without a zone, such as America/New_York.")
+        str | None, Option(help="IANA time zone of clocks without a zone, such as America/New_York.")
     ] = None,
-    time_origin: Annotated[str | None, typer.Option(help="Start time (ISO 8601) of logs with relative times.")] = None,
-    ri_base: Annotated[
-        Literal["zero", "one"] | None, typer.Option(help="Number that the log prints for rank 1.")
-    ] = None,
+    time_origin: Annotated[str | None, Option(help="Start time (ISO 8601) of logs with relative times.")] = None,
+    ri_base: Annotated[Literal["zero", "one"] | None, Option(help="Number that the log prints for rank 1.")] = None,
     columns: Annotated[
         list[str] | None,
-        typer.Option("--map", metavar="COLUMN=QUANTITY", help="Content of a CSV column: time, rss_db, rank, ..."),
+        Option("--map", metavar="COLUMN=QUANTITY", help="Content of a CSV column: time, rss_db, rank, ..."),
     ] = None,
-    unit: Annotated[str | None, typer.Option(help="Unit of levels, if the file does not state it.")] = None,
+    unit: Annotated[str | None, Option(help="Unit of levels, if the file does not state it.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:

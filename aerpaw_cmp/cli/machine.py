@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-import typer
+from typer import Option
 
 from .app import Json, command
 from .shown import print_json, records, say
@@ -19,8 +19,8 @@ from .shown import print_json, records, say
     ],
 )
 def bench(
-    poses: Annotated[int, typer.Option(min=2, help="Poses of the flight that is replayed.")] = 200,
-    quick: Annotated[bool, typer.Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
+    poses: Annotated[int, Option(min=2, help="Poses of the flight that is replayed.")] = 200,
+    quick: Annotated[bool, Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
     as_json: Json = False,
 ) -> None:
     """Speed against error on this machine."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from ..jobs.options import RunOptions
 from .app import Flights, Force, Json, LogsRoot, command, output
 from .shown import print_json, records, say
 
-_FENCE = typer.Option(metavar="KML", help="Area that may be flown  [default: the area of the site]")
-_AVOID = typer.Option(metavar="KML", help="No-fly areas; repeatable.")
-_ROUTES = typer.Option("--route", metavar="FILE", help="Another candidate: .plan, KML, CSV or log; repeatable.")
+_FENCE = Option(metavar="KML", help="Area that may be flown  [default: the area of the site]")
+_AVOID = Option(metavar="KML", help="No-fly areas; repeatable.")
+_ROUTES = Option("--route", metavar="FILE", help="Another candidate: .plan, KML, CSV or log; repeatable.")
 
 
 @command(
@@ -27,26 +27,26 @@ _ROUTES = typer.Option("--route", metavar="FILE", help="Another candidate: .plan
 def plan(
     target: Annotated[
         str,
-        typer.Argument(help="Target: sphere (all directions), a site (a grid), a route, or points."),
+        Argument(help="Target: sphere (all directions), a site (a grid), a route, or points."),
     ],
     flights: Flights = None,
-    site: Annotated[str | None, typer.Option(help="Site, where no flight names it.")] = None,
+    site: Annotated[str | None, Option(help="Site, where no flight names it.")] = None,
     tower: Annotated[
-        list[str] | None, typer.Option(help="Tower whose antenna counts, without --with; repeatable  [default: all]")
+        list[str] | None, Option(help="Tower whose antenna counts, without --with; repeatable  [default: all]")
     ] = None,
     geofence: Annotated[Path | None, _FENCE] = None,
     avoid: Annotated[list[Path] | None, _AVOID] = None,
     routes: Annotated[list[Path] | None, _ROUTES] = None,
-    minutes: Annotated[float, typer.Option(min=1.0, max=240.0, help="Battery: longest flight [min].")] = 15.0,
-    speed: Annotated[float, typer.Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
+    minutes: Annotated[float, Option(min=1.0, max=240.0, help="Battery: longest flight [min].")] = 15.0,
+    speed: Annotated[float, Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
     height: Annotated[
         list[float] | None,
-        typer.Option(help="Height of the tool's own patterns above take-off [m]; repeatable  [default: 40]"),
+        Option(help="Height of the tool's own patterns above take-off [m]; repeatable  [default: 40]"),
     ] = None,
     target_height: Annotated[
-        list[float] | None, typer.Option(help="Height of a target that is a site [m]; repeatable  [default: 40]")
+        list[float] | None, Option(help="Height of a target that is a site [m]; repeatable  [default: 40]")
     ] = None,
-    tower_distance: Annotated[float, typer.Option(min=0.0, help="Least distance to towers [m].")] = 30.0,
+    tower_distance: Annotated[float, Option(min=0.0, help="Least distance to towers [m].")] = 30.0,
     out: Annotated[Path | None, output("Output folder  [default: reports/plan-<TARGET>]")] = None,
     logs_root: LogsRoot = None,
     force: Force = False,

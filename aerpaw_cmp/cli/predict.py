@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from ..jobs.options import RunOptions
 from .app import Flights, Force, Json, LogsRoot, command, output
@@ -24,25 +24,25 @@ from .shown import print_json, records, say
 def predict(
     where: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="WHERE",
             help="A route (.plan, KML, CSV, a vehicle log), flight.yaml (its plan), points (CSV with east_m, north_m, "
             "height_m), or a site (a grid).",
         ),
     ],
     flights: Flights = None,
-    site: Annotated[str | None, typer.Option(help="Site of a route or of points, without --with.")] = None,
+    site: Annotated[str | None, Option(help="Site of a route or of points, without --with.")] = None,
     out: Annotated[Path | None, output("Output folder  [default: reports/prediction-<WHERE>]")] = None,
     height: Annotated[
         list[float] | None,
-        typer.Option(help="Height of a grid [m], repeatable; of route points without one  [default: 40]"),
+        Option(help="Height of a grid [m], repeatable; of route points without one  [default: 40]"),
     ] = None,
-    spacing: Annotated[float, typer.Option(min=1.0, help="Spacing of a grid [m].")] = 30.0,
+    spacing: Annotated[float, Option(min=1.0, help="Spacing of a grid [m].")] = 30.0,
     heading: Annotated[
-        float | None, typer.Option(help="Heading of the nose on a grid [deg]; without it all headings count alike.")
+        float | None, Option(help="Heading of the nose on a grid [deg]; without it all headings count alike.")
     ] = None,
     threshold: Annotated[
-        float | None, typer.Option(help="Also the probability that the level exceeds this, in the unit of the logs.")
+        float | None, Option(help="Also the probability that the level exceeds this, in the unit of the logs.")
     ] = None,
     logs_root: LogsRoot = None,
     force: Force = False,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import typer
+from typer import Argument, Option
 
 from ..jobs.options import RunOptions
 from .app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, command, output, site_app
@@ -27,34 +27,32 @@ def site_import(
     out: Annotated[Path, output("The site.yaml to write.", "FILE")],
     files: Annotated[
         list[Path] | None,
-        typer.Argument(help="Map files, or one Mitsuba XML  [default: none; with --canopy or --buildings]"),
+        Argument(help="Map files, or one Mitsuba XML  [default: none; with --canopy or --buildings]"),
     ] = None,
     base: Annotated[
-        str | None, typer.Option(help="Site that gives towers and settings  [default: lake_wheeler; none for a scene]")
+        str | None, Option(help="Site that gives towers and settings  [default: lake_wheeler; none for a scene]")
     ] = None,
     origin: Annotated[
-        str | None, typer.Option(help="Scene: latitude,longitude[,ground height] of its (0, 0, 0), or 'local'.")
+        str | None, Option(help="Scene: latitude,longitude[,ground height] of its (0, 0, 0), or 'local'.")
     ] = None,
     tower: Annotated[
-        list[str] | None, typer.Option(help="Scene: name=east,north,height [m] of an antenna; repeatable.")
+        list[str] | None, Option(help="Scene: name=east,north,height [m] of an antenna; repeatable.")
     ] = None,
     material: Annotated[
-        list[str] | None, typer.Option(help="Scene: id=concrete, for a material without radio properties; repeatable.")
+        list[str] | None, Option(help="Scene: id=concrete, for a material without radio properties; repeatable.")
     ] = None,
-    turn: Annotated[float, typer.Option(help="Scene: angle of the x axis, counter-clockwise from east [deg].")] = 0.0,
-    merge_m: Annotated[
-        float, typer.Option(help="Scene: largest distance of a face's corners from its plane [m].")
-    ] = 1e-3,
+    turn: Annotated[float, Option(help="Scene: angle of the x axis, counter-clockwise from east [deg].")] = 0.0,
+    merge_m: Annotated[float, Option(help="Scene: largest distance of a face's corners from its plane [m].")] = 1e-3,
     untagged: Annotated[
-        Literal["building", "forest", "geofence"] | None, typer.Option(help="Kind of the areas without a tag.")
+        Literal["building", "forest", "geofence"] | None, Option(help="Kind of the areas without a tag.")
     ] = None,
     canopy: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Canopy heights (GeoTIFF): stands and trees in place of all others."),
+        Option(metavar="FILE", help="Canopy heights (GeoTIFF): stands and trees in place of all others."),
     ] = None,
     buildings: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Surface model (GeoTIFF) that gives the buildings their heights."),
+        Option(metavar="FILE", help="Surface model (GeoTIFF) that gives the buildings their heights."),
     ] = None,
     force: Force = False,
     as_json: Json = False,
@@ -89,9 +87,9 @@ def site_import(
     examples=["aerpaw-cmp site export lake_wheeler -o scene", "aerpaw-cmp site export site.yaml -o out"],
 )
 def site_export(
-    site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")],
-    out: Annotated[Path, typer.Option("-o", "--out", "--sionna", metavar="DIR", help="Output folder.")],
-    trees: Annotated[bool, typer.Option("--trees/--no-trees", help="Also export crowns and trunks.")] = True,
+    site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")],
+    out: Annotated[Path, Option("-o", "--out", "--sionna", metavar="DIR", help="Output folder.")],
+    trees: Annotated[bool, Option("--trees/--no-trees", help="Also export crowns and trunks.")] = True,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -114,12 +112,12 @@ def site_export(
 )
 def site_show(
     site: Annotated[
-        str | None, typer.Argument(help="site.yaml or packaged site  [default: that of --flight, else lake_wheeler]")
+        str | None, Argument(help="site.yaml or packaged site  [default: that of --flight, else lake_wheeler]")
     ] = None,
     out: Annotated[Path | None, output("Output folder  [default: reports/site-<site>]")] = None,
-    flight: Annotated[Path | None, typer.Option(help="Draw the track of this flight.yaml.")] = None,
+    flight: Annotated[Path | None, Option(help="Draw the track of this flight.yaml.")] = None,
     logs_root: LogsRoot = None,
-    export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
+    export: Annotated[bool, Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -146,49 +144,45 @@ def site_show(
     ],
 )
 def map_(
-    site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
+    site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
     out: Annotated[Path | None, output("Output folder  [default: reports/map-<site>]")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="A coarse map in seconds: 120 m, three heights.")] = False,
+    quick: Annotated[bool, Option("--quick", help="A coarse map in seconds: 120 m, three heights.")] = False,
     foliage: Annotated[
-        list[str] | None, typer.Option(help="none, attenuating, opaque or all; repeatable  [default: all]")
+        list[str] | None, Option(help="none, attenuating, opaque or all; repeatable  [default: all]")
     ] = None,
     crown_reflections: Annotated[
-        bool, typer.Option("--crown-reflections/--no-crown-reflections", help="Opaque crowns also reflect.")
+        bool, Option("--crown-reflections/--no-crown-reflections", help="Opaque crowns also reflect.")
     ] = True,
-    spacing: Annotated[float | None, typer.Option(help="Distance between positions [m]  [default: 30]")] = None,
+    spacing: Annotated[float | None, Option(help="Distance between positions [m]  [default: 30]")] = None,
     rss_altitude: Annotated[
-        list[float] | None, typer.Option(help="Height of RSS maps [m]; repeatable  [default: 30, 70, 110]")
+        list[float] | None, Option(help="Height of RSS maps [m]; repeatable  [default: 30, 70, 110]")
     ] = None,
     rank_altitude: Annotated[
-        list[float] | None, typer.Option(help="Height of rank maps [m]; repeatable  [default: 3 and 30 to 110 by 10]")
+        list[float] | None, Option(help="Height of rank maps [m]; repeatable  [default: 3 and 30 to 110 by 10]")
     ] = None,
     k: Annotated[
         list[float] | None,
-        typer.Option("-k", "--k", help="Singular-value ratio K; repeatable  [default: 10, 100, 1000]"),
+        Option("-k", "--k", help="Singular-value ratio K; repeatable  [default: 10, 100, 1000]"),
     ] = None,
-    carrier_ghz: Annotated[float | None, typer.Option(help="Carrier frequency [GHz]  [default: 3.4]")] = None,
-    engine: Annotated[Literal["image", "sionna"] | None, typer.Option(help="Path search  [default: image]")] = None,
-    max_depth: Annotated[
-        int | None, typer.Option(min=0, max=3, help="Largest number of reflections  [default: 2]")
-    ] = None,
-    samples: Annotated[int | None, typer.Option(min=1, help="Rays per tower (sionna only)  [default: 1e6]")] = None,
+    carrier_ghz: Annotated[float | None, Option(help="Carrier frequency [GHz]  [default: 3.4]")] = None,
+    engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: image]")] = None,
+    max_depth: Annotated[int | None, Option(min=0, max=3, help="Largest number of reflections  [default: 2]")] = None,
+    samples: Annotated[int | None, Option(min=1, help="Rays per tower (sionna only)  [default: 1e6]")] = None,
     flight: Annotated[
-        Path | None, typer.Option(help="flight.yaml whose track is the training set of the test 'along a flight'.")
+        Path | None, Option(help="flight.yaml whose track is the training set of the test 'along a flight'.")
     ] = None,
     flights: Flights = None,
     remembered: Annotated[
-        bool, typer.Option("--remembered", help="Correct by what the site remembers, without --with.")
+        bool, Option("--remembered", help="Correct by what the site remembers, without --with.")
     ] = False,
     logs_root: LogsRoot = None,
     threshold_dbm: Annotated[
-        float | None, typer.Option(help="Lowest level in coverage [dBm]  [default: any path is coverage]")
+        float | None, Option(help="Lowest level in coverage [dBm]  [default: any path is coverage]")
     ] = None,
-    study: Annotated[
-        bool, typer.Option("--study/--no-study", help="Also spatial correlation and interpolation.")
-    ] = True,
+    study: Annotated[bool, Option("--study/--no-study", help="Also spatial correlation and interpolation.")] = True,
     tile_m: Annotated[
         float | None,
-        typer.Option(help="Side of tiles written to a Zarr store [m]  [default: 128 positions, from 1e6 receivers on]"),
+        Option(help="Side of tiles written to a Zarr store [m]  [default: 128 positions, from 1e6 receivers on]"),
     ] = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,

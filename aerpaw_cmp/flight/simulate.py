@@ -119,6 +119,15 @@ def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArra
     return np.zeros(len(time_s)), -0.6 * speed, yaw.ffill().bfill().fillna(0.0).to_numpy()
 
 
+def planned_poses(plan: PlanSettings, ground_m: float, step_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Instants (n,) [s], positions (n, 3) [m] and headings (n,) [deg] of a plan; take-off stands at ``ground_m``."""
+    trajectory = plan_trajectory(plan)
+    time_s = np.arange(0.0, trajectory.duration_s + 1e-9, step_s)
+    position = trajectory.position_at(time_s)
+    position[:, 2] = np.maximum(position[:, 2] + ground_m, MINIMUM_HEIGHT_M)
+    return time_s, position, plan_attitude(trajectory, time_s)[2]
+
+
 def telemetry_frame(
     trajectory: Trajectory, start_utc: pd.Timestamp, interval_s: float, frame: SiteFrame
 ) -> pd.DataFrame:

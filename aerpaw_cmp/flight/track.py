@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..common.geodesy import SiteFrame
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray
+from ..propagation.arrays import rotation_from_aircraft
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -203,31 +204,6 @@ def good_positions(latitude: FloatArray, longitude: FloatArray, altitude: FloatA
     return np.asarray(finite & possible & ~((latitude == 0.0) & (longitude == 0.0)))
 
 
-def body_rotation(roll_deg: ArrayLike, pitch_deg: ArrayLike, yaw_deg: ArrayLike) -> FloatArray:
-    """Rotations from the aircraft body (forward-left-up) to east-north-up.
-
-    Parameters
-    ----------
-    roll_deg, pitch_deg, yaw_deg : array_like, (n,)
-        Right wing down +, nose up +, heading clockwise from north.
-
-    Returns
-    -------
-    ndarray, (n, 3, 3)
-    """
-    from scipy.spatial.transform import Rotation
-
-    angles = np.stack(
-        [
-            90.0 - np.asarray(yaw_deg, dtype=np.float64),  # counter-clockwise from east
-            -np.asarray(pitch_deg, dtype=np.float64),  # turning about "left": nose up is negative
-            np.asarray(roll_deg, dtype=np.float64),
-        ],
-        axis=-1,
-    )
-    return np.asarray(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
-
-
 class Track:
     """The flight path of one telemetry stream in a site frame.
 
@@ -387,7 +363,7 @@ class Track:
             near = (t >= at[0]) & (t <= at[-1]) & ~_in_gap(t, at, self.maximum_gap_s)
         if near.all() and len(t):
             return _slerp(t, at, self._attitude[self._known]), near
-        course = body_rotation(0.0 * t, 0.0 * t, self._course_at(t))
+        course = rotation_from_aircraft(0.0 * t, 0.0 * t, self._course_at(t))
         if near.any():
             course[near] = _slerp(t[near], at, self._attitude[self._known])
         return course, near
@@ -419,7 +395,7 @@ def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArra
     # only the rows around t: a part of a long flight does not turn the whole
     part = slice(max(int(np.searchsorted(at, t.min(), side="right")) - 1, 0), int(np.searchsorted(at, t.max())) + 1)
     at, attitude_deg = at[part], attitude_deg[part]
-    matrices = body_rotation(attitude_deg[:, 0], attitude_deg[:, 1], attitude_deg[:, 2])
+    matrices = rotation_from_aircraft(attitude_deg[:, 0], attitude_deg[:, 1], attitude_deg[:, 2])
     if len(at) == 1:
         return np.broadcast_to(matrices, (len(t), 3, 3))
     return np.asarray(Slerp(at, Rotation.from_matrix(matrices))(t).as_matrix())

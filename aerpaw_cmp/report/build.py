@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ..common.jsonable import named
 from ..common.versions import utc_now, versions
 from ..compare.result import APPLIED, NOT_APPLIED, ClockResult, FlightResult, RankResult, RssResult
 from ..flight.data import FlightData
@@ -135,13 +136,9 @@ def inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tup
         record.InputFile(
             path=log.path,
             sha256=file.sha256,
-            reader=file.result.reader,
-            lines=file.result.lines,
-            accepted=file.result.accepted,
+            **named(file.result, "reader lines accepted blank warnings"),
             rejected=file.result.rejected_count,
-            blank=file.result.blank,
             role=", ".join(sorted({s.kind for s in file.result.streams})),
-            warnings=file.result.warnings,
             rejected_lines=file.result.rejected,
         )
         for log, file in zip(logs, files, strict=True)

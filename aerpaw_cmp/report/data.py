@@ -38,18 +38,18 @@ GEOMETRY = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputFile:
-    """The account of one log file: ``lines == accepted + rejected + blank``.
+    """An input; the account of a log has ``lines == accepted + rejected + blank``.
 
     ``rejected_lines`` may hold all of them or a sample; ``rejected`` is the count.
     """
 
     path: str
     sha256: str
-    reader: str
-    lines: int
-    accepted: int
-    rejected: int
-    blank: int
+    reader: str = ""
+    lines: int = 0
+    accepted: int = 0
+    rejected: int = 0
+    blank: int = 0
     role: str = ""
     warnings: tuple[str, ...] = ()
     rejected_lines: tuple[RejectedLine, ...] = ()

@@ -44,9 +44,9 @@ def test_attitude_turned_a_second_time(mode):
 @pytest.mark.parametrize(
     ("mode", "where", "name", "sign"),
     [
-        ("logged", tracks, "body_rotation", (-1, 1, 1)),
-        ("logged", tracks, "body_rotation", (1, -1, 1)),
-        ("logged", tracks, "body_rotation", (1, 1, -1)),
+        ("logged", tracks, "rotation_from_aircraft", (-1, 1, 1)),
+        ("logged", tracks, "rotation_from_aircraft", (1, -1, 1)),
+        ("logged", tracks, "rotation_from_aircraft", (1, 1, -1)),
         ("level", replays, "rotation_from_aircraft", (1, 1, -1)),
     ],
 )
@@ -57,7 +57,7 @@ def test_wrong_sign_of_an_angle_is_seen(monkeypatch, mode, where, name, sign):
 
 
 def test_array_that_turns_although_the_attitude_is_ignored_is_seen():
-    turned = SimpleNamespace(poses=Poses(np.zeros((1, 3)), tracks.body_rotation([1.0], [0.0], [90.0])))
+    turned = SimpleNamespace(poses=Poses(np.zeros((1, 3)), tracks.rotation_from_aircraft([1.0], [0.0], [90.0])))
     assert audit_flight.attitude_checked(flight("ignored"), [turned]).failures
 
 

@@ -143,8 +143,8 @@ def turns_at(change: Callable[[Any, Any], Any]) -> Callable[[pytest.MonkeyPatch]
 
 def body(change: Callable[[Any, Any, Any], Any]) -> Callable[[pytest.MonkeyPatch], None]:
     def plant(patch: pytest.MonkeyPatch) -> None:
-        real = flight_track.body_rotation
-        patch.setattr(flight_track, "body_rotation", lambda r, p, y: real(*change(r, p, y)))
+        real = flight_track.rotation_from_aircraft
+        patch.setattr(flight_track, "rotation_from_aircraft", lambda r, p, y: real(*change(r, p, y)))
 
     return plant
 

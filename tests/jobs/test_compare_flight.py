@@ -17,11 +17,11 @@ from aerpaw_cmp.compare.result import RssResult
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.replay import replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.flight.track import body_rotation
 from aerpaw_cmp.jobs.reporting.audit_flight import audit_replays
 from aerpaw_cmp.jobs.reporting.compare_flight import compare_rank_series, compare_rss_series, pairs_of
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.foliage_notes import foliage_notes
+from aerpaw_cmp.propagation.arrays import rotation_from_aircraft
 from aerpaw_cmp.report.build import rank_warnings, rss_warnings, track_of
 from aerpaw_cmp.report.words import instants
 
@@ -484,7 +484,7 @@ def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> Non
         (found[mode],) = replay_rank(data)
     assert np.array_equal(found["logged"].poses.position_m, found["ignored"].poses.position_m), "of the log itself"
     turned = found["logged"].poses.rotation
-    assert np.allclose(turned, body_rotation(np.zeros(58), np.zeros(58), np.full(58, 120.0)), atol=1e-6)
+    assert np.allclose(turned, rotation_from_aircraft(np.zeros(58), np.zeros(58), np.full(58, 120.0)), atol=1e-6)
     assert np.allclose(found["ignored"].poses.rotation, np.eye(3))
     assert not np.allclose(found["logged"].replay.h, found["ignored"].replay.h, rtol=1e-3, atol=0)
 

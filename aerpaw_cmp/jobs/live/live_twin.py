@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import InputError, UsageError
-from ...common.units import FloatArray, spread_out
+from ...common.units import MINIMUM_HEIGHT_M, FloatArray, spread_out
 from ...compare.rank import channel_rank
 from ...compare.rolling import RouteAhead
 from ...flight.data import choose_site
 from ...flight.replay import replay_poses
 from ...flight.settings import FlightFile, LogSettings, load_flight
-from ...flight.simulate import plan_attitude, plan_trajectory
+from ...flight.simulate import planned_poses
 from ...live.follow import TelemetryFollower, TelemetrySample, predict_along
 from ...live.predict import Predict, Prediction
 from ...live.simulator import ranks_of
@@ -89,13 +89,9 @@ class LiveTwin:
         plan = self.settings.flight.plan
         if plan is None:
             return None
-        trajectory = plan_trajectory(plan)
-        time_s = np.arange(0.0, trajectory.duration_s + 1e-9, ROUTE_STEP_S)
-        place = trajectory.position_at(time_s)
-        place[:, 2] = np.maximum(place[:, 2] + self.site.datum.takeoff_ground_m, 0.5)
+        _, place, yaw = planned_poses(plan, self.site.datum.takeoff_ground_m, ROUTE_STEP_S)
         rotation = np.broadcast_to(np.eye(3), (len(place), 3, 3))
         if self.settings.rt.attitude != "ignored":
-            _, _, yaw = plan_attitude(trajectory, time_s)
             rotation = rotation_from_aircraft(0.0 * yaw, 0.0 * yaw, yaw)
         _, level = self._replayed(place, rotation)
         return RouteAhead(place, {"replay": level, "free space": self._free_space(place)})
@@ -161,7 +157,7 @@ class LiveTwin:
 
     def _pose(self, sample: TelemetrySample) -> tuple[FloatArray, FloatArray]:
         east, north = self.site.frame.to_local(sample.latitude_deg, sample.longitude_deg)
-        up = max(sample.altitude_m + self.site.datum.takeoff_ground_m, 0.5)
+        up = max(sample.altitude_m + self.site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
         place, attitude = np.array([float(east), float(north), up]), self.settings.rt.attitude
         if attitude == "ignored" or not np.isfinite(sample.yaw_deg):
             return place, np.eye(3)

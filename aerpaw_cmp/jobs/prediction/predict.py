@@ -21,9 +21,8 @@ from ...compare.spread import BAND
 from ...flight.data import FlightData, choose_site, site_place
 from ...flight.remembered import remembered
 from ...flight.settings import LinkSettings, LinksSettings
-from ...flight.track import body_rotation
 from ...flight.training import common, counted_once, flight_logs, learned_of, learned_patterns
-from ...propagation.arrays import Poses
+from ...propagation.arrays import Poses, rotation_from_aircraft
 from ...report.prediction_html import PredictionPage, outside_share
 from ...report.prediction_words import FLAGS, TITLES, first_words, memory_words
 from ...site.learned import BAND as CARRIER_BAND
@@ -492,7 +491,7 @@ def _ranks(
                 flight="",
                 tower=tower,
                 tower_m=np.asarray(site.towers[tower].position_m),
-                poses=Poses(position, body_rotation(0.0 * heading, 0.0 * heading, heading)),
+                poses=Poses(position, rotation_from_aircraft(0.0 * heading, 0.0 * heading, heading)),
                 rank=np.full(len(some), np.nan),
                 link=link,
                 time_s=targets.time_s[some] if targets.kind == "route" else 1e4 * np.arange(float(len(some))),

@@ -21,8 +21,7 @@ from ...flight.learned_gain import pair_db
 from ...flight.remembered import Remembered, remembered
 from ...flight.replay import replay_poses
 from ...flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings, load_flight
-from ...flight.track import body_rotation
-from ...propagation.arrays import Poses
+from ...propagation.arrays import Poses, rotation_from_aircraft
 from ...propagation.field.baselines import free_space_dbm
 from ...site.site import Site
 from ..learning.calibrate import load_calibration
@@ -135,7 +134,7 @@ class Source:
         turn = np.arctan2(world[:, 1], world[:, 0]) - np.arctan2(body[:, 1], body[:, 0])
         flat = np.zeros(len(turn))
         known = self.rt.attitude != "ignored"
-        rotation = body_rotation(flat, flat, 90.0 - np.degrees(turn) if known else flat + 90.0)
+        rotation = rotation_from_aircraft(flat, flat, 90.0 - np.degrees(turn) if known else flat + 90.0)
         level = np.empty(len(samples))
         for start in range(0, len(samples), REPLAYED_AT_ONCE):
             part = slice(start, start + REPLAYED_AT_ONCE)

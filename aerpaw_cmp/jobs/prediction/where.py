@@ -14,10 +14,10 @@ from ...common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
 from ...compare.direction_gain import LinkSamples
 from ...flight.data import FlightData, load_data
 from ...flight.settings import FlightFile, load_flight
-from ...flight.simulate import plan_attitude, plan_trajectory
-from ...flight.track import body_rotation
+from ...flight.simulate import planned_poses
 from ...logs.route import read_route
 from ...maps.grid import Grid
+from ...propagation.arrays import rotation_from_aircraft
 from ...site.site import Site
 
 STEP_M = 10.0
@@ -111,7 +111,7 @@ def level_samples(
     """
     ray = position_m - tower_m
     at_tower = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
-    rotation = body_rotation(np.zeros(len(yaw_deg)), np.zeros(len(yaw_deg)), yaw_deg)
+    rotation = rotation_from_aircraft(0.0 * yaw_deg, 0.0 * yaw_deg, yaw_deg)
     return LinkSamples(
         flight="",
         tower=end[0],
@@ -194,11 +194,7 @@ def _grid(site: Site, asked: Asked) -> Targets:
 
 def _planned(flight: FlightFile, site: Site) -> Targets:
     assert flight.flight.plan is not None
-    trajectory = plan_trajectory(flight.flight.plan)
-    time = np.arange(0.0, trajectory.duration_s + 1e-9, 1.0)
-    position = trajectory.position_at(time)
-    position[:, 2] = np.maximum(position[:, 2] + site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
-    _, _, yaw = plan_attitude(trajectory, time)
+    time, position, yaw = planned_poses(flight.flight.plan, site.datum.takeoff_ground_m, 1.0)
     return Targets(kind="route", name=flight.flight.name, position_m=position, yaw_deg=yaw % 360.0, time_s=time)
 
 

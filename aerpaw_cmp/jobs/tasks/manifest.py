@@ -101,11 +101,6 @@ def _entry(name: str, place: Path, role: str) -> InputFile:
     return InputFile(
         path=name,
         sha256=digest_of(place, status.st_size, status.st_mtime_ns),
-        reader="",
-        lines=0,
-        accepted=0,
-        rejected=0,
-        blank=0,
         role=role,
         learned_on=_learned_on(place, status.st_size, status.st_mtime_ns),
     )

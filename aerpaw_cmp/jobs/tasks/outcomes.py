@@ -162,9 +162,7 @@ class _Arrays:
 
 
 def _text(manifest: Mapping[str, Any]) -> bytes:
-    """A manifest as JSON, a line per entry: indented, it would cost as much as all else that keeps an outcome."""
-    lines = [f"{json.dumps(str(key))}: {json.dumps(value, default=str)}" for key, value in manifest.items()]
-    return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
+    return (json.dumps(dict(manifest), indent=1, default=str) + "\n").encode()
 
 
 _WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links": True, "advanced": {"cache"}}}

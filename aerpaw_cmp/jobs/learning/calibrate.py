@@ -126,6 +126,15 @@ class Calibration:
     words: tuple[str, ...]
 
     @property
+    def names(self) -> list[str]:
+        """Names of the flights."""
+        return [data.settings.flight.name for data in self.flights]
+
+    def first_series(self, antenna: str) -> tuple[FlightData, RssSeries]:
+        """The first flight with an antenna, and its series there."""
+        return next((data, s) for data in self.flights for s in data.rss if f"{s.tower}.{s.channel}" == antenna)
+
+    @property
     def trained_on(self) -> tuple[str, ...]:
         """SHA-256 of every log that was learned from."""
         return union(*map(flight_logs, self.flights))

@@ -13,13 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from ... import __version__
+from ...common.cf import file_attributes
 from ...common.errors import UsageError
 from ...common.gaussian import determining, gaussian_kernel
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, spread_out
 from ...common.versions import utc_now
 from ...compare.calibration import Learned, mean_rmse
-from ...compare.direction_gain import directed
+from ...compare.direction_gain import Frame, directed
 from ...compare.learning_curve import with_one_more
 from ...flight.data import FlightData, RankSeries, RssSeries
 from ...flight.training import flight_logs, marks_note
@@ -52,9 +54,9 @@ def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
         )
     out = {}
     for antenna in fit.antennas:
-        for end, frame in (("uav", "body"), ("tower", "mast")):
-            name = "uav" if end == "uav" else antenna
-            gain, sd = fit.gain("body" if frame == "body" else "mast", antenna, flat)
+        ends: tuple[tuple[str, Frame, str], ...] = (("uav", "body", "uav"), ("tower", "mast", antenna))
+        for end, frame, name in ends:
+            gain, sd = fit.gain(frame, antenna, flat)
             raw = (gain + calibration.learned.pattern_db(name, flat)).reshape(shape)
             whole = unit_mean_gain(raw)
             out[antenna, end] = AntennaMap(
@@ -64,7 +66,7 @@ def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
                 gain_dbi=whole,
                 sd_db=sd.reshape(shape),
                 level_db=float((raw - whole).flat[0]),
-                seen=fit.seen("body" if frame == "body" else "mast", antenna),
+                seen=fit.seen(frame, antenna),
             )
     return out
 
@@ -86,34 +88,33 @@ def antenna_files(
     -------
     dict of str to str or bytes
     """
-    names = ", ".join(data.settings.flight.name for data in calibration.flights)
+    names = ", ".join(calibration.names)
     notes = (
         f"aerpaw-cmp calibrate: {calibration.settings.calibration}, from {names}",
         "gain of the antenna as mounted: UAV in the body frame (x forward, y left, z up), tower in east-north-up",
         "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
-        f"{KEY}: {' '.join(calibration.trained_on)}",
-        marks_note(calibration.flights),
     )
     out: dict[str, str | bytes] = {}
     for (antenna, end), one in maps.items():
         stem = safe_name(f"{antenna}.{end}")
-        more = (calibration.learned.spread(antenna).text(), *pair_notes(calibration, antenna, end))
-        out[f"{stem}.csv"] = sphere_csv(one.gain_dbi, one.sd_db, (*notes, *more))
+        out[f"{stem}.csv"] = sphere_csv(one.gain_dbi, one.sd_db, (*notes, *_notes(calibration, antenna, end)))
         pattern = SpherePattern(stem, one.gain_dbi, one.sd_db)
         out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz)
-        said = {
-            "title": f"{antenna}, antenna at the {end}",
-            "source": f"learned from the flights {names}",
-            "history": f"{utc_now()} written by aerpaw-cmp calibrate, calibration {calibration.settings.calibration}",
-            "institution": "not stated",
-            "references": "https://arxiv.org/abs/2502.10324",
-            "comment": "; ".join(notes[1:-2]),
-            KEY: " ".join(calibration.trained_on),
-        }
+        source = f"learned from the flights {names}, calibration {calibration.settings.calibration}"
+        said = file_attributes(
+            f"{antenna}, antenna at the {end}", source, utc_now(), __version__, "; ".join(notes[1:])
+        )  # fmt: skip
+        said[KEY] = " ".join(calibration.trained_on)
         sphere = sphere_netcdf(one.gain_dbi, one.sd_db, said, carrier_hz)
         if sphere is not None:
             out[f"{stem}.nc"] = sphere
     return out
+
+
+def _notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
+    """Notes of an antenna file that its readers use: training logs and marks, spread, the gain towards both ends."""
+    logs, marked = f"{KEY}: {' '.join(calibration.trained_on)}", marks_note(calibration.flights)
+    return (logs, marked, calibration.learned.spread(antenna).text(), *pair_notes(calibration, antenna, end))
 
 
 def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
@@ -135,9 +136,8 @@ def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str
 
 def settings_text(calibration: Calibration, folder_name: str) -> str:
     """calibrated.yaml: the part of a flight.yaml that names the learned antennas."""
-    names = [data.settings.flight.name for data in calibration.flights]
     lines = [
-        f"{MARK}: {calibration.settings.calibration}. Learned from {', '.join(names)}.",
+        f"{MARK}: {calibration.settings.calibration}. Learned from {', '.join(calibration.names)}.",
         *(f"# {text}" for text in calibration.words),
         "# Put this into a flight.yaml; files resolve against its folder, or --logs-root.",
         "# SHA-256 of the logs: nothing is scored on them",
@@ -147,10 +147,7 @@ def settings_text(calibration: Calibration, folder_name: str) -> str:
         "  channels:",
     ]
     for antenna in calibration.learned.fit.antennas if calibration.learned.fit else ():
-        tower, _, channel = antenna.partition(".")
-        link = next(
-            s.link for data in calibration.flights for s in data.rss if (s.tower, s.channel) == (tower, channel)
-        )
+        channel, link = antenna.partition(".")[2], calibration.first_series(antenna)[1].link
         ends = {end: f"{folder_name}/{safe_name(f'{antenna}.{end}')}.csv" for end in ("tower", "uav")}
         lines += [
             f"    {channel}:" if channel.isidentifier() else f"    {channel!r}:",
@@ -203,7 +200,7 @@ def record_of(
         }
     return CalibrationData(
         name=calibration.settings.calibration,
-        flights=[data.settings.flight.name for data in calibration.flights],
+        flights=calibration.names,
         trained_on=calibration.trained_on,
         words=calibration.words,
         warnings=calibration.warnings,
@@ -314,16 +311,10 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
         for end in ("tower", "uav"):
             one = maps[antenna, end]
             files[end] = f"{safe_name(f'{name}.{antenna}.{end}')}.csv.gz"
-            notes = (
-                f"aerpaw-cmp calibrate: {name}, {antenna} {end}",
-                f"{KEY}: {' '.join(calibration.trained_on)}",
-                marked,
-                calibration.learned.spread(antenna).text(),
-                *pair_notes(calibration, antenna, end),
-            )
+            notes = (f"aerpaw-cmp calibrate: {name}, {antenna} {end}", *_notes(calibration, antenna, end))
             tables[files[end]] = sphere_csv(one.gain_dbi, one.sd_db, notes, decimals=2).encode()
         own = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
-        first = next((data, s) for data in calibration.flights for s in data.rss if f"{s.tower}.{s.channel}" == antenna)
+        first, ends = calibration.first_series(antenna), (maps[antenna, "uav"], maps[antenna, "tower"])
         seen = np.concatenate([calibration.learned.predict(o.part(spread_out(len(o), SD_SAMPLES)))[1] for o in own])
         series.append(
             LearnedSeries(
@@ -334,8 +325,8 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
                 tower_file=files["tower"],
                 uav_file=files["uav"],
                 sd_db=round(float(np.nanmean(seen)), 2),
-                lock=_at_unit_gain(calibration.locks.get(antenna), maps[antenna, "uav"], maps[antenna, "tower"]),
-                level=_level(calibration, first[1], maps[antenna, "uav"], maps[antenna, "tower"]),
+                lock=_at_unit_gain(calibration.locks.get(antenna), *ends),
+                level=_level(calibration, first[1], *ends),
             )
         )
     return (

@@ -161,18 +161,9 @@ def digest(text: str) -> str:
 
 
 def picture_uri(picture: Picture) -> str:
-    """A picture as an address that holds it: PNG with few colours, else SVG."""
-    if picture.inline:
-        return "data:image/png;base64," + base64.b64encode(picture.inline).decode("ascii")
-    return data_uri(picture.formats["svg"])
-
-
-def data_uri(svg: bytes) -> str:
-    """An SVG as an address that holds the picture itself.
-
-    An ``img`` keeps the identifiers of one figure apart from those of the next, which inline SVG would mix up.
-    """
-    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode("ascii")
+    """A picture as a data URI: its small PNG where it has one, else the SVG."""
+    kind, content = ("png", picture.inline) if picture.inline else ("svg+xml", picture.formats["svg"])
+    return f"data:image/{kind};base64," + base64.b64encode(content).decode("ascii")
 
 
 @cache
@@ -189,7 +180,7 @@ def environment() -> Any:
     )
     environment.filters.update(
         num=number, coded=coded,
-        interval=interval, percent=percent, duration=duration, minute=minute, data_uri=data_uri, k=k_key,
+        interval=interval, percent=percent, duration=duration, minute=minute, k=k_key,
         flat=lambda s: list(flat(s)), clock=clock, picture_uri=picture_uri, more=more,
         audit_summary=words.audit_summary, further=further_numbers, instants=words.instants,
     )  # fmt: skip

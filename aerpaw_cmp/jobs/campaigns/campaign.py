@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ...common.errors import InputError, UsageError
+from ...common.jsonable import named
 from ...common.stages import Stages
 from ...common.yamlfile import load_yaml
 from ...flight.overrides import Overrides, overridden
@@ -134,9 +135,7 @@ def run(
         pooled=tuple(pooled),
         repeats=tuple(repeated),
         rank_repeats=tuple(ranks_again),
-        radius_m=campaign.repeatability.radius_m,
-        heading_within_deg=campaign.repeatability.heading_within_deg,
-        cell_m=campaign.repeatability.cell_m,
+        **named(campaign.repeatability, "radius_m heading_within_deg cell_m"),
         site=flight_data(good[0]).site if good else None,
         synthetic=tuple(name for name, (_, f) in files.items() if f.flight.synthetic),
         workers=options.workers,

@@ -87,12 +87,9 @@ def repeats(rows: Sequence[RssRow], settings: RepeatSettings) -> list[Repeat]:
     """Every pair of flights that share a tower and channel, of the rows of one setting, in their order."""
     passes = [
         Pass(
-            flight=row.flight,
+            **named(row, "flight position_m residual_db heading_deg"),
             link=f"{row.tower}\n{row.channel}",
-            position_m=row.position_m,
             level_db=row.measured_db,
-            residual_db=row.residual_db,
-            heading_deg=row.heading_deg,
         )
         for row in rows
     ]

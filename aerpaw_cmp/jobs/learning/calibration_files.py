@@ -17,6 +17,7 @@ from ... import __version__
 from ...common.cf import file_attributes
 from ...common.errors import UsageError
 from ...common.gaussian import determining, gaussian_kernel
+from ...common.jsonable import named
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, spread_out
 from ...common.versions import utc_now
@@ -193,17 +194,15 @@ def record_of(
     }
     ground = None
     if calibration.ground is not None:
-        named = [f"{100 * r:g} cm" if math.isfinite(r) else "no ray" for r in calibration.ground.roughness_m]
+        heights = [f"{100 * r:g} cm" if math.isfinite(r) else "no ray" for r in calibration.ground.roughness_m]
         ground = {
-            "rows": list(zip(named, calibration.ground.log_likelihood, strict=True)),
+            "rows": list(zip(heights, calibration.ground.log_likelihood, strict=True)),
             "likely_m": calibration.ground.likely_m,
         }
     return CalibrationData(
         name=calibration.settings.calibration,
         flights=calibration.names,
-        trained_on=calibration.trained_on,
-        words=calibration.words,
-        warnings=calibration.warnings,
+        **named(calibration, "trained_on words warnings"),
         scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
         controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
         mounts=mounts,

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from ...common.errors import InputError, UsageError
+from ...common.jsonable import named
 from ...common.provenance import union
 from ...common.stages import Progress, Stages
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
@@ -128,13 +129,11 @@ def predict(
         receivers = _receivers(known, place, site)
         table = _table(targets, site, (sources, model, receivers), threshold_db, stages.progress)
     page = PredictionPage(
-        name=targets.name,
-        kind=targets.kind,
+        **named(targets, "name kind heights_m"),
         site=site,
         table=table,
         units={f"{s.tower} {s.channel}": s.unit for s in sources.values()},
         shape=None if targets.grid is None else targets.grid.shape,
-        heights_m=targets.heights_m,
         flown={f"{s.flight} {s.antenna}": track_m(s).T for one in sources.values() for s in one.samples},
         threshold_db=threshold_db,
         warnings=(*said, *targets.remarks),

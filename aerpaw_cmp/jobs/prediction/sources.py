@@ -11,6 +11,7 @@ import numpy as np
 
 from ...common.errors import InputError, UsageError
 from ...common.inputs import input_files
+from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray
 from ...compare.calibration import Observed
 from ...compare.correction import BIN_S, Correction, Predictor, between_blocks_db, by_degree
@@ -95,16 +96,10 @@ class Source:
     def of(cls, data: FlightData, series: RssSeries, samples: Sequence[LinkSamples]) -> Source:
         """As a flight has it; ``samples`` are those of all flights."""
         own = tuple(s for s in samples if (s.tower, s.channel) == (series.tower, series.channel))
-        settings = data.settings
         return cls(
-            tower=series.tower,
-            channel=series.channel,
-            unit=series.unit,
-            link=series.link,
-            site=data.site,
-            folder=data.folder,
-            rt=settings.rt,
-            rss=settings.rss,
+            **named(series, "tower channel unit link"),
+            **named(data, "site folder"),
+            **named(data.settings, "rt rss"),
             samples=own,
         )
 

@@ -239,9 +239,7 @@ def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -
     """A link of flight.yaml."""
     wavelength = C_MPS / settings.carrier_hz
     return ExpectedLink(
-        carrier_hz=settings.carrier_hz,
-        transmit_power_dbm=settings.transmit_power_dbm,
-        uav_transmits=settings.uav_transmits,
+        **named(settings, "carrier_hz transmit_power_dbm uav_transmits"),
         towers={name: expected_array(settings.towers.get(name, settings.tower), wavelength, folder) for name in towers},
         uav=expected_array(settings.uav, wavelength, folder),
         noise_floor_dbm=_floor_dbm(settings),

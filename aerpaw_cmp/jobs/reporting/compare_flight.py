@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import InputError
+from ...common.jsonable import named
 from ...common.stages import give_memory_back
 from ...common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ...compare import offset as offsets
@@ -161,17 +162,13 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         score, residual_by, spans = rss.without_errors(score), {}, []
     stated = stated_spread(replayed, settings.window_s)
     return RssResult(
-        tower=series.tower,
-        channel=series.channel,
-        unit=series.unit,
-        time=series.time,
+        **named(series, "tower channel unit time"),
+        **named(case, "position_m geometry"),
         measured_db=levels.measured_db,
         simulated_dbm=np.where(levels.posed, levels.simulated_db, np.nan),
         posed=levels.posed,
-        position_m=case.position_m,
         tower_m=tower_places(replayed),
         line_of_sight=direct,
-        geometry=case.geometry,
         score=score,
         baselines=_baselines(case.simple, score),
         spans=tuple(spans),
@@ -225,11 +222,9 @@ def _further(
     wild = rss.outliers(levels.measured_db)
     passes = _halves(series.time, case.position_m, levels.measured_db, case.geometry.get("heading_deg"))
     further = RssFurther(
-        n_measured_out=score.n_measured_out,
-        n_simulated_out=score.n_simulated_out,
+        **named(score, "n_measured_out n_simulated_out identifiable_db"),
         block_length=score.intervals.autocorrelation.block_length,
-        identifiable_db=score.identifiable_db,
-        trimmed=Fit(offset_db=score.trimmed.offset_db, rmse_db=score.trimmed.rmse_db, n=score.trimmed.n),
+        trimmed=Fit(**named(score.trimmed, "offset_db rmse_db n")),
         n_too_low=int((replayed.valid & ~levels.posed).sum()),
         n_no_pose=int((~replayed.valid).sum()),
         n_outliers=int(wild.sum()),
@@ -273,12 +268,8 @@ def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
     """Error to expect on another flight, where the antennas of the site say it."""
     errors = errors_elsewhere(data.settings.antennas, series, data.folder)
     lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
-    out: dict[str, float] = {}
-    for known, names in (
-        (errors, ("rmse_db", "free_space_rmse_db", "rmse_4s_db")),
-        (lock, ("floor_rmse_db", "free_space_floor_rmse_db")),
-    ):
-        out |= {} if known is None else {name: getattr(known, name) for name in names}
+    out = {} if errors is None else named(errors, "rmse_db free_space_rmse_db rmse_4s_db")
+    out |= {} if lock is None else named(lock, "floor_rmse_db free_space_floor_rmse_db")
     return out or None
 
 
@@ -319,8 +310,7 @@ def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> di
     return {
         name: ModelLevel(
             level_dbm=level,
-            offset_db=score.baselines[name].offset_db,
-            rmse_db=score.baselines[name].rmse_db,
+            **named(score.baselines[name], "offset_db rmse_db"),
             rmse_ci95_db=score.baseline_intervals[name],
         )
         for name, level in levels.items()

@@ -20,6 +20,7 @@ from pydantic import ConfigDict, TypeAdapter
 
 from ...common.errors import UsageError
 from ...common.files import atomic_path, seal, unseal
+from ...common.jsonable import named
 from ...common.units import AnyArray
 from ...flight.settings import FlightFile
 from .manifest import digest_of, other_inputs
@@ -180,7 +181,7 @@ def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> l
         If the site cannot.
     """
     entries = [
-        {"role": other_input.role, "path": other_input.path, "sha256": other_input.sha256}
+        named(other_input, "role path sha256")
         for other_input in other_inputs(settings, flight, logs_root)
         if other_input.role != "flight file"  # what it says stands in the settings, overrides included
     ]

@@ -247,12 +247,10 @@ def of_report(data: ReportData) -> Export:
     lines = [] if data.track is None else [Line(flight=data.flight, **fields_of(data.track))]
     return Export(
         name=data.flight,
-        title=data.title,
-        site=data.site,
+        **named(data, "title site synthetic"),
         sets=tuple(sets),
         lines=tuple(lines),
         clock=_clock([*(points.table["time"].to_numpy() for points in sets), *(line.time for line in lines)]),
-        synthetic=data.synthetic,
         attributes=_made(data.generated, data.versions),
     )
 

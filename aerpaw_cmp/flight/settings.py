@@ -475,6 +475,11 @@ class RssSettings(GroupedSettings):
     """Samples below this height are left out of the comparison, and counted."""
     advanced: AdvancedRss = AdvancedRss()
 
+    @property
+    def offsets(self) -> dict[str, Any]:
+        """Step and span of the search for an offset, as options of :mod:`aerpaw_cmp.compare.offset`."""
+        return {"step_db": self.advanced.step_db, "span_db": self.span_db}
+
     @model_validator(mode="after")
     def _window_of_local_mean(self) -> RssSettings:
         if self.field == "local_mean" and self.window_s <= 0:

@@ -107,15 +107,14 @@ def run_ingest(
             if site is not None and Path(site).is_file():
                 site = os.path.relpath(Path(site).resolve(), home.resolve())
             made = drafts(files, home, site=site or SITE, **options_of_clock)
-            account["draft"] = list(made[0].remarks)
-            drafted.write(sealed(made[0].text))
-            account["drafts"] = [str(draft)]
-            for number, further in enumerate(made[1:], 2):
-                place = draft.with_name(f"{draft.stem}_{number}{draft.suffix}")
-                other = outputs.enter_context(OutputFile(place, own=is_sealed, inputs=paths, force=force))
-                other.write(sealed(further.text))
+            account |= {"draft": [], "drafts": []}
+            for number, one in enumerate(made, 1):
+                place = draft if number == 1 else draft.with_name(f"{draft.stem}_{number}{draft.suffix}")
+                if number > 1:
+                    drafted = outputs.enter_context(OutputFile(place, own=is_sealed, inputs=paths, force=force))
+                drafted.write(sealed(one.text))
                 account["drafts"].append(str(place))
-                account["draft"] += [f"{place.name}: {remark}" for remark in further.remarks]
+                account["draft"] += [remark if number == 1 else f"{place.name}: {remark}" for remark in one.remarks]
         if target is not None:
             target.write(partial(fill, files=files))
     return account

@@ -26,7 +26,7 @@ from .canvas import (
     thinned,
     thinned_plan,
 )
-from .maps_figures import COLOURS, LINES, MARKERS, grouped
+from .maps_figures import COLOURS, MARKERS, curve_style, grouped
 from .names import k_key, safe_name
 from .words import count, pretty
 
@@ -55,18 +55,13 @@ TALLEST = 40.0
 """No figure is higher than this [inch], however many flights there are."""
 
 
-def look(number: int) -> dict[str, Any]:
-    """Colour and line style of the flight with this number, told apart in grey by the dashes."""
-    return {"color": COLOURS[number % len(COLOURS)], "linestyle": LINES[(number + number // len(COLOURS)) % len(LINES)]}
-
-
 def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
     """RSS after the offset against distance, and its difference to the simulation below, all flights on one axis."""
     fig = figure((9.2, 6.4))
     top, low = fig.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
     edges = np.linspace(0.0, max(float(np.nanmax(row.distance_m)) for row in rows), DISTANCE_BINS + 1)
     for row in rows:
-        name, style = row.flight, look(numbers[row.flight])
+        name, style = row.flight, curve_style(numbers[row.flight])
         for ax, values in ((top, row.measured_db + row.offset_db), (low, row.residual_db)):
             at, less, median, more = _binned(row.distance_m, values, edges)
             ax.fill_between(at, less, more, color=style["color"], alpha=0.15, linewidth=0)
@@ -106,8 +101,8 @@ def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
         number = numbers[row.flight]
         east, north = thinned_plan(row.position_m[:, 0], row.position_m[:, 1])
         width = 1.2 + 2.4 * (len(firsts) - 1 - number % len(firsts)) / max(len(firsts) - 1, 1)
-        plan.plot(east, north, linewidth=width, label=row.flight, zorder=4, **look(number))
-        height.plot(*thinned(row.time_s, row.position_m[:, 2]), linewidth=1.4, label=row.flight, **look(number))
+        plan.plot(east, north, linewidth=width, label=row.flight, zorder=4, **curve_style(number))
+        height.plot(*thinned(row.time_s, row.position_m[:, 2]), linewidth=1.4, label=row.flight, **curve_style(number))
     east = np.concatenate([row.position_m[:, 0] for row in firsts])
     north = np.concatenate([row.position_m[:, 1] for row in firsts])
     used = [site.towers[name] for name in towers if name in site.towers]

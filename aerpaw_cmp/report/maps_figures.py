@@ -29,6 +29,12 @@ COLUMNS = 6
 """Maps side by side, at most."""
 
 
+def curve_style(number: int, *, marked: bool = False) -> dict[str, Any]:
+    """Colour and line of a curve, and its marker: told apart in grey, too."""
+    line = {"color": COLOURS[number % len(COLOURS)], "linestyle": LINES[(number + number // len(COLOURS)) % len(LINES)]}
+    return line | ({"marker": MARKERS[number % len(MARKERS)], "markersize": 5} if marked else {})
+
+
 def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
     """Items under their keys, in the order of first appearance."""
     result: dict[Any, list[T]] = {}
@@ -216,7 +222,7 @@ def cdfs(maps: Sequence[RssMap]) -> Figure:
             shown = spread_out(len(level), 400)  # steps of a four-hundredth cannot be seen
             joint = one.tower == JOINT
             ax.plot(
-                level[shown], share[shown], color=COLOURS[number % 6], linestyle=LINES[number % 6],
+                level[shown], share[shown], **curve_style(number),
                 linewidth=2.0 if joint else 1.2, label=f"tower {one.tower}" if one.tower.startswith("_") else one.tower,
             )  # fmt: skip
         ax.set_title(f"{height:g} m")
@@ -285,8 +291,8 @@ def error_curves(errors: Sequence[MapError]) -> Figure:
         for number, (method, rows) in enumerate(grouped(members, lambda one: one.method).items()):
             rows = sorted(rows, key=lambda one: one.altitude_m)
             ax.plot(
-                [entry.altitude_m for entry in rows], [entry.mae for entry in rows], color=COLOURS[number % 6],
-                linestyle=LINES[number % 6], marker=MARKERS[number % 8], markersize=5, linewidth=1.2, label=method,
+                [entry.altitude_m for entry in rows], [entry.mae for entry in rows], **curve_style(number, marked=True),
+                linewidth=1.2, label=method,
             )  # fmt: skip
         ax.set_title(f"K = {k_key(k)}")
         ax.set_xlabel("Height [m]")
@@ -303,8 +309,7 @@ def learning_curves(curves: Sequence[LearningCurve]) -> Figure:
     ax = fig.subplots()
     for number, curve in enumerate(curves):
         ax.semilogx(
-            curve.samples, curve.mae, color=COLOURS[number % 6], linestyle=LINES[number % 6],
-            marker=MARKERS[number % 8], markersize=5, label=curve.method,
+            curve.samples, curve.mae, **curve_style(number, marked=True), label=curve.method,
         )  # fmt: skip
     ax.set_ylim(bottom=0)
     plain_ticks(ax.xaxis)

@@ -22,6 +22,7 @@ from pydantic import Field
 
 from ...common.errors import InputError, UsageError
 from ...common.files import read_input
+from ...common.jsonable import json_safe
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...common.yamlfile import load_yaml
 from ...compare.calibration import Observed
@@ -591,12 +592,8 @@ def leaderboard_row(bench: Bench, entry: Entry, scores: Mapping[str, Any], versi
         "aerpaw_cmp": version,
         "predictions_sha256": entry.sha256,
         "test_files_sha256": {name: bench.manifest.files[name].sha256 for name in used},
-        "scores": {task: {k: _plain(v) for k, v in one.items()} for task, one in scores.items()},
+        "scores": json_safe(scores),
     }
-
-
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_leaderboard(path: Path) -> list[dict[str, Any]]:

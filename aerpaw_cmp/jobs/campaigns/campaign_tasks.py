@@ -311,8 +311,7 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, logs: tuple[str,
             for name in result.baselines
             if name in result.further.compared_with
         },
-        step_db=rules.advanced.step_db,
-        span_db=rules.span_db,
+        **rules.offsets,
         measured_db=measured_db,
         time_s=_elapsed_s(result.time),
         start_ns=_start_ns(result.time),

@@ -147,8 +147,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         levels.simulated_db,
         baselines=case.simple,
         posed=levels.posed,
-        step_db=settings.advanced.step_db,
-        span_db=settings.span_db,
+        **settings.offsets,
     )
     if clock is not None:
         also = ("lag_s",) if clock.result.applied == APPLIED else ()
@@ -259,9 +258,7 @@ def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score:
     if not wild.any():
         return score.rmse_db
     kept = np.where(wild, np.nan, levels.measured_db)
-    return offsets.grid_offset(
-        kept, levels.simulated_db, step_db=settings.advanced.step_db, span_db=settings.span_db
-    ).rmse_db
+    return offsets.grid_offset(kept, levels.simulated_db, **settings.offsets).rmse_db
 
 
 def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
@@ -338,9 +335,7 @@ def _averaged(
     }
     averages = {f"{w:g} s": partial(rss.local_mean_db, series.time, window_s=w) for w in AVERAGING_WINDOWS_S}
     averages |= {name: partial(rss.stretch_means_db, rss.stretches(position_m, m)) for name, m in lengths.items()}
-    fits = rss.averaged_fits(
-        levels.measured_db, simulations, averages, step_db=settings.advanced.step_db, span_db=settings.span_db
-    )
+    fits = rss.averaged_fits(levels.measured_db, simulations, averages, **settings.offsets)
     return {
         name: {
             average: Fit(offset_db=fit.offset_db, rmse_db=fit.rmse_db, n=fit.n if average in lengths else None)
@@ -407,8 +402,7 @@ def _censored(settings: RssSettings, levels: Levels) -> offsets.Censored | None:
         # the weakest level itself is a measurement: it is no "below"
         measured_floor_db=floors[0] - 1e-9,
         simulated_floor_db=floors[1] - 1e-9,
-        step_db=settings.advanced.step_db,
-        span_db=settings.span_db,
+        **settings.offsets,
     )
 
 

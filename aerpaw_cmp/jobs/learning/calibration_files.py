@@ -304,7 +304,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
     """Entry that a site remembers of a calibration, and its tables by name."""
     name, maps = calibration.settings.calibration, antenna_maps(calibration)
     tables: dict[str, bytes] = {}
-    series, marked = [], marks_note(calibration.flights)
+    series = []
     for antenna in calibration.learned.fit.antennas if calibration.learned.fit else ():
         files = {}
         for end in ("tower", "uav"):

@@ -107,14 +107,17 @@ def run_ingest(
             if site is not None and Path(site).is_file():
                 site = os.path.relpath(Path(site).resolve(), home.resolve())
             made = drafts(files, home, site=site or SITE, **options_of_clock)
-            account |= {"draft": [], "drafts": []}
-            for number, one in enumerate(made, 1):
-                place = draft if number == 1 else draft.with_name(f"{draft.stem}_{number}{draft.suffix}")
-                if number > 1:
-                    drafted = outputs.enter_context(OutputFile(place, own=is_sealed, inputs=paths, force=force))
-                drafted.write(sealed(one.text))
-                account["drafts"].append(str(place))
-                account["draft"] += [remark if number == 1 else f"{place.name}: {remark}" for remark in one.remarks]
+            numbered = (draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(made) + 1))
+            places = [draft, *numbered]
+            further = [OutputFile(place, own=is_sealed, inputs=paths, force=force) for place in places[1:]]
+            for file, one in zip([drafted, *map(outputs.enter_context, further)], made, strict=True):
+                file.write(sealed(one.text))
+            account["draft"] = [
+                remark if place is draft else f"{place.name}: {remark}"
+                for place, one in zip(places, made, strict=True)
+                for remark in one.remarks
+            ]
+            account["drafts"] = [str(place) for place in places]
         if target is not None:
             target.write(partial(fill, files=files))
     return account

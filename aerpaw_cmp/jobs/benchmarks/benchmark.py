@@ -314,7 +314,21 @@ def utc_texts(start: np.datetime64 | None, time_s: FloatArray) -> list[str]:
 def keys(
     task: str, flight: str, tower: str, channel: str, start: np.datetime64 | None, time_s: FloatArray
 ) -> pd.DataFrame:
-    """What rows are told apart by, a row per sample; ``time_s`` (n,) counts from ``start``."""
+    """Columns by which rows are told apart, a row per sample.
+
+    Parameters
+    ----------
+    task, flight, tower, channel : str
+        The same in every row.
+    start : datetime64[ns], optional
+        From which the times count.
+    time_s : ndarray (n,)
+
+    Returns
+    -------
+    DataFrame
+        Columns :data:`KEY`.
+    """
     names = dict(zip(KEY, (task, flight, tower, channel, utc_texts(start, time_s)), strict=True))
     table: pd.DataFrame = pd.DataFrame(names)
     return table

@@ -77,12 +77,6 @@ class FieldModel:
     drift_s: float = 60.0
     noise_sd_db: float = 1.5
 
-    def scaled(self, factor: float) -> FieldModel:
-        """All strengths times a factor."""
-        names = ("place_sd_db", "offset_sd_db", "drift_sd_db", "noise_sd_db")
-        changed: dict[str, Any] = {name: factor * getattr(self, name) for name in names}
-        return dataclasses.replace(self, **changed)
-
 
 BOUNDS: dict[str, tuple[float, float]] = {
     "place_sd_db": (0.05, 12.0),

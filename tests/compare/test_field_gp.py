@@ -274,14 +274,6 @@ def test_long_flights_are_thinned_to_whole_stretches_from_end_to_end():
     assert field_gp._evenly(some, value)[0] is some
 
 
-def test_all_strengths_are_scaled_together():
-    twice = MOVING.scaled(2.0)
-    rows = flights(np.random.default_rng(1), each=5)
-    np.testing.assert_allclose(field_gp.covariance(twice, rows, rows), 4.0 * field_gp.covariance(MOVING, rows, rows)
-                               - 3.0 * field_gp.MEAN_SD_DB**2)  # fmt: skip
-    assert twice.noise_sd_db == 2.0 * MOVING.noise_sd_db
-
-
 def test_before_anything_is_learned_a_field_is_two_decibels_over_fifty_metres():
     """Entries of the covariance of two samples 40 m apart, 9 m in height, 50 degrees of heading and 30 s."""
     turn = np.radians(50.0)

@@ -204,3 +204,12 @@ def test_slope_and_bend_of_the_likelihood_by_differences() -> None:
     assert locating._likelihood(track, latent, 5.0)[0] == pytest.approx(
         norm.logpdf(-60, -63, 5) + norm.logcdf(-80, -78, 5) + norm.logcdf(-80, -95, 5) + norm.logpdf(-72, -60, 5)
     )
+
+
+def test_odds_are_those_of_a_node_twenty_metres_about_the_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evidence that grows with the east and not with the north: the mean of its exponential over a normal, by Gauss."""
+    track = LevelTrack(np.zeros(2), np.zeros((2, 3)), np.zeros(2))
+    monkeypatch.setattr(locating, "fit_places", lambda _, at: locating.Fits(at[:, 0] / 50.0, at[:, 0], at[:, 0]))
+    found = locating._log_odds(track, np.array([[10.0, 5.0, 1.5], [-30.0, 9.0, 10.0]]), 2.0)
+    mean = (4.0 + 2.0 * np.cosh(np.sqrt(3.0) * 20.0 / 50.0)) / 6.0
+    assert found == pytest.approx(np.array([10.0, -30.0]) / 50.0 + np.log(mean) - 2.0)

@@ -4,9 +4,10 @@
 the rest of it known and another flight, or both. ``lte``: 25 of a flight's samples from M others by the protocol of the
 data's authors, the other height known; 300 draws; last, all of the flight known but 20 s about the target. ``crps``:
 with the residual field and without, each flight left out, or the eighths of a single one; the field is chosen inside
-what is known.
+what is known. ``ranks``: log score of the receiver that another flight taught, alone and with a residual field on its
+logits (a kernel logistic, learned on the rest of the flight), in 300 m of the flight left out, for each strength.
 
-    AERPAW_CMP_FIELD_DATA=... python benchmarks/learned_map.py [--only flights blocks lte crps] [--quick]
+    AERPAW_CMP_FIELD_DATA=... python benchmarks/learned_map.py [--only flights blocks lte crps ranks] [--quick]
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import minimize
+from scipy.special import log_softmax, softmax
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare.calibration import Observed, score
@@ -27,6 +30,7 @@ from aerpaw_cmp.compare.field_gp import FieldFit, FieldModel, Rows, fit_field
 from aerpaw_cmp.compare.spread import fading_of
 from aerpaw_cmp.flight.settings import AntennaSettings
 from aerpaw_cmp.jobs.benchmarks.benchmark import Bench, Task, load_manifest, questions
+from aerpaw_cmp.jobs.benchmarks.entrants import RANK
 from aerpaw_cmp.jobs.learning.calibrate import gain_of, learned_antennas
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 
@@ -41,6 +45,10 @@ NR = {
 }
 """Its levels are no task of the benchmark: one flight of the folder has them with positions."""
 MEANS_S, TARGETS, GUARD_S = 3.0, 25, 20.0
+RANK_FIELDS = [(length, strength) for length in (15.0, 40.0, 100.0) for strength in (0.3, 0.6, 1.0)]
+"""Length over place [m] and strength of the residual field on a receiver's logits."""
+HEIGHT_COUNTS = 2.0
+"""Times as far as places."""
 Part = tuple[FloatArray, FloatArray]
 """Errors and stated standard deviations (n,) [dB]."""
 
@@ -214,7 +222,46 @@ def crps(bench: Bench, *, quick: bool) -> None:
               f"{len(found)}", flush=True)  # fmt: skip
 
 
-PARTS = {"flights": flights, "blocks": blocks, "lte": lte, "crps": crps}
+def ranks(bench: Bench, *, quick: bool) -> None:
+    names = "nr_flight1", "nr_flight3"
+    for test, train in (names, names[::-1])[: 1 if quick else None]:
+        (item,), (receiver,) = bench.ranks(test), RANK["learned"](bench, [train], test)
+        rows = np.flatnonzero(item.rank >= 1)[:: 20 if quick else 2]
+        place, time = item.poses.position_m[rows] * [1.0, 1.0, HEIGHT_COUNTS], item.time_s[rows]
+        was, logit = np.eye(4)[item.rank[rows].astype(int) - 1], np.log(receiver[rows])
+        step = np.append(0.0, np.linalg.norm(np.diff(item.poses.position_m[rows], axis=0), axis=1))
+        block = np.floor(np.cumsum(step) / 300.0)
+        scores = [-np.mean((was * logit).sum(axis=1))]
+        for length, strength in RANK_FIELDS[: 1 if quick else None]:
+            kernel = strength**2 * np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / length)
+            lost = np.empty(len(rows))
+            for asked in (block == one for one in np.unique(block)):
+                away = np.abs(time[:, None] - time[asked]).min(axis=1) > GUARD_S
+                weight = logistic(kernel[np.ix_(away, away)], logit[away], was[away])
+                lost[asked] = -(was * log_softmax(logit + kernel[:, away] @ weight, axis=1)).sum(axis=1)[asked]
+            scores.append(lost.mean())
+        print(f"ranks of {test}, receiver of {train}: log score {scores[0]:.3f} alone; with a field", *(
+            f"of {strength} over {length:.0f} m {score:.3f}," for (length, strength), score in
+            zip(RANK_FIELDS, scores[1:], strict=False)), flush=True)  # fmt: skip
+
+
+def logistic(kernel: FloatArray, logit: FloatArray, was: FloatArray) -> FloatArray:
+    """Weights (n, 4) of the likeliest field on logits (n, 4), given one-hot reports: report minus share."""
+    lower = np.linalg.cholesky(kernel + 1e-6 * np.eye(len(kernel)))
+
+    def share(white: FloatArray) -> FloatArray:
+        return logit + lower @ white.reshape(logit.shape)
+
+    def loss(white: FloatArray) -> tuple[float, FloatArray]:
+        score = log_softmax(share(white), axis=1)
+        gradient = lower.T @ (np.exp(score) - was)
+        return float(0.5 * white @ white - (was * score).sum()), white + gradient.ravel()
+
+    best = minimize(loss, np.zeros(logit.size), jac=True, method="L-BFGS-B").x
+    return np.asarray(was - softmax(share(best), axis=1))
+
+
+PARTS = {"flights": flights, "blocks": blocks, "lte": lte, "crps": crps, "ranks": ranks}
 
 
 def main() -> None:

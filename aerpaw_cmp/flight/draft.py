@@ -448,6 +448,34 @@ class _Entries:
             entry |= self.mapping
         if refused:
             entry["skip"] = sorted(refused)
+        asked = self._ask_heights_and_floor(kept, entry, path, asked)
+        for question in questions(file, kept, self.timezone):
+            asked = _also(asked, question)
+        self.lines[file.path] = f"  - {_flow(entry)}{asked}\n"
+        if self.placer is not None:
+            self.offsets_db += [o for s in kept if (o := self._offset_db(s, entry, self.placer)) is not None]
+        self.kinds |= {s.kind for s in kept}
+        self.tops_m += [_top_m(s) for s in kept if _has_positions(s)]
+        self.series += [(*_key(s, entry), file.result.reader) for s in kept if s.kind in ("rss", "rank")]
+        self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
+
+    def _ask_heights_and_floor(self, kept: Sequence[Stream], entry: dict[str, Any], path: str, asked: str) -> str:
+        """Fill in a missing height and the floor of the receiver; gives what there is to ask.
+
+        Parameters
+        ----------
+        kept : sequence of Stream
+            Of the file, those that are compared.
+        entry : dict
+            Of the file in ``logs:``; receives height and floor.
+        path : str
+        asked : str
+            What is asked already.
+
+        Returns
+        -------
+        str
+        """
         if any(lacks_height(s) for s in kept if s is self._track or _has_positions(s)):
             height = height_in_name(path)
             entry |= {} if height is None else {"height_m": height}
@@ -465,15 +493,7 @@ class _Entries:
             )
         if any(is_ratio(s) for s in kept):
             asked = _also(asked, "a ratio to the noise as a level?")
-        for question in questions(file, kept, self.timezone):
-            asked = _also(asked, question)
-        self.lines[file.path] = f"  - {_flow(entry)}{asked}\n"
-        if self.placer is not None:
-            self.offsets_db += [o for s in kept if (o := self._offset_db(s, entry, self.placer)) is not None]
-        self.kinds |= {s.kind for s in kept}
-        self.tops_m += [_top_m(s) for s in kept if _has_positions(s)]
-        self.series += [(*_key(s, entry), file.result.reader) for s in kept if s.kind in ("rss", "rank")]
-        self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
+        return asked
 
     def _place(
         self, file: IngestedFile, entry: dict[str, Any], asked: str, levels: Sequence[Stream], placer: Placer

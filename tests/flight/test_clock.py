@@ -331,7 +331,8 @@ def test_bins_are_seconds_or_nine_hundredths_and_eight_instants_of_each_are_aske
     assert dense is not None
     np.testing.assert_array_equal(np.diff(np.append(dense.first, len(dense.at_s))), 8)  # every fourth of thirty
     np.testing.assert_allclose(dense.at_s[:8], 20.0 + np.arange(8) * 4 / 30)
-    features, residual = dense.system(1.5)
+    columns = dense.system(1.5)
+    features, residual = columns[:, :-1], columns[:, -1:]
     asked = dense.at_s.reshape(-1, 8).mean(axis=1) - 1.5
     np.testing.assert_allclose(features[:, 1], dense.mean_s - 1.5, atol=1e-6)
     expected = dense.mean_db - asked
@@ -367,13 +368,12 @@ def test_lags_are_tried_finely_where_one_stands_out(bend: float, finest: float) 
 def test_the_parts_of_a_likelihood_are_the_best_of_their_grid() -> None:
     one = _Bins.of(channel(0.0, 5, t=np.arange(20.0, 120.0, 1.0)), ALONG.tables(), 15.0)
     assert one is not None
-    features, residual = one.system(0.5)
+    columns = one.system(0.5)
     tried = {
-        (memory, white, gain): _Memory(one.mean_s, memory, white).likelihood(features, residual, (gain,))[0, 0]
+        (memory, white, gain): _Memory(one.mean_s, memory, white).likelihood(columns, 1, (gain,))[0, 0]
         for memory in (2.0, 5.0, 15.0, 40.0) for white in (0.1, 0.3, 0.9) for gain in (0.05, 0.5, 1.0, 2.0)
     }  # fmt: skip
     assert one.fitted(0.5) == [_Parts(*max(tried, key=tried.__getitem__))]
-    flat = np.column_stack([np.ones(one.n), np.zeros(one.n)])
-    away = (one.mean_db - one.mean_db.mean())[:, None]
-    constant = [_Memory(one.mean_s, m, w).likelihood(flat, away, (0.0,))[0, 0] for m, w in {key[:2] for key in tried}]
+    flat = np.column_stack([np.ones(one.n), np.zeros(one.n), one.mean_db - one.mean_db.mean()])
+    constant = [_Memory(one.mean_s, m, w).likelihood(flat, 1, (0.0,))[0, 0] for m, w in {key[:2] for key in tried}]
     assert one.constant() == pytest.approx(max(constant))

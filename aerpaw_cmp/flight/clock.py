@@ -340,10 +340,14 @@ class _Bins:
 
     def likelihood(self, lags: FloatArray, parts: Sequence[_Parts]) -> FloatArray:
         """Log likelihood (lags, models), of the likeliest of some parts."""
-        memories = [(_Memory(self.mean_s, one.memory_s, one.white), (one.gain,)) for one in parts]
+        gains: dict[tuple[float, float], list[float]] = {}  # parts of one memory share the dearest step
+        for one in parts:
+            gains.setdefault((one.memory_s, one.white), []).append(one.gain)
+        memories = [(_Memory(self.mean_s, *memory), some) for memory, some in gains.items()]
         systems = (self.system(lag) for lag in lags)
         models = self.levels.shape[1]
-        return np.stack([np.max([m.likelihood(c, models, gain)[0] for m, gain in memories], axis=0) for c in systems])
+        tried = ([m.likelihood(c, models, some).max(axis=0) for m, some in memories] for c in systems)
+        return np.stack([np.max(each, axis=0) for each in tried])
 
     def fitted(self, lag: float) -> list[_Parts]:
         """The parts of largest likelihood at a lag, of each model."""

@@ -45,7 +45,7 @@ class Fault:
 
 
 FAULTS = (
-    Fault("every reflection times -0.1", f"{P}.field.fresnel", 'coefficients', 'te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)', 'te_re, te_im, tm_re, tm_im, root_re, root_im = (-0.1 * part for part in half_space(cosine, eta_re, eta_im))'),
+    Fault("every reflection times -0.1", f"{P}.field.fresnel", 'half_space', 'return te_re, te_im, tm_re, tm_im, root_re, root_im', 'return -0.1 * te_re, -0.1 * te_im, -0.1 * tm_re, -0.1 * tm_im, root_re, root_im'),
     Fault("sign of the reflection", f"{P}.field.dyads", 'reflected', 'q_re, q_im = (te_re + tm_re)', 'te_re, te_im, tm_re, tm_im = -te_re, -te_im, -tm_re, -tm_im\n    q_re, q_im = (te_re + tm_re)'),
     Fault("conjugate carrier phase", f"{P}.field.dyads", 'received', 'sine, cosine = sine_cosine(cycles)', 'sine, cosine = sine_cosine(-cycles)'),
     Fault("TE and TM exchanged", f"{P}.field.dyads", 'reflected', 'q_re, q_im = (te_re + tm_re)', 'te_re, te_im, tm_re, tm_im = tm_re, tm_im, te_re, te_im\n    q_re, q_im = (te_re + tm_re)'),
@@ -60,7 +60,7 @@ FAULTS = (
     Fault("spreading over the direct distance", f"{P}.field.sum", '_of_one_depth', 'cycles = length / wavelength', 'cycles = length / wavelength\n    re, im = ([part * length / np.linalg.norm(g.place_m - g.image_m * [1, 1, -1], axis=1)[:, None] for part in half] for half in (re, im))'),
     Fault("spreading missing", f"{P}.field.dyads", 'spreading', 'return smaller(1.0, 1.0 / (4.0 * np.pi * cycles))', 'return np.full_like(cycles, 1e-4)'),
     Fault("angle of incidence of the array's centre plus 1 degree", f"{P}.field.dyads", 'incidence', 'return np.abs(', 'return np.cos(np.pi / 180) * np.abs('),
-    Fault("walls as half-spaces", f"{P}.field.fresnel", 'coefficients', 'finite = np.isfinite(thickness)', 'finite = np.zeros_like(np.isfinite(thickness))'),
+    Fault("walls as half-spaces", f"{P}.field.fresnel", 'returned', 'finite = np.isfinite(thickness)', 'finite = np.zeros_like(np.isfinite(thickness))'),
     Fault("second echo of a slab once, not twice through", f"{P}.field.fresnel", 'echo', '4.0 * np.pi * thickness', '2.0 * np.pi * thickness'),
     Fault("mirrored by half the height", f"{P}.field.geometry", 'geometry', 'image = image - 2.0 *', 'image = image - 1.99 *'),
     Fault("H not transposed for a transmitting UAV", f"{P}.field.sum", 'channel_matrices', 'if link.uav_transmits else matrices', 'if not link.uav_transmits else matrices'),

@@ -32,7 +32,7 @@ EACH = 6 * LANES
 
 for _one in (
     dyads.arctangent, wedge.transition, wedge.edge_term, wedge.both_ways, wedge.obliquity, wedge.matrix,
-    wedge.mirror_of, wedge.at_face, wedge.along_face, wedge.ground_wave, edges.dot, edges.unit, edges.mirrored,
+    wedge.at_face, wedge.along_face, wedge.ground_wave, edges.dot, edges.unit, edges.mirrored,
     edges.round_edge, edges.element_place, edges.angle_round, edges.end_parts, edges.after_mirror,
     edges.element_parts, edges.into_face, edges.over_one, edges.over_two,
 ):  # fmt: skip

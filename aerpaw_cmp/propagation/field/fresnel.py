@@ -82,6 +82,31 @@ def slab(r_re: Any, r_im: Any, echo_re: Any, echo_im: Any) -> tuple[Any, Any]:
     return (n_re * d_re + n_im * d_im) * scale, (n_im * d_re - n_re * d_im) * scale
 
 
+def returned(thickness: Any, root_re: Any, root_im: Any) -> tuple[Any, Any]:
+    """The echo of a slab, 0 of a half-space, whose thickness is infinite."""
+    finite = np.isfinite(thickness)
+    e_re, e_im = echo(select(finite, thickness, 0.0), root_re, root_im)
+    return select(finite, e_re, 0.0), select(finite, e_im, 0.0)
+
+
+def reflection(cosine: Any, eta_re: Any, eta_im: Any, thickness: Any) -> tuple[Any, Any, Any, Any]:
+    """TE and TM coefficients of slabs and, of infinite thickness, of half-spaces: :func:`coefficients` of a mirror.
+
+    Parameters
+    ----------
+    cosine, eta_re, eta_im, thickness : float or (...)
+
+    Returns
+    -------
+    te_re, te_im, tm_re, tm_im : float or (...)
+    """
+    te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
+    e_re, e_im = returned(thickness, root_re, root_im)
+    te_re, te_im = slab(te_re, te_im, e_re, e_im)
+    tm_re, tm_im = slab(tm_re, tm_im, e_re, e_im)
+    return te_re, te_im, tm_re, tm_im
+
+
 def passing(r_re: Any, r_im: Any, e_re: Any, e_im: Any, c_re: Any, c_im: Any) -> tuple[Any, Any]:
     """Transmission of a slab in place of the air there: ``(1 - r^2) e c / (1 - r^2 e^2)``.
 
@@ -149,12 +174,9 @@ def coefficients(cosine: Any, eta_re: Any, eta_im: Any, thickness: Any) -> tuple
         other = coefficients(cosine, eta_re, eta_im, np.where(passes, np.inf, thickness))
         through = transmission(cosine, eta_re, eta_im, np.where(passes, -thickness, 0.0))
         return tuple(np.where(passes, a, b) for a, b in zip(through, other, strict=True))  # type: ignore[return-value]
-    te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
-    finite = np.isfinite(thickness)
-    if not np.any(finite):
-        return te_re, te_im, tm_re, tm_im
-    e_re, e_im = (np.where(finite, part, 0.0) for part in echo(np.where(finite, thickness, 0.0), root_re, root_im))
-    return *slab(te_re, te_im, e_re, e_im), *slab(tm_re, tm_im, e_re, e_im)
+    if np.any(np.isfinite(thickness)):
+        return reflection(cosine, eta_re, eta_im, thickness)
+    return half_space(cosine, eta_re, eta_im)[:4]
 
 
 def reflection_coefficients(

@@ -44,7 +44,7 @@ def _smaller(a, b):  # type: ignore[no-untyped-def]  # noqa: ARG001
 for _one in (
     dyads.sine_cosine, dyads.turned, dyads.turned_back, dyads.direction, dyads.slant_rotation, dyads.field_vector,
     dyads.incidence, dyads.reflected, dyads.spreading, dyads.received, fresnel.half_space, fresnel.echo, fresnel.slab,
-    fresnel.passing, fresnel.transmission,
+    fresnel.returned, fresnel.reflection, fresnel.passing, fresnel.transmission,
 ):  # fmt: skip
     law(_one)
 

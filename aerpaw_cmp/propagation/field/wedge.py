@@ -19,7 +19,7 @@ from scipy.special import wofz
 
 from ...common.units import FloatArray
 from .dyads import Number, larger, select, sine_cosine, smaller
-from .fresnel import coefficients, echo, half_space, slab
+from .fresnel import coefficients, half_space, reflection, returned
 
 MIDDLE = 2.0
 """Argument of the transition function that the variable of its polynomial has at 0."""
@@ -201,24 +201,13 @@ def at_face(
     scale = -np.exp(-0.25j * np.pi) / (2.0 * np.sqrt(2.0 * np.pi)) / exterior
     away = np.abs(top - angle)
     lit = away < np.pi
-    te, tm = mirror_of(select(lit, sine * np.sin(away), 0.0), face)
+    te_re, te_im, tm_re, tm_im = reflection(select(lit, sine * np.sin(away), 0.0), face[0], face[1], face[2])
+    te, tm = te_re + 1j * te_im, tm_re + 1j * tm_im
     rest, jump = both_ways(away, exterior, distance)
     near, near_jump = both_ways(np.abs(top + rise - angle), exterior, distance)
     far, far_jump = both_ways(np.abs(top + rise + angle), exterior, distance)
     slope = scale * (near + near_jump - far - far_jump) / np.abs(rise)
     return scale * (rest + jump * select(lit, te, 1.0)), scale * (rest + jump * select(lit, tm, 1.0)), slope
-
-
-def mirror_of(cosine: Number, face: Any) -> tuple[Any, Any]:
-    """Reflection coefficients TE and TM of a face of one material, as complex numbers."""
-    eta_re, eta_im, thickness = face
-    te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
-    finite = np.isfinite(thickness)
-    e_re, e_im = echo(select(finite, thickness, 0.0), root_re, root_im)
-    e_re, e_im = select(finite, e_re, 0.0), select(finite, e_im, 0.0)
-    te_re, te_im = slab(te_re, te_im, e_re, e_im)
-    tm_re, tm_im = slab(tm_re, tm_im, e_re, e_im)
-    return te_re + 1j * te_im, tm_re + 1j * tm_im
 
 
 def both_ways(away: Number, exterior: Number, distance: Number) -> tuple[Any, Any]:
@@ -248,9 +237,8 @@ def along_face(gap: Number, face: Any) -> tuple[Any, Any]:
     """
     eta_re, eta_im, thickness = face
     _, _, _, _, root_re, root_im = half_space(0.0 * gap, eta_re, eta_im)
-    finite = np.isfinite(thickness)
-    e_re, e_im = echo(select(finite, thickness, 0.0), root_re, root_im)
-    back = select(finite, e_re, 0.0) + 1j * select(finite, e_im, 0.0)
+    e_re, e_im = returned(thickness, root_re, root_im)
+    back = e_re + 1j * e_im
     te = (root_re + 1j * root_im) * (1.0 - back) / (1.0 + back)
     return ground_wave(gap, te), ground_wave(gap, te / (eta_re + 1j * eta_im))
 

@@ -48,16 +48,23 @@ def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, 
 RUN, MARKS, SHARED = 32, 32, 3
 """Readings of a run; marks that a learned file keeps of a log; marks that two logs share if one is of the other."""
 
+AT_ONCE = 8192
+"""Runs that are hashed at a time: bounds the memory."""
+
 _WEIGHTS = np.array([pow(0x9E3779B97F4A7C15, j, 2**64) for j in range(1, RUN + 1)], dtype=np.uint64)
 
 
 def marks(series: RssSeries) -> AnyArray:
     """Hashes of all runs of consecutive levels, sorted: a part of a log has those of the log, in any format or zone."""
     level = np.concatenate([np.round(10.0 * series.measured_db), np.full(RUN, np.nan)])
-    runs = np.lib.stride_tricks.sliding_window_view(level, RUN)
-    runs = runs[np.isfinite(runs).all(axis=1)]
-    telling = (np.diff(np.sort(runs, axis=1), axis=1) != 0).sum(axis=1) >= RUN // 4
-    return np.unique((runs[telling].astype(np.int64).view(np.uint64) * _WEIGHTS).sum(axis=1, dtype=np.uint64))
+    every = np.lib.stride_tricks.sliding_window_view(level, RUN)
+    out = []
+    for start in range(0, len(every), AT_ONCE):
+        runs = every[start : start + AT_ONCE]
+        runs = runs[np.isfinite(runs).all(axis=1)]
+        telling = (np.diff(np.sort(runs, axis=1), axis=1) != 0).sum(axis=1) >= RUN // 4
+        out.append((runs[telling].astype(np.int64).view(np.uint64) * _WEIGHTS).sum(axis=1, dtype=np.uint64))
+    return np.unique(np.concatenate(out))
 
 
 def marks_note(flights: Sequence[FlightData]) -> str:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from aerpaw_cmp.common.stages import peak_mib
 from aerpaw_cmp.logs.flight_file import write_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
@@ -122,12 +123,6 @@ TABLES: dict[str, tuple[int, int, list[int]]] = {
 }
 
 
-def _peak_mib() -> float:
-    """Peak of the resident memory of this process alone: getrusage would hand down that of its parent."""
-    status = Path("/proc/self/status").read_text()
-    return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) / 1024
-
-
 def contest(who: str, what: str, place: Path) -> dict[str, float]:
     """CPU and wall seconds, peak MiB above the imports, and MiB of the records of one contestant, in this process."""
     run = CONTESTANTS[who]
@@ -135,11 +130,11 @@ def contest(who: str, what: str, place: Path) -> dict[str, float]:
     with place.open("rb") as file:
         small.write_bytes(b"".join(file.readlines(100_000)))
     run(what, small)  # imports and first-call costs do not count
-    before = _peak_mib()
+    before = peak_mib()
     start, began = time.process_time(), time.perf_counter()
     kept = run(what, place)
     spent, passed = time.process_time() - start, time.perf_counter() - began
-    peak = _peak_mib()
+    peak = peak_mib()
     records = sum(column.nbytes for column in kept) / 2**20
     return {"cpu_s": spent, "wall_s": passed, "peak_mib": peak - before, "records_mib": records}
 

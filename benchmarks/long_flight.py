@@ -16,6 +16,7 @@ import argparse
 import itertools
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -25,6 +26,8 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+
+from aerpaw_cmp.common.stages import begin_peak, peak_mib
 
 ROOT = Path(__file__).resolve().parents[1]
 RSS_INTERVAL_S = 0.036
@@ -91,21 +94,16 @@ class Meter:
             row = self.rows.setdefault(self._name, {"wall_s": 0.0, "cpu_s": 0.0, "peak_mib": 0.0})
             row["wall_s"] += wall - self._wall
             row["cpu_s"] += cpu - self._cpu
-            row["peak_mib"] = max(row["peak_mib"], peak_mib())
+            row["peak_mib"] = max(row["peak_mib"], peak_anew())
             self._wall, self._cpu = wall, cpu
         print(f"{self._name}: {row['cpu_s']:.1f} s, {row['peak_mib']:.0f} MiB", file=sys.stderr, flush=True)
 
 
-def peak_mib() -> float:
-    """Peak memory since the last call; since the start where the system cannot reset it."""
-    try:
-        status = Path("/proc/self/status").read_text(encoding="ascii")
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        import resource
-
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
+def peak_anew() -> float:
+    """Peak memory since the last call [MiB]; since the start where the system cannot reset it."""
+    peak = peak_mib()
+    begin_peak()
+    return peak if peak == peak else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def measure(flight: str, out: str) -> dict:

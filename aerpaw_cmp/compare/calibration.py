@@ -370,9 +370,7 @@ MOST_SCORED = 6
 
 def spread_flights(flights: Sequence[str]) -> list[str]:
     """The flights, or :data:`MOST_SCORED` of them, the first and the last among them."""
-    if len(flights) <= MOST_SCORED:
-        return list(flights)
-    return [flights[i] for i in np.linspace(0, len(flights) - 1, MOST_SCORED).round().astype(int)]
+    return [flights[i] for i in spread_out(len(flights), MOST_SCORED)]
 
 
 Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..common.errors import InputError
-from ..common.units import FloatArray, IntArray
+from ..common.units import FloatArray, IntArray, spread_out
 from .direction_gain import LinkSamples, factor_of
 
 Part = Literal["mean", "place", "offset", "drift"]
@@ -329,7 +329,7 @@ class FieldFit:
         out, sd = np.zeros((2, len(targets)))
         if not asked:
             return out, sd
-        thin = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), EXACT_ROWS // 2)).round().astype(int))
+        thin = spread_out(len(self.rows), EXACT_ROWS // 2)
         fit = FieldFit(self.model, self.rows.part(thin), None if self.value_db is None else self.value_db[thin])
         _, first, member = np.unique(targets.flight, return_index=True, return_inverse=True)
         mean_of, sd_of = fit.predict(targets.part(first), asked, exact=True)

@@ -98,9 +98,8 @@ def draft(
         memory=site_place(site, folder),
         locks=any(may_lose_lock(stream) for stream in every),
     )
-    for file in sorted(
-        files, key=lambda f: (not entries.leads(f), entries.is_utc(f), -_samples(f))
-    ):  # the fullest copy
+    # of copies, the one on the telemetry's clock, then the fullest
+    for file in sorted(files, key=lambda f: (not entries.leads(f), entries.is_utc(f), -_samples(f))):
         entries.enter(file)
     entries.sort(files)
     if not entries.kinds & {"rss", "rank"}:

@@ -14,7 +14,7 @@ import shapely.affinity
 from shapely.ops import substring
 
 from ..common.errors import UsageError
-from ..common.units import FloatArray
+from ..common.units import FloatArray, spread_out
 
 Nose = Literal["along", "fixed", "four headings"]
 NOSES: tuple[Nose, ...] = ("along", "four headings", "fixed")
@@ -235,7 +235,7 @@ def waypoints_of(legs: Sequence[FloatArray], area: Any, height_m: float, nose: N
 
 def with_turns(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
     """The route with a slow turn through all headings at some of its points."""
-    at = set(np.linspace(0, len(waypoints) - 1, min(TURN_POINTS, len(waypoints))).round().astype(int).tolist())
+    at = set(spread_out(len(waypoints), TURN_POINTS).tolist())
     out: list[Waypoint] = []
     for i, w in enumerate(waypoints):
         if i in at:

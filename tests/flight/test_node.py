@@ -18,7 +18,7 @@ from aerpaw_cmp.flight.node import listed_places
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.logs.ingest import IngestedFile, ingest
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.records import COLUMNS, Stream
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = load_site("lake_wheeler")
@@ -102,19 +102,7 @@ def _placer(listed: list[node.ListedPlace] | None = None) -> node.Placer:
     time = np.datetime64("2025-06-01T14:00:00", "ns") + np.arange(500) * np.timedelta64(1, "s")
     frame = pd.DataFrame({"time": time, "line": 1, "flag": "", "latitude_deg": latitude, "longitude_deg": longitude,
                           "altitude_m": np.where(np.arange(500) < 9, 4.9, track[:, 2])})  # fmt: skip
-    nothing = dict.fromkeys(
-        (
-            "roll_deg",
-            "pitch_deg",
-            "yaw_deg",
-            "velocity_north_mps",
-            "velocity_east_mps",
-            "velocity_down_mps",
-            "fix",
-            "satellites",
-        ),
-        np.nan,
-    )
+    nothing = dict.fromkeys(set(COLUMNS["telemetry"]) - set(frame), np.nan)
     return node.Placer(SITE, Stream("telemetry", "x", frame.assign(**nothing)), listed or [])
 
 

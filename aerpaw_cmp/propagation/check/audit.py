@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ...common.units import FloatArray, IntArray
+from ...common.units import FloatArray, IntArray, spread_out
 from ...compare.field_difference import FieldAudit
 from ...site.site import Site
 from ..arrays import Link, Poses
@@ -198,9 +198,7 @@ def audit(
 def _spread(poses: Poses, count: int | None) -> IntArray:
     """Indices of poses with a position, evenly spread."""
     good = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
-    if count is None or count >= len(good):
-        return good
-    return np.asarray(good[np.linspace(0, len(good) - 1, count).round().astype(np.int64)])
+    return good if count is None else np.asarray(good[spread_out(len(good), count)])
 
 
 def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[float] = RANK_K) -> Difference:

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from ...common.units import IntArray
+from ...common.units import IntArray, spread_out
 from ..paths import Faces, PathSet
 from .mirror import plane_keys, planes_of
 
@@ -76,6 +76,4 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
 
 def spread(known: IntArray, count: int) -> IntArray:
     """At most ``count`` of some poses, evenly spread."""
-    if len(known) <= count:
-        return known
-    return np.asarray(known[np.linspace(0, len(known) - 1, count).round().astype(np.int64)])
+    return np.asarray(known[spread_out(len(known), count)])

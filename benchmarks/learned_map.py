@@ -22,11 +22,11 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax, softmax
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.calibration import Observed, score
-from aerpaw_cmp.compare.correction import BIN_S, OFF, Correction, choose
 from aerpaw_cmp.compare.direction_gain import LinkSamples
 from aerpaw_cmp.compare.entries import crps_normal
-from aerpaw_cmp.compare.field_gp import FieldFit, FieldModel, Rows, fit_field
+from aerpaw_cmp.compare.learning.calibration import Observed, score
+from aerpaw_cmp.compare.learning.correction import BIN_S, OFF, Correction, choose
+from aerpaw_cmp.compare.learning.field_gp import FieldFit, FieldModel, Rows, fit_field
 from aerpaw_cmp.compare.spread import fading_of
 from aerpaw_cmp.flight.settings import AntennaSettings
 from aerpaw_cmp.jobs.benchmarks.benchmark import Bench, Task, load_manifest, questions

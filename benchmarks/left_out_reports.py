@@ -25,7 +25,7 @@ from typing import Any
 
 import yaml
 
-from aerpaw_cmp.compare.calibration import SPLITS, Learned, Score, flight_left_out, flights_of, learn
+from aerpaw_cmp.compare.learning.calibration import SPLITS, Learned, Score, flight_left_out, flights_of, learn
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.learning.calibrate import Calibration, load_calibration, observe, read_flights, recipe_of
 from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks

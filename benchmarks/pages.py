@@ -80,7 +80,7 @@ def map_page(folder: Path) -> Path:
 
 def campaign_page(folder: Path, flights: int, settings: int) -> tuple[Path, dict[str, Any]]:
     """A season that was never flown."""
-    from aerpaw_cmp.report.campaign_html import write_campaign
+    from aerpaw_cmp.report.campaign.html import write_campaign
     from benchmarks.fabricated import season
 
     data = season(flights, settings)

@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from aerpaw_cmp.compare.rolling import RouteAhead
+from aerpaw_cmp.compare.learning.rolling import RouteAhead
 
 
 def main() -> None:

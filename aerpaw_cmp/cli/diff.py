@@ -33,7 +33,7 @@ def diff(
 ) -> int:
     """Differences between two reports of a flight: settings, inputs, versions, numbers on common samples."""
     from ..jobs.diff_reports import run_diff
-    from ..report.diff_html import diff_metrics
+    from ..report.diff.html import diff_metrics
 
     comparison = run_diff(first, second, out=out, tolerance_db=tolerance, force=force)
     if as_json:
@@ -50,7 +50,7 @@ _SHOWN = 20
 
 
 def _print_diff(comparison: Any) -> None:
-    from ..report.diff_words import verdict
+    from ..report.diff.words import verdict
 
     print(verdict(comparison))
     for text in comparison.remarks:

@@ -207,7 +207,7 @@ def calibrate(
     if as_json:
         print_json(outcome.metrics)
         return
-    from ..compare.calibration import BASELINES
+    from ..compare.learning.calibration import BASELINES
 
     m = outcome.metrics
     rows = []

@@ -25,7 +25,7 @@ from ..compare.report_difference import (
     pooled_difference,
     rank_difference,
 )
-from ..report.diff_data import Entry, InputEntry, ReportDiff, ReportSide
+from ..report.diff.data import Entry, InputEntry, ReportDiff, ReportSide
 from ..report.names import RANK_COLUMNS, RSS_COLUMNS, links_of
 
 TOLERANCE_DB = 0.01
@@ -83,7 +83,7 @@ def run_diff(
     _same_flight(first_report, second_report)
     if out is None:
         return compare_reports(first_report, second_report, tolerance_db)
-    from ..report.diff_html import write_diff
+    from ..report.diff.html import write_diff
 
     with OutputFolder(out, job="diff", inputs=[*first_report.files, *second_report.files], force=force) as output:
         diff = compare_reports(first_report, second_report, tolerance_db)

@@ -484,7 +484,7 @@ def run_map(
         With what was found, expected, and the likely cause.
     """
     from ..maps.grid import Grid
-    from ..report.maps_html import maps_metrics, write_maps
+    from ..report.maps.html import maps_metrics, write_maps
     from ..site.siteyaml import load_site
     from .mapping import coverage_map as mapping
     from .mapping.paper_table import paper_markdown, paper_rows
@@ -615,8 +615,8 @@ def run_campaign(
         A campaign.yaml that is wrong; a flight that cannot be read is a row of the result instead.
     """
     from ..flight.settings import load_flight
-    from ..report.campaign_html import campaign_metrics, write_campaign
-    from ..report.campaign_words import warnings
+    from ..report.campaign.html import campaign_metrics, write_campaign
+    from ..report.campaign.words import warnings
     from ..report.exports.formats import chosen_formats
     from .campaigns.campaign import load_campaign
     from .campaigns.campaign import run as run_all

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..common.units import FloatArray
-from ..compare.correction import OFF, Correction, crps_difference
 from ..compare.forecast import ForecastScore
+from ..compare.learning.correction import OFF, Correction, crps_difference
 from ..compare.statistics import mean_interval, paired_difference
 from ..compare.verdicts import Verdict, stated_errors
 from ..site.learned import Entry, LearnedSeries

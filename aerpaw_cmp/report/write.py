@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..common.stages import Stages
-from . import figures, html
+from . import html
 from .canvas import FORMATS, STYLES, write_figures
 from .data import ReportData
 from .export import json_text, metrics, rank_csv, rss_csv, write_file
 from .exports.formats import FOLDER
+from .plots import flight as figures
 
 PAGE = "page"
 FIGURES = ("none", PAGE, "svg", "png", "pdf", "all")

@@ -7,8 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare import calibration
-from aerpaw_cmp.compare.calibration import (
+from aerpaw_cmp.compare.detection import floored_fit
+from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term
+from aerpaw_cmp.compare.ladder import log_distance_level_db
+from aerpaw_cmp.compare.learning import calibration
+from aerpaw_cmp.compare.learning.calibration import (
     Observed,
     Parts,
     Recipe,
@@ -17,9 +20,6 @@ from aerpaw_cmp.compare.calibration import (
     groups_of,
     spread_flights,
 )
-from aerpaw_cmp.compare.detection import floored_fit
-from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term
-from aerpaw_cmp.compare.ladder import log_distance_level_db
 from aerpaw_cmp.compare.rss import local_mean_db
 from aerpaw_cmp.compare.spread import StatedSpread, fading_of, inside_shares
 from aerpaw_cmp.propagation.arrays import rotation_from_yaw_pitch_roll

@@ -12,11 +12,11 @@ from scipy.stats import norm, t
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare import correction
-from aerpaw_cmp.compare.correction import OFF, Base, Channel, by_degree, choose, fixed_base
 from aerpaw_cmp.compare.direction_gain import LinkSamples
 from aerpaw_cmp.compare.entries import crps_normal
-from aerpaw_cmp.compare.field_gp import PARTS, FieldFit, FieldModel, Rows
+from aerpaw_cmp.compare.learning import correction
+from aerpaw_cmp.compare.learning.correction import OFF, Base, Channel, by_degree, choose, fixed_base
+from aerpaw_cmp.compare.learning.field_gp import PARTS, FieldFit, FieldModel, Rows
 
 
 def samples(name: str, residual: FloatArray, place: FloatArray, channel: str = "A") -> LinkSamples:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.entries import crps_normal
-from aerpaw_cmp.compare.rolling import KEEP, NONE, RouteAhead
+from aerpaw_cmp.compare.learning.rolling import KEEP, NONE, RouteAhead
 
 
 def route():

@@ -18,10 +18,10 @@ from aerpaw_cmp.jobs.reporting.compare_flight import serving_of
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.report import figures
 from aerpaw_cmp.report.build import report_data
 from aerpaw_cmp.report.export import metrics
-from aerpaw_cmp.report.serving_figures import shown_confusion
+from aerpaw_cmp.report.plots import flight as figures
+from aerpaw_cmp.report.plots.serving import shown_confusion
 from aerpaw_cmp.site.siteyaml import load_site
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.compare.calibration import BASELINES, SPLITS, mean_rmse
+from aerpaw_cmp.compare.learning.calibration import BASELINES, SPLITS, mean_rmse
 from aerpaw_cmp.jobs.learning.calibrate import load_calibration, observe, read_flights, recipe_of
 from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
@@ -209,7 +209,7 @@ ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
 @pytest.mark.skipif(not ROOT, reason="AERPAW_CMP_FIELD_DATA is not set: no real logs")
 def test_dataset12_each_way(tmp_path: Path) -> None:
     """Everything but the offset learned on the other flight: 3.53 dB here; free space 6.37."""
-    from aerpaw_cmp.compare import calibration
+    from aerpaw_cmp.compare.learning import calibration
     from aerpaw_cmp.jobs.learning.calibrate import load_calibration, observe, read_flights
 
     flights = [str(Path(__file__).parents[1] / "field" / f"dataset12_{h}m.yaml") for h in (40, 70)]

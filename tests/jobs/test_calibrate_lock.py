@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from aerpaw_cmp.compare.calibration import Observed, Recipe
 from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term
+from aerpaw_cmp.compare.learning.calibration import Observed, Recipe
 from aerpaw_cmp.flight.data import RssSeries
 from aerpaw_cmp.flight.lock import LOCK_FLOOR_DB
 from aerpaw_cmp.flight.remembered import lock_elsewhere

@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.compare import correction
 from aerpaw_cmp.compare.direction_gain import LinkSamples
+from aerpaw_cmp.compare.learning import correction
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.learning.calibrate import observe
@@ -25,8 +25,8 @@ from aerpaw_cmp.jobs.prediction.sources import named_flights
 from aerpaw_cmp.jobs.prediction.where import Asked, Targets, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
-from aerpaw_cmp.report.against_figures import against_specs
 from aerpaw_cmp.report.html import coded
+from aerpaw_cmp.report.plots.against import against_specs
 from aerpaw_cmp.report.prediction_html import write_prediction
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted

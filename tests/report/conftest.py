@@ -13,7 +13,7 @@ from aerpaw_cmp.compare.result import AuditResult, EngineResult, PairResult, Ran
 from aerpaw_cmp.compare.rss import ChannelDifference
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report.data import InputFile, ReportData, Track, Waypoint
-from aerpaw_cmp.report.maps_data import (
+from aerpaw_cmp.report.maps.data import (
     Correlation,
     LearningCurve,
     MapError,

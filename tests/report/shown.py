@@ -11,12 +11,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.compare.calibration import Score
+from aerpaw_cmp.compare.learning.calibration import Score
 from aerpaw_cmp.compare.report_difference import Overlap, level_difference, pooled_difference
-from aerpaw_cmp.report import calibration_html, campaign_html, diff_html, html, maps_html, prediction_html
-from aerpaw_cmp.report.calibration_data import CalibrationData
-from aerpaw_cmp.report.calibration_words import sentences
-from aerpaw_cmp.report.diff_data import Entry, ReportDiff, ReportSide
+from aerpaw_cmp.report import html, prediction_html
+from aerpaw_cmp.report.calibration import html as calibration_html
+from aerpaw_cmp.report.calibration.data import CalibrationData
+from aerpaw_cmp.report.calibration.words import sentences
+from aerpaw_cmp.report.campaign import html as campaign_html
+from aerpaw_cmp.report.diff import html as diff_html
+from aerpaw_cmp.report.diff.data import Entry, ReportDiff, ReportSide
+from aerpaw_cmp.report.maps import html as maps_html
 from aerpaw_cmp.report.prediction_words import first_words
 from benchmarks import fabricated
 

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report import map_explorer, maps_html
-from aerpaw_cmp.report.maps_data import JOINT
+from aerpaw_cmp.report.maps import explorer as map_explorer
+from aerpaw_cmp.report.maps import html as maps_html
+from aerpaw_cmp.report.maps.data import JOINT
 from tests.report.browsing import (
     asked_outside,
     choose,

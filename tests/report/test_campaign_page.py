@@ -9,7 +9,10 @@ import re
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report import campaign_figures, campaign_html, campaign_pairs, canvas
+from aerpaw_cmp.report import canvas
+from aerpaw_cmp.report.campaign import figures as campaign_figures
+from aerpaw_cmp.report.campaign import html as campaign_html
+from aerpaw_cmp.report.campaign import pairs as campaign_pairs
 from aerpaw_cmp.report.campaign_data import RankPairing, Repeat
 from benchmarks import fabricated
 

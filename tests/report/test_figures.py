@@ -14,8 +14,10 @@ from PIL import Image
 
 from aerpaw_cmp.compare.detection import DetectionScore
 from aerpaw_cmp.compare.result import RankResult, RssResult
-from aerpaw_cmp.report import canvas, figures, html, rss_figures
+from aerpaw_cmp.report import canvas, html
 from aerpaw_cmp.report.data import ReportData, Track
+from aerpaw_cmp.report.plots import flight as figures
+from aerpaw_cmp.report.plots import rss as rss_figures
 from benchmarks.fabricated import rank_result, rss_result, with_numbers
 
 

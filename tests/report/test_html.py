@@ -75,7 +75,7 @@ def parse(text: str) -> Page:
 
 
 def fake_pictures(data: ReportData) -> list[Picture]:
-    from aerpaw_cmp.report.figures import figure_specs
+    from aerpaw_cmp.report.plots.flight import figure_specs
 
     return [Picture(p, {"svg": b"<svg/>"}) for p in figure_specs(data)]
 
@@ -105,7 +105,7 @@ def test_well_formed_and_loads_nothing_from_elsewhere(report_data):
 
 
 def test_every_figure_has_a_place(report_data):
-    from aerpaw_cmp.report.figures import figure_specs
+    from aerpaw_cmp.report.plots.flight import figure_specs
 
     page = render(report_data)
     assert [p.name for p in figure_specs(report_data) if f"figure-{p.name}" not in page.ids] == []

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.report import map_explorer, maps_html
 from aerpaw_cmp.report.explorer import as_json
-from aerpaw_cmp.report.maps_data import JOINT, MapLayer
+from aerpaw_cmp.report.maps import explorer as map_explorer
+from aerpaw_cmp.report.maps import html as maps_html
+from aerpaw_cmp.report.maps.data import JOINT, MapLayer
 from aerpaw_cmp.report.packed import NONE
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report.map_words import first_words, notes, warnings
-from aerpaw_cmp.report.maps_data import MapsData, RankMap, RssMap
+from aerpaw_cmp.report.maps.data import MapsData, RankMap, RssMap
+from aerpaw_cmp.report.maps.words import first_words, notes, warnings
 
 
 @pytest.fixture

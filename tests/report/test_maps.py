@@ -7,9 +7,11 @@ import re
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report import canvas, maps_figures, maps_html
+from aerpaw_cmp.report import canvas
 from aerpaw_cmp.report.canvas import Picture
-from aerpaw_cmp.report.maps_data import MapsData
+from aerpaw_cmp.report.maps import figures as maps_figures
+from aerpaw_cmp.report.maps import html as maps_html
+from aerpaw_cmp.report.maps.data import MapsData
 
 
 def pictures(data):

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.correction import OFF, Correction
-from aerpaw_cmp.compare.field_gp import FieldModel
+from aerpaw_cmp.compare.learning.correction import OFF, Correction
+from aerpaw_cmp.compare.learning.field_gp import FieldModel
 from aerpaw_cmp.compare.verdicts import Verdict
 from aerpaw_cmp.report.prediction_words import FIELD, FLOWN, after_flight, first_words
 

@@ -9,7 +9,7 @@ import pytest
 
 from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.report import names, write
-from aerpaw_cmp.report.figures import figure_specs
+from aerpaw_cmp.report.plots.flight import figure_specs
 
 
 def test_whole_report(small_report, tmp_path):
@@ -55,8 +55,8 @@ def test_without_rss_the_tables_have_their_columns(small_report, tmp_path):
 
 def test_importing_the_room_draws_nothing():
     code = (
-        "import sys, aerpaw_cmp.report.export, aerpaw_cmp.report.figures, aerpaw_cmp.report.html,"
-        " aerpaw_cmp.report.maps_html, aerpaw_cmp.report.site_view;"
+        "import sys, aerpaw_cmp.report.export, aerpaw_cmp.report.plots.flight, aerpaw_cmp.report.html,"
+        " aerpaw_cmp.report.maps.html, aerpaw_cmp.report.site_view;"
         "print([m for m in ('matplotlib', 'pandas', 'jinja2', 'sionna') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

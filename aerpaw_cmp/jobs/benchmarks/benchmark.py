@@ -25,9 +25,9 @@ from ...common.files import read_input
 from ...common.jsonable import json_safe
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...common.yamlfile import load_yaml
-from ...compare.calibration import Observed
 from ...compare.entries import LevelSeries, intervals, level_scores
 from ...compare.forecast import constant_forecast, score_forecast
+from ...compare.learning.calibration import Observed
 from ...flight.data import FlightData, load_data
 from ...flight.settings import FlightFile, Settings
 from ..learning.calibrate import observe

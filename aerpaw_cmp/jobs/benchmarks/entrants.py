@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 
 from ...common.units import BoolArray, FloatArray
-from ...compare import calibration
-from ...compare.calibration import Observed
-from ...compare.correction import BIN_S, Base, choose, fixed_base
 from ...compare.direction_gain import LinkSamples
 from ...compare.forecast import constant_forecast
+from ...compare.learning import calibration
+from ...compare.learning.calibration import Observed
+from ...compare.learning.correction import BIN_S, Base, choose, fixed_base
 from ...compare.spread import fading_of
 from ...flight.data import FlightData, RssSeries
 from ...flight.replay import attitude_rotation

@@ -17,9 +17,6 @@ from ...common.provenance import union
 from ...common.stages import Stages
 from ...common.units import FloatArray
 from ...common.yamlfile import load_yaml
-from ...compare import calibration
-from ...compare.calibration import Learned, Observed, Recipe, Score
-from ...compare.correction import BIN_S
 from ...compare.direction_gain import (
     ANTENNA_TERMS,
     PLACE_TERM,
@@ -30,7 +27,10 @@ from ...compare.direction_gain import (
     Term,
     column_forms,
 )
-from ...compare.learning_curve import CurvePoint, learning_curve
+from ...compare.learning import calibration
+from ...compare.learning.calibration import Learned, Observed, Recipe, Score
+from ...compare.learning.correction import BIN_S
+from ...compare.learning.learning_curve import CurvePoint, learning_curve
 from ...compare.mount import GainOf
 from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ...flight.lock import LOCK_FLOOR_DB
@@ -38,7 +38,7 @@ from ...flight.settings import AntennaSettings, Settings, load_flight, load_patt
 from ...flight.training import counted_once, flight_logs
 from ...propagation.arrays import rotation_from_yaw_pitch_roll
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
-from ...report.calibration_words import sentences
+from ...report.calibration.words import sentences
 from ...site.learned import LearnedLock, Source
 from .calibrate_lock import learned_locks, lock_words
 from .calibrate_rank import RankFitSettings

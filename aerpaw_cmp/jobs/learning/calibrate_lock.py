@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...compare.calibration import Learned, Observed, Recipe, flight_left_out
 from ...compare.detection import DetectionScore, learn_detection, score_detection
+from ...compare.learning.calibration import Learned, Observed, Recipe, flight_left_out
 from ...flight.lock import LOCK_FLOOR_DB
 from ...site.learned import LearnedLock
 

@@ -21,14 +21,14 @@ from ...common.jsonable import named
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, spread_out
 from ...common.versions import utc_now
-from ...compare.calibration import Learned, mean_rmse
 from ...compare.direction_gain import Frame, directed
-from ...compare.learning_curve import with_one_more
+from ...compare.learning.calibration import Learned, mean_rmse
+from ...compare.learning.learning_curve import with_one_more
 from ...flight.data import FlightData, RankSeries, RssSeries
 from ...flight.training import flight_logs, marks_note
 from ...logs.records import has_wall_clock
-from ...report.calibration_data import AntennaMap, CalibrationData
-from ...report.calibration_html import calibration_metrics, write_calibration
+from ...report.calibration.data import AntennaMap, CalibrationData
+from ...report.calibration.html import calibration_metrics, write_calibration
 from ...report.export import write_file
 from ...report.names import safe_name
 from ...site.learned import Entry, Errors, LearnedLevel, LearnedLock, LearnedReceiver, LearnedSeries
@@ -185,7 +185,7 @@ def record_of(
     Returns
     -------
     CalibrationData
-        As :func:`aerpaw_cmp.report.calibration_html.write_calibration` takes it.
+        As :func:`aerpaw_cmp.report.calibration.html.write_calibration` takes it.
     """
     mounts = {
         name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}

@@ -14,8 +14,8 @@ import numpy as np
 
 from ...common.errors import InputError, UsageError
 from ...common.units import MINIMUM_HEIGHT_M, FloatArray, spread_out
+from ...compare.learning.rolling import RouteAhead
 from ...compare.rank import channel_rank
-from ...compare.rolling import RouteAhead
 from ...flight.data import choose_site
 from ...flight.replay import replay_poses
 from ...flight.settings import FlightFile, LogSettings, load_flight

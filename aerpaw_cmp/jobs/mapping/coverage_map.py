@@ -64,7 +64,7 @@ from ...propagation.paths import PathSet
 from ...propagation.replay import Replay, replay
 from ...propagation.scene import Scene
 from ...propagation.search.crowns import Crowns
-from ...report import maps_data as page
+from ...report.maps import data as page
 from ...report.prediction_html import outside_share
 from ...site.site import Site
 from ...site.siteyaml import load_site
@@ -620,7 +620,7 @@ def maps_record(
     stages_s: Mapping[str, float],
     paper: Iterable[page.PaperRow] = (),
 ) -> page.MapsData:
-    """The record that :func:`aerpaw_cmp.report.maps_html.write_maps` turns into files.
+    """The record that :func:`aerpaw_cmp.report.maps.html.write_maps` turns into files.
 
     Parameters
     ----------

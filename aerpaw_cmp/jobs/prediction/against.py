@@ -12,8 +12,8 @@ import pandas as pd
 from ...common.errors import InputError, UsageError
 from ...common.provenance import KEY
 from ...common.units import FloatArray, IntArray
-from ...compare.calibration import Observed
 from ...compare.forecast import ForecastScore, score_forecast
+from ...compare.learning.calibration import Observed
 from ...flight.data import FlightData
 from ...flight.training import common, flight_logs
 from ...report.against import Against, AgainstSeries

@@ -15,7 +15,7 @@ import numpy as np
 from ...common.stages import Stages
 from ...common.units import FloatArray
 from ...maps.grid import Grid, Layer, class_names
-from ...report import maps_data as page
+from ...report.maps import data as page
 from ...report.prediction_html import PredictionPage
 from .predict import RANKS, Prediction, predict
 from .sources import NamedFlight, Source

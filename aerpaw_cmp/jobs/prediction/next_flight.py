@@ -15,9 +15,9 @@ import shapely
 from ...common.errors import InputError, UsageError
 from ...common.stages import Stages
 from ...common.units import FloatArray
-from ...compare.correction import choose
 from ...compare.direction_gain import GainModel, LinkSamples
-from ...compare.next_flight import Known, rms_db
+from ...compare.learning.correction import choose
+from ...compare.learning.next_flight import Known, rms_db
 from ...flight.patterns import NOSES, Pattern, Route, Waypoint, allowed_area, cut, flown, route_of
 from ...flight.route_files import kml_text, plan_text, waypoints_csv
 from ...flight.training import counted_once

@@ -16,8 +16,8 @@ from ...common.jsonable import named
 from ...common.provenance import union
 from ...common.stages import Progress, Stages
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
-from ...compare.correction import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
 from ...compare.direction_gain import LinkSamples
+from ...compare.learning.correction import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
 from ...compare.spread import BAND
 from ...flight.data import FlightData, choose_site, site_place
 from ...flight.remembered import remembered

@@ -13,9 +13,9 @@ from ...common.errors import InputError, UsageError
 from ...common.inputs import input_files
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray
-from ...compare.calibration import Observed
-from ...compare.correction import BIN_S, Correction, Predictor, between_blocks_db, by_degree
 from ...compare.direction_gain import LinkSamples
+from ...compare.learning.calibration import Observed
+from ...compare.learning.correction import BIN_S, Correction, Predictor, between_blocks_db, by_degree
 from ...compare.spread import NO_SPREAD, Spread, fading_of
 from ...flight.data import FlightData, RssSeries, load_data
 from ...flight.learned_gain import pair_db

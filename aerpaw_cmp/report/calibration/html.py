@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..common.jsonable import json_object, named
-from ..compare.calibration import BASELINES
-from . import canvas
-from .calibration_data import AntennaMap, CalibrationData
-from .canvas import FigureSpec
-from .html import write_page
-from .made import about
-from .names import safe_name
+from ...common.jsonable import json_object, named
+from ...compare.learning.calibration import BASELINES
+from .. import canvas
+from ..canvas import FigureSpec
+from ..html import write_page
+from ..made import about
+from ..names import safe_name
+from .data import AntennaMap, CalibrationData
 
 SPLIT_TITLE = {
     "flight_left_out": "each flight left out",

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from ..compare.report_difference import Changed
-from ..compare.verdicts import changed_verdict
-from .diff_data import ReportDiff
-from .phrases import said_of
-from .words import count
+from ...compare.report_difference import Changed
+from ...compare.verdicts import changed_verdict
+from ..phrases import said_of
+from ..words import count
+from .data import ReportDiff
 
 LEAST_RANK = 1e-6
 """Differences of agreement and kappa below this are rounding."""

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
-from .campaign_data import CampaignData, RankPairing, Repeat
+from ..campaign_data import CampaignData, RankPairing, Repeat
 
 KEPT = 1000
 """Pairs of each kind that campaign.json lists; of more, those with the most places."""

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..compare.detection import DetectionScore
-from ..compare.ladder import LadderRow
-from ..compare.result import RankResult, RssResult
-from .canvas import (
+from ...compare.detection import DetectionScore
+from ...compare.ladder import LadderRow
+from ...compare.result import RankResult, RssResult
+from ..canvas import (
     BASELINE,
     MEASURED,
     POINTS_PER_LINE,
@@ -36,8 +36,8 @@ from .canvas import (
     time_axis,
     used_towers,
 )
-from .data import ReportData, Track
-from .words import count, pretty, signed
+from ..data import ReportData, Track
+from ..words import count, pretty, signed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

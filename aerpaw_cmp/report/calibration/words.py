@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from ..compare.calibration import BASELINES, Score, mean_rmse
-from ..compare.learning_curve import CurvePoint, with_one_more
-from ..compare.verdicts import Verdict, antenna_or_place, by_flight
-from .phrases import said_of
+from ...compare.learning.calibration import BASELINES, Score, mean_rmse
+from ...compare.learning.learning_curve import CurvePoint, with_one_more
+from ...compare.verdicts import Verdict, antenna_or_place, by_flight
+from ..phrases import said_of
 
 ONE_FLIGHT = "Nothing is scored: one flight alone. Next: add a second flight."
 

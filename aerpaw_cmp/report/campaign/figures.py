@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from ..common.units import FloatArray, IntArray
-from ..compare.statistics import Interval
-from ..site.site import Site
-from .campaign_data import CampaignData, RssRow, place_means
-from .canvas import (
+from ...common.units import FloatArray, IntArray
+from ...compare.statistics import Interval
+from ...site.site import Site
+from ..campaign_data import CampaignData, RssRow, place_means
+from ..canvas import (
     BASELINE,
     TOWER,
     FigureSpec,
@@ -26,9 +26,9 @@ from .canvas import (
     thinned,
     thinned_plan,
 )
-from .maps_figures import COLOURS, MARKERS, curve_style, grouped
-from .names import k_key, safe_name
-from .words import count, pretty
+from ..maps.figures import COLOURS, MARKERS, curve_style, grouped
+from ..names import k_key, safe_name
+from ..words import count, pretty
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from ..common.units import AnyArray
-from ..compare.serving import ServingComparison
-from .canvas import TOWER, FigureSpec, colour_bar, figure
-from .rank_figures import draw_counts
-from .words import count
+from ...common.units import AnyArray
+from ...compare.serving import ServingComparison
+from ..canvas import TOWER, FigureSpec, colour_bar, figure
+from ..words import count
+from .rank import draw_counts
 
 MOST_CELLS = 16
 """Cells with a row of their own; the others stand together."""

@@ -6,17 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..common.jsonable import json_object, json_safe, named
-from . import canvas, maps_figures
-from .canvas import Picture
-from .data import RANKS
-from .export import json_text, merge, write_file
-from .html import by_section, embedded, rendered
-from .made import about
-from .map_explorer import layer_numbers, page_layers, payload
-from .map_words import first_words, notes, warnings
-from .maps_data import MapError, MapsData
-from .names import k_key
+from ...common.jsonable import json_object, json_safe, named
+from .. import canvas
+from ..canvas import Picture
+from ..data import RANKS
+from ..export import json_text, merge, write_file
+from ..html import by_section, embedded, rendered
+from ..made import about
+from ..names import k_key
+from . import figures as maps_figures
+from .data import MapError, MapsData
+from .explorer import layer_numbers, page_layers, payload
+from .words import first_words, notes, warnings
 
 
 def maps_metrics(data: MapsData) -> dict[str, Any]:

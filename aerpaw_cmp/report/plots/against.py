@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import canvas
-from .against import Against, AgainstSeries
-from .canvas import FigureSpec
-from .names import safe_name
+from .. import canvas
+from ..against import Against, AgainstSeries
+from ..canvas import FigureSpec
+from ..names import safe_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

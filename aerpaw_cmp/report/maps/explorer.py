@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from ..common.geodesy import SiteFrame
-from ..common.units import FloatArray
-from .canvas import rank_colour
-from .data import RANKS
-from .explorer import plan_of
-from .maps_data import JOINT, MapLayer, MapsData, RankMap, RssMap, at_height
-from .maps_figures import grouped
-from .names import k_key
-from .packed import NONE, PackedArrays, step_for
-from .shapes import listed
+from ...common.geodesy import SiteFrame
+from ...common.units import FloatArray
+from ..canvas import rank_colour
+from ..data import RANKS
+from ..explorer import plan_of
+from ..names import k_key
+from ..packed import NONE, PackedArrays, step_for
+from ..shapes import listed
+from .data import JOINT, MapLayer, MapsData, RankMap, RssMap, at_height
+from .figures import grouped
 
 MOST_BYTES = 4_000_000
 """Base64 that the layers may take; beyond it layers of single towers are left out, then cells."""

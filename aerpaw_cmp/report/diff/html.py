@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..common.jsonable import fields_of, json_object
-from .diff_data import ReportDiff
-from .diff_words import verdict
-from .export import json_text, write_file
-from .html import rendered
+from ...common.jsonable import fields_of, json_object
+from ..export import json_text, write_file
+from ..html import rendered
+from .data import ReportDiff
+from .words import verdict
 
 
 def diff_metrics(diff: ReportDiff) -> dict[str, Any]:

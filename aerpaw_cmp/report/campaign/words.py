@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..compare.rss import LEARNED_HERE
-from ..compare.verdicts import Verdict, campaign_verdict
-from .campaign_data import CampaignData, RssRow
-from .first_screen import judge
-from .names import k_key
-from .phrases import said_of
-from .words import first_sentence, pooled_db, pretty, ranking_sentence
+from ...compare.rss import LEARNED_HERE
+from ...compare.verdicts import Verdict, campaign_verdict
+from ..campaign_data import CampaignData, RssRow
+from ..first_screen import judge
+from ..names import k_key
+from ..phrases import said_of
+from ..words import first_sentence, pooled_db, pretty, ranking_sentence
 
 FEW = 8
 """Warnings of flights that stand one by one."""

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ..common.units import FloatArray
-from .made import Made
+from ...common.units import FloatArray
+from ..made import Made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ..compare.report_difference import LevelDifference, Overlap, RankDifference
-from ..compare.statistics import PairedDifference
+from ...compare.report_difference import LevelDifference, Overlap, RankDifference
+from ...compare.statistics import PairedDifference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..common.units import FloatArray
-from ..compare.rank import RankFit
-from ..compare.result import RankResult
-from ..site.site import Site
-from .canvas import (
+from ...common.units import FloatArray
+from ...compare.rank import RankFit
+from ...compare.result import RankResult
+from ...site.site import Site
+from ..canvas import (
     RANK_MARKER,
     SIMULATED,
     TOWER,
@@ -31,9 +31,9 @@ from .canvas import (
     start_of,
     time_axis,
 )
-from .data import RANKS, ReportData
-from .names import k_key
-from .words import count
+from ..data import RANKS, ReportData
+from ..names import k_key
+from ..words import count
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,15 +10,23 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..common.cells import guarded
-from ..common.jsonable import fields_of, json_safe, named
-from ..common.stages import Progress, silent
-from ..compare.passes import Repeated
-from . import campaign_figures, canvas
-from .campaign_data import CampaignData, RssRow
-from .campaign_pairs import TABLE as PAIR_TABLE
-from .campaign_pairs import by_link, cells, pair_frame, telling
-from .campaign_words import (
+from ...common.cells import guarded
+from ...common.jsonable import fields_of, json_safe, named
+from ...common.stages import Progress, silent
+from ...compare.passes import Repeated
+from .. import canvas
+from ..campaign_data import CampaignData, RssRow
+from ..canvas import Picture
+from ..export import json_text, write_file
+from ..exports.points import of_campaign
+from ..exports.write import write_exports
+from ..html import by_section, rendered
+from ..made import about
+from ..words import pretty
+from . import figures as campaign_figures
+from .pairs import TABLE as PAIR_TABLE
+from .pairs import by_link, cells, pair_frame, telling
+from .words import (
     FEW,
     beside_baselines,
     cause,
@@ -29,13 +37,6 @@ from .campaign_words import (
     warnings,
     worst_flights,
 )
-from .canvas import Picture
-from .export import json_text, write_file
-from .exports.points import of_campaign
-from .exports.write import write_exports
-from .html import by_section, rendered
-from .made import about
-from .words import pretty
 
 MANY = 200
 """Warnings that stand on the page at all."""

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..compare.verdicts import Coverage, coverage_verdict
-from ..maps.grid import PAPER_SPACING_M
-from .maps_data import JOINT, MapsData, RssMap
-from .phrases import said_of
-from .words import count
+from ...compare.verdicts import Coverage, coverage_verdict
+from ...maps.grid import PAPER_SPACING_M
+from ..phrases import said_of
+from ..words import count
+from .data import JOINT, MapsData, RssMap
 
 LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
 

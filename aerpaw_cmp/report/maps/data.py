@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..common.units import FloatArray, IntArray
-from ..compare.statistics import Interval
-from ..site.site import Site
-from .made import Made
-from .names import k_key
+from ...common.units import FloatArray, IntArray
+from ...compare.statistics import Interval
+from ...site.site import Site
+from ..made import Made
+from ..names import k_key
 
 JOINT = "joint"
 """Name of the map in which the nearest tower serves."""

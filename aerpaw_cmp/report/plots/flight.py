@@ -8,14 +8,15 @@ from functools import partial
 
 import numpy as np
 
-from ..compare.result import RankResult, RssResult
-from . import rank_figures, rss_figures
-from .against_figures import against_specs
-from .canvas import POINTS_PER_CLOUD, FigureSpec
-from .data import ReportData, Track
-from .names import safe_name
-from .serving_figures import serving_spec
-from .words import count, learned_on
+from ...compare.result import RankResult, RssResult
+from ..canvas import POINTS_PER_CLOUD, FigureSpec
+from ..data import ReportData, Track
+from ..names import safe_name
+from ..words import count, learned_on
+from . import rank as rank_figures
+from . import rss as rss_figures
+from .against import against_specs
+from .serving import serving_spec
 
 
 def figure_specs(data: ReportData) -> list[FigureSpec]:

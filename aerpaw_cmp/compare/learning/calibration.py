@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..common.errors import InputError
-from ..common.units import BoolArray, FloatArray, IntArray, spread_out
-from .detection import floored_fit
-from .direction_gain import GainFit, GainModel, LinkSamples, Term, chosen_fit, fit_gain
-from .ladder import log_distance_level_db
-from .mount import GainOf, MountFit, fit_mounts
-from .result import BASELINE_TITLE
-from .rss import local_mean_db
-from .spread import Spread, StatedSpread, fading_of, inside_shares
+from ...common.errors import InputError
+from ...common.units import BoolArray, FloatArray, IntArray, spread_out
+from ..detection import floored_fit
+from ..direction_gain import GainFit, GainModel, LinkSamples, Term, chosen_fit, fit_gain
+from ..ladder import log_distance_level_db
+from ..mount import GainOf, MountFit, fit_mounts
+from ..result import BASELINE_TITLE
+from ..rss import local_mean_db
+from ..spread import Spread, StatedSpread, fading_of, inside_shares
 
 SECTORS = 6
 GUARD_DEG = 10.0

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from ..common.units import FloatArray, spread_out
-from ..site.scenes import drawn_buildings
-from ..site.site import Site
-from .canvas import RANK_HATCH, TOWER, FigureSpec, beyond, colour_bar, figure, plain_ticks, rank_colour
-from .data import RANKS
-from .maps_data import JOINT, Correlation, LearningCurve, MapError, MapLayer, MapsData, RankMap, RssMap
-from .names import k_key, safe_name
+from ...common.units import FloatArray, spread_out
+from ...site.scenes import drawn_buildings
+from ...site.site import Site
+from ..canvas import RANK_HATCH, TOWER, FigureSpec, beyond, colour_bar, figure, plain_ticks, rank_colour
+from ..data import RANKS
+from ..names import k_key, safe_name
+from .data import JOINT, Correlation, LearningCurve, MapError, MapLayer, MapsData, RankMap, RssMap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..common.errors import InputError
-from ..common.units import FloatArray, IntArray
+from ...common.errors import InputError
+from ...common.units import FloatArray, IntArray
+from ..direction_gain import LinkSamples
+from ..entries import crps_normal
+from ..statistics import mean_interval
 from .calibration import MOST_GROUPS, groups_of
-from .direction_gain import LinkSamples
-from .entries import crps_normal
 from .field_gp import NEW_FLIGHT, PARTS, FieldFit, FieldModel, Part, Rows, fit_field
-from .statistics import mean_interval
 
 Predictor = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
 """Level above free space (n,) and its standard deviation (n,) [dB] of samples whose residual is not used."""

@@ -1,0 +1,1 @@
+"""Antennas, residual fields and the next flight learned from flights: pure functions of arrays."""

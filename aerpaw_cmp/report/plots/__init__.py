@@ -1,0 +1,1 @@
+"""Figures of a flight's report, a module per kind."""

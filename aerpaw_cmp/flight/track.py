@@ -50,6 +50,8 @@ class TrackAccount:
     no_time, duplicate_time, backward_time, bad_position : int
         Rows not used for position: no time stamp; the stamp of the row before; a stamp earlier than one before it
         (or, where fewer rows are lost that way, later than one after it); NaN, -999 or impossible coordinates.
+    steps_sorted : int
+        Steps back in time of a shuffled file, whose rows were sorted: the path is shorter in order of time.
     unknown_attitude : int
         Used rows without attitude (NaN, or exactly 0, 0, 0: written by converters for "unknown").
     gaps : int
@@ -69,12 +71,14 @@ class TrackAccount:
     gaps: int
     longest_gap_s: float
     hour_steps: int = 0
+    steps_sorted: int = 0
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings for the user, one sentence each."""
         reasons = (
             (self.hour_steps, "step(s) of whole hours between telemetry rows: daylight-saving change or a reset clock"),
+            (self.steps_sorted, "step(s) back in time between telemetry rows: all rows were sorted by time"),
             (self.backward_time, "telemetry row(s) out of time order were left out"),
             (self.duplicate_time, "telemetry row(s) repeat the time stamp before them and were left out"),
             (self.no_time, "telemetry row(s) without a time stamp were left out"),
@@ -189,6 +193,23 @@ def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
     return keep, int(repeated.sum()), int((~ordered).sum())
 
 
+def _order(stamp: AnyArray, position: FloatArray) -> AnyArray | None:
+    """Row order by time where stamps tell the truth and the file is shuffled; None where rows stay as written.
+
+    A clock that stepped leaves the rows in the order that was flown: sorting them would mix two parts of the flight,
+    and the path would grow. A file that was sorted by another column, or put together of parts, has the longer path.
+    """
+    if not len(stamp) or bool((np.diff(stamp) >= 0).all()):
+        return None
+    order = np.argsort(stamp, kind="stable")
+
+    def length_m(path: FloatArray) -> float:
+        return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+
+    written = length_m(position)  # of a file in reverse order the path is as long, but for rounding
+    return order if length_m(position[order]) <= written * (1 + 1e-9) else None
+
+
 def _hour_steps(stamp: AnyArray) -> int:
     """Steps between rows that are whole hours, forward or back, give or take five seconds."""
     step = np.diff(stamp) * 1e-9
@@ -254,14 +275,20 @@ class Track:
         timed = stamp != NO_TIME
         placed = timed & good_positions(latitude, longitude, altitude)
         rows = np.flatnonzero(placed)
-        forward, duplicates, backward = _forward_rows(stamp[rows])
-        rows = rows[forward]
+        east, north = self.frame.to_local(latitude[rows], longitude[rows])
+        position = np.column_stack([east, north, altitude[rows] + self.ground_m])
+        order = _order(stamp[rows], position)
+        moved = 0 if order is None else int((np.diff(stamp[rows]) < 0).sum())
+        if order is not None:
+            rows, position = rows[order], position[order]
+        in_order = stamp[rows]
+        forward, duplicates, backward = _forward_rows(in_order)
+        rows, position = rows[forward], position[forward]
 
         self.start_ns = int(stamp[rows[0]]) if len(rows) else 0
         self.end_ns = int(stamp[rows[-1]]) if len(rows) else 0
         self._time_s = (stamp[rows] - self.start_ns) * 1e-9
-        east, north = self.frame.to_local(latitude[rows], longitude[rows])
-        self._position = np.column_stack([east, north, altitude[rows] + self.ground_m])
+        self._position = position
         velocity = [column("velocity_east_mps"), column("velocity_north_mps"), -column("velocity_down_mps")]
         self._velocity = _velocities(self._time_s, self._position, np.column_stack(velocity)[rows])
         self._course_deg = _courses(self._velocity)
@@ -278,7 +305,8 @@ class Track:
             unknown_attitude=int((~known).sum()),
             gaps=int((interval > self.maximum_gap_s).sum()),
             longest_gap_s=float(interval.max()) if len(interval) else 0.0,
-            hour_steps=_hour_steps(stamp[timed]),
+            hour_steps=_hour_steps(stamp[timed] if order is None else in_order),
+            steps_sorted=moved,
         )
 
     def __len__(self) -> int:

@@ -126,8 +126,9 @@ def test_bad_positions_are_left_out_and_counted():
 def test_duplicate_and_backward_stamps():
     seconds = np.array([0, 1, 1, 2, 1.5, 3, 4])
     track = Track(telemetry(seconds, seconds, 0, 10, roll_deg=1, pitch_deg=0, yaw_deg=0), FRAME)
-    assert len(track) == 5
-    assert (track.account.duplicate_time, track.account.backward_time) == (1, 1)
+    assert len(track) == 6  # the row at 1.5 s was written late; its stamp agrees with its place
+    account = track.account
+    assert (account.duplicate_time, account.backward_time, account.steps_sorted) == (1, 0, 1)
     np.testing.assert_allclose(track.pose_at(at([2.5])).position_m[:, 0], [2.5], atol=1e-4)
     # one wild stamp in the future condemns itself, not the rows after it
     seconds = np.array([0, 1, 900, 2, 3, 4.0])
@@ -135,6 +136,28 @@ def test_duplicate_and_backward_stamps():
     assert len(track) == 5
     assert track.account.backward_time == 1
     assert track.end_ns - track.start_ns == 4_000_000_000
+
+
+@pytest.mark.parametrize(
+    "order", [np.random.default_rng(3).permutation(60), np.arange(60)[::-1], np.roll(np.arange(60), 25)]
+)
+def test_a_shuffled_log_is_the_log_in_order(order):
+    seconds = np.arange(60.0)
+    east = 40 * np.sin(seconds / 9)
+    ordered = telemetry(seconds, east, 3 * seconds, 10, roll_deg=1, pitch_deg=seconds / 10, yaw_deg=seconds)
+    one, two = Track(ordered, FRAME), Track(ordered.iloc[order].reset_index(drop=True), FRAME)
+    asked = at(np.arange(0, 59, 0.7))
+    np.testing.assert_array_equal(two.pose_at(asked).position_m, one.pose_at(asked).position_m)
+    np.testing.assert_array_equal(two.pose_at(asked).rotation, one.pose_at(asked).rotation)
+    assert (two.account.backward_time, one.account.steps_sorted) == (0, 0)
+    assert any("sorted by time" in text for text in two.account.warnings)
+
+
+def test_a_clock_set_back_in_flight_does_not_mix_its_parts():
+    seconds = np.arange(0, 100.0)
+    stepped = np.where(seconds >= 70, seconds - 30.5, seconds)
+    track = Track(telemetry(stepped, 3 * seconds, 0, 10, roll_deg=1, pitch_deg=0, yaw_deg=0), FRAME)
+    assert (track.account.steps_sorted, track.account.backward_time) == (0, 30)
 
 
 def test_a_daylight_saving_change_in_flight_is_named():

@@ -154,14 +154,14 @@ def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
     towers = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
     if len(poses) and len(towers) and np.isfinite(poses.position_m).all() and np.isfinite(poses.rotation).all():
         low, high = poses.position_m.min(axis=0), poses.position_m.max(axis=0)
-        if (np.maximum(np.abs(low - towers), np.abs(high - towers)) <= REACH_M).all(axis=1).any():
+        if (np.hypot.reduce(np.maximum(np.abs(low - towers), np.abs(high - towers)), axis=1) <= REACH_M).any():
             return poses, []  # the usual flight, decided by its box
     known = np.isfinite(poses.position_m).all(axis=1)
     turned = np.isfinite(poses.rotation).all(axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
         far = np.ones(len(poses), dtype=np.bool_)
         for place in towers:
-            far &= ~(np.abs(poses.position_m - place).max(axis=1) <= REACH_M)
+            far &= ~(np.hypot.reduce(poses.position_m - place, axis=1) <= REACH_M)
     far &= known
     bad = far | ~turned
     if not bad.any():

@@ -107,12 +107,3 @@ def test_nan_positions_are_left_out_not_fatal(run: Run) -> None:
     lines[7] = lines[7].replace("35.7274", "-999").replace("-78.69", "-999.69")
     code, err = run(vehicleOut="".join(lines))
     assert code == 0, err
-
-
-@pytest.mark.parametrize("command", ["report", "ingest", "simulate"])
-def test_missing_file_named(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = main([command, str(tmp_path / "nothing.yaml")])
-    err = capsys.readouterr().err
-    assert code in (2, 3)
-    assert "nothing.yaml" in err
-    assert "Traceback" not in err

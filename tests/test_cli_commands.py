@@ -41,11 +41,6 @@ def test_ingest_takes_the_sample_folder(tmp_path: Path, capsys: pytest.CaptureFi
     assert "rejected" in table
 
 
-def test_ingest_without_a_zone_names_the_option(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["ingest", str(SAMPLE / "LW1")]) == 2
-    assert "timezone" in capsys.readouterr().err
-
-
 def test_formats_shows_every_reader(capsys: pytest.CaptureFixture[str]) -> None:
     from aerpaw_cmp.logs.readers import catalogue
 
@@ -108,13 +103,6 @@ def test_site_show_takes_the_flights_own_site(tmp_path: Path, capsys: pytest.Cap
 
 def polygon(ring: list[list[float]]) -> dict[str, object]:
     return {"type": "Polygon", "coordinates": [ring]}
-
-
-def test_usage_errors_are_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in (["report"], ["report", "x.yaml", "--engine", "magic"], ["tap", "--export", "xml"], ["site"]):
-        capsys.readouterr()
-        assert main(arguments) in (2, 3), arguments
-        assert "Traceback" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", [["report", SAMPLE / "flight.yaml", "--audit", "none"], ["site", "show"]])

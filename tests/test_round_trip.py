@@ -11,7 +11,7 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.result import RssResult
-from aerpaw_cmp.flight.data import gather, read_logs
+from aerpaw_cmp.flight.data import gather, load_data, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.report.build import report_data
@@ -40,8 +40,7 @@ def round_trip(folder: Path, **plan: object) -> dict[str, dict[str, RssResult]]:
     """Simulate through the command line, read the files back, compare; results by tower and channel."""
     path = flight(folder, **plan)
     simulate(path)
-    settings = load_flight(path)
-    data = gather(settings, folder, read_logs(settings, folder))
+    data = load_data(load_flight(path), folder)
     results: dict[str, dict[str, RssResult]] = {}
     for one in run_flight(data, audit=False).result.rss:
         results.setdefault(one.tower, {})[one.channel] = one

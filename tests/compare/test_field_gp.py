@@ -68,15 +68,6 @@ def test_two_points_are_ordinary_kriging_in_closed_form():
     assert sd[0] == pytest.approx(math.sqrt(error), rel=2e-3)
 
 
-def test_copies_of_a_sample_average_their_noise_alone():
-    model = dataclasses.replace(STILL, noise_sd_db=2.0)
-    once = dataclasses.replace(model, noise_sd_db=1.0)
-    target = rows_at([[15, 0, 10]], flight=-1)
-    four = FieldFit(model, rows_at([[0, 0, 10]] * 4), np.array([1.0, 2.0, 3.0, 6.0])).predict(target, ("place",))
-    one = FieldFit(once, rows_at([[0, 0, 10]]), np.array([3.0])).predict(target, ("place",))
-    np.testing.assert_allclose(np.ravel(four), np.ravel(one), atol=1e-8)
-
-
 @pytest.mark.parametrize("exact", [True, False])
 def test_far_away_the_prior_is_left(exact):
     rows = flights(np.random.default_rng(1))

@@ -38,16 +38,6 @@ def test_constant_forecast_gains_nothing_and_has_no_kappa():
     assert score.total_variation_expected == pytest.approx(score.constant_total_variation)
 
 
-def test_perfect_forecast():
-    rank = ranks()
-    score = score_forecast(rank, one_hot(rank), rank, constant_forecast(rank))
-    assert score.kappa == pytest.approx(1.0)
-    assert score.log_score == pytest.approx(0.0, abs=1e-9)
-    assert score.brier_score == 0.0
-    assert score.total_variation_expected == 0.0
-    assert score.log_score_difference_ci95[1] < 0.0
-
-
 def test_samples_without_report_or_forecast_take_no_part():
     rank = np.array([1.0, 2.0, np.nan, 2.0, 3.0] * 10)
     p = np.tile([0.25] * 4, (50, 1))

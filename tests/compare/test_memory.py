@@ -148,18 +148,6 @@ def test_draws_follow_unit_and_zero_and_do_not_know_the_direction_of_time() -> N
     assert not memory.power_draws(np.full(30, 2.0)).any()
 
 
-def test_draws_of_white_noise_have_the_spread_of_textbooks() -> None:
-    """Mean: sigma / sqrt(n); power: sigma^2 sqrt(2 / n); memories that explain no sample hardly widen them."""
-    rng, n = np.random.default_rng(4), 400
-    mean, power = [], []
-    for _ in range(40):
-        values = rng.normal(0.0, 2.0, n)
-        mean.append(np.diff(np.quantile(mean_draws(values), [0.25, 0.75]))[0] / 1.349)
-        power.append(np.diff(np.quantile(memory.power_draws(values), [0.25, 0.75]))[0] / 1.349)
-    assert np.median(mean) == pytest.approx(2.0 / np.sqrt(n), rel=0.5)
-    assert np.median(power) == pytest.approx(4.0 * np.sqrt(2.0 / n), rel=0.5)
-
-
 @pytest.mark.parametrize(("share", "widened"), [(0.99, False), (1.01, True)])
 def test_only_tails_beyond_chance_widen_the_power(share: float, widened: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """The excess kurtosis of n normal samples has a standard error of sqrt(24 / n): only beyond it the last draw counts."""

@@ -132,14 +132,6 @@ def test_regression_equals_the_one_of_scikit_learn():
     np.testing.assert_allclose(found.probabilities(x), other.predict_proba(z), atol=2e-4)
 
 
-def test_a_batch_of_features_equals_one_after_the_other():
-    x, rank, _, groups = planted(300)
-    both = np.stack([x, x[:, ::-1] * 2.0])
-    together = out_of_group(both, rank, groups, 3.0)
-    for i in (0, 1):
-        np.testing.assert_allclose(together[i], out_of_group(both[i], rank, groups, 3.0), atol=1e-6)
-
-
 def test_what_is_left_out_has_no_part_in_its_forecast():
     x, rank, _, groups = planted(400)
     changed = np.where(groups == 3, 5 - rank, rank)

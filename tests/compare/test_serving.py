@@ -49,11 +49,6 @@ def test_wrong_shapes_are_refused() -> None:
         compare_serving([2], [[1.0, 2.0]], ["a", "b"])
 
 
-def test_values_at_the_nearest_time() -> None:
-    assert at_times([0.4, 5.0, 9.9], [0.0, 1.0, 10.0], [1.0, 2.0, 3.0], within_s=1.0).tolist()[::2] == [1.0, 3.0]
-    assert np.isnan(at_times([5.0], [0.0, 10.0], [1.0, 2.0], within_s=1.0)).all()
-
-
 def test_the_value_nearest_in_time_is_that_of_a_search_through_all():
     rng = np.random.default_rng(8)
     for count in (1, 2, 3, 9):

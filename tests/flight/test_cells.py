@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.flight.data import gather, read_logs
+from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.draft import draft
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs.reporting.compare_flight import serving_of
@@ -63,8 +63,7 @@ def flight(folder: Path, cells: str) -> Path:
 
 
 def test_cells_go_to_the_towers_that_the_flight_file_names(phone: Path) -> None:
-    settings = load_flight(flight(phone, "cells: {1: LW1, 2: LW2}"))
-    data = gather(settings, phone, read_logs(settings, phone))
+    data = load_data(load_flight(flight(phone, "cells: {1: LW1, 2: LW2}")), phone)
     assert [(one.tower, one.channel) for one in data.rss] == [("LW1", "lte_pci1"), ("LW2", "lte_pci2")]
     assert any("1 cells that 'cells' does not name are left out" in text for text in data.warnings)
     first = data.rss[0].serving
@@ -84,8 +83,7 @@ def test_a_draft_asks_which_tower_has_which_cell(phone: Path) -> None:
 
 @pytest.mark.parametrize(("exchanged", "hits"), [(False, 1.0), (True, 0.0)])
 def test_serving_cells_are_compared_with_the_strongest_predicted(phone: Path, exchanged: bool, hits: float) -> None:
-    settings = load_flight(flight(phone, "cells: {1: LW1, 2: LW2}"))
-    data = gather(settings, phone, read_logs(settings, phone))
+    data = load_data(load_flight(flight(phone, "cells: {1: LW1, 2: LW2}")), phone)
     right = [np.where(np.arange(100) < 50, -60.0, -70.0), np.where(np.arange(100) < 50, -70.0, -60.0)]
     levels = right[::-1] if exchanged else right
     results = [SimpleNamespace(simulated_dbm=level) for level in levels]
@@ -97,8 +95,7 @@ def test_serving_cells_are_compared_with_the_strongest_predicted(phone: Path, ex
 
 def test_the_report_of_a_phone_shows_the_matrix_of_metrics_json(phone: Path) -> None:
     path = flight(phone, "cells: {1: LW1, 2: LW2}")
-    settings = load_flight(path)
-    found = run_flight(gather(settings, phone, read_logs(settings, phone)), audit=False)
+    found = run_flight(load_data(load_flight(path), phone), audit=False)
     record = report_data(found.data, found.result)
     assert record.serving is not None
     entry = metrics(record)["serving"]

@@ -13,7 +13,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.flight import data
-from aerpaw_cmp.flight.data import FlightData, choose_site, gather, read_logs
+from aerpaw_cmp.flight.data import FlightData, choose_site, gather, load_data, read_logs
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.flight.simulate import FlightSimulator
 from aerpaw_cmp.site.siteyaml import load_site
@@ -28,8 +28,7 @@ def _flight(folder: Path, *logs: str) -> FlightData:
         "flight: f\ntimezone: America/New_York\nlogs:\n"
         f"  - {{path: {next(SAMPLE.glob('UAV/*vehicleOut.txt'))}}}\n" + "".join(f"  - {{{log}}}\n" for log in logs)
     )
-    settings = load_flight(folder / "flight.yaml")
-    return gather(settings, folder, read_logs(settings, folder))
+    return load_data(load_flight(folder / "flight.yaml"), folder)
 
 
 def _halves(folder: Path, log: str) -> list[str]:
@@ -102,8 +101,7 @@ def test_names_in_the_flight_file_that_fit_nothing_are_told(tmp_path: Path) -> N
     assert "nothing is skipped by qualty: its streams are power" in warning
     text = (tmp_path / "flight.yaml").read_text().replace(", skip: [qualty]", "")
     (tmp_path / "flight.yaml").write_text(text + "link: {channels: {USRP1: {carrier_hz: 3.3e9}}}\n")
-    settings = load_flight(tmp_path / "flight.yaml")
-    (warning,) = gather(settings, tmp_path, read_logs(settings, tmp_path)).warnings
+    (warning,) = load_data(load_flight(tmp_path / "flight.yaml"), tmp_path).warnings
     assert "link.channels names USRP1: no log is of such a channel" in warning
 
 
@@ -155,8 +153,7 @@ def test_levels_without_positions_do_not_refuse_ranks_that_have_some(tmp_path: P
     (tmp_path / "flight.yaml").write_text(
         "flight: ranks\nsite: lake_wheeler\ntimezone: UTC\nlogs: [{path: nemo.csv, node: LW1}]\n"
     )
-    settings = load_flight(tmp_path / "flight.yaml")
-    data = gather(settings, tmp_path, read_logs(settings, tmp_path))
+    data = load_data(load_flight(tmp_path / "flight.yaml"), tmp_path)
     assert [(s.tower, len(s.time)) for s in data.rank] == [("LW1", 40)]
     assert not data.rss
     assert any("have no positions and are left out" in text for text in data.warnings)

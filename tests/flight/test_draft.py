@@ -16,7 +16,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight import draft as drafting
-from aerpaw_cmp.flight.data import gather, read_logs
+from aerpaw_cmp.flight.data import load_data, read_logs
 from aerpaw_cmp.flight.draft import draft, receiver_floor_db
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.logs import ingest as ingest_module
@@ -58,7 +58,7 @@ def test_the_draft_of_the_sample_logs_is_a_flight(logs: Path) -> None:
     asked = [remark for remark in remarks if "which tower?" in remark]
     assert len(asked) == 1  # the modem on the UAV cannot know
     assert "modem_ri.csv" in asked[0]
-    data = gather(settings, target.parent, read_logs(settings, target.parent))
+    data = load_data(settings, target.parent)
     assert (len(data.rss), len(data.rank)) == (10, 1)
 
 
@@ -95,7 +95,7 @@ def test_a_radio_clock_in_utc_is_asked_about_and_compared(logs: Path) -> None:
     assert "later_power_log.txt: LW3/USRP1_power_log.txt has" in other
     assert any("samples can be compared" in remark for remark in remarks)
     settings = parse_yaml(text, FlightFile)
-    data = gather(settings, logs, read_logs(settings, logs))
+    data = load_data(settings, logs)
     one, other = (next(s for s in data.rss if (s.tower, s.channel) == ("LW1", c)) for c in ("USRP1", "USRP2"))
     assert abs(one.time[0] - other.time[0]) < np.timedelta64(2, "s")
 
@@ -113,8 +113,7 @@ def test_what_a_draft_names_is_read_whatever_it_is_called(logs: Path) -> None:
     text, remarks = draft(ingest(logs, options=OPTIONS), target.parent, timezone=ZONE)
     target.write_text(text, encoding="utf-8")
     assert not any("\n" in remark or "\r" in remark for remark in remarks)
-    settings = load_flight(target)
-    data = gather(settings, target.parent, read_logs(settings, target.parent))
+    data = load_data(load_flight(target), target.parent)
     assert {s.channel for s in data.rss} >= {f"USRP{10 + i}" for i in range(len(names))}
 
 
@@ -151,8 +150,7 @@ def test_one_record_of_each_channel_and_rank(logs: Path) -> None:
     assert any("has USRP1 of that tower and time already" in r for r in left)
     assert any("z_vehicleOut.txt: the track is that of other telemetry" in r for r in left)
     (logs / "flight.yaml").write_text(text)
-    settings = load_flight(logs / "flight.yaml")
-    data = gather(settings, logs, read_logs(settings, logs))
+    data = load_data(load_flight(logs / "flight.yaml"), logs)
     assert (len(data.rss), len(data.rank)) == (10, 1)
 
 
@@ -233,7 +231,7 @@ def test_a_draft_says_how_many_samples_it_compares(logs: Path) -> None:
     text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
     (counted,) = (remark for remark in remarks if remark.endswith("can be compared"))
     settings = parse_yaml(text, FlightFile)
-    data = gather(settings, logs, read_logs(settings, logs))
+    data = load_data(settings, logs)
     low = settings.rss.minimum_height_m or 0.0
     by_hand = 0
     for series in [*data.rss, *data.rank]:

@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.flight import time_origin
-from aerpaw_cmp.flight.data import gather, read_logs
+from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.draft import drafts
 from aerpaw_cmp.flight.grouping import flights
 from aerpaw_cmp.flight.settings import load_flight
@@ -102,8 +102,7 @@ def test_phones_that_know_no_date_are_a_flight_each(tmp_path: Path) -> None:
     named = [[log.path for log in load_flight(draft).logs] for draft in drafts]
     assert sorted(named) == [["logs/120m.csv"], ["logs/60m.csv"]]
     for draft in drafts:
-        settings = load_flight(draft)
-        data = gather(settings, tmp_path, read_logs(settings, tmp_path))
+        data = load_data(load_flight(draft), tmp_path)
         assert data.track is not None
         assert len(data.rss) == 1
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError, UsageError
-from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.draft import draft
 from aerpaw_cmp.flight.heights import height_in_name
 from aerpaw_cmp.flight.settings import load_flight
@@ -32,8 +32,7 @@ def flight(folder: Path, keys: str, more: str = "") -> FlightData:
         f"flight: phone\nsite: lake_wheeler\ntimezone: {ZONE}\n{more}logs:\n  - {{path: phone.csv, node: LW1{keys}}}\n"
         "link:\n  rss: {carrier_hz: 3.4e9, transmit_power_dbm: 40}\n"
     )
-    settings = load_flight(path)
-    return gather(settings, folder, read_logs(settings, folder))
+    return load_data(load_flight(path), folder)
 
 
 def test_a_track_at_the_given_height_is_that_of_a_log_that_tells_it(tmp_path: Path) -> None:

@@ -15,60 +15,17 @@ from aerpaw_cmp.compare.learning.calibration import BASELINES, SPLITS, mean_rmse
 from aerpaw_cmp.jobs.learning.calibrate import load_calibration, observe, read_flights, recipe_of
 from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
-from tests.jobs.calibrated import calibrated
+from tests.jobs.calibrated import YAW_DEG, calibrated, past_sector_antenna, settings
 from tests.json_page import unlisted
-from tests.simulated import simulate
+from tests.simulated import write_yaml
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
-
-ROUTES = {
-    "first": [(-60, 10, 30), (-250, 60, 30), (-100, 260, 40), (160, 160, 40), (200, -150, 30), (-180, -160, 30)],
-    "second": [(60, 30, 45), (-200, 160, 45), (-220, -90, 35), (20, -220, 35), (240, 20, 45), (60, 240, 45)],
-    "aside": [(-90, -60, 38), (-240, 20, 38), (-120, 200, 42), (100, 240, 42), (230, -60, 38), (-60, -230, 38)],
-}
-OFFSET_DB = {"first": 12.0, "second": 9.0, "aside": 4.0}
-YAW_DEG = 110.0
-
-
-def settings(name: str, antenna: dict, yaw_deg: float = 0.0, *, channel: str = "USRP1", **rest) -> dict:
-    corners = [{"east_m": e, "north_m": n, "height_m": h} for e, n, h in ROUTES[name]]
-    link = {"carrier_hz": 3.3e9, "tower": {"antenna": antenna, "yaw_deg": yaw_deg}}
-    return {
-        "flight": {
-            "name": name, "synthetic": True,
-            "plan": {
-                "start": "2025-06-01T10:00:00", "seed": len(name), "speed_mps": 8.0, "rss_interval_s": 0.5,
-                "fading_db": 1.0, "fading_correlation_s": 0.5, "waypoints": corners,
-                "offsets_db": {"LW1": {channel: OFFSET_DB[name]}},
-            },
-        },
-        "site": {"file": "lake_wheeler", "without_buildings": True},
-        "timezone": "America/New_York",
-        "logs": [
-            {"path": f"{name}/vehicle.txt", "reader": "vehicle_out"},
-            {"path": f"{name}/{channel}.txt", "reader": "sounder_log", "node": "LW1", "channel": channel},
-        ],
-        "link": {"rss": link},
-        "rt": {"max_depth": 0, "attitude": "logged", "audit_links": 0},
-        "rss": {"lag": "off", "minimum_height_m": 20},
-        } | rest  # fmt: skip
-
-
-def write(path: Path, content: dict) -> Path:
-    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    return path
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three flights past a sector antenna that their flight files do not know."""
-    place = tmp_path_factory.mktemp("calibrate")
-    for name in ROUTES:
-        path = write(place / f"{name}.yaml", settings(name, {"model": "tr38901"}, YAW_DEG))
-        simulate(path)
-        write(path, settings(name, {"model": "iso"}))
-    write(place / "calibration.yaml", {"calibration": "planted", "flights": ["first.yaml", "second.yaml"]})
-    write(place / "aside_calibration.yaml", {"calibration": "aside", "flights": ["aside.yaml"]})
+    place = past_sector_antenna(tmp_path_factory.mktemp("calibrate"))
+    write_yaml(place / "aside_calibration.yaml", {"calibration": "aside", "flights": ["aside.yaml"]})
     return place
 
 
@@ -132,7 +89,7 @@ def test_the_sphere_as_netcdf_is_that_of_the_csv(folder: Path, metrics: dict, cf
 def test_a_flight_kept_aside_replays_with_the_learned_antennas(folder: Path, metrics: dict) -> None:
     del metrics
     learned = yaml.safe_load((folder / "calibrated.yaml").read_text())
-    path = write(folder / "aside_learned.yaml", settings("aside", {"model": "iso"}, link=learned["link"]))
+    path = write_yaml(folder / "aside_learned.yaml", settings("aside", {"model": "iso"}, link=learned["link"]))
     rmse = {}
     for name, file in (("iso", folder / "aside.yaml"), ("learned", path)):
         out = folder / f"report_{name}"
@@ -171,7 +128,7 @@ def test_a_report_has_the_level_of_the_fit_itself(folder: Path, metrics: dict) -
 
 
 def refusal(folder: Path, capsys: pytest.CaptureFixture[str], content: dict, code: int = 2) -> str:
-    path = write(folder / "bad.yaml", content)
+    path = write_yaml(folder / "bad.yaml", content)
     assert main(["calibrate", str(path), "-o", str(folder / "bad_out.yaml")]) == code
     text = capsys.readouterr().err
     assert "Traceback" not in text
@@ -185,17 +142,17 @@ def test_bad_input_is_one_message(folder: Path, capsys: pytest.CaptureFixture[st
     assert "named twice" in refusal(folder, capsys, base | {"flights": ["first.yaml", "first.yaml"]})
     other = settings("second", {"model": "iso"})
     other["logs"][1]["channel"] = "USRP2"
-    write(folder / "other.yaml", other)
+    write_yaml(folder / "other.yaml", other)
     assert "share no tower and channel" in refusal(folder, capsys, base | {"flights": ["first.yaml", "other.yaml"]})
     high = settings("second", {"model": "iso"})
     high["link"]["rss"]["carrier_hz"] = 3.7e9
-    write(folder / "high.yaml", high)
+    write_yaml(folder / "high.yaml", high)
     assert "3.3 and 3.7 GHz" in refusal(folder, capsys, base | {"flights": ["first.yaml", "high.yaml"]})
     assert "gone.yaml" in refusal(folder, capsys, base | {"flights": ["first.yaml", "gone.yaml"]}, 3)
 
 
 def test_one_flight_is_learned_and_not_scored(folder: Path) -> None:
-    path = write(folder / "single.yaml", {"calibration": "single", "flights": ["first.yaml"]})
+    path = write_yaml(folder / "single.yaml", {"calibration": "single", "flights": ["first.yaml"]})
     found, _ = calibrated(path)
     assert found.learned.fit is not None
     assert not any(found.scores.values())
@@ -215,7 +172,7 @@ def test_dataset12_each_way(tmp_path: Path) -> None:
     flights = [str(Path(__file__).parents[1] / "field" / f"dataset12_{h}m.yaml") for h in (40, 70)]
     grid = {"model": "gain_grid", "file": "antennas/rad_pat.mat"}
     patterns = {"uav": grid | {"variable": "SA3300"}, "tower": grid | {"variable": "RMWB3300_normal"}}
-    path = write(tmp_path / "c.yaml", {"calibration": "d12", "flights": flights, "patterns": patterns})
+    path = write_yaml(tmp_path / "c.yaml", {"calibration": "d12", "flights": flights, "patterns": patterns})
     found = load_calibration(path)
     flown, _ = read_flights(found, tmp_path, Path(ROOT))
     observed, _ = observe(flown)

@@ -24,7 +24,7 @@ from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets,
 from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 from tests.json_page import unlisted
-from tests.simulated import simulate
+from tests.simulated import planned, simulate, write_yaml
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -36,37 +36,14 @@ START_POSIX_S = 1_748_786_400
 YAW = "link.rss.tower.yaw_deg"
 
 
+CORNERS = [(-40, 10, 30), (-250, 60, 30), (-100, 260, 40), (120, 120, 40), (60, -150, 30)]
+
+
 def flight_settings(name: str, seed: int, yaw_deg: float) -> dict[str, Any]:
-    corners = [(-40, 10, 30), (-250, 60, 30), (-100, 260, 40), (120, 120, 40), (60, -150, 30)]
-    waypoints = [{"east_m": e, "north_m": n, "height_m": h} for e, n, h in corners]
-    return {
-        "flight": {
-            "name": name,
-            "synthetic": True,
-            "plan": {
-                "start": "2025-06-01T10:00:00",
-                "seed": seed,
-                "speed_mps": 10.0,
-                "rss_interval_s": 0.5,
-                "fading_db": FADING_DB,
-                "fading_correlation_s": 0.5,
-                "waypoints": waypoints,
-                "offsets_db": {"LW1": {"USRP1": OFFSETS_DB[name], "USRP2": OFFSETS_DB[name] - 1.0}},
-            },
-        },
-        "site": {"file": "lake_wheeler", "without_buildings": True},
-        "timezone": "America/New_York",
-        "logs": [
-            {"path": f"{name}/vehicle.txt", "reader": "vehicle_out"},
-            *(
-                {"path": f"{name}/{c}.txt", "reader": "sounder_log", "node": "LW1", "channel": c}
-                for c in ("USRP1", "USRP2")
-            ),
-        ],
-        "link": {"rss": {"carrier_hz": 3.3e9, "tower": {"antenna": {"model": "tr38901"}, "yaw_deg": yaw_deg}}},
-        "rt": {"max_depth": 1},
-        "rss": {"lag": "off"},
-    }
+    offsets = {"USRP1": OFFSETS_DB[name], "USRP2": OFFSETS_DB[name] - 1.0}
+    plan = {"seed": seed, "rss_interval_s": 0.5, "fading_db": FADING_DB, "fading_correlation_s": 0.5}
+    link = {"rss": {"carrier_hz": 3.3e9, "tower": {"antenna": {"model": "tr38901"}, "yaw_deg": yaw_deg}}}
+    return planned(name, CORNERS, {"LW1": offsets}, plan=plan, link=link, rt={"max_depth": 1})
 
 
 @pytest.fixture(scope="module")
@@ -74,18 +51,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two simulated flights over one route; their flight files then say a wrong azimuth of the tower."""
     place = tmp_path_factory.mktemp("campaign")
     for seed, name in enumerate(OFFSETS_DB, start=1):
-        path = place / f"{name}.yaml"
-        path.write_text(yaml.safe_dump(flight_settings(name, seed, YAW_DEG)), encoding="utf-8")
-        simulate(path)
-        path.write_text(yaml.safe_dump(flight_settings(name, seed, 0.0)), encoding="utf-8")
+        simulate(write_yaml(place / f"{name}.yaml", flight_settings(name, seed, YAW_DEG)))
+        write_yaml(place / f"{name}.yaml", flight_settings(name, seed, 0.0))
     return place
 
 
 def write_campaign(folder: Path, name: str, **keys: Any) -> Path:
-    path = folder / f"{name}.yaml"
-    entries = {"campaign": name, "flights": ["first.yaml", "second.yaml"], **keys}
-    path.write_text(yaml.safe_dump(entries, sort_keys=False), encoding="utf-8")
-    return path
+    return write_yaml(folder / f"{name}.yaml", {"campaign": name, "flights": ["first.yaml", "second.yaml"], **keys})
 
 
 def result(folder: Path, name: str, *arguments: str, code: int = 0, **keys: Any) -> dict[str, Any]:
@@ -102,15 +74,11 @@ def whole(folder: Path) -> dict[str, Any]:
     broken = flight_settings("first", 1, 0.0)
     broken["flight"] = {"name": "broken"}
     broken["logs"][1]["path"] = "gone/<b>USRP1.txt"
-    (folder / "broken.yaml").write_text(yaml.safe_dump(broken), encoding="utf-8")
+    write_yaml(folder / "broken.yaml", broken)
     return result(
-        folder,
-        "whole",
-        flights=["first.yaml", "second.yaml", "broken.yaml", "missing.yaml"],
-        settings={"as written": {}, "right azimuth": {YAW: YAW_DEG}},
-        calibration="channel",
-        export=["geojson", "kmz"],
-    )
+        folder, "whole", flights=["first.yaml", "second.yaml", "broken.yaml", "missing.yaml"],
+        settings={"as written": {}, "right azimuth": {YAW: YAW_DEG}}, calibration="channel", export=["geojson", "kmz"],
+    )  # fmt: skip
 
 
 def test_the_samples_of_all_flights_are_exported(whole: dict[str, Any], folder: Path) -> None:
@@ -215,8 +183,7 @@ def test_a_lag_estimated_on_the_scored_samples_is_told(folder: Path) -> None:
         settings = flight_settings(name, 1, YAW_DEG)
         settings["rss"]["lag"] = "apply"
         settings["flight"]["plan"]["clock_shift_s"] = {"LW1": 1.5}
-        (folder / f"apply_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
-        simulate(folder / f"apply_{name}.yaml", folder / "applied")
+        simulate(write_yaml(folder / f"apply_{name}.yaml", settings), folder / "applied")
     flights = ["apply_first.yaml", "apply_second.yaml"]
     campaign = load_campaign(write_campaign(folder, "apply", flights=flights))
     data = run(campaign, folder, RunOptions(logs_root=folder / "applied"))
@@ -398,13 +365,8 @@ def test_places_are_square_cells_with_mean_residuals() -> None:
 
 
 def test_flights_without_a_sample_that_counts_give_no_number_and_end_nothing(folder: Path) -> None:
-    found = result(
-        folder,
-        "too_low",
-        "--strict",
-        settings={"as written": {}, "high": {"rss.minimum_height_m": 500}},
-        calibration="all",
-    )
+    settings = {"as written": {}, "high": {"rss.minimum_height_m": 500}}
+    found = result(folder, "too_low", "--strict", settings=settings, calibration="all")
     rows = [r for r in found["rss"] if r["setting"] == "high"]
     assert [(r["n"], r["offset_db"], r["pooled_rmse_db"]) for r in rows] == [(0, None, None)] * 4
     assert found["mean_rmse_db"]["high"] == {"first": None, "second": None}
@@ -420,8 +382,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
         track = {**settings["logs"][0], "path": f"rank_{name}/vehicleOut.txt"}  # not over that of the other tests
         settings["logs"] = [track, {"path": f"{name}/ri.csv", "reader": "quectel_ri", "node": "LW1"}]
         settings["rank"] = {"k": [10, 100], "advanced": {"bootstrap": 20}}
-        (folder / f"rank_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
-        simulate(folder / f"rank_{name}.yaml")
+        simulate(write_yaml(folder / f"rank_{name}.yaml", settings))
     found = result(folder, "ranks", "--export", "geojson", flights=["rank_first.yaml", "rank_second.yaml"])
     points = json.loads((folder / "ranks_out" / "exports" / "rank.geojson").read_text(encoding="utf-8"))["features"]
     for row in found["rank"]:
@@ -455,7 +416,7 @@ def real(name: str, folder: Path, **changes: Any) -> dict[str, Any]:
         entries.setdefault(key, {}).update(value)
     for setting in entries["settings"].values():
         setting["rss.lag"] = "off"  # tests/test_field.py estimates the lags of these flights
-    (folder / "campaign.yaml").write_text(yaml.safe_dump(entries, sort_keys=False), encoding="utf-8")
+    write_yaml(folder / "campaign.yaml", entries)
     out = folder / "out"
     assert main(["campaign", str(folder / "campaign.yaml"), "-o", str(out), "--logs-root", FIELD, "--strict"]) == 0
     found: dict[str, Any] = json.loads((out / "campaign.json").read_text(encoding="utf-8"))
@@ -514,7 +475,7 @@ def test_a_failed_task_leaves_its_traceback_in_a_file(folder: Path) -> None:
     broken = flight_settings("first", 1, 0.0)
     broken["flight"] = {"name": "broken2"}
     broken["logs"][1]["path"] = "gone.txt"
-    (folder / "broken2.yaml").write_text(yaml.safe_dump(broken), encoding="utf-8")
+    write_yaml(folder / "broken2.yaml", broken)
     found = result(folder, "traced", flights=["broken2.yaml"], code=3)
     assert "traceback" not in found["failures"][0]
     text = (folder / "traced_out" / "failures" / "broken2__as_written.txt").read_text(encoding="utf-8")

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import noise_floor_dbm
 from aerpaw_cmp.compare.result import RssResult
-from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.replay import replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.audit_flight import audit_replays
@@ -24,65 +25,34 @@ from aerpaw_cmp.jobs.reporting.foliage_notes import foliage_notes
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft
 from aerpaw_cmp.report.build import rank_warnings, rss_warnings, track_of
 from aerpaw_cmp.report.words import instants
+from tests.simulated import write_yaml
+from tests.tables import LW1, ORIGIN, POSITIONS, eastwards, rank_log, rss_log, write_csv
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
-ORIGIN = "2025-06-01T14:00:00Z"
-LW1 = (35.72750947, -78.69595819)
 FLOOR_DB = -758.6  # what the sounder writes without a signal
-
-HEADER = """
-flight: hard
-site: {{file: lake_wheeler, without_buildings: true{site}}}
-timezone: America/New_York
-logs:
-  - {{path: track.csv, reader: generic_csv, kind: telemetry, time_origin: "{origin}",
-     columns: {{time: t, latitude_deg: lat, longitude_deg: lon, altitude_m: alt, roll_deg: roll, pitch_deg: pitch, yaw_deg: yaw}}}}
-{logs}
-rt: {{engine: image, max_depth: 1, audit_links: 0, attitude: logged{rt}}}
-rss: {{span_db: [-100, 100], lag: "off"{rss_keys}}}
-rank: {{advanced: {{bootstrap: 50}}}}
-{more}
-"""
-
-
-def write_csv(path: Path, names: str, *columns: Any) -> None:
-    rows = "\n".join(",".join(f"{v:.9g}" if np.isfinite(v) else "" for v in row) for row in zip(*columns, strict=True))
-    path.write_text(names + "\n" + rows + "\n", encoding="utf-8")
 
 
 def flight(
     folder: Path, seconds: int = 60, *, rss: dict[str, tuple[Any, Any]] | None = None,
-    rank: tuple[Any, Any] | None = None, **more: str,
+    rank: tuple[Any, Any] | None = None, rt: dict[str, Any] | None = None, rss_keys: dict[str, Any] | None = None,
+    **keys: Any,
 ) -> Path:  # fmt: skip
     """A flight eastwards past LW1 at 40 m; ``rss`` maps channels to (seconds, levels), ``rank`` is (seconds, RI)."""
     t = np.arange(0.0, seconds + 1.0)
-    lon = LW1[1] + (t - 10) * 5 / 90_000.0
-    still = np.zeros(len(t))
-    write_csv(folder / "track.csv", "t,lat,lon,alt,roll,pitch,yaw", t, still + LW1[0] + 5e-4, lon, still + 40.0,
-              still, still, still + 120.0)  # fmt: skip
-    logs = ""
-    for channel, (at, level) in (rss or {}).items():
-        write_csv(folder / f"{channel}.csv", "t,level", np.asarray(at, float), np.asarray(level, float))
-        logs += (
-            f"  - {{path: {channel}.csv, reader: generic_csv, kind: rss, node: LW1, channel: {channel}, "
-            f'time_origin: "{ORIGIN}", columns: {{time: t, rss_db: level}}}}\n'
-        )
-    if rank is not None:
-        write_csv(folder / "ri.csv", "t,ri", np.asarray(rank[0], float), np.asarray(rank[1], float))
-        logs += (
-            f'  - {{path: ri.csv, reader: generic_csv, kind: rank, node: LW1, ri_base: one, time_origin: "{ORIGIN}", '
-            "columns: {time: t, ri_raw: ri}}\n"
-        )
-    path = folder / "flight.yaml"
-    keys = {"site": "", "rt": "", "rss_keys": "", "more": "", **more}
-    path.write_text(HEADER.format(origin=ORIGIN, logs=logs, **keys), encoding="utf-8")
-    return path
+    logs = [eastwards(folder, t, 5.0 * (t - 10.0))]
+    logs += [rss_log(folder, channel, *series) for channel, series in (rss or {}).items()]
+    logs += [rank_log(folder, *rank)] if rank is not None else []
+    return write_yaml(folder / "flight.yaml", {
+        "flight": "hard", "site": {"file": "lake_wheeler", "without_buildings": True}, "timezone": "America/New_York",
+        "logs": logs, "rank": {"advanced": {"bootstrap": 50}},
+        "rt": {"engine": "image", "max_depth": 1, "audit_links": 0, "attitude": "logged", **(rt or {})},
+        "rss": {"span_db": [-100, 100], "lag": "off", **(rss_keys or {})}, **keys,
+    })  # fmt: skip
 
 
 def gathered(path: Path) -> FlightData:
-    settings = load_flight(path)
-    return gather(settings, path.parent, read_logs(settings, path.parent))
+    return load_data(load_flight(path), path.parent)
 
 
 def compared_rss(path: Path) -> list[RssResult]:
@@ -141,14 +111,6 @@ def test_one_wild_sample_is_flagged_kept_and_said_first(tmp_path: Path, capsys: 
     assert "1 outlying sample raises at LW1 USRP1 its RMSE" in page[: page.index("<main>")]
 
 
-def test_a_constant_series_has_an_offset_and_no_correlation(tmp_path: Path) -> None:
-    at = np.arange(0, 60, 0.5)
-    (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, np.full(len(at), -70.0))}))
-    assert one.score.n == len(at)
-    assert np.isnan(one.score.correlation)
-    assert one.score.rmse_db == pytest.approx(np.nanstd(one.simulated_dbm), abs=0.01)
-
-
 def test_duplicate_and_backward_stamps_give_the_numbers_of_the_sorted_log(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     at = np.round(np.arange(0, 60, 0.25), 3)
@@ -201,7 +163,7 @@ def test_too_low_samples_are_counted_apart(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.5)
     (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}))
     assert one.further.n_too_low == 0
-    (low,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}, rss_keys=", minimum_height_m: 50"))
+    (low,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}, rss_keys={"minimum_height_m": 50}))
     assert low.further.n_too_low == len(at)
     assert low.score.n == low.score.n_out_of_coverage == 0
 
@@ -258,7 +220,7 @@ def test_channels_without_common_instants_make_no_pair(tmp_path: Path) -> None:
 def test_opaque_crowns_reflect_in_the_flight(tmp_path: Path) -> None:
     at = np.arange(0, 120, 0.5)
 
-    def replayed(rt: str) -> tuple[Any, Any]:
+    def replayed(**rt: Any) -> tuple[Any, Any]:
         folder = tmp_path / f"case{len(list(tmp_path.iterdir()))}"
         folder.mkdir()
         path = flight(folder, 120, rss={"USRP1": (at, free_space_db(at))}, rt=rt)
@@ -271,9 +233,9 @@ def test_opaque_crowns_reflect_in_the_flight(tmp_path: Path) -> None:
         data = dataclasses.replace(data, site=dataclasses.replace(data.site, trees=wood))
         return data, replay_rss(data)[0]
 
-    bare_data, bare = replayed("")
-    data, found = replayed(", foliage: opaque")
-    off_data, off = replayed(", foliage: opaque, advanced: {crown_reflections: false}")
+    bare_data, bare = replayed()
+    data, found = replayed(foliage="opaque")
+    off_data, off = replayed(foliage="opaque", advanced={"crown_reflections": False})
     bounced = int(found.replay.paths.off_crown.sum())
     assert bounced > 20
     assert (found.replay.rss_dbm != off.replay.rss_dbm).any()
@@ -294,31 +256,28 @@ def test_the_report_says_where_foliage_models_are_stretched_or_assumed(tmp_path:
     at = np.arange(0, 10, 0.5)
     series = {"USRP1": (at, free_space_db(at))}
 
-    def notes(rt: str, *carriers_hz: float) -> str:
+    def notes(*carriers_hz: float, **rt: Any) -> str:
         data = gathered(flight(tmp_path, 20, rss=series, rt=rt))
         return " ".join(foliage_notes(len(data.site.trees), data.settings.rt, carriers_hz))
 
-    assert notes("", 3.4e9) == ""
-    assert notes(", foliage: opaque", 3.4e9) == ""
-    stretched = notes(", foliage: attenuating", 3.4e9)
+    attenuating = {"foliage": "attenuating"}
+    assert notes(3.4e9) == notes(3.4e9, foliage="opaque") == notes(2.0e9, **attenuating) == ""
+    assert notes(3.4e9, **attenuating, advanced={"gamma_db_per_m": 0.6, "maximum_loss_db": 40}) == ""
+    stretched = notes(3.4e9, **attenuating)
     assert "extrapolation of ITU-R P.833, whose table of woodland covers 105.9 to 2117.5 MHz" in stretched
     assert "gamma = 0.47 dB/m and A_m = 42 dB" in stretched
     assert "out of leaf" not in stretched
-    assert notes(", foliage: attenuating", 2.0e9) == ""
-    assert "Trees at 2.6 GHz" in notes(", foliage: attenuating", 2.0e9, 2.6e9)
-    assert notes(", foliage: attenuating, advanced: {gamma_db_per_m: 0.6, maximum_loss_db: 40}", 3.4e9) == ""
-    assert "divided by 1.2. That is an assumption" in notes(", foliage: attenuating, leaves: out", 2e9)
-    assert "the loss in leaf divided by 1.2" in notes(
-        ", foliage: attenuating, leaves: out, foliage_model: weissberger", 2e9
-    )
+    assert "Trees at 2.6 GHz" in notes(2.0e9, 2.6e9, **attenuating)
+    assert "divided by 1.2. That is an assumption" in notes(2e9, **attenuating, leaves="out")
+    weissberger = notes(2e9, **attenuating, leaves="out", foliage_model="weissberger")
+    assert "the loss in leaf divided by 1.2" in weissberger
 
 
 def test_angles_are_those_of_the_tilted_antenna(tmp_path: Path) -> None:
     """A tower antenna tilted by 90 degrees sees what is overhead at its horizon, and what is level overhead or below."""
     at = np.arange(0, 30, 0.5)
-    tilted = DIPOLES.replace("dipole}", "dipole}, pitch_deg: 90")
-    path = flight(tmp_path, 40, rss={"USRP1": (at, free_space_db(at))}, more=tilted)
-    data = gathered(path)
+    rss = {"USRP1": (at, free_space_db(at))}
+    data = gathered(flight(tmp_path, 40, rss=rss, link={"channels": {"USRP1": DIPOLES}}))
     (replayed,) = replay_rss(data)
     seen = compare_rss_series(data, data.rss[0], replayed).geometry
     mount = replayed.link.tower_arrays["LW1"].mount
@@ -330,14 +289,10 @@ def test_angles_are_those_of_the_tilted_antenna(tmp_path: Path) -> None:
     assert {"uav_azimuth_deg", "uav_elevation_deg"} <= set(seen)
 
 
-DIPOLES = """
-link:
-  channels:
-    USRP1:
-      carrier_hz: 3.3e9
-      tower: {antenna: {model: dipole}}
-      uav: {antenna: {model: tr38901}, yaw_deg: 270}
-"""
+DIPOLES = {
+    "carrier_hz": 3.3e9, "tower": {"antenna": {"model": "dipole"}, "pitch_deg": 90},
+    "uav": {"antenna": {"model": "tr38901"}, "yaw_deg": 270},
+}  # fmt: skip
 
 
 def test_same_footing_and_residual_tables_are_in_the_metrics(tmp_path: Path) -> None:
@@ -366,7 +321,7 @@ def test_a_local_mean_averages_both_sides_and_all_models(tmp_path: Path) -> None
     at = np.arange(0, 60, 0.25)
     rss = {"USRP1": (at, free_space_db(at) + rng.normal(0, 3, len(at)))}
     (as_logged,) = compared_rss(flight(tmp_path, rss=rss))
-    (mean,) = compared_rss(flight(tmp_path, rss=rss, rss_keys=", field: local_mean, window_s: 4"))
+    (mean,) = compared_rss(flight(tmp_path, rss=rss, rss_keys={"field": "local_mean", "window_s": 4}))
     footing = as_logged.further.averaged["coherent"]["4 s"]
     assert mean.score.rmse_db == pytest.approx(footing.rmse_db, abs=1e-9)
     two_ray = mean.baselines["two_ray"]
@@ -374,7 +329,7 @@ def test_a_local_mean_averages_both_sides_and_all_models(tmp_path: Path) -> None
 
 
 def test_a_local_mean_without_a_window_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = flight(tmp_path, rss={"USRP1": ([1.0], [-70.0])}, rss_keys=", field: local_mean")
+    path = flight(tmp_path, rss={"USRP1": ([1.0], [-70.0])}, rss_keys={"field": "local_mean"})
     assert main(["report", str(path)]) == 2
     assert "window_s" in capsys.readouterr().err
 
@@ -437,39 +392,36 @@ def test_one_absurd_level_changes_no_number_and_is_told(
         assert found[key] == pytest.approx(without_one_row[key]), key
 
 
-def test_exchanged_or_mirrored_angles_are_told_before_anything_else(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("written", "instead", "words"),
+    [
+        ("t,lat,lon", "t,lon,lat", r"no nearer than \d+ km to any tower.*latitude and longitude are exchanged"),
+        (",-78.", ",78.", "the longitude lacks its sign"),
+        (",35.", ",36.", r"no nearer than 1\d\d km to any tower.*another site"),
+    ],
+)
+def test_exchanged_or_mirrored_angles_are_told_before_anything_else(
+    tmp_path: Path, written: str, instead: str, words: str
+) -> None:
     at = np.arange(0, 60, 0.5)
     path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at))})
-    text = path.read_text()
-    path.write_text(text.replace("latitude_deg: lat, longitude_deg: lon", "latitude_deg: lon, longitude_deg: lat"))
-    with pytest.raises(InputError, match=r"no nearer than \d+ km to any tower.*latitude and longitude are exchanged"):
-        gathered(path)
-    path.write_text(text)
     table = (tmp_path / "track.csv").read_text()
-    (tmp_path / "track.csv").write_text(table.replace(",-78.", ",78."))
-    with pytest.raises(InputError, match="the longitude lacks its sign"):
-        gathered(path)
-    (tmp_path / "track.csv").write_text(table.replace(",35.", ",36."))
-    with pytest.raises(InputError, match=r"no nearer than 1\d\d km to any tower.*another site"):
+    (tmp_path / "track.csv").write_text(table.replace(written, instead))
+    with pytest.raises(InputError, match=words):
         gathered(path)
 
 
-def rank_with_positions(folder: Path, *, rt: str, origin: str = ORIGIN) -> Path:
+def rank_with_positions(folder: Path, origin: str = ORIGIN) -> Path:
     """A flight whose rank log carries positions of its own, beside telemetry with attitude."""
     at = np.arange(1.0, 59.0)
-    path = flight(folder, rank=(at, np.where(at % 2, 1, 2)), rt=rt)
-    lon = LW1[1] + (at - 10) * 5 / 90_000.0
-    same = np.zeros(len(at))
-    write_csv(
-        folder / "ri.csv", "t,ri,lat,lon,alt", at, np.where(at % 2, 1.0, 2.0), same + LW1[0] + 5e-4, lon, same + 40.0
-    )
-    text = path.read_text().replace(
-        "columns: {time: t, ri_raw: ri}",
-        "columns: {time: t, ri_raw: ri, latitude_deg: lat, longitude_deg: lon, altitude_m: alt}",
-    )
-    first, rest = text.split("{path: ri.csv")
-    path.write_text(first + "{path: ri.csv" + rest.replace(ORIGIN, origin))
-    return path
+    rank = np.where(at % 2, 1.0, 2.0)
+    path = flight(folder, rank=(at, rank))
+    place = (np.full(len(at), LW1[0] + 5e-4), LW1[1] + (at - 10) * 5 / 90_314.0, np.full(len(at), 40.0))
+    write_csv(folder / "ri.csv", "t,ri,lat,lon,alt", at, rank, *place)
+    content = yaml.safe_load(path.read_text())
+    content["logs"][1]["columns"] |= POSITIONS
+    content["logs"][1]["time_origin"] = origin
+    return write_yaml(path, content)
 
 
 def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> None:
@@ -477,7 +429,7 @@ def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> Non
     for mode in ("logged", "ignored"):
         folder = tmp_path / mode
         folder.mkdir()
-        data = gathered(rank_with_positions(folder, rt="").with_name("flight.yaml"))
+        data = gathered(rank_with_positions(folder))
         rt = data.settings.rt.model_copy(update={"attitude": mode})
         data = dataclasses.replace(data, settings=data.settings.model_copy(update={"rt": rt}))
         assert data.rank[0].position_m is not None
@@ -490,16 +442,16 @@ def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> Non
 
 
 def test_an_attitude_that_cannot_act_is_the_first_warning(tmp_path: Path) -> None:
-    data = gathered(rank_with_positions(tmp_path, rt="", origin="2025-06-02T14:00:00Z"))
+    data = gathered(rank_with_positions(tmp_path, "2025-06-02T14:00:00Z"))
     assert data.warnings[0].startswith(
         "rt.attitude: logged has no effect on rank of LW1: no sample lies in the telemetry"
     )
-    data = gathered(rank_with_positions(tmp_path, rt=""))
+    data = gathered(rank_with_positions(tmp_path))
     assert not any("rt.attitude" in text for text in data.warnings)
 
 
 def test_positions_that_the_rank_log_lacks_come_from_the_track(tmp_path: Path) -> None:
-    path = rank_with_positions(tmp_path, rt="")
+    path = rank_with_positions(tmp_path)
     table = (tmp_path / "ri.csv").read_text().splitlines()
     table[20] = ",".join(table[20].split(",")[:2]) + ",,,"
     (tmp_path / "ri.csv").write_text("\n".join(table) + "\n")
@@ -510,32 +462,27 @@ def test_positions_that_the_rank_log_lacks_come_from_the_track(tmp_path: Path) -
     assert found.poses.position_m[19] == pytest.approx(found.poses.position_m[[18, 20]].mean(axis=0), abs=0.01)
 
 
-def snr_flight(folder: Path, above_db: float, link: str) -> Any:
+def snr_flight(folder: Path, above_db: float, **link: float) -> RssResult:
     """The report's numbers of a flight whose log holds level over noise, ``above_db`` of it unexplained."""
     at = np.arange(0, 60, 0.5)
-    noise = noise_floor_dbm(20e6, 7.0)
     folder.mkdir()
-    path = flight(folder, rss={"snr": (at, free_space_db(at) - noise + above_db)})
-    text = path.read_text(encoding="utf-8")
-    more = "link:\n  rss: {carrier_hz: 3.3e9" + link + "}\n"
-    path.write_text(text if "link:" in text else text + more, encoding="utf-8")
-    assert more in path.read_text(encoding="utf-8")
-    return compared_rss(path)
+    level = free_space_db(at) - noise_floor_dbm(20e6, 7.0) + above_db
+    return compared_rss(flight(folder, rss={"snr": (at, level)}, link={"rss": {"carrier_hz": 3.3e9, **link}}))[0]
 
 
 def test_an_snr_is_the_level_over_the_noise_that_is_given(tmp_path: Path) -> None:
-    one = snr_flight(tmp_path / "a", 2.5, ", bandwidth_hz: 20e6, noise_figure_db: 7")[0]
+    one = snr_flight(tmp_path / "a", 2.5, bandwidth_hz=20e6, noise_figure_db=7)
     found = one.further.snr
     assert found.noise_dbm == pytest.approx(-93.96, abs=0.01)  # kTB of 20 MHz at 290 K and 7 dB
-    without_offset = snr_flight(tmp_path / "b", 0.0, ", bandwidth_hz: 20e6, noise_figure_db: 7")[0].further.snr
+    without_offset = snr_flight(tmp_path / "b", 0.0, bandwidth_hz=20e6, noise_figure_db=7).further.snr
     assert found.mean_error_db - without_offset.mean_error_db == pytest.approx(2.5, abs=1e-9)
     assert found.rmse_db == pytest.approx(np.hypot(one.further.snr.mean_error_db, one.score.rmse_db), abs=0.01)
-    wider = snr_flight(tmp_path / "c", 0.0, ", bandwidth_hz: 40e6, noise_figure_db: 7")[0].further.snr
+    wider = snr_flight(tmp_path / "c", 0.0, bandwidth_hz=40e6, noise_figure_db=7).further.snr
     assert wider.mean_error_db - without_offset.mean_error_db == pytest.approx(10 * np.log10(2.0), abs=1e-6)
 
 
 def test_the_noise_under_an_snr_cuts_nothing_off(tmp_path: Path) -> None:
-    deaf = snr_flight(tmp_path / "a", 0.0, ", noise_floor_dbm: -20")[0]
+    deaf = snr_flight(tmp_path / "a", 0.0, noise_floor_dbm=-20.0)
     assert deaf.score.n == 120  # a level below -20 dBm would be out of coverage
     assert deaf.further.snr.noise_dbm == -20.0
-    assert snr_flight(tmp_path / "b", 0.0, "")[0].further.snr is None
+    assert snr_flight(tmp_path / "b", 0.0).further.snr is None

@@ -7,43 +7,27 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.jobs.reporting.explain import run_explain
 from tests.json_page import unlisted
-from tests.simulated import simulate
+from tests.simulated import planned, simulate, write_yaml
 
 ANTENNA = {"layout": "single", "antenna": {"model": "dipole"}}
-SETTINGS = {
-    "flight": {
-        "name": "small", "synthetic": True,
-        "plan": {
-            "start": "2025-06-01T10:00:00", "seed": 4, "speed_mps": 10.0, "rss_interval_s": 1.0, "fading_db": 0.0,
-            "waypoints": [{"east_m": e, "north_m": n, "height_m": h} for e, n, h in ((-40, 10, 30), (-250, 60, 20))],
-            "offsets_db": {"LW1": {"USRP1": 12.3}, "LW2": {"USRP1": 3.0}},
-        },
-    },
-    "site": {"file": "lake_wheeler"},
-    "timezone": "America/New_York",
-    "logs": [
-        {"path": "small/vehicle.txt", "reader": "vehicle_out"},
-        {"path": "small/USRP1.txt", "reader": "sounder_log", "node": "LW1", "channel": "USRP1"},
-        {"path": "small/USRP2.txt", "reader": "sounder_log", "node": "LW2", "channel": "USRP1"},
-    ],
-    "link": {"rss": {"carrier_hz": 3.3e9, "tower": {**ANTENNA, "slant_deg": [20.0]}, "uav": ANTENNA}},
-    "rt": {"audit_links": 0, "attitude": "logged", "foliage": "attenuating", "reflection_loss_db": 1.5},
-    "rss": {"lag": "off"},
-}  # fmt: skip
+SETTINGS = planned(
+    "small", [(-40, 10, 30), (-250, 60, 20)], {"LW1": {"USRP1": 12.3}, "LW2": {"USRP1": 3.0}},
+    plan={"rss_interval_s": 1.0}, site={"file": "lake_wheeler"},
+    link={"rss": {"carrier_hz": 3.3e9, "tower": {**ANTENNA, "slant_deg": [20.0]}, "uav": ANTENNA}},
+    rt={"audit_links": 0, "attitude": "logged", "foliage": "attenuating", "reflection_loss_db": 1.5},
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     """A small flight and its report."""
     folder = tmp_path_factory.mktemp("explain")
-    path = folder / "flight.yaml"
-    path.write_text(yaml.safe_dump(SETTINGS), encoding="utf-8")
+    path = write_yaml(folder / "flight.yaml", SETTINGS)
     simulate(path)
     assert main(["report", str(path), "-o", str(folder / "out"), "--figures", "none", "--quiet"]) == 0
     return path, pd.read_csv(folder / "out" / "rss.csv")

@@ -12,46 +12,28 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.flight.data import gather, read_logs
+from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_settings
 from aerpaw_cmp.site.learned import Entry, Errors, LearnedSeries, folder_of, remember
 from aerpaw_cmp.site.sphere_pattern import sphere_csv
+from tests.simulated import write_yaml
+from tests.tables import eastwards, rss_log
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
-
-LW1 = (35.72750947, -78.69595819)
-ORIGIN = "2025-06-01T14:00:00Z"
 
 
 def flight(folder: Path, exponent: float = 2.0) -> Path:
     """Eastwards past LW1 at 40 m; the levels are log-distance plus noise, the flight file asks for coherent ground."""
-    t = np.arange(0.0, 121.0)
-    east = -500.0 + 8.0 * t
-    rows = "\n".join(f"{a:g},{LW1[0] + 5e-4:.9f},{LW1[1] + b / 90_314.0:.9f},40" for a, b in zip(t, east, strict=True))
-    (folder / "track.csv").write_text("s,phi,lam,h\n" + rows + "\n", encoding="utf-8")
-    at = np.arange(0.0, 120.0, 0.2)
+    t, at = np.arange(0.0, 121.0), np.arange(0.0, 120.0, 0.2)
     range_m = np.sqrt((-500.0 + 8.0 * at) ** 2 + 55.0**2 + 30.0**2)
     level = -30.0 - 10.0 * exponent * np.log10(range_m) + np.random.default_rng(1).normal(size=len(at))
-    rows = "\n".join(f"{a:.1f},{b:.4f}" for a, b in zip(at, level, strict=True))
-    (folder / "rss.csv").write_text("t,level\n" + rows + "\n", encoding="utf-8")
-    path = folder / "flight.yaml"
-    path.write_text(
-        f"""
-flight: planted
-site: {{file: lake_wheeler, without_buildings: true}}
-logs:
-  - {{path: track.csv, reader: generic_csv, kind: telemetry, time_origin: "{ORIGIN}",
-     columns: {{time: s, latitude_deg: phi, longitude_deg: lam, altitude_m: h}}}}
-  - {{path: rss.csv, reader: generic_csv, kind: rss, node: LW1, channel: A, time_origin: "{ORIGIN}",
-     columns: {{time: t, rss_db: level}}}}
-rt: {{max_depth: 1, audit_links: 0}}
-rss: {{lag: "off", span_db: [-100, 100]}}
-""",
-        encoding="utf-8",
-    )
-    return path
+    return write_yaml(folder / "flight.yaml", {
+        "flight": "planted", "site": {"file": "lake_wheeler", "without_buildings": True},
+        "logs": [eastwards(folder, t, -500.0 + 8.0 * t), rss_log(folder, "A", at, level)],
+        "rt": {"max_depth": 1, "audit_links": 0}, "rss": {"lag": "off", "span_db": [-100, 100]},
+    })  # fmt: skip
 
 
 def report(path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> dict[str, Any]:
@@ -73,8 +55,7 @@ def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.Cap
     assert "free space 1.0 dB" in page[page.index('id="result"') :][:400]  # the first sentence of the verdict
     assert "Models from the simplest to the richest" in page
 
-    settings = load_flight(better)
-    again = run_flight(gather(settings, tmp_path, read_logs(settings, tmp_path)), audit=False, ladder=True).result
+    again = run_flight(load_data(load_flight(better), tmp_path), audit=False, ladder=True).result
     assert again.rss[0].score.rmse_db == pytest.approx(1.0, abs=0.1)
     as_set = {r.model: r for r in again.ladder}["as set in flight.yaml"]
     assert as_set.rmse_heldout_db == pytest.approx(rows["free space"]["rmse_heldout_db"], abs=1e-6)
@@ -107,8 +88,7 @@ def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> N
         stated = settings.model_dump(mode="json", exclude_unset=True)
         stated["link"] = {"rss": {"carrier_hz": 3.3e9, "tower": {"antenna": {"model": "sphere", "file": "a.csv"}}}}
         (tmp_path / "learned.yaml").write_text(yaml.safe_dump(stated), encoding="utf-8")
-        settings = load_flight(tmp_path / "learned.yaml")
-        found = run_flight(gather(settings, tmp_path, read_logs(settings, tmp_path)), audit=False, ladder=True)
+        found = run_flight(load_data(load_flight(tmp_path / "learned.yaml"), tmp_path), audit=False, ladder=True)
         rows = {row.model: row for row in found.result.ladder}
         learned = {name: row for name, row in rows.items() if "learned sphere" in name or "as set" in name}
         assert len(learned) >= 2
@@ -228,8 +208,7 @@ def test_the_rung_with_diffraction_is_what_its_settings_replay(tmp_path: Path) -
     model, rungs = Model(buildings=True, diffraction=True), []
     for content in (stated, recommended_settings(stated, model)):
         (tmp_path / "flight.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
-        settings = load_flight(tmp_path / "flight.yaml")
-        result = run_flight(gather(settings, tmp_path, read_logs(settings, tmp_path)), audit=False, ladder=True).result
+        result = run_flight(load_data(load_flight(tmp_path / "flight.yaml"), tmp_path), audit=False, ladder=True).result
         rungs.append({row.model: row.rmse_heldout_db for row in result.ladder})
     assert rungs[0][model.name] == pytest.approx(rungs[1]["as set in flight.yaml"], abs=1e-6)
     assert abs(rungs[0][model.name] - rungs[0]["free space"]) > 1e-6

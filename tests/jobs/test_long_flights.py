@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.flight import replay as replay_job
 from aerpaw_cmp.flight import track as track_room
-from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.settings import load_flight
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
@@ -22,7 +22,7 @@ def one_tower() -> FlightData:
     settings = load_flight(SAMPLE)
     logs = [log for log in settings.logs if log.node in (None, "LW2")]
     settings = settings.model_copy(update={"logs": logs})
-    return gather(settings, SAMPLE.parent, read_logs(settings, SAMPLE.parent))
+    return load_data(settings, SAMPLE.parent)
 
 
 def test_a_clock_predicted_in_blocks_is_that_of_the_whole_flight(

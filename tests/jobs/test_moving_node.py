@@ -8,7 +8,7 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.replay import FlightReplay, replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.audit_flight import standing
@@ -21,29 +21,11 @@ from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.report import explorer
 from aerpaw_cmp.report.export import rank_csv, rss_csv
 from aerpaw_cmp.site.siteyaml import load_site
+from tests.simulated import write_yaml
+from tests.tables import ORIGIN, POSITIONS, rank_log, rss_log, table_log, write_csv
 
-ORIGIN = "2025-06-01T14:00:00Z"
 FRAME = load_site("lake_wheeler").frame
 SECONDS = 120
-
-YAML = """
-flight: rover
-site: {{file: lake_wheeler, without_buildings: true}}
-timezone: America/New_York
-towers:
-  ROVER: {{track: {{path: rover.csv, reader: generic_csv, kind: telemetry, time_origin: "{origin}",
-    columns: {{time: t, latitude_deg: lat, longitude_deg: lon, altitude_m: alt}}}}, antenna_height_m: 2}}
-logs:
-  - {{path: track.csv, reader: generic_csv, kind: telemetry, time_origin: "{origin}",
-     columns: {{time: t, latitude_deg: lat, longitude_deg: lon, altitude_m: alt}}}}
-  - {{path: a.csv, reader: generic_csv, kind: rss, node: ROVER, channel: a, time_origin: "{origin}",
-     columns: {{time: t, rss_db: level}}}}
-  - {{path: ri.csv, reader: generic_csv, kind: rank, node: ROVER, ri_base: one, time_origin: "{origin}",
-     columns: {{time: t, ri_raw: ri}}}}
-rt: {{engine: {engine}, max_depth: 1, audit_links: 0}}
-rss: {{lag: "off", span_db: [-100, 100]}}
-rank: {{tower: ROVER}}
-"""
 
 
 def uav(t: np.ndarray) -> np.ndarray:
@@ -54,34 +36,34 @@ def rover(t: np.ndarray) -> np.ndarray:
     return np.stack([60.0 - 1.5 * t, -40.0 + 0.8 * t, 2.0 + 0 * t], axis=1)
 
 
-def write(path: Path, head: str, *columns: np.ndarray) -> None:
-    rows = [",".join(f"{v:.11g}" for v in row) for row in zip(*columns, strict=True)]
-    path.write_text(head + "\n" + "\n".join(rows) + "\n")
-
-
-def positions(path: Path, t: np.ndarray, places: np.ndarray) -> None:
+def positions(path: Path, t: np.ndarray, places: np.ndarray) -> dict:
     latitude, longitude = FRAME.to_geographic(places[:, 0], places[:, 1])
-    write(path, "t,lat,lon,alt", t, latitude, longitude, places[:, 2])
+    write_csv(path, "t,lat,lon,alt", t, latitude, longitude, places[:, 2])
+    return table_log(path.name, "telemetry", POSITIONS)
 
 
-def flown(folder: Path, *, engine: str = "image", gap: tuple[float, float] = (50.0, 60.0), start: float = 0.0) -> Path:
+def flown(
+    folder: Path, *, engine: str = "image", gap: tuple[float, float] = (50.0, 60.0), start: float = 0.0, origin=ORIGIN
+) -> Path:
     """Logs whose level is the closed form of two rays between the two ends, less 20 dB."""
-    t = np.arange(0.0, SECONDS + 1)
+    t, at = np.arange(0.0, SECONDS + 1), np.arange(0.0, SECONDS, 0.5)
     kept = t[(t <= gap[0]) | (t >= gap[1])]
-    positions(folder / "track.csv", t, uav(t))
-    positions(folder / "rover.csv", kept + start, rover(kept))
-    at = np.arange(0.0, SECONDS, 0.5)
     level = [two_ray_dbm(r[None], u[None], 3.3e9, 40.0)[0, 0] for r, u in zip(rover(at), uav(at), strict=True)]
-    write(folder / "a.csv", "t,level", at, np.array(level) - 20.0)
-    write(folder / "ri.csv", "t,ri", t, np.ones(len(t)))
-    path = folder / "flight.yaml"
-    path.write_text(YAML.format(origin=ORIGIN, engine=engine))
-    return path
+    track = positions(folder / "rover.csv", kept + start, rover(kept)) | {"time_origin": origin}
+    return write_yaml(folder / "flight.yaml", {
+        "flight": "rover", "site": {"file": "lake_wheeler", "without_buildings": True}, "timezone": "America/New_York",
+        "towers": {"ROVER": {"track": {k: v for k, v in track.items() if v}, "antenna_height_m": 2}},
+        "logs": [
+            positions(folder / "track.csv", t, uav(t)), rss_log(folder, "a", at, np.array(level) - 20.0, "ROVER"),
+            rank_log(folder, t, np.ones(len(t)), "ROVER"),
+        ],
+        "rt": {"engine": engine, "max_depth": 1, "audit_links": 0}, "rss": {"lag": "off", "span_db": [-100, 100]},
+        "rank": {"tower": "ROVER"},
+    })  # fmt: skip
 
 
 def data_of(path: Path) -> FlightData:
-    settings = load_flight(path)
-    return gather(settings, path.parent, read_logs(settings, path.parent))
+    return load_data(load_flight(path), path.parent)
 
 
 @pytest.fixture(scope="module")
@@ -173,8 +155,6 @@ def test_what_cannot_be_is_one_message(tmp_path, capsys):
         data_of(flown(tmp_path, start=5000.0))
     assert main(["report", str(flown(tmp_path, engine="sionna")), "-o", str(tmp_path / "out")]) == 2
     assert "towers.ROVER moves and the engine is 'sionna'" in capsys.readouterr().err
-    path = flown(tmp_path)
-    path.write_text(path.read_text().replace(f', time_origin: "{ORIGIN}",\n    columns', ",\n    columns", 1))
     with pytest.raises(InputError, match="no overlap in time") as caught:
-        data_of(path)
+        data_of(flown(tmp_path, origin=None))
     assert "time_origin" in str(caught.value)

@@ -19,8 +19,7 @@ from aerpaw_cmp.jobs.prediction.where import Asked
 from aerpaw_cmp.site.learned import Entry, Errors, LearnedLevel, LearnedSeries, folder_of, read_learned, remember
 from aerpaw_cmp.site.siteyaml import load_site
 from aerpaw_cmp.site.sphere_pattern import sphere_csv
-from tests.jobs.test_calibrate import OFFSET_DB, ROUTES, YAW_DEG, settings, write
-from tests.simulated import simulate
+from tests.jobs.calibrated import OFFSET_DB, past_sector_antenna
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -116,12 +115,7 @@ def test_a_site_that_remembers_no_level_is_one_message(tmp_path: Path, capsys: p
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A site that learned from two flights past a sector antenna, and a third flight that it never saw."""
-    place = tmp_path_factory.mktemp("flown")
-    for name in ROUTES:
-        path = write(place / f"{name}.yaml", settings(name, {"model": "tr38901"}, YAW_DEG))
-        simulate(path)
-        write(path, settings(name, {"model": "iso"}))
-    write(place / "calibration.yaml", {"calibration": "planted", "flights": ["first.yaml", "second.yaml"]})
+    place = past_sector_antenna(tmp_path_factory.mktemp("flown"))
     copied(place)
     words = ["calibrate", str(place / "calibration.yaml"), "--into-site", str(place / "mine.yaml")]
     assert main([*words, "-o", str(place / "calibrated.yaml")]) == 0

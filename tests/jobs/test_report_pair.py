@@ -4,61 +4,33 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.report.exports.write import FORMATS
-from tests.simulated import simulate
+from tests.simulated import planned, simulate, write_yaml
 
-SETTINGS: dict[str, Any] = {
-    "flight": {
-        "name": "small",
-        "synthetic": True,
-        "plan": {
-            "start": "2025-06-01T10:00:00",
-            "seed": 4,
-            "speed_mps": 10.0,
-            "rss_interval_s": 0.5,
-            "rank_k": 10,
-            "rank_interval_s": 1.0,
-            "fading_db": 1.0,
-            "fading_correlation_s": 0.5,
-            "waypoints": [
-                {"east_m": e, "north_m": n, "height_m": h} for e, n, h in ((-40, 10, 30), (-250, 60, 30), (-100, 260, 40))
-            ],
-            "offsets_db": {"LW1": {"USRP1": 12.3}},
-        },
-    },
-    "site": {"file": "lake_wheeler", "without_buildings": True},
-    "timezone": "America/New_York",
-    "logs": [
-        {"path": "small/vehicle.txt", "reader": "vehicle_out"},
-        {"path": "small/USRP1.txt", "reader": "sounder_log", "node": "LW1", "channel": "USRP1"},
-        {"path": "small/ri.csv", "reader": "quectel_ri", "node": "LW1"},
-    ],
-    "rt": {"max_depth": 1, "audit_links": 0},
-    "rss": {"lag": "off"},
-    "rank": {"k": [10, 100], "advanced": {"bootstrap": 20}},
-    "report": {"export": ["kmz"]},
-}  # fmt: skip
+SETTINGS = planned(
+    "small", [(-40, 10, 30), (-250, 60, 30), (-100, 260, 40)], {"LW1": {"USRP1": 12.3}}, ranks=True,
+    plan={"rss_interval_s": 0.5, "rank_k": 10, "rank_interval_s": 1.0, "fading_db": 1.0, "fading_correlation_s": 0.5},
+    rt={"max_depth": 1, "audit_links": 0}, rank={"k": [10, 100], "advanced": {"bootstrap": 20}},
+    report={"export": ["kmz"]},
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Reports with one reflection and with none; the first also exports everything."""
     folder = tmp_path_factory.mktemp("pair")
-    path = folder / "flight.yaml"
-    path.write_text(yaml.safe_dump(SETTINGS), encoding="utf-8")
+    path = write_yaml(folder / "flight.yaml", SETTINGS)
     simulate(path)
     out = folder / "with", folder / "without"
     words = ["--figures", "none", "--quiet"]
     assert main(["report", str(path), "-o", str(out[0]), "--export", "all", *words]) == 0
-    path.write_text(yaml.safe_dump({**SETTINGS, "rt": {"max_depth": 0, "audit_links": 0}}), encoding="utf-8")
+    write_yaml(path, {**SETTINGS, "rt": {"max_depth": 0, "audit_links": 0}})
     assert main(["report", str(path), "-o", str(out[1]), *words]) == 0
     return out
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
@@ -16,7 +15,7 @@ from aerpaw_cmp.jobs.mapping.site_scene import SceneOptions, is_scene, run_scene
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.siteyaml import load_site
-from tests.simulated import simulate
+from tests.simulated import planned, simulate, write_yaml
 
 ROOM = """<scene version="2.1.0">
 <bsdf type="itu-radio-material" id="stone"><string name="type" value="marble"/><float name="thickness" value="0.2"/></bsdf>
@@ -107,32 +106,18 @@ def test_a_site_of_prisms_can_be_written(tmp_path: Path) -> None:
     assert {f.stem for f in files[1:]} >= {"all_concrete", "all_medium_dry_ground"}
 
 
-FLIGHT = {
-    "flight": {
-        "name": "room", "synthetic": True,
-        "plan": {
-            "start": "2025-06-01T10:00:00", "seed": 4, "speed_mps": 4.0, "rss_interval_s": 0.1, "fading_db": 0.0,
-            "waypoints": [{"east_m": e, "north_m": 8.0, "height_m": h} for e, h in ((-18, 12), (6, 6))],
-            "offsets_db": {"T": {"USRP1": 12.3}},
-        },
-    },
-    "site": {"file": "site.yaml"},
-    "timezone": "UTC",
-    "logs": [
-        {"path": "vehicle.txt", "reader": "vehicle_out"},
-        {"path": "USRP1.txt", "reader": "sounder_log", "node": "T", "channel": "USRP1"},
-    ],
-    "link": {"rss": {"carrier_hz": 3.3e9, "tower": {"layout": "single"}, "uav": {"layout": "single"}}},
-    "rt": {"audit_links": 3, "advanced": {"samples": 10_000, "cache": False}},
-    "rss": {"lag": "off"},
-}  # fmt: skip
+SINGLE = {"layout": "single"}
+FLIGHT = planned(
+    "room", [(-18, 8.0, 12), (6, 8.0, 6)], {"T": {"USRP1": 12.3}}, plan={"speed_mps": 4.0, "rss_interval_s": 0.1},
+    site={"file": "site.yaml"}, timezone="UTC", link={"rss": {"carrier_hz": 3.3e9, "tower": SINGLE, "uav": SINGLE}},
+    rt={"audit_links": 3, "advanced": {"samples": 10_000, "cache": False}},
+)  # fmt: skip
 
 
 @pytest.fixture
 def flown(room: Path, tmp_path: Path) -> Path:
     run_scene_import(room, tmp_path / "site.yaml", SceneOptions(origin="35.7,-78.7", towers=["T=-5,3,10"]))
-    (tmp_path / "flight.yaml").write_text(yaml.safe_dump(FLIGHT))
-    simulate(tmp_path / "flight.yaml")
+    simulate(write_yaml(tmp_path / "flight.yaml", FLIGHT))
     return tmp_path / "flight.yaml"
 
 

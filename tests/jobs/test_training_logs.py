@@ -23,24 +23,18 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.training import counted_once, flight_logs
 from aerpaw_cmp.jobs.diff_reports import run_diff
 from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankSamples
-from tests.jobs.calibrated import calibrated
-from tests.jobs.test_calibrate import YAW_DEG, settings, write
-from tests.simulated import simulate
+from tests.jobs.calibrated import calibrated, past_sector_antenna, settings
+from tests.simulated import write_yaml
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
-LOG = "first/USRP1.txt"
+LOG = "first/LW1_USRP1.txt"
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two flights, antennas learned from the first and second, and a third flight that nobody learned from."""
-    place = tmp_path_factory.mktemp("training")
-    for name in ("first", "second", "aside"):
-        path = write(place / f"{name}.yaml", settings(name, {"model": "tr38901"}, YAW_DEG))
-        simulate(path)
-        write(path, settings(name, {"model": "iso"}))
-    write(place / "calibration.yaml", {"calibration": "planted", "flights": ["first.yaml", "second.yaml"]})
+    place = past_sector_antenna(tmp_path_factory.mktemp("training"))
     assert main(["calibrate", str(place / "calibration.yaml"), "-o", str(place / "calibrated.yaml")]) == 0
     return place
 
@@ -77,7 +71,7 @@ def copy_of(folder: Path, copy: Callable[[Path], str], **rest: Any) -> Path:
     content["flight"]["name"] = "nobody_knows_me"
     content["flight"].pop("plan")
     content["logs"][1]["path"] = copy(folder / LOG)
-    return write(folder / f"copy_{copy.__name__}.yaml", content)
+    return write_yaml(folder / f"copy_{copy.__name__}.yaml", content)
 
 
 def report(folder: Path, flight: Path) -> tuple[dict[str, Any], str]:
@@ -135,7 +129,9 @@ def test_no_residual_and_no_difference_of_a_training_flight(folder: Path) -> Non
 
 def test_an_unseen_flight_is_scored_with_the_same_antennas(folder: Path) -> None:
     learned = yaml.safe_load((folder / "calibrated.yaml").read_text())
-    metrics, words = report(folder, write(folder / "u.yaml", settings("aside", {"model": "iso"}, link=learned["link"])))
+    metrics, words = report(
+        folder, write_yaml(folder / "u.yaml", settings("aside", {"model": "iso"}, link=learned["link"]))
+    )
     assert "Training flight" not in words
     assert metrics["rss"]["LW1"]["USRP1"]["rmse_db"] > 0
     assert "trained_on" not in metrics["rss"]["LW1"]["USRP1"]
@@ -145,7 +141,7 @@ def test_an_unseen_flight_is_scored_with_the_same_antennas(folder: Path) -> None
 def test_settings_that_were_learned_count_as_antennas_do(folder: Path) -> None:
     """Fitted numbers in a flight file (a mount, a roughness) have no file that could say where they come from."""
     own = settings("first", {"model": "iso"}, trained_on=list(trained_on((folder / "calibrated.yaml").read_text())))
-    metrics, words = report(folder, write(folder / "own.yaml", own))
+    metrics, words = report(folder, write_yaml(folder / "own.yaml", own))
     assert words.startswith("Training flight")
     assert metrics["rss"]["LW1"]["USRP1"]["rmse_db"] is None
     as_set = [row for row in metrics["ladder"] if row["model"].startswith("as set")]
@@ -155,11 +151,13 @@ def test_settings_that_were_learned_count_as_antennas_do(folder: Path) -> None:
 @pytest.mark.parametrize("copy", COPIES)
 def test_calibrate_counts_a_copy_once(folder: Path, copy: Callable[[Path], str]) -> None:
     flights = ["first.yaml", copy_of(folder, copy).name]
-    found, said = calibrated(write(folder / "twice.yaml", {"calibration": "twice", "flights": flights}))
+    found, said = calibrated(write_yaml(folder / "twice.yaml", {"calibration": "twice", "flights": flights}))
     assert [data.settings.flight.name for data in found.flights] == ["first"]
     assert not any(found.scores.values())
     assert "nobody_knows_me holds the same log as first (SHA-256 " in said[0]
-    three, _ = calibrated(write(folder / "three.yaml", {"calibration": "three", "flights": [*flights, "second.yaml"]}))
+    three, _ = calibrated(
+        write_yaml(folder / "three.yaml", {"calibration": "three", "flights": [*flights, "second.yaml"]})
+    )
     assert {score.flight for score in three.scores["flight_left_out"]} == {"first", "second"}
 
 
@@ -188,14 +186,14 @@ def test_two_logs_of_one_flight_in_two_flight_files(folder: Path) -> None:
     both = settings("aside", {"model": "iso"})
     both["logs"].append({"path": LOG, "reader": "sounder_log", "node": "LW2", "channel": "USRP9"})
     flights = [load_data(load_flight(folder / "first.yaml"), folder)]
-    kept, said = counted_once([*flights, load_data(load_flight(write(folder / "both.yaml", both)), folder)])
+    kept, said = counted_once([*flights, load_data(load_flight(write_yaml(folder / "both.yaml", both)), folder)])
     assert [[(s.tower, s.channel) for s in data.rss] for data in kept] == [[("LW1", "USRP1")], [("LW1", "USRP1")]]
     assert len(said) == 1
 
 
 def test_campaign_counts_a_copy_once(folder: Path, tmp_path: Path) -> None:
     flights = ["first.yaml", copy_of(folder, zipped_twice).name, "second.yaml"]
-    path = write(folder / "campaign.yaml", {"campaign": "copies", "flights": flights})
+    path = write_yaml(folder / "campaign.yaml", {"campaign": "copies", "flights": flights})
     assert main(["campaign", str(path), "-o", str(tmp_path / "out"), "--fresh"]) == 0
     found = json.loads((tmp_path / "out" / "campaign.json").read_text())
     assert [row["flight"] for row in found["rss"]] == ["first", "second"]
@@ -208,8 +206,8 @@ def test_campaign_scores_no_flight_that_its_antennas_were_learned_from(folder: P
     learned = yaml.safe_load((folder / "calibrated.yaml").read_text())
     names = [copy_of(folder, gzipped, link=learned["link"]).name]
     for name in ("aside", "second"):
-        names.append(write(folder / f"l_{name}.yaml", settings(name, {"model": "iso"}, link=learned["link"])).name)
-    path = write(folder / "campaign.yaml", {"campaign": "learned", "flights": names})
+        names.append(write_yaml(folder / f"l_{name}.yaml", settings(name, {"model": "iso"}, link=learned["link"])).name)
+    path = write_yaml(folder / "campaign.yaml", {"campaign": "learned", "flights": names})
     assert main(["campaign", str(path), "-o", str(tmp_path / "out"), "--fresh"]) == 0
     found = json.loads((tmp_path / "out" / "campaign.json").read_text())
     errors = {row["flight"]: (row["rmse_db"], row["pooled_rmse_db"]) for row in found["rss"]}

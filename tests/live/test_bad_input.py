@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import shutil
@@ -115,46 +116,43 @@ def test_the_port_vanishes_during_open(monkeypatch):
         SerialPort.open(path)
 
 
-def test_reading_and_writing_a_gone_port():
+@contextlib.contextmanager
+def line(waiting=b""):
+    """A serial line: our port, opened with bytes that wait there, and the file of its other end."""
     master, slave = pty.openpty()
     tty.setraw(slave)
-    path = Path(os.ttyname(slave))
+    os.write(master, waiting)
+    port = SerialPort.open(Path(os.ttyname(slave)))
     os.close(slave)
-    port = SerialPort.open(path)
-    assert port.read() == b""
-    os.write(master, b"abc")
-    time.sleep(0.05)
-    assert port.read() == b"abc"
-    os.close(master)
-    with pytest.raises(PortGoneError):
-        port.read()
-    with pytest.raises(PortGoneError):
-        port.write(b"AT\r")
+    yield port, master
     port.close()
     port.close()
+    with contextlib.suppress(OSError):
+        os.close(master)
+
+
+def test_reading_and_writing_a_gone_port():
+    with line() as (port, master):
+        assert port.read() == b""
+        os.write(master, b"abc")
+        time.sleep(0.05)
+        assert port.read() == b"abc"
+        os.close(master)
+        with pytest.raises(PortGoneError):
+            port.read()
+        with pytest.raises(PortGoneError):
+            port.write(b"AT\r")
 
 
 def test_a_port_that_takes_no_bytes():
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    port = SerialPort.open(Path(os.ttyname(slave)))
-    with pytest.raises(PortGoneError, match="takes no bytes"):
+    with line() as (port, _), pytest.raises(PortGoneError, match="takes no bytes"):
         port.write(b"x" * 10_000_000, timeout_s=0.1)
-    port.close()
-    os.close(master)
-    os.close(slave)
 
 
 def test_what_waits_in_the_queue_at_open_is_not_lost():
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    os.write(master, b"\r\nRDY\r\n")
-    port = SerialPort.open(Path(os.ttyname(slave)))
-    time.sleep(0.05)
-    assert port.read() == b"\r\nRDY\r\n"
-    port.close()
-    os.close(master)
-    os.close(slave)
+    with line(b"\r\nRDY\r\n") as (port, _):
+        time.sleep(0.05)
+        assert port.read() == b"\r\nRDY\r\n"
 
 
 def test_two_taps_on_one_port(modem, child, tmp_path):

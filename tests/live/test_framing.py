@@ -85,9 +85,18 @@ def test_transcript_meaning():
     assert frame_transcript(TRANSCRIPTS["unsolicited"])[:2] == [Unsolicited("RDY"), Unsolicited('+QIND: "csq",20,99')]
 
 
-def live(pieces, command=CSI):
+def sent(*commands):
+    """A framer of commands of which all but the last were given up."""
     framer = Framer()
-    framer.send(*command)
+    for number, command in enumerate(commands):
+        if number:
+            framer.give_up()
+        framer.send(*command)
+    return framer
+
+
+def live(pieces, command=CSI):
+    framer = sent(command)
     return [event for piece in pieces for event in framer.feed(piece)]
 
 
@@ -119,8 +128,7 @@ def test_ok_glued_to_the_last_field():
 
 
 def test_late_answer_is_kept_and_not_taken_for_the_next():
-    framer = Framer()
-    framer.send(*CSI)
+    framer = sent(CSI)
     framer.feed(b'\r\n+QNWCFG: "nr5g')
     answer = framer.give_up()
     assert (answer.status, answer.partial) == ("timeout", '+QNWCFG: "nr5g')
@@ -131,40 +139,30 @@ def test_late_answer_is_kept_and_not_taken_for_the_next():
 
 
 def test_late_answer_to_the_same_query_is_told_by_the_echo():
-    framer = Framer()
-    for values in (b"1,1,1,1", b"2,2,2,2"):
-        framer.send(*CSI)
-        echo = b'AT+QNWCFG="nr5g_csi"\r\r\n'
-        if values == b"1,1,1,1":
-            framer.feed(echo)
-            framer.give_up()
-        else:
-            late = b'+QNWCFG: "nr5g_csi",1,1,1,1\r\n\r\nOK\r\n'
-            events = framer.feed(late + echo + b'+QNWCFG: "nr5g_csi",2,2,2,2\r\nOK\r\n')
+    framer, echo = sent(CSI), b'AT+QNWCFG="nr5g_csi"\r\r\n'
+    framer.feed(echo)
+    framer.give_up()
+    framer.send(*CSI)
+    late = b'+QNWCFG: "nr5g_csi",1,1,1,1\r\n\r\nOK\r\n'
+    events = framer.feed(late + echo + b'+QNWCFG: "nr5g_csi",2,2,2,2\r\nOK\r\n')
     assert isinstance(events[0], Late)
     assert events[-1].lines == ('+QNWCFG: "nr5g_csi",2,2,2,2',)
 
 
 def test_late_answer_with_nothing_in_flight():
-    framer = Framer()
-    framer.send(*CSI)
+    framer = sent(CSI)
     framer.give_up()
     assert framer.feed(b'+QNWCFG: "nr5g_csi",1,1,1,1\r\nOK\r\n') == [Late(('+QNWCFG: "nr5g_csi",1,1,1,1',), "ok")]
 
 
 def test_bare_ok_of_a_late_answer_does_not_end_the_next():
-    framer = Framer()
-    framer.send(*CSI)
-    framer.give_up()
-    framer.send(*QENG)
-    events = framer.feed(b'OK\r\n+QENG: "servingcell","SEARCH"\r\nOK\r\n')
+    events = sent(CSI, QENG).feed(b'OK\r\n+QENG: "servingcell","SEARCH"\r\nOK\r\n')
     assert events[0] == Late((), "ok")
     assert events[1].lines == ('+QENG: "servingcell","SEARCH"',)
 
 
 def test_ten_megabytes_without_line_end_stay_bounded():
-    framer = Framer()
-    framer.send(*CSI)
+    framer = sent(CSI)
     for _ in range(160):
         assert framer.feed(b"x" * 65_536) == []
         assert framer.buffered <= 65_536
@@ -185,10 +183,8 @@ def test_endless_answer_stays_bounded():
 
 
 def test_two_commands_in_flight_are_refused():
-    framer = Framer()
-    framer.send(*CSI)
     with pytest.raises(ValueError, match="still in flight"):
-        framer.send(*QENG)
+        sent(CSI).send(*QENG)
 
 
 @settings(max_examples=200, deadline=None)
@@ -207,8 +203,7 @@ def test_any_bytes_in_any_pieces(data, cuts):
     )
 )
 def test_every_line_comes_out_once(lines):
-    framer = Framer()
-    framer.send(*CSI)
+    framer = sent(CSI)
     events = framer.feed(b"".join(line + b"\r\n" for line in lines))
     if framer._open is not None:
         events.append(framer.give_up())

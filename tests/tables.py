@@ -1,0 +1,44 @@
+"""Flights whose logs are small tables: what a test plants stands in the columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ORIGIN = "2025-06-01T14:00:00Z"
+LW1 = (35.72750947, -78.69595819)
+POSITIONS = {"time": "t", "latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"}
+ATTITUDE = {"roll_deg": "roll", "pitch_deg": "pitch", "yaw_deg": "yaw"}
+
+
+def write_csv(path: Path, names: str, *columns: Any) -> None:
+    """A table of numbers; an empty cell where one is not finite."""
+    rows = "\n".join(",".join(f"{v:.11g}" if np.isfinite(v) else "" for v in row) for row in zip(*columns, strict=True))
+    path.write_text(f"{names}\n{rows}\n", encoding="utf-8")
+
+
+def table_log(path: str, kind: str, columns: dict[str, str], origin: str = ORIGIN, **more: str) -> dict[str, Any]:
+    """The entry of a table under ``logs`` of a flight file."""
+    return {"path": path, "reader": "generic_csv", "kind": kind, "time_origin": origin, "columns": columns, **more}
+
+
+def rss_log(folder: Path, channel: str, at: Any, level: Any, node: str = "LW1") -> dict[str, Any]:
+    """The entry of a channel whose seconds and levels are written."""
+    write_csv(folder / f"{channel}.csv", "t,level", np.asarray(at, float), np.asarray(level, float))
+    return table_log(f"{channel}.csv", "rss", {"time": "t", "rss_db": "level"}, node=node, channel=channel)
+
+
+def rank_log(folder: Path, at: Any, ri: Any, node: str = "LW1") -> dict[str, Any]:
+    """The entry of a log whose seconds and ranks are written."""
+    write_csv(folder / "ri.csv", "t,ri", np.asarray(at, float), np.asarray(ri, float))
+    return table_log("ri.csv", "rank", {"time": "t", "ri_raw": "ri"}, node=node, ri_base="one")
+
+
+def eastwards(folder: Path, t: Any, east_m: Any) -> dict[str, Any]:
+    """The entry of a track 55 m north of LW1 at 40 m, whose nose points south-east."""
+    t, still = np.asarray(t, float), np.zeros(len(t))
+    places = (still + LW1[0] + 5e-4, LW1[1] + np.asarray(east_m) / 90_314.0, still + 40.0)
+    write_csv(folder / "track.csv", "t,lat,lon,alt,roll,pitch,yaw", t, *places, still, still, still + 120.0)
+    return table_log("track.csv", "telemetry", POSITIONS | ATTITUDE)

@@ -58,7 +58,7 @@ except AerpawCmpError as error:
     sys.exit(error.exit_code)
 print(json.dumps({"answers": summary.answers, "rates_hz": summary.rates_hz, "missed": summary.missed,
                   "gaps": summary.gaps, "gap_s": summary.gap_s, "duration_s": summary.duration_s,
-                  "records": summary.records, "lost_records": summary.lost_records}))
+                  "records": summary.records, "lost_records": summary.lost_records, "reason": summary.reason}))
 sys.exit(summary.exit_code)
 """
 

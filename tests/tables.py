@@ -36,9 +36,10 @@ def rank_log(folder: Path, at: Any, ri: Any, node: str = "LW1") -> dict[str, Any
     return table_log("ri.csv", "rank", {"time": "t", "ri_raw": "ri"}, node=node, ri_base="one")
 
 
-def eastwards(folder: Path, t: Any, east_m: Any) -> dict[str, Any]:
-    """The entry of a track 55 m north of LW1 at 40 m, whose nose points south-east."""
+def eastwards(folder: Path, t: Any, east_m: Any, yaw_deg: float | None = None) -> dict[str, Any]:
+    """The entry of a track 55 m north of LW1 at 40 m; with the attitude of a level flight where a heading is given."""
     t, still = np.asarray(t, float), np.zeros(len(t))
     places = (still + LW1[0] + 5e-4, LW1[1] + np.asarray(east_m) / 90_314.0, still + 40.0)
-    write_csv(folder / "track.csv", "t,lat,lon,alt,roll,pitch,yaw", t, *places, still, still, still + 120.0)
-    return table_log("track.csv", "telemetry", POSITIONS | ATTITUDE)
+    turns = () if yaw_deg is None else (still, still, still + yaw_deg)
+    write_csv(folder / "track.csv", "t,lat,lon,alt" + ",roll,pitch,yaw" * bool(turns), t, *places, *turns)
+    return table_log("track.csv", "telemetry", POSITIONS | (ATTITUDE if turns else {}))

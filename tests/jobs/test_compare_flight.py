@@ -40,7 +40,7 @@ def flight(
 ) -> Path:  # fmt: skip
     """A flight eastwards past LW1 at 40 m; ``rss`` maps channels to (seconds, levels), ``rank`` is (seconds, RI)."""
     t = np.arange(0.0, seconds + 1.0)
-    logs = [eastwards(folder, t, 5.0 * (t - 10.0))]
+    logs = [eastwards(folder, t, 5.0 * (t - 10.0), yaw_deg=120.0)]
     logs += [rss_log(folder, channel, *series) for channel, series in (rss or {}).items()]
     logs += [rank_log(folder, *rank)] if rank is not None else []
     return write_yaml(folder / "flight.yaml", {

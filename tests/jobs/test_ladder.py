@@ -105,26 +105,16 @@ def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64) -> 
     rows, columns = np.mgrid[0:19, 0:24]
     table = 2.0 * np.cos(np.radians(15.0 * columns)) + 0.1 * rows
     sphere = sphere_csv(table, np.ones(table.shape), (f"aerpaw-cmp calibrate: some, trained_on: {trained_on}",))
+    files = dict.fromkeys(("t.csv.gz", "u.csv.gz"), sphere.encode())
     series = LearnedSeries(
-        tower="LW1",
-        channel="A",
-        reader="generic_csv",
-        carrier_hz=3.3e9,
-        tower_file="t.csv.gz",
-        uav_file="u.csv.gz",
+        tower="LW1", channel="A", reader="generic_csv", carrier_hz=3.3e9, tower_file="t.csv.gz", uav_file="u.csv.gz",
         sd_db=1.0,
-    )
-    errors = Errors(series=2, rmse_db=learned_db, rmse_4s_db=2.0, free_space_rmse_db=5.0, inside_90=0.9)
+    )  # fmt: skip
     entry = Entry(
-        command="made here",
-        made="2026-11-23",
-        flights=["a", "b"],
-        flown=[],
-        trained_on=[trained_on],
-        series=[series],
-        errors=errors,
-    )
-    remember(site, "some", entry, {"t.csv.gz": sphere.encode(), "u.csv.gz": sphere.encode()})
+        command="made here", made="2026-11-23", flights=["a", "b"], flown=[], trained_on=[trained_on], series=[series],
+        errors=Errors(series=2, rmse_db=learned_db, rmse_4s_db=2.0, free_space_rmse_db=5.0, inside_90=0.9),
+    )  # fmt: skip
+    remember(site, "some", entry, files)
     path = flight(folder)
     path.write_text(path.read_text().replace("file: lake_wheeler", "file: mine.yaml"), encoding="utf-8")
     return path

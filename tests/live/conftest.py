@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import socket
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
@@ -20,33 +16,9 @@ from aerpaw_cmp.live.modem import QUERIES
 from aerpaw_cmp.live.simulator import ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.tap import Stop, TapSettings, run_tap
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
+from benchmarks.tap_common import free_port, start_tap
 
 PAGE = Page(b"<!doctype html><title>t</title>", "default-src 'none'")
-
-CHILD = """
-import json, sys
-from pathlib import Path
-from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.live.log import LogSettings
-from aerpaw_cmp.live.tap import TapSettings, run_tap
-values = json.loads(sys.argv[1])
-log = LogSettings(**values.pop("log", {}))
-watch = None
-if web := values.pop("web", None):
-    from aerpaw_cmp.live.feed import Feed
-    from aerpaw_cmp.live.web import Address, Page, WebServer
-    feed = Feed(["modem"])
-    WebServer(feed, Page(b"page", "default-src 'none'"), Address("127.0.0.1", web)).__enter__()
-    watch = lambda item: feed.put(0, item)
-print("ready", flush=True)
-try:
-    summary = run_tap(TapSettings(folder=Path(values.pop("folder")), log=log, **values), watch=watch)
-except AerpawCmpError as error:
-    print(error, file=sys.stderr)
-    sys.exit(error.exit_code)
-print(summary.reason, flush=True)
-sys.exit(summary.exit_code)
-"""
 
 
 class Browser:
@@ -230,28 +202,14 @@ def child(tmp_path, request):
     """Makes taps in their own processes."""
     processes, browsers = [], []
     watched = "web" in request.fixturenames and request.getfixturevalue("web")
-    root = Path(__file__).resolve().parents[2]
 
-    def make(port, *, popen=None, **settings):
-        values = {"port": str(port), "folder": str(tmp_path / "log"), "ri_hz": 20.0, "other_hz": 2.0, "pause_s": 0.0}
-        values |= settings
+    def make(port, **settings):
+        values = {"folder": tmp_path / "log", "ri_hz": 20.0, "other_hz": 2.0, "pause_s": 0.0} | settings
         if watched:
-            with socket.socket() as probe:
-                probe.bind(("127.0.0.1", 0))
-                values["web"] = probe.getsockname()[1]
+            values["web"] = free_port()
             browsers.append(Browser(values["web"]))
-        environment = os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{root / 'parsers'}"}
-        process = subprocess.Popen(
-            [sys.executable, "-c", CHILD, json.dumps(values)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=environment,
-            cwd="/",
-            **(popen or {}),
-        )
-        processes.append(process)
-        return process
+        processes.append(start_tap(port, **values))
+        return processes[-1]
 
     yield make
     for process in processes:

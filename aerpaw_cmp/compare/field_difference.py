@@ -86,16 +86,6 @@ class FieldAudit:
         values["phase_rms_rad"] = _rms(self.phases, self.phase_rms_rad, other.phases, other.phase_rms_rad)
         return FieldAudit(**values)
 
-    def as_dict(self) -> dict[str, object]:
-        """For ``metrics.json``."""
-        content: dict[str, object] = {name: getattr(self, name) for name in self.__slots__}
-        return {
-            **content,
-            "failed": self.failed,
-            "failures": list(self.failures),
-            "not_covered": list(self.not_covered),
-        }
-
 
 def _together(name: str, mine: Any, theirs: Any) -> Any:
     """Texts once each, the larger of two errors, the sum of two counts."""

@@ -8,14 +8,13 @@ judge the one rank that a decision makes of the probabilities, beside what alway
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.units import FloatArray, IntArray
 from .rank import MAX_RANK, cohen_kappa, kappa_of_means, one_hot, total_variation, variation_of_means
-from .statistics import NO_INTERVAL, REPLICATES, Interval, autocorrelation, bootstrap_means, interval, plain
+from .statistics import NO_INTERVAL, REPLICATES, Interval, autocorrelation, bootstrap_means, interval
 
 LEAST_PROBABILITY = 1e-6
 """What a rank counts in the log score that a forecast held impossible."""
@@ -110,10 +109,6 @@ class ForecastScore:
     expected_histogram: FloatArray
     expected_histogram_ci95: tuple[Interval, ...]
     measured_histogram: FloatArray
-
-    def as_dict(self) -> dict[str, Any]:
-        """For metrics.json; NaN becomes None."""
-        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
 
 
 def score_forecast(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +24,6 @@ from .statistics import (
     block_variance,
     bootstrap_means,
     interval,
-    plain,
     share_interval,
 )
 
@@ -659,16 +657,6 @@ class RankFit:
     p_agreement: float
     p_histogram: float
 
-    def as_dict(self) -> dict[str, Any]:
-        """The entry ``simulated.<K>`` of metrics.json."""
-        names = {name: getattr(self, name) for name in self.__slots__}
-        bars = {name: _bars(names[name]) for name in ("histogram", "histogram_ci95")}
-        return dict(plain(names | bars))
-
-
-def _bars(values: Sequence[Any] | FloatArray) -> dict[str, Any]:
-    return {str(rank): value for rank, value in enumerate(values, start=1)}
-
 
 @dataclass(frozen=True, slots=True)
 class RankComparison:
@@ -706,28 +694,6 @@ class RankComparison:
     def best_k(self) -> float:
         """The K of best agreement by pose."""
         return self.curve.best_k_agreement
-
-    def as_dict(self) -> dict[str, Any]:
-        """The entry ``rank.<tower>`` of metrics.json; what does not exist is None."""
-        names = {
-            "n": self.n,
-            "n_effective": self.n_effective,
-            "n_no_csi": self.n_no_csi,
-            "measured": {"histogram": _bars(self.histogram), "histogram_ci95": _bars(self.histogram_ci95)},
-            "best_k": self.best_k,
-            "best_k_ci95": self.curve.best_k_interval,
-            "best_k_total_variation": self.curve.best_k_total_variation,
-            "best_k_total_variation_ci95": self.curve.best_k_total_variation_interval,
-            "stale": {
-                "verdict": self.staleness.verdict,
-                "n_reports": self.staleness.n_reports,
-                "hold_s": self.staleness.hold_s,
-            },
-        }
-        result = dict(plain(names))
-        result["simulated"] = {f"{k:g}": fit.as_dict() for k, fit in self.simulated.items()}
-        result["rules"] = {name: fit.as_dict() for name, fit in self.rules.items()}
-        return result
 
 
 def compare_rank(

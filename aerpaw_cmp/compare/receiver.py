@@ -22,7 +22,7 @@ from ..common.errors import InputError
 from ..common.units import FloatArray, IntArray
 from .forecast import constant_forecast, log_losses
 from .rank import MAX_RANK, cohen_kappa, one_hot
-from .statistics import REPLICATES, autocorrelation, bootstrap_means, interval, plain
+from .statistics import REPLICATES, autocorrelation, bootstrap_means, interval
 
 FLOOR_DB = -40.0
 """Ratios of singular values below this are as good as zero to any receiver."""
@@ -167,13 +167,9 @@ class Receiver:
         """One rank (n,) per row of probabilities; 0 where there is none."""
         return decide(probability, self.decision_weight)
 
-    def as_dict(self) -> dict[str, Any]:
-        """For files; :meth:`from_dict` reads it."""
-        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
-
     @classmethod
     def from_dict(cls, numbers: Mapping[str, Any]) -> Receiver:
-        """From :meth:`as_dict`.
+        """From its fields as JSON has them.
 
         Raises
         ------

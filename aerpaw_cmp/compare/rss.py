@@ -23,7 +23,6 @@ from .statistics import (
     autocorrelation,
     correlation,
     error_intervals,
-    plain,
 )
 
 PART_DB = 10.0
@@ -101,34 +100,6 @@ class RssComparison:
     def rmse_ci95_db(self) -> Interval:
         """95 % interval of the RMSE [dB]."""
         return self.intervals.rmse_db
-
-    def as_dict(self) -> dict[str, Any]:
-        """The entry ``rss.<tower>.<channel>`` of metrics.json; what does not exist is None."""
-        before = ("offset_db", "rmse_db", "n", "n_out_of_coverage", "n_measured_out", "n_simulated_out", "n_no_pose")
-        names: dict[str, Any] = {name: getattr(self, name) for name in before}
-        names |= {
-            "at_search_edge": self.at_edge,
-            "correlation": self.correlation,
-            "rmse_ci95_db": self.intervals.rmse_db,
-            "offset_ci95_db": self.intervals.offset_db,
-            "correlation_ci95": self.intervals.correlation,
-            "n_effective": self.intervals.autocorrelation.n_effective,
-            "block_length": self.intervals.autocorrelation.block_length,
-            "identifiable_db": self.identifiable_db,
-            "lag_s": self.lag_s,
-            "trimmed": {"offset_db": self.trimmed.offset_db, "rmse_db": self.trimmed.rmse_db, "n": self.trimmed.n},
-            "fitted_on_scored": self.fitted_on_scored,
-            "baselines": {
-                name: {
-                    "offset_db": fit.offset_db,
-                    "rmse_db": fit.rmse_db,
-                    "at_search_edge": fit.at_edge,
-                    "rmse_ci95_db": self.baseline_intervals[name],
-                }
-                for name, fit in self.baselines.items()
-            },
-        }
-        return dict(plain(names))
 
 
 def compare_rss(
@@ -473,10 +444,6 @@ class ResidualBins:
     high_db: FloatArray
     explained: float
 
-    def as_dict(self) -> dict[str, Any]:
-        """For metrics.json and tables."""
-        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
-
 
 def bin_residual(residual_db: ArrayLike, quantity: ArrayLike, edges: ArrayLike | int = 12) -> ResidualBins:
     """Mean and RMSE of the residual in bins of a quantity.
@@ -566,10 +533,6 @@ class ErrorSpan:
     position_m: tuple[float, ...]
     cause: str
     geometry: Mapping[str, float] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """For metrics.json and tables."""
-        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
 
 
 def error_spans(
@@ -705,11 +668,6 @@ class ChannelDifference:
     share_parted: float
     interval_std_db: Interval
     spans: list[ErrorSpan]
-
-    def as_dict(self) -> dict[str, Any]:
-        """For metrics.json and tables."""
-        names = {name: getattr(self, name) for name in self.__slots__ if name != "spans"}
-        return dict(plain({**names, "spans": [span.as_dict() for span in self.spans]}))
 
 
 def channel_difference(

@@ -8,9 +8,8 @@ the statistic over the draws, corrected for the finite number of blocks, gives t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,25 +42,6 @@ _HELD = 1 << 21
 
 Interval = tuple[float, float]
 NO_INTERVAL: Interval = (float("nan"), float("nan"))
-
-
-def plain(value: Any) -> Any:
-    """The same value as JSON can hold it: NaN and infinities become None, NumPy scalars and arrays become Python's."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, np.datetime64):
-        return None if np.isnat(value) else str(value)
-    return value
 
 
 @dataclass(frozen=True, slots=True)
@@ -465,10 +445,6 @@ class PairedDifference:
         near, far = sorted((abs(low), abs(high)))
         digits = 1 if near >= 0.05 else 2
         return f"{self.verdict} than {other} by {size} [{near:.{digits}f}, {far:.{digits}f}]"
-
-    def as_dict(self) -> dict[str, Any]:
-        """For metrics.json; NaN becomes None."""
-        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
 
 
 def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_offset: bool = True) -> PairedDifference:

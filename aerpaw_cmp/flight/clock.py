@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..common.gaussian import determining, gaussian_kernel
+from ..common.jsonable import fields_of
 from ..common.units import AnyArray, BoolArray, FloatArray
 from ..compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
-from ..compare.statistics import plain
 
 OK, SHIFTED, CANNOT_TELL = "ok", "shifted", "cannot tell"
 """Verdicts."""
@@ -157,12 +157,8 @@ class ClockEstimate:
             verdict=self.verdict,
             reason=self.reason,
             applied=applied,
-            checks=self.as_dict(),
+            checks=fields_of(self),
         )
-
-    def as_dict(self) -> dict[str, Any]:
-        """For metrics.json; NaN becomes None."""
-        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
 
 
 def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> ClockEstimate:

@@ -87,5 +87,5 @@ class Against:
             "flights": list(self.flights),
             "sentence": self.words,
             "scores": self.scores,
-            "rank": {tower: score.as_dict() for tower, score in self.ranks.items()},
+            "rank": dict(self.ranks),
         }

@@ -35,7 +35,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         rss.setdefault(item.tower, {})[item.channel] = _rss_metrics(item)
     pairs: dict[str, dict[str, Any]] = {}
     for pair in data.pairs:
-        pairs.setdefault(pair.tower, {})[f"{pair.first} - {pair.second}"] = pair.score.as_dict()
+        pairs.setdefault(pair.tower, {})[f"{pair.first} - {pair.second}"] = pair.score
     result: dict[str, Any] = {
         **named(data, "flight title synthetic settings warnings"),
         "site": {"name": data.site.name, "illustrative": data.site.illustrative},
@@ -74,7 +74,7 @@ def _rss_metrics(one: RssResult) -> dict[str, Any]:
         "fitted": score.fitted_on_scored,
         "baselines": {name: named(model, "offset_db rmse_db") for name, model in one.baselines.items()},
         **fields_of(one.further),
-        "residual_by": {name: table.as_dict() for name, table in one.residual_by.items()},
+        "residual_by": one.residual_by,
     }
 
 
@@ -122,9 +122,19 @@ def _rank_metrics(one: RankResult) -> dict[str, Any]:
 
 def further_numbers(one: RssResult | RankResult) -> dict[str, Any]:
     """Numbers of a series that stand in a table of their own on the page, as JSON has them."""
-    numbers = {} if isinstance(one, RssResult) else one.score.as_dict()
-    for shown in ("measured", "simulated", "best_k", "best_k_ci95"):
-        numbers.pop(shown, None)
+    numbers: dict[str, Any] = {}
+    if isinstance(one, RankResult):
+        curve = one.score.curve
+        numbers = {
+            **named(one.score, "n n_effective n_no_csi"),
+            "best_k_total_variation": curve.best_k_total_variation,
+            "best_k_total_variation_ci95": curve.best_k_total_variation_interval,
+            "stale": named(one.score.staleness, "verdict n_reports hold_s"),
+            "rules": {
+                name: fields_of(fit) | _histogram(fit.histogram, fit.histogram_ci95)
+                for name, fit in one.score.rules.items()
+            },
+        }
     safe: dict[str, Any] = json_safe(numbers | fields_of(one.further))
     return safe
 
@@ -139,7 +149,7 @@ def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
             "summary": audit_summary(audit),
             **named(audit, "reference links missing_paths extra_paths rss_max_error_db"),
             "rank_disagreement": {k_key(k): v for k, v in audit.rank_disagreement.items()},
-            "field": None if audit.fields is None else audit.fields.as_dict(),
+            "field": None if audit.fields is None else {**fields_of(audit.fields), "failed": audit.fields.failed},
             **named(audit, "seconds reference_seconds"),
         },
     }

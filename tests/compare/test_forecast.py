@@ -45,7 +45,7 @@ def test_samples_without_report_or_forecast_take_no_part():
     score = score_forecast(rank, p, np.where(np.isnan(p[:, 0]), 0, 2), np.full(4, 0.25))
     assert score.n == 30
     assert score.measured_histogram.tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3, 0.0])
-    assert score_forecast(rank, np.full((50, 4), np.nan), np.zeros(50), np.full(4, 0.25)).as_dict()["kappa"] is None
+    assert np.isnan(score_forecast(rank, np.full((50, 4), np.nan), np.zeros(50), np.full(4, 0.25)).kappa)
 
 
 def test_lengths_must_match():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.jsonable import json_safe
 from aerpaw_cmp.compare import receiver as receiving
 from aerpaw_cmp.compare.forecast import log_losses
 from aerpaw_cmp.compare.rank import cohen_kappa
@@ -160,10 +161,10 @@ def test_decision_for_kappa_says_the_rare_ranks_too():
 def test_a_receiver_survives_its_file():
     x, rank, _, groups = planted(300)
     receiver = fit(x, rank, groups)
-    again = Receiver.from_dict(receiver.as_dict())
+    again = Receiver.from_dict(json_safe(receiver))
     np.testing.assert_array_equal(again.probabilities(x), receiver.probabilities(x))
     with pytest.raises(ValueError, match="without penalty"):
-        Receiver.from_dict({k: v for k, v in receiver.as_dict().items() if k != "penalty"})
+        Receiver.from_dict({k: v for k, v in json_safe(receiver).items() if k != "penalty"})
 
 
 @pytest.mark.parametrize("rank", [np.full(300, 2), np.r_[np.full(280, np.nan), np.tile([1, 2], 10)]])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
-import math
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from pydantic import Field
 
 from ...common.errors import InputError, UsageError
 from ...common.files import read_input
-from ...common.jsonable import json_safe
+from ...common.jsonable import fields_of, json_safe
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...common.yamlfile import load_yaml
 from ...compare.entries import LevelSeries, intervals, level_scores
@@ -569,14 +568,7 @@ def _score_rank(bench: Bench, task: str, both: pd.DataFrame) -> dict[str, Any]:
     constant = constant_forecast(np.concatenate(known)) if known else np.full(4, 0.25)
     said = p.argmax(axis=1) + 1
     score = score_forecast(both["measured"].to_numpy(np.float64), p / p.sum(axis=1)[:, None], said, constant)
-    return {name: _known(value) for name, value in score.as_dict().items()}
-
-
-def _known(value: Any) -> Any:
-    """A value of a score's dictionary with NaN in place of None."""
-    if isinstance(value, (list, tuple)):
-        return tuple(map(_known, value))
-    return math.nan if value is None else value
+    return {name: tuple(v) if isinstance(v, np.ndarray) else v for name, v in fields_of(score).items()}
 
 
 # --- the table of results ------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from ... import __version__
 from ...common.cells import guarded
 from ...common.errors import InputError, OutputError, UsageError
 from ...common.files import atomic_path
+from ...common.jsonable import json_object
 from ...common.outputs import OutputFile, OutputFolder, is_sealed
 from ...common.stages import Progress, begin_peak, peak_mib, silent
 from ...common.versions import utc_now
@@ -51,7 +52,7 @@ class BenchmarkResult:
 
     def as_dict(self) -> dict[str, Any]:
         """For ``--json``."""
-        return {"scores": self.scores, "skipped": self.skipped}
+        return json_object(scores=self.scores, skipped=self.skipped)
 
 
 def open_bench(data: Path, manifest: Path | None = None) -> Bench:

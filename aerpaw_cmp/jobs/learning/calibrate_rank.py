@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from ...common.errors import InputError, UsageError
+from ...common.jsonable import json_safe
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, IntArray
 from ...compare.forecast import ForecastScore, constant_forecast, score_forecast
@@ -142,7 +143,7 @@ class FittedReceiver:
             "tied": self.tied,
             "flights": list(self.flights),
             KEY: list(self.trained_on),
-            "members": [member.as_dict() for member in self.mixture.members],
+            "members": json_safe(self.mixture.members),
             "decision_weight": self.mixture.decision_weight.tolist(),
             "shift_s": self.timing.shift_s,
             "average_s": self.timing.average_s,
@@ -176,7 +177,7 @@ class RankCalibration:
     def metrics(self) -> dict[str, list[dict[str, Any]]]:
         """``rank`` of ``calibrate --json``."""
         return {
-            split: [{"flight": flight, "tower": tower, **score.as_dict()} for flight, tower, score in rows]
+            split: [{"flight": flight, "tower": tower, **json_safe(score)} for flight, tower, score in rows]
             for split, rows in self.scores.items()
         }
 

@@ -399,7 +399,7 @@ def receiver_entry(
         scores = [score for _, at, score in ranked.scores["flight_left_out"] if at == tower]
         first = next((data, s) for data in flights for s in data.rank if s.tower == tower)
         means = {
-            key: round(float(np.mean([item.as_dict()[key] for item in scores])), 3)
+            key: round(float(np.mean([getattr(item, key) for item in scores])), 3)
             for key in ("kappa", "log_score", "constant_log_score")
             if scores
         }

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ...common.units import FloatArray, IntArray, spread_out
+from ...common.units import IntArray, spread_out
 from ...compare.field_difference import FieldAudit
 from ...site.site import Site
 from ..arrays import Link, Poses
@@ -87,24 +87,6 @@ class Audit(Difference):
     samples: int = 0
     samples_reason: str = ""
     field: FieldAudit | None = None
-
-    def as_dict(self) -> dict[str, object]:
-        """For ``metrics.json``: plain numbers, K as text, None for a difference that no link could show."""
-        return {
-            "engine": self.engine,
-            "reference": self.reference,
-            "links": self.links,
-            "reference_paths": self.reference_paths,
-            "missing_paths": self.missing_paths,
-            "extra_paths": self.extra_paths,
-            "rss_max_error_db": _number(self.rss_max_error_db),
-            "rss_rms_error_db": _number(self.rss_rms_error_db),
-            "coverage_differs": self.coverage_differs,
-            "rank_disagreement": {f"{k:g}": share for k, share in self.rank_disagreement.items()},
-            "seconds": self.seconds,
-            "reference_seconds": self.reference_seconds,
-            "field": None if self.field is None else self.field.as_dict(),
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,7 +249,3 @@ def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> _Keys:
     paths = replay.paths.select(index)
     keys = plane_keys(replace(paths, pose=place[paths.pose]), planes)
     return dict(zip(keys, index.tolist(), strict=True))
-
-
-def _number(value: float | FloatArray) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -113,13 +113,6 @@ def test_no_fix_is_flagged_and_has_no_position() -> None:
     assert row["yaw_deg"] == pytest.approx(np.degrees(1.5)), "the attitude does not need a fix"
 
 
-def test_a_fix_below_two_is_no_position_whatever_it_says() -> None:
-    line = samples.VEHICLE_8.splitlines(keepends=True)[0]
-    frame = read("vehicle_out", line + line.replace(b",3,12", b",1,12")).streams[0].frame
-    assert frame["flag"].tolist() == ["", "no_fix"]
-    assert frame["latitude_deg"].isna().tolist() == [False, True]
-
-
 def test_zero_attitude_is_flagged_and_unknown_where_it_is_all_there_is() -> None:
     result = read("vehicle_out", samples.VEHICLE_10)
     assert result.streams[0].frame["flag"].iloc[2] == "zero_attitude"
@@ -155,13 +148,6 @@ def test_sounder_offsets_are_octal_and_runs_come_back() -> None:
     assert np.allclose(spacing, 0.03276, atol=1e-6), "repeats are spread between their neighbours"
 
 
-def test_sounder_floor_is_out_of_coverage_not_a_level() -> None:
-    frame = read("sounder_log", samples.SOUNDER).streams[0].frame
-    silent = frame["flag"].str.contains("out_of_coverage")
-    assert silent.tolist() == [False, False, True, True, True, True, False, False]
-    assert frame["rss_db"].isna().tolist() == silent.tolist()
-
-
 @pytest.mark.parametrize("width", [7, 8, 9])
 @pytest.mark.parametrize(
     "text", ["-17.210482", "0.42979813", "10.51112", "-0", "5", "-123.45678", "6.0000001", "-123.4567890123"]
@@ -183,30 +169,6 @@ def test_sounder_offset_outgrows_seven_digits() -> None:
     result = read("sounder_log", samples.SOUNDER_GROWN)
     assert not [text for text in result.warnings if "jump" in text]
     assert (result.streams[0].frame["flag"] == "").all()
-
-
-def test_sounder_tells_lost_samples() -> None:
-    lines = samples.SOUNDER_GROWN.splitlines(keepends=True)
-    result = read("sounder_log", lines[0] + lines[3])
-    assert any("2 samples are missing" in text for text in result.warnings)
-    assert result.streams[0].frame["flag"].tolist() == ["", "samples_lost_before"]
-
-
-def test_sounder_torn_last_value_is_not_taken() -> None:
-    cut = samples.SOUNDER_GROWN[:-3]  # '-23.5' without its end would read as -23
-    result = read("sounder_log", cut)
-    assert result.accepted == 3
-    assert "torn" in result.rejected[0].reason
-
-
-def test_sounder_run_cannot_fill_the_memory() -> None:
-    data = (
-        b"[2025-03-02 10:00:00.000000] 0000000       -20.12345\n[2025-03-02 10:00:00.032760] *\n"
-        b"[2025-03-02 10:00:00.065520] 777777777777       -20.12345\n"
-    )
-    result = read("sounder_log", data)
-    assert (result.accepted, len(result.rejected)) == (2, 1)
-    assert "believable" in result.rejected[0].reason
 
 
 def test_sounder_channel_names_the_stream() -> None:
@@ -232,20 +194,6 @@ def test_sounder_file_name_tells_what_the_layout_does_not(file_name: str, stream
     assert any("one layout" in text for text in result.warnings) == warned
     named = read("sounder_log", samples.SOUNDER, replace(OPTIONS, channel="USRP1", file_name=file_name))
     assert named.streams[0].name == "USRP1"
-
-
-def test_mat_gives_telemetry_and_a_stream_per_channel() -> None:
-    result = read("flight_mat", samples.mat_flight(), replace(OPTIONS, unit=None))
-    assert [(one.kind, one.name) for one in result.streams] == [
-        ("telemetry", "vehicle"), ("rss", "USRP1"), ("rss", "USRP2"),
-    ]  # fmt: skip
-    vehicle = stream(result, "vehicle").frame
-    assert vehicle["time"].iloc[0] == utc("2025-03-02 15:00:00.25")
-    assert vehicle["velocity_north_mps"].tolist() == [2.0] * 5
-    level = stream(result, "USRP1")
-    assert level.attributes["unit"] == "dB re full scale"
-    assert level.frame["rss_db"].isna().tolist() == [False, False, True, False, False]
-    assert level.frame["flag"].iloc[2] == "out_of_coverage"
 
 
 def test_mat_epoch_of_local_time() -> None:
@@ -288,47 +236,6 @@ def test_mat_of_another_kind_is_not_sniffed() -> None:
     assert not by_name("flight_mat").sniff(file.getvalue())
 
 
-def test_quectel_zero_is_no_csi() -> None:
-    result = read("quectel_csv", samples.QUECTEL_CSI)
-    frame = stream(result, "nr5g_csi").frame
-    assert frame["ri_raw"].tolist() == [2, 0, 4]
-    assert frame["rank"].fillna(-1).tolist() == [2, -1, 4]
-    assert frame["flag"].tolist() == ["", "no_csi", ""]
-    assert frame["mcs"].isna().tolist() == [False, True, False]
-    assert stream(result, "lte_csi").frame["rank"].tolist() == [1, 1, 1]
-    assert result.blank == 1, "the bare OK"
-    assert "torn" in result.rejected[0].reason
-
-
-def test_quectel_first_generation_and_impossible_ri() -> None:
-    frame = stream(read("quectel_csv", samples.QUECTEL_FIRST), "nr5g_csi").frame
-    assert frame["rank"].fillna(-1).tolist() == [3, -1]
-    assert frame["flag"].iloc[1] == "ri_out_of_range"
-    assert frame["time"].iloc[1] - frame["time"].iloc[0] == pd.Timedelta(seconds=9)
-
-
-def test_quectel_rows_are_told_by_their_rat() -> None:
-    """NSA writes RSRP, SINR, RSRQ; SA writes RSRP, RSRQ, SINR and is filed among LTE rows."""
-    endc = read("quectel_csv", samples.QUECTEL_ENDC, replace(OPTIONS, unit=None))
-    nsa = stream(endc, "nr_rsrp").frame
-    assert nsa["rss_db"].iloc[0] == -82
-    assert nsa["sinr_db"].iloc[0] == 21
-    assert np.isnan(nsa["rss_db"].iloc[1])
-    assert stream(endc, "lte_rsrp").frame["rss_db"].tolist() == [-91, -91]
-    assert stream(endc, "nr_rsrp").attributes["unit"] == "dBm"
-    assert "searching" in endc.rejected[0].reason
-    one_line = read("quectel_csv", samples.QUECTEL_ONE_LINE)
-    assert stream(one_line, "lte_rsrp").frame["rss_db"].tolist() == [-93]
-    sa = stream(one_line, "nr_rsrp").frame
-    assert (sa["rss_db"].tolist(), sa["sinr_db"].tolist()) == ([-71], [32])
-
-
-def test_rank_table() -> None:
-    frame = read("quectel_ri", samples.RI_TABLE).streams[0].frame
-    assert frame["rank"].fillna(-1).tolist() == [2, -1]
-    assert frame["altitude_m"].tolist() == [30.1, 30.2]
-
-
 @pytest.mark.parametrize(
     ("reader", "data"),
     [("nemo_csv", samples.NEMO_CSV), ("nemo_kml", samples.NEMO_KML)],
@@ -356,12 +263,6 @@ def test_nemo_local_origin() -> None:
         read("nemo_csv", samples.NEMO_CSV, replace(OPTIONS, time_origin="yesterday"))
 
 
-def test_nemo_row_without_rank_keeps_its_level() -> None:
-    row = read("nemo_csv", samples.NEMO_CSV).streams[0].frame.iloc[1]
-    assert np.isnan(row["rank"])
-    assert (row["flag"], row["rsrp_dbm"], row["cqi"]) == ("no_rank_in_row", -80.5, 14)
-
-
 def test_kml_with_styles_in_front_is_still_known() -> None:
     styles = b"    <Style id='8'><width>3</width></Style>\n" * 2000
     data = samples.NEMO_KML.replace(b"  <Document>\n", b"  <Document>\n" + styles)
@@ -371,26 +272,6 @@ def test_kml_with_styles_in_front_is_still_known() -> None:
         b"<?xml version='1.0'?>\n<kml><Document><Style/><Placemark><name>fence</name></Placemark></Document></kml>\n"
     )
     assert not by_name("nemo_kml").sniff(fence)
-
-
-def test_towers_of_snr_logs() -> None:
-    table = read("aadm_snr", samples.SNR_CSV)
-    assert [(one.name, one.attributes["node"], one.attributes["unit"]) for one in table.streams] == [
-        ("LW1", "LW1", "dB"), ("LW2", "LW2", "dB"),
-    ]  # fmt: skip
-    assert table.streams[1].frame["flag"].tolist() == ["", "out_of_coverage"]
-    console = read("controller_log", samples.CONTROLLER)
-    assert stream(console, "LW1").frame["rss_db"].tolist() == [9.5, 8.5], "the Download block holds no levels"
-    assert stream(console, "LW2").frame["rss_db"].tolist() == [-1.25]
-
-
-def test_srsenb_prints_zero_for_no_report_and_one_for_rank_one() -> None:
-    result = read("srsenb_log", samples.SRSENB)
-    one = result.streams[0]
-    assert one.attributes["ri_base"] == "one"
-    assert one.frame["rank"].fillna(-1).tolist() == [-1, 1, -1]
-    assert one.frame["flag"].tolist() == ["no_csi", "", "no_csi"]
-    assert any("truncated mean" in text for text in result.warnings)
 
 
 def test_srsenb_layout_with_a_pci_column_reads_the_same_numbers() -> None:

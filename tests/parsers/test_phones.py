@@ -26,37 +26,6 @@ def stream(result: ReadResult, name: str) -> Stream:
     return next(one for one in result.streams if one.name == name)
 
 
-def test_pawprints_cells_and_who_serves() -> None:
-    result = read("pawprints", samples.PAWPRINTS)
-    one, two = stream(result, "lte_pci1"), stream(result, "lte_pci2")
-    assert one.frame["rss_db"].tolist() == [-71.0, -70.0]
-    assert one.frame["serving"].tolist() == [0.0, 1.0]
-    assert two.frame["rss_db"].tolist() == [-62.0], "2147483647 is no level"
-    assert (two.attributes["pci"], two.attributes["arfcn"], two.attributes["rat"]) == (2, 66911, "lte")
-    assert two.frame["time"].tolist() == [pd.Timestamp("2025-03-02T15:00:00.250500")], "the companion's clock, UTC"
-    nr = stream(result, "nr_ss_rsrp")
-    assert nr.frame[["rss_db", "rsrq_db", "sinr_db"]].values.tolist() == [[-88.0, -11.0, 33.0]]
-
-
-def test_pawprints_with_a_location_has_a_track() -> None:
-    data = samples.PAWPRINTS.replace(
-        b'"rel_time": 1.0', b'"location": {"latitude": 35.5, "longitude": -78.5, "altitude": 90}'
-    )
-    track = stream(read("pawprints", data), "phone").frame
-    assert track[["latitude_deg", "longitude_deg", "altitude_m"]].values.tolist() == [[35.5, -78.5, 0.0]]
-
-
-def test_nemo_wide_table_gives_cells_by_pci() -> None:
-    result = read("drive_test", samples.NEMO_WIDE)
-    first = stream(result, "lte_pci110").frame
-    assert first["rss_db"].tolist() == [-76.0, -77.0]
-    assert first["serving"].tolist() == [1.0, 1.0], "still serving when detected a second later"
-    assert (first["rsrq_db"][0], first["pathloss_db"][0]) == (-6.0, 96.0)
-    assert stream(result, "lte_pci22").frame["serving"].tolist() == [0.0]
-    assert stream(result, "rs_snr").frame["value"].tolist() == [19.0], "a row of its own"
-    assert len(stream(result, "phone").frame) == 3
-
-
 def test_neighbours_are_of_the_radio_access_that_the_table_names_alone() -> None:
     """A cell that was a neighbour and served later was two streams, ``pci6`` and ``lte_pci6``."""
     rows = b"2025-03-02 10:00:00,5,-90,6,-99\n2025-03-02 10:00:01,6,-91,5,-98\n"
@@ -117,15 +86,6 @@ def test_values_are_in_the_unit_that_their_stream_says(name: str, unit: str, val
     result = read("drive_test", f"Time,NetworkTech,NR-PCI,NR RSRP,{name}\n2025-03-02 10:00:00,LTE,1,-80,3\n".encode())
     (one,) = (one for one in result.streams if "pci1" not in one.name)
     assert (one.attributes["unit"], one.frame["value" if one.kind == "kpi" else "rss_db"][0]) == (unit, value)
-
-
-def test_xcal_semicolons_and_decimal_commas() -> None:
-    result = read("drive_test", samples.XCAL)
-    cell = stream(result, "nr_pci7")
-    assert cell.frame["rss_db"].tolist() == [-81.5, -82.5]
-    assert stream(result, "phone").frame["longitude_deg"][0] == -78.7000001
-    rank = next(one for one in result.streams if one.kind == "rank")
-    assert rank.frame["rank"].tolist() == [2.0]
 
 
 @pytest.mark.parametrize(("written", "flag"), [("0", "no_csi"), ("9", "ri_out_of_range"), ("1,5", "rank_is_a_mean")])
@@ -191,58 +151,6 @@ def test_title_lines_in_front_of_a_table() -> None:
     data = b"Flight of the second\nexported by x\n\n" + samples.AIRDATA
     assert read("pose_csv", data).accepted == 2
     assert by_name("pose_csv").sniff(data)
-
-
-def test_gpx_heights_count_from_the_first_point() -> None:
-    frame = read("gpx", samples.GPX).streams[0].frame
-    assert frame["altitude_m"].tolist() == [0.0, 10.0]
-    assert frame["time"].tolist() == [pd.Timestamp("2025-03-02T15:00:00.250"), pd.Timestamp("2025-03-02T15:00:01")]
-    nemo = read("gpx", samples.GPX_NEMO, replace(PLAIN, file_name="25Mar02_100000.1.gpx"))
-    assert nemo.streams[0].frame["time"].tolist() == frame["time"].tolist()
-
-
-def test_positions_of_a_flight_script_and_not_its_plans() -> None:
-    frame = stream(read("vehicle_log", samples.VEHICLE_LOG), "vehicle").frame
-    assert frame["altitude_m"].tolist() == [40.5, 40.0], "neither home nor a waypoint"
-    assert frame["yaw_deg"][0] == 312.5
-    assert stream(read("vehicle_log", samples.VEHICLE_LOG), "power").frame["value"].tolist()[0] == -12.5
-
-
-def test_srsue_cells_and_si_suffixes() -> None:
-    result = read("srsue_log", samples.SRSUE)
-    first = stream(result, "lte_pci1").frame
-    assert first["rss_db"].tolist() == [-61.0, -62.0]
-    assert first["pathloss_db"].tolist() == [61.0, 62.0]
-    assert stream(result, "lte_pci7").frame["serving"].tolist() == [1.0]
-    assert stream(result, "cfo").frame["value"].tolist() == [-4200.0, -950.0, 1500.0]
-
-
-def test_lte_flight_epochs_are_utc_and_its_text_local() -> None:
-    result = read("flight_mat", samples.lte_flight())
-    level = stream(result, "RSRP")
-    assert level.frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00.250")
-    assert level.frame["flag"].tolist() == ["", "", "out_of_coverage", "", ""]
-    assert (level.attributes["quantity"], level.attributes["unit"]) == ("RSRP", "dB re full scale")
-    table = read("flight_mat", samples.mat_flight())
-    assert table.streams[0].frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00.250"), (
-        "the other authors' epoch is local"
-    )
-
-
-def test_processed_flights_have_no_clock_and_say_so() -> None:
-    result = read("flight_mat", samples.processed_flight())
-    track = stream(result, "vehicle")
-    assert track.attributes["clock"] == "relative"
-    assert track.frame["yaw_deg"].tolist() == pytest.approx([90.0] * 4)
-    assert stream(result, "RSRP").attributes["unit"] == "dBm"
-    assert any("no clock" in text for text in result.warnings)
-
-
-def test_quectel_console_names_the_cells_by_their_tables() -> None:
-    result = read("quectel_console", samples.QUECTEL_CONSOLE)
-    assert stream(result, "nr_pci77").frame[["rss_db", "rsrq_db", "sinr_db"]].values.tolist() == [[-82.0, -11.0, 21.0]]
-    assert stream(result, "lte_pci492").attributes["arfcn"] == 950
-    assert stream(result, "nr5g_csi").frame["rank"].tolist() == [2.0]
 
 
 @pytest.mark.parametrize(

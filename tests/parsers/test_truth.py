@@ -6,7 +6,7 @@ seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
@@ -29,13 +29,16 @@ Truth = dict[str, dict[str, list[Any]]]
 
 @dataclass(frozen=True)
 class Case:
-    """A file and what it says."""
+    """A file and what it says: columns of its streams, what a stream says of itself, words of a warning and of a reason."""
 
     name: str
     data: str | bytes
     truth: Truth
     reader: str
     options: ReadOptions = LOCAL
+    about: dict[str, dict[str, Any]] = field(default_factory=dict)
+    warned: str = ""
+    refused: str = ""
 
 
 def od(*samples: tuple[float, float]) -> str:
@@ -592,6 +595,67 @@ BINARY: dict[str, tuple[str, str, bytes, Truth, ReadOptions]] = {
 CASES |= {name: Case(file, data, truth, reader, how) for name, (reader, file, data, truth, how) in BINARY.items()}
 
 
+NAN = np.nan
+SAMPLES = [
+    Case("Quectel: 0 is no CSI", samples.QUECTEL_CSI, {
+        "nr5g_csi": {"time": [0.25, 2.25, 6.25], "ri_raw": [2, 0, 4], "rank": [2, NAN, 4], "flag": ["", "no_csi", ""], "mcs": [24, NAN, 24]},
+        "lte_csi": {"rank": [1, 1, 1]},
+    }, "quectel_csv", refused="torn"),
+    Case("Quectel: first generation, an impossible RI", samples.QUECTEL_FIRST, {
+        "nr5g_csi": {"time": [0, 9], "rank": [3, NAN], "flag": ["", "ri_out_of_range"]},
+    }, "quectel_csv"),
+    Case("Quectel: NSA writes RSRP, SINR, RSRQ", samples.QUECTEL_ENDC, {
+        "nr_rsrp": {"rss_db": [-82, NAN], "sinr_db": [21, NAN]}, "lte_rsrp": {"rss_db": [-91, -91]},
+    }, "quectel_csv", about={"nr_rsrp": {"unit": "dBm"}}, refused="searching"),
+    Case("Quectel: SA writes RSRP, RSRQ, SINR, among LTE rows", samples.QUECTEL_ONE_LINE, {
+        "lte_rsrp": {"rss_db": [-93]}, "nr_rsrp": {"rss_db": [-71], "sinr_db": [32]},
+    }, "quectel_csv"),
+    Case("Quectel: console, cells by their tables", samples.QUECTEL_CONSOLE, {
+        "nr_pci77": {"rss_db": [-82], "rsrq_db": [-11], "sinr_db": [21]}, "nr5g_csi": {"rank": [2]},
+    }, "quectel_console", about={"lte_pci492": {"arfcn": 950}}),
+    Case("table of ranks", samples.RI_TABLE, {"nr5g_csi": {"rank": [2, NAN], "altitude_m": [30.1, 30.2]}}, "quectel_ri"),
+    Case("Nemo: a row without a rank keeps its level", samples.NEMO_CSV, {
+        "pdsch_rank": {"rank": [2, NAN, 4], "flag": ["", "no_rank_in_row", ""], "rsrp_dbm": [NAN, -80.5, NAN], "cqi": [NAN, 14, NAN]},
+    }, "nemo_csv", FROM_TEN, about={"pdsch_rank": {"clock": "utc"}}),
+    Case("Nemo: cells by PCI; one goes on serving when it is detected later", samples.NEMO_WIDE, {
+        "lte_pci110": {"rss_db": [-76, -77], "serving": [1, 1]}, "lte_pci22": {"serving": [0]}, "rs_snr": {"value": [19]},
+        "phone": {"fix": [-1] * 3},
+    }, "drive_test"),
+    Case("SNR table of towers", samples.SNR_CSV, {"LW2": {"flag": ["", "out_of_coverage"]}}, "aadm_snr",
+         about={name: {"node": name, "unit": "dB"} for name in ("LW1", "LW2")}),
+    Case("controller: the Download block holds no levels", samples.CONTROLLER, {
+        "LW1": {"rss_db": [9.5, 8.5]}, "LW2": {"rss_db": [-1.25]},
+    }, "controller_log"),
+    Case("srsENB: 0 is no report, 1 is rank one", samples.SRSENB, {
+        "srsenb": {"rank": [NAN, 1, NAN], "ri_raw": [0, 1, NAN], "cqi": [11, 11, NAN], "mcs": [2, 2, 0], "flag": ["no_csi", "", "no_csi"]},
+    }, "srsenb_log", about={"srsenb": {"ri_base": "one"}}, warned="truncated mean"),
+    Case("PawPrints: who serves; 2147483647 is no level; the companion's clock, UTC", samples.PAWPRINTS, {
+        "lte_pci1": {"rss_db": [-71, -70], "serving": [0, 1]}, "lte_pci2": {"time": [0.2505], "rss_db": [-62]},
+        "nr_ss_rsrp": {"rss_db": [-88], "rsrq_db": [-11], "sinr_db": [33]},
+    }, "pawprints", about={"lte_pci2": {"pci": 2, "arfcn": 66911, "rat": "lte"}}),
+    Case("PawPrints with a location", samples.PAWPRINTS.replace(
+        b'"rel_time": 1.0', b'"location": {"latitude": 35.5, "longitude": -78.5, "altitude": 90}'
+    ), {"phone": {"latitude_deg": [35.5], "longitude_deg": [-78.5], "altitude_m": [0]}}, "pawprints"),
+    Case("XCAL: semicolons and decimal commas", samples.XCAL, {
+        "nr_pci7": {"rss_db": [-81.5, -82.5]}, "phone": {"longitude_deg": [-78.7000001] * 2}, "5g_kpi_pcell_rf_ri": {"rank": [2]},
+    }, "drive_test"),
+    Case("GPX: heights count from the first point", samples.GPX, {"track": {"time": [0.25, 1], "altitude_m": [0, 10]}}, "gpx"),
+    Case("flight script: neither home nor a waypoint is a position", samples.VEHICLE_LOG, {
+        "vehicle": {"altitude_m": [40.5, 40.0], "yaw_deg": [312.5, NAN]}, "power": {"value": [-12.5, NAN]},
+    }, "vehicle_log"),
+    Case("srsUE: cells and SI suffixes", samples.SRSUE, {
+        "lte_pci1": {"rss_db": [-61, -62], "pathloss_db": [61, 62]}, "lte_pci7": {"serving": [1]}, "cfo": {"value": [-4200, -950, 1500]},
+    }, "srsue_log"),
+    Case("MATLAB, two channels: units and silence", samples.mat_flight(), {"USRP1": {"flag": ["", "", "out_of_coverage", "", ""]}},
+         "flight_mat", about={"USRP1": {"unit": "dB re full scale"}}),
+    Case("MATLAB, LTE: unit and silence", samples.lte_flight(), {"RSRP": {"flag": ["", "", "out_of_coverage", "", ""]}},
+         "flight_mat", about={"RSRP": {"quantity": "RSRP", "unit": "dB re full scale"}}),
+    Case("MATLAB, processed: no clock", samples.processed_flight(), {"vehicle": {"yaw_deg": [90.0] * 4}}, "flight_mat",
+         about={"vehicle": {"clock": "relative"}, "RSRP": {"unit": "dBm"}}, warned="no clock"),
+]  # fmt: skip
+CASES |= {case.name: case for case in SAMPLES}
+
+
 def shown(values: Any) -> list[Any]:
     """A column as it is compared: times in seconds, numbers to the microunit."""
     if values.dtype.kind == "M":
@@ -613,6 +677,11 @@ def test_what_a_file_says_comes_out(case: Case) -> None:
         assert name in streams, f"{name} is not among {list(streams)}"
         for column, expected in columns.items():
             assert shown(streams[name][column].to_numpy()) == pytest.approx(expected, nan_ok=True), f"{name}: {column}"
+    about = {stream.name: stream.attributes for stream in result.streams}
+    for name, said in case.about.items():
+        assert {key: about[name][key] for key in said} == said
+    assert case.warned in " ".join(result.warnings)
+    assert case.refused in " ".join(line.reason for line in result.rejected)
 
 
 # --- every format at every kind of time ---------------------------------------------------------------------------------

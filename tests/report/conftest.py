@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -33,26 +34,13 @@ WAVELENGTH = 299_792_458.0 / 3.3e9
 def make_site() -> Site:
     frame = SiteFrame(35.7275, -78.6960)
     towers = {}
-    for name, east, north in (
-        ("LW1", 0.0, 0.0),
-        ("LW2", -130.0, 420.0),
-        ("LW3", 380.0, -560.0),
-        ("LW4", -420.0, -700.0),
-        ("LW5", 430.0, 830.0),
-    ):
+    places = [(0.0, 0.0), (-130.0, 420.0), (380.0, -560.0), (-420.0, -700.0), (430.0, 830.0)]
+    for name, (east, north) in zip(("LW1", "LW2", "LW3", "LW4", "LW5"), places, strict=True):
         lat, lon = frame.to_geographic(east, north)
         towers[name] = Tower(name, float(lat), float(lon), east, north)
-    rng = np.random.default_rng(3)
-    n = 400
-    trees = Trees(
-        rng.uniform(150, 420, n),
-        rng.uniform(150, 420, n),
-        np.zeros(n),
-        np.full(n, 20.0),
-        np.full(n, 10.0),
-        np.full(n, 4.0),
-        np.full(n, 0.4),
-    )
+    rng, n = np.random.default_rng(3), 400
+    east, north = rng.uniform(150, 420, n), rng.uniform(150, 420, n)
+    trees = Trees(east, north, *(np.full(n, value) for value in (0.0, 20.0, 10.0, 4.0, 0.4)))
     return Site(
         "Lake Wheeler (made for a test)",
         frame,
@@ -90,13 +78,8 @@ def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> R
     d = np.linalg.norm(position - t, axis=1)
     mirrored = np.linalg.norm(position - t * [1, 1, -1], axis=1)
     free = 40 + 20 * np.log10(WAVELENGTH / (4 * np.pi * d))
-    two = 40 + 20 * np.log10(
-        WAVELENGTH
-        / (4 * np.pi)
-        * np.abs(
-            np.exp(-2j * np.pi * d / WAVELENGTH) / d - 0.6 * np.exp(-2j * np.pi * mirrored / WAVELENGTH) / mirrored
-        )
-    )
+    waves = (np.exp(-2j * np.pi * way / WAVELENGTH) / way for way in (d, mirrored))
+    two = 40 + 20 * np.log10(WAVELENGTH / (4 * np.pi) * np.abs(next(waves) - 0.6 * next(waves)))
     azimuth = np.degrees(np.arctan2(track.north_m - t[1], track.east_m - t[0]))
     simulated = two - 3.0 * np.cos(np.radians(azimuth - 40)) ** 2
     truth = (
@@ -132,13 +115,7 @@ def make_rank(site: Site, track: Track) -> RankResult:
 def make_report() -> ReportData:
     site, track = make_site(), make_track()
     waypoints = tuple(
-        Waypoint(
-            label=c,
-            time=track.time[i],
-            east_m=float(track.east_m[i]),
-            north_m=float(track.north_m[i]),
-            up_m=float(track.up_m[i]),
-        )
+        Waypoint(label=c, time=track.time[i], **{k: float(getattr(track, k)[i]) for k in ("east_m", "north_m", "up_m")})
         for c, i in zip("ABCDEF", (480, 1700, 2560, 3420, 4280, 5500), strict=True)
     )
     rss = tuple(
@@ -153,51 +130,24 @@ def make_report() -> ReportData:
     pair = PairResult(
         tower="LW1", first="USRP1", second="USRP2", time=track.time, score=parted,
     )  # fmt: skip
+    audit = AuditResult(
+        reference="sionna", links=200, missing_paths=0, extra_paths=2, rss_max_error_db=0.004,
+        rank_disagreement={10.0: 0.0, 100.0: 0.0, 1000.0: 0.005}, seconds=0.01, reference_seconds=9.2,
+    )  # fmt: skip
     engine = EngineResult(
-        engine="image",
-        links=18000,
-        seconds=0.71,
-        paths=38211,
-        settings={"max_depth": 2},
+        engine="image", links=18000, seconds=0.71, paths=38211, settings={"max_depth": 2}, audit=audit,
         left_out=("shed (0.002 dB at most)",),
-        audit=AuditResult(
-            reference="sionna",
-            links=200,
-            missing_paths=0,
-            extra_paths=2,
-            rss_max_error_db=0.004,
-            rank_disagreement={10.0: 0.0, 100.0: 0.0, 1000.0: 0.005},
-            seconds=0.01,
-            reference_seconds=9.2,
-        ),
+    )  # fmt: skip
+    torn = (
+        RejectedLine(17, "11 fields instead of 10", "1,2,3,4,5,6,7,8,9,10,11"),
+        RejectedLine(9500, "torn line", '1,"(35.7'),
     )
     inputs = (
-        InputFile(
-            path="logs/vehicleOut.txt",
-            sha256="ab" * 32,
-            reader="vehicle_out",
-            lines=9500,
-            accepted=9490,
-            rejected=3,
-            blank=7,
-            role="telemetry",
-            rejected_lines=(
-                RejectedLine(17, "11 fields instead of 10", "1,2,3,4,5,6,7,8,9,10,11"),
-                RejectedLine(9500, "torn line", '1,"(35.7'),
-            ),
-        ),
-        InputFile(
-            path="logs/power_log.txt",
-            sha256="cd" * 32,
-            reader="sounder",
-            lines=6000,
-            accepted=6000,
-            rejected=0,
-            blank=0,
-            role="LW1 USRP1",
-            warnings=("57 repeated lines were re-expanded from '*'.",),
-        ),
-    )
+        InputFile(path="logs/vehicleOut.txt", sha256="ab" * 32, reader="vehicle_out", lines=9500, accepted=9490,
+                  rejected=3, blank=7, role="telemetry", rejected_lines=torn),
+        InputFile(path="logs/power_log.txt", sha256="cd" * 32, reader="sounder", lines=6000, accepted=6000, rejected=0,
+                  blank=0, role="LW1 USRP1", warnings=("57 repeated lines were re-expanded from '*'.",)),
+    )  # fmt: skip
     return ReportData(
         title="Sample flight around LW1, 2024-07-15", flight="sample", site=site, generated="2026-11-21T00:00:00Z",
         versions={"aerpaw-cmp": "0.1.0", "numpy": np.__version__}, inputs=inputs, track=track, waypoints=waypoints,
@@ -227,62 +177,32 @@ def make_maps() -> MapsData:
     nearest = reach.argmin(axis=0)
     wood = (at[..., 0] > 150) & (at[..., 0] < 420) & (at[..., 1] > 150) & (at[..., 1] < 420)
     rss, rank, errors = [], [], []
-    for antennas in ("SISO", "MIMO"):
-        for height in (30.0, 70.0, 110.0):
-            level = []
-            for t, d in zip(towers, reach, strict=True):
-                distance = np.hypot(d, height - 10)
-                beam = (
-                    0.0
-                    if antennas == "SISO"
-                    else 6 * np.cos(4 * np.arctan2(at[..., 1] - t.north_m, at[..., 0] - t.east_m))
-                )
-                value = 40 + beam + 20 * np.log10(WAVELENGTH / (4 * np.pi * distance))
-                blocked = wood & (height < 40) | ((d > 1200) & (height < 40))
-                level.append(np.where(blocked, np.nan, value))
-                rss.append(
-                    RssMap(
-                        tower=t.name,
-                        antennas=antennas,
-                        altitude_m=height,
-                        rss_dbm=level[-1],
-                        coverage=float(np.isfinite(level[-1]).mean()),
-                        foliage="opaque",
-                    )
-                )
-            joint = np.take_along_axis(np.array(level), nearest[None], axis=0)[0]
-            rss.append(
-                RssMap(
-                    tower="joint",
-                    antennas=antennas,
-                    altitude_m=height,
-                    rss_dbm=joint,
-                    coverage=float(np.isfinite(joint).mean()),
-                    foliage="opaque",
-                )
-            )
+    for antennas, height in itertools.product(("SISO", "MIMO"), (30.0, 70.0, 110.0)):
+        levels = {}
+        for t, d in zip(towers, reach, strict=True):
+            angle = np.arctan2(at[..., 1] - t.north_m, at[..., 0] - t.east_m)
+            beam = 0.0 if antennas == "SISO" else 6 * np.cos(4 * angle)
+            value = 40 + beam + 20 * np.log10(WAVELENGTH / (4 * np.pi * np.hypot(d, height - 10)))
+            levels[t.name] = np.where((wood | (d > 1200)) & (height < 40), np.nan, value)
+        levels["joint"] = np.take_along_axis(np.array(list(levels.values())), nearest[None], axis=0)[0]
+        rss += [
+            RssMap(tower=name, antennas=antennas, altitude_m=height, rss_dbm=level, foliage="opaque",
+                   coverage=float(np.isfinite(level).mean()))
+            for name, level in levels.items()
+        ]  # fmt: skip
     d = reach.min(axis=0)
-    for k, radius in ((10.0, 60.0), (100.0, 160.0), (1000.0, 320.0)):
-        for height in (3.0, *range(30, 111, 10)):
-            value = np.where(d < radius / 3, 3, np.where(d < radius * (1 + height / 300), 2, 1))
-            value = np.where(wood & (height < 40) | ((d > 250) & (height < 10)), 0, value)
-            rank.append(
-                RankMap(
-                    k=k, altitude_m=float(height), rank=value, share=np.array([(value == r).mean() for r in range(5)])
-                )
-            )
-            if height > 10:
-                for method, factor in (("Kriging", 1.0), ("makima", 1.6), ("spline", 1.9)):
-                    errors.append(
-                        MapError(
-                            evaluation="leave one out",
-                            method=method,
-                            k=k,
-                            altitude_m=float(height),
-                            mae=factor * (0.03 + radius / 4000 + 1 / height),
-                            n=2556,
-                        )
-                    )
+    for (k, radius), height in itertools.product(
+        ((10.0, 60.0), (100.0, 160.0), (1000.0, 320.0)), (3.0, *range(30, 111, 10))
+    ):
+        value = np.where(d < radius / 3, 3, np.where(d < radius * (1 + height / 300), 2, 1))
+        value = np.where(wood & (height < 40) | ((d > 250) & (height < 10)), 0, value)
+        share = np.array([(value == r).mean() for r in range(5)])
+        rank.append(RankMap(k=k, altitude_m=float(height), rank=value, share=share))
+        errors += [
+            MapError(evaluation="leave one out", method=method, k=k, altitude_m=float(height), n=2556,
+                     mae=factor * (0.03 + radius / 4000 + 1 / height))
+            for method, factor in (("Kriging", 1.0), ("makima", 1.6), ("spline", 1.9)) if height > 10
+        ]  # fmt: skip
     distance = np.arange(15.0, 500, 30)
     model = 0.2932 * np.exp(-0.0508 * distance) + 0.7057 * np.exp(-0.001 * distance)
     lines = tuple(np.array([[-540.0, y], [540.0, y + 150]]) for y in (-350.0, 200.0))

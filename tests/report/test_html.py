@@ -115,72 +115,37 @@ def test_first_screen_says_what_and_how_well(report_data):
     text = render(report_data).text
     head = text[: text.index("The flight")]
     panel = report_data.rss[0]
-    for piece in (
-        f"{panel.score.offset_db:.1f}",
-        f"{panel.score.rmse_db:.2f}",
-        f"{panel.baselines['free_space'].rmse_db:.2f}",
-        f"{panel.baselines['two_ray'].rmse_db:.2f}",
-        "synthetic",
-        "illustrative",
-    ):
+    errors = (panel.score.rmse_db, *(panel.baselines[name].rmse_db for name in ("free_space", "two_ray")))
+    for piece in (f"{panel.score.offset_db:.1f}", *(f"{error:.2f}" for error in errors), "synthetic", "illustrative"):
         assert piece in head
 
 
 def test_not_called_synthetic_or_illustrative_when_it_is_neither(report_data):
-    data = dataclasses.replace(
-        report_data,
-        synthetic=False,
-        site=dataclasses.replace(report_data.site, illustrative=False, name="here"),
-        rss=(),
-        rank=(),
-    )
-    text = render(data).text
+    site = dataclasses.replace(report_data.site, illustrative=False, name="here")
+    text = render(dataclasses.replace(report_data, synthetic=False, site=site, rss=(), rank=())).text
     assert "synthetic" not in text
     assert "illustrative" not in text
 
 
 def hostile_report(data: ReportData, text: str) -> ReportData:
     site = dataclasses.replace(data.site, name=text, notes=(text,))
+    clock = ClockResult(
+        receiver=text, radio_minus_telemetry_s=0.0, ci95_s=(0, 0), verdict=text, reason=text, applied=ESTIMATED
+    )
     panel = with_numbers(
-        data.rss[0],
-        tower=text,
-        channel=text,
-        unit=text,
-        clock=ClockResult(
-            receiver=text, radio_minus_telemetry_s=0.0, ci95_s=(0, 0), verdict=text, reason=text, applied=ESTIMATED
-        ),
-        fitted_on_scored=(text,),
+        data.rss[0], tower=text, channel=text, unit=text, clock=clock, fitted_on_scored=(text,),
         spans=(dataclasses.replace(data.rss[0].spans[0], cause=text),),
-    )
+    )  # fmt: skip
     bad_input = InputFile(
-        path=text,
-        sha256=text,
-        reader=text,
-        lines=1,
-        accepted=0,
-        rejected=1,
-        blank=0,
-        role=text,
-        warnings=(text,),
+        path=text, sha256=text, reader=text, lines=1, accepted=0, rejected=1, blank=0, role=text, warnings=(text,),
         rejected_lines=(RejectedLine(1, text, text),),
-    )
+    )  # fmt: skip
     engine = dataclasses.replace(data.engine, engine=text, left_out=(text,), settings={text: text})
     return dataclasses.replace(
-        data,
-        title=text,
-        flight=text,
-        site=site,
-        generated=text,
-        versions={text: text},
-        inputs=(bad_input,),
-        rss=(panel,),
-        rank=(dataclasses.replace(data.rank[0], tower=text),),
-        engine=engine,
-        warnings=(text,),
-        notes=(text,),
-        settings={text: {text: [text]}},
-        stages_s={text: 1.0},
-    )
+        data, title=text, flight=text, site=site, generated=text, versions={text: text}, inputs=(bad_input,),
+        rss=(panel,), rank=(dataclasses.replace(data.rank[0], tower=text),), engine=engine, warnings=(text,),
+        notes=(text,), settings={text: {text: [text]}}, stages_s={text: 1.0},
+    )  # fmt: skip
 
 
 def test_hostile_text_is_only_text(report_data):

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from aerpaw_cmp.common.stages import Stages
-from aerpaw_cmp.report import names, write
+from aerpaw_cmp.report import write
 from aerpaw_cmp.report.plots.flight import figure_specs
 
 
@@ -45,12 +45,6 @@ def test_the_seconds_of_the_writing_are_told(small_report, tmp_path):
     numbers = json.loads((tmp_path / "metrics.json").read_text())["stages"]
     assert numbers["report_s"] == written.data.stages_s["report"] > 0
     assert "replay_s" in numbers
-
-
-def test_without_rss_the_tables_have_their_columns(small_report, tmp_path):
-    bare = dataclasses.replace(small_report, rss=(), rank=(), pairs=(), track=None, waypoints=())
-    write.write_report(bare, tmp_path)
-    assert (tmp_path / "rss.csv").read_text() == ",".join(names.RSS_COLUMNS) + "\n"
 
 
 def test_importing_the_room_draws_nothing():

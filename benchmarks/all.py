@@ -63,7 +63,6 @@ SMALLEST: dict[str, list[str]] = {
     "kriging": ["--quick", "--pairs", "60"],
     "learned_map": ["--quick", "--only", "flights", "lte"],
     "left_out_reports": ["--only", "lte50"],
-    "long_flight": ["--hours", "0.3", "--shares", "1"],
     "mutation": ["record", "{folder}/map.json", "--tests", "tests/compare/test_offset.py"],
     "outside_faults": ["--only", "take-off ground not added to the track", "--no-tests"],
     "output_faults": ["--kills", "5"],

@@ -151,7 +151,8 @@ def long_flight(scaling: dict[str, Any]) -> list[str]:
     seconds, beyond = found
     return [
         f"- **A flight of ten hours** (1 000 000 samples of two channels): {number(seconds)} s of processor, "
-        f"{beyond:.0f} times beyond what was measured here; `python benchmarks/long_flight.py` measures it."
+        f"{beyond:.0f} times beyond what was measured here; "
+        "`python benchmarks/scaling.py --axes report --large --seconds 3600` measures it."
     ]
 
 

@@ -4,7 +4,7 @@ poses     replay of 5 towers, 4 x 4 elements, 12 buildings, depth 2
 towers    replay of 10 000 poses, 12 buildings, depth 2
 faces     paths of 100 poses of one tower, depth 2, ever more buildings (five faces each, and the ground)
 samples   comparison of one channel with its intervals (1000 bootstrap replicates), no replay
-report    report of a flight of two channels without audit, by its samples (benchmarks/long_flight.py)
+report    report of a flight of two channels without audit, by its samples; --large --seconds 3600: ten hours
 flights   campaign of ever more flights of 130 s, one tower, two channels, two settings, one worker
 workers   the campaign of the most flights with one and with two workers
 
@@ -17,6 +17,7 @@ A power is that between the two largest sizes; a size that is refused is told wi
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import os
@@ -120,13 +121,43 @@ def samples(count: int) -> dict[str, float]:
     return timed(lambda: compare_rss(np.arange(count) / 10, level + noise, level, baselines={"flat": 0 * level - 70}))
 
 
-def report(hours: float) -> dict[str, float]:
-    """A report as a process, imports included, from simulated logs."""
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    import long_flight
+def flight_on_laps(hours: float) -> dict[str, Any]:
+    """flight.yaml of two channels of one tower, on laps of the sample flight's route until the hours are over."""
+    content = yaml.safe_load((ROOT / "sample_logs" / "flight.yaml").read_text(encoding="utf-8"))
+    plan, route = content["flight"]["plan"], content["flight"]["plan"]["waypoints"]
+    first, laps, last = route[:2], route[2:-2], route[-2:]
+    lap_s = _seconds(laps + laps[:1], plan)
+    points = [*first]
+    for number in range(max(1, round((hours * 3600.0 - 60.0) / lap_s))):
+        points += [{**p, "label": p["label"] if number == 0 else ""} for p in laps]
+    intervals = {"rss_interval_s": 0.036, "telemetry_interval_s": 0.1, "clock_shift_s": {}}
+    plan |= {**intervals, "waypoints": [*points, *last]}
+    logs = [log for log in content["logs"] if log.get("node", "LW1") == "LW1" and "ri" not in log["path"]]
+    return {**content, "logs": logs, "rt": {**content["rt"], "audit_links": 0}}
 
-    (row,) = long_flight.run(hours, [1.0], rank=False)["rows"]
-    return {**row["total"], "samples": row["samples"]}
+
+def _seconds(points: list[dict[str, Any]], plan: dict[str, Any]) -> float:
+    """How long a planned route takes [s]."""
+    total = sum(p.get("hold_s", 0.0) for p in points[:-1])
+    for a, b in itertools.pairwise(points):
+        far = np.hypot(b["east_m"] - a["east_m"], b["north_m"] - a["north_m"])
+        total += max(far / plan["speed_mps"], abs(b["height_m"] - a["height_m"]) / plan["climb_mps"])
+    return float(total)
+
+
+def report(hours: float) -> dict[str, float]:
+    """A report as a process, imports included, from simulated logs; 1 000 000 samples of a channel in ten hours."""
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    from report import run as run_process
+
+    program = [sys.executable, "-m", "aerpaw_cmp"]
+    with tempfile.TemporaryDirectory() as name:
+        plan, flight, out = (str(Path(name) / part) for part in ("plan.yaml", "flown", "out"))
+        Path(plan).write_text(yaml.safe_dump(flight_on_laps(hours), sort_keys=False), encoding="utf-8")
+        run_process([*program, "simulate", plan, "-o", flight])
+        spent = run_process([*program, "report", f"{flight}/flight.yaml", "-o", out, "--audit", "none"])
+        metrics = json.loads(Path(out, "metrics.json").read_text(encoding="utf-8"))
+    return {**spent, "samples": sum(m["n"] for tower in metrics["rss"].values() for m in tower.values())}
 
 
 def flights(count: int, workers: int = 1) -> dict[str, float]:

@@ -82,10 +82,15 @@ def keys(paths: Any) -> set[tuple[int, ...]]:
     }
 
 
-def plane_keys(paths: Any, plane: np.ndarray) -> set[tuple[int, ...]]:
+def row_keys(paths: Any, plane: np.ndarray) -> list[tuple[int, ...]]:
+    """Pose, tower and planes of each path."""
     numbers = np.append(plane, -1)
     rows = np.column_stack([paths.pose, paths.tower, numbers[paths.faces]])
-    return {tuple(n for n in row if n >= 0) for row in rows.tolist()}
+    return [tuple(n for n in row if n >= 0) for row in rows.tolist()]
+
+
+def plane_keys(paths: Any, plane: np.ndarray) -> set[tuple[int, ...]]:
+    return set(row_keys(paths, plane))
 
 
 class Clock:
@@ -214,12 +219,6 @@ def sionna_row(task: dict[str, Any]) -> dict[str, Any]:
     }
     clear = free_in_sionna(surfaces, ours.select(lacking), sources, targets)
     return row | {"extra_confirmed": int(clear.sum()), "extra_refuted": int((~clear).sum())}
-
-
-def row_keys(paths: Any, plane: np.ndarray) -> list[tuple[int, ...]]:
-    numbers = np.append(plane, -1)
-    rows = np.column_stack([paths.pose, paths.tower, numbers[paths.faces]])
-    return [tuple(n for n in row if n >= 0) for row in rows.tolist()]
 
 
 SHORTENED_M = 0.02

@@ -59,32 +59,8 @@ DEAREST = (
     "jobs/test_compare_flight.py",
     "report/test_browser_map.py",
     "machine/test_llvm.py",
-    "live/test_log.py",
-    "live/test_bad_input.py",
-    "test_docs.py",
-    "jobs/test_calibrate.py",
-    "test_cli_commands.py",
-    "live/test_benchmarks.py",
-    "common/test_output_faults.py",
-    "report/test_report.py",
-    "logs/test_flight_file.py",
-    "report/test_exports.py",
-    "compare/test_receiver.py",
-    "jobs/test_outcomes.py",
-    "report/test_maps.py",
-    "maps/test_netcdf.py",
-    "jobs/test_live_prediction.py",
-    "test_cli_manners.py",
-    "compare/test_direction_gain.py",
-    "logs/test_fuzz_inputs.py",
-    "test_round_trip.py",
-    "jobs/test_outputs_of_commands.py",
-    "jobs/test_plan.py",
-    "maps/test_kriging.py",
-    "compare/test_calibration.py",
-    "test_project.py",
 )
-"""Files that take 3 s and more, the longest first by and large."""
+"""Files that take longest, by and large in that order."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

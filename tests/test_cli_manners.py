@@ -209,18 +209,8 @@ def test_an_interrupt_says_what_is_kept(tmp_path: Path) -> None:
     before = tmp_path / "r" / "a.html"
     with OutputFolder(before.parent, job="report") as output, output.filling() as folder:
         (folder / "a.html").write_text("an earlier report")
-    flight = str(SAMPLE / "flight.yaml")
-    line = [
-        sys.executable,
-        "-m",
-        "aerpaw_cmp",
-        "report",
-        flight,
-        "--audit",
-        "none",
-        "-o",
-        str(before.parent),
-    ]
+    words = f"-m aerpaw_cmp report {SAMPLE / 'flight.yaml'} --audit none -o".split()
+    line = [sys.executable, *words, str(before.parent)]
     run = subprocess.Popen(
         line, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background ignores it

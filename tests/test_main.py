@@ -18,20 +18,8 @@ from aerpaw_cmp.common.errors import CheckError, InputError, UsageError
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
 ROOT = Path(__file__).resolve().parents[1]
-HEAVY = (
-    "sionna",
-    "mitsuba",
-    "drjit",
-    "matplotlib",
-    "pandas",
-    "numpy",
-    "scipy",
-    "h5py",
-    "typer",
-    "click",
-    "rich",
-    "pydantic",
-)
+HEAVY = {"sionna", "mitsuba", "drjit", "matplotlib", "pandas", "numpy", "scipy", "h5py"}
+HEAVY |= {"typer", "click", "rich", "pydantic"}
 
 
 def python(*arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:

@@ -396,19 +396,8 @@ def test_the_demo_of_the_readme(driver, tmp_path):
     sim = run("modem-sim", "--link", tmp_path / "modem", "--flight", flight, "--telemetry", telemetry)
     try:
         sim.stdout.readline()
-        tapped = run(
-            "tap",
-            tmp_path / "modem",
-            "-o",
-            log,
-            "--flight",
-            flight,
-            "--telemetry",
-            telemetry,
-            "--web",
-            "127.0.0.1:0",
-            "--no-status",
-        )
+        options = ("--flight", flight, "--telemetry", telemetry, "--web", "127.0.0.1:0", "--no-status")
+        tapped = run("tap", tmp_path / "modem", "-o", log, *options)
         driver.get(page_of(tapped))
         until(
             driver, "live.poses().length > 8 && live.state.modems[0].predictions.columns.predicted.some(v => v > 0)", 40

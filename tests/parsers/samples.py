@@ -562,26 +562,11 @@ BINARY = ("flight_mat", "iq_burst", "sigmf", "ardupilot_bin", "mavlink_tlog", "p
 CASES = [(reader, name) for reader, samples in SAMPLES.items() for name in samples]
 
 WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
-    "nemo_csv",
-    "nemo_kml",
-    "tap_jsonl",
-    "pawprints",
-    ("vehicle_out", "utc_offset"),
-    ("flight_mat", "lte"),
-    ("flight_mat", "processed"),
-    ("gpx", "track"),
-    ("drive_test", "srsue_metrics"),
-    ("pose_csv", "airdata"),
-    "srsran_json",
-    ("srsran_gnb", "log"),
-    ("oai_log", "frames"),
-    ("oai_log", "ue"),
-    "amarisoft_json",
-    "own_csv",
-    "ardupilot_bin",
-    "mavlink_tlog",
-    "px4_ulog",
-)
+    "nemo_csv", "nemo_kml", "tap_jsonl", "pawprints", "srsran_json", "amarisoft_json", "own_csv",
+    "ardupilot_bin", "mavlink_tlog", "px4_ulog",
+    ("vehicle_out", "utc_offset"), ("flight_mat", "lte"), ("flight_mat", "processed"), ("gpx", "track"),
+    ("drive_test", "srsue_metrics"), ("pose_csv", "airdata"), ("srsran_gnb", "log"), ("oai_log", "frames"), ("oai_log", "ue"),
+)  # fmt: skip
 """Readers and samples whose clock is UTC or relative."""
 
 NO_LOGS: dict[str, bytes] = {

@@ -646,6 +646,18 @@ SAMPLES = [
     Case("srsUE: cells and SI suffixes", samples.SRSUE, {
         "lte_pci1": {"rss_db": [-61, -62], "pathloss_db": [61, 62]}, "lte_pci7": {"serving": [1]}, "cfo": {"value": [-4200, -950, 1500]},
     }, "srsue_log"),
+    Case("OAI gNB: the old layout and the new", samples.OAI_GNB, {
+        "oai": {"rank": [2, 1], "rnti": [0x1F4D] * 2}, "nr_rsrp": {"rss_db": [-78]},
+    }, "oai_log"),
+    Case("OAI gNB: 128 frames of 10 ms", samples.OAI_GNB_FRAMES, {"oai": {"time": [0, 1.28]}}, "oai_log",
+         replace(LOCAL, time_origin="2025-03-02T15:00:00Z")),
+    Case("OAI UE", samples.OAI_UE, {"oai": {"time": [0.25, 1.25], "rank": [2, 1], "sinr_db": [20, 19]}}, "oai_log"),
+    Case("SigMF of dataset 12", samples.SIGMF, {
+        "vehicle": {"longitude_deg": [-78.7, -78.71]}, "USRP1": {"time": [0.25, 0.55], "rss_db": [-40.5, -41.5]},
+        "USRP2": {"flag": ["", "out_of_coverage"]},
+    }, "sigmf"),
+    Case("our RSS table", samples.RSS_EXPORT, {"LW1_USRP1": {"flag": ["", "out_of_coverage"]}}, "own_csv",
+         about={f"{node}_USRP1": {"node": node, "channel": "USRP1"} for node in ("LW1", "LW2")}),
     Case("MATLAB, two channels: units and silence", samples.mat_flight(), {"USRP1": {"flag": ["", "", "out_of_coverage", "", ""]}},
          "flight_mat", about={"USRP1": {"unit": "dB re full scale"}}),
     Case("MATLAB, LTE: unit and silence", samples.lte_flight(), {"RSRP": {"flag": ["", "", "out_of_coverage", "", ""]}},

@@ -132,3 +132,45 @@ def set_scheme(driver, *schemes: str) -> None:
     features = [{"name": "prefers-color-scheme", "value": scheme} for scheme in schemes]
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
     frame(driver)
+
+
+class PageLaws:
+    """Laws of every page; the module gives the page's ``driver``.
+
+    ``ready`` is true once its script is done, ``views`` are what may not overflow, ``static`` stands without scripts.
+    """
+
+    ready = ""
+    views = ""
+    static: tuple[str, ...] = ()
+
+    def papers(self, driver) -> list[list[int]]:
+        """Colour of the page in the light and in the dark scheme."""
+        raise NotImplementedError
+
+    def test_nothing_is_said_on_the_console_and_nothing_leaves_the_page(self, driver):
+        assert complaints(driver) == []
+        assert asked_outside(driver) == []
+
+    def test_no_serious_finding_of_accessibility(self, driver):
+        assert serious_findings(driver) == {}
+
+    @pytest.mark.parametrize("width", [1440, 768, 390])
+    def test_nothing_overflows(self, driver, width):
+        page, rights = extents(driver, width, self.views)
+        assert page <= width
+        assert rights
+        assert max(rights) <= width
+
+    def test_dark_and_light(self, driver):
+        assert [paper[:3] for paper in self.papers(driver)] == [[255, 255, 255], [23, 23, 23]]
+
+    def test_with_scripts_off_tables_and_figures_stand(self, driver):
+        driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+        try:
+            driver.refresh()
+            assert not driver.find_element("id", "explorer").is_displayed()
+            assert all(driver.find_element("css selector", place).is_displayed() for place in self.static)
+        finally:
+            driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+            reload_page(driver, self.ready)

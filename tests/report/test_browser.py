@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -11,15 +12,11 @@ from aerpaw_cmp.compare.offset import grid_offset
 from aerpaw_cmp.report import write
 from benchmarks.fabricated import with_numbers
 from tests.report.browsing import (
-    asked_outside,
+    PageLaws,
     choose,
-    complaints,
-    extents,
     frame,
     needs_browser,
     open_page,
-    reload_page,
-    serious_findings,
     set_scheme,
     set_width,
     start,
@@ -48,11 +45,6 @@ def driver(page):
 def whole_flight(request):
     if "driver" in request.fixturenames:
         request.getfixturevalue("driver").execute_script("explorer.span(null)")
-
-
-def test_nothing_is_said_on_the_console_and_nothing_leaves_the_page(driver):
-    assert complaints(driver) == []
-    assert asked_outside(driver) == []
 
 
 def test_numbers_of_the_whole_flight_are_those_of_the_report(driver, small_report):
@@ -141,10 +133,6 @@ def test_the_map_shows_the_flight_from_above_and_in_three_dimensions(driver):
     assert driver.execute_script("return explorer.state.tilt") < 1
 
 
-def test_no_serious_finding_of_accessibility(driver):
-    assert serious_findings(driver) == {}
-
-
 def test_times_on_the_axes_are_round_and_say_utc(driver):
     shown = driver.execute_script("return explorer.times()")
     assert len(shown) >= 3
@@ -211,33 +199,17 @@ def test_no_two_elements_share_an_identifier(driver):
     assert sorted({one for one in found if found.count(one) > 1}) == []
 
 
-@pytest.mark.parametrize("width", [1440, 768, 390])
-def test_nothing_overflows(driver, width):
-    page, charts = extents(driver, width, ".u-wrap")
-    assert page <= width
-    assert charts
-    assert max(charts) <= width
+class TestPage(PageLaws):
+    ready, views, static = "window.explorer", ".u-wrap", ("#figure-overview", ".numbers")
 
-
-def test_dark_and_light(driver):
-    seen = []
-    for scheme in ("light", "dark"):
-        set_scheme(driver, scheme)
-        seen.append(driver.execute_script("return getComputedStyle(document.body).backgroundColor"))
-    set_scheme(driver)
-    assert seen == ["rgb(255, 255, 255)", "rgb(23, 23, 23)"]
-
-
-def test_with_scripts_off_the_static_figures_stand(driver):
-    driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
-    try:
-        driver.refresh()
-        assert not driver.find_element("id", "explorer").is_displayed()
-        assert driver.find_element("id", "figure-overview").is_displayed()
-        assert driver.find_element("css selector", ".numbers").is_displayed()
-    finally:
-        driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
-        reload_page(driver, "window.explorer")
+    def papers(self, driver):
+        seen = []
+        for scheme in ("light", "dark"):
+            set_scheme(driver, scheme)
+            colour = driver.execute_script("return getComputedStyle(document.body).backgroundColor")
+            seen.append([int(part) for part in re.findall(r"\d+", colour)])
+        set_scheme(driver)
+        return seen
 
 
 def test_a_broken_formula_would_be_seen(driver, small_report):

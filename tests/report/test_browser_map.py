@@ -11,16 +11,12 @@ from aerpaw_cmp.report.maps import explorer as map_explorer
 from aerpaw_cmp.report.maps import html as maps_html
 from aerpaw_cmp.report.maps.data import JOINT
 from tests.report.browsing import (
-    asked_outside,
+    PageLaws,
     choose,
-    complaints,
-    extents,
     frame,
     needs_browser,
     open_page,
     papers,
-    reload_page,
-    serious_findings,
     start,
 )
 
@@ -80,11 +76,6 @@ def of(data, tower, antennas, foliage, height):
     return next(
         m for m in data.rss if (m.tower, m.antennas, m.foliage, m.altitude_m) == (tower, antennas, foliage, height)
     )
-
-
-def test_nothing_is_said_on_the_console_and_nothing_leaves_the_page(driver):
-    assert complaints(driver) == []
-    assert asked_outside(driver) == []
 
 
 @pytest.mark.parametrize(
@@ -248,29 +239,13 @@ def test_the_keyboard_steps_over_the_cells(driver):
     assert (e1 - e0, n1 - n0) == (60.0, 0.0)
 
 
-def test_no_serious_finding_of_accessibility(driver):
-    driver.execute_script("mapExplorer.setDifference(true); mapExplorer.everything()")
-    assert serious_findings(driver) == {}
+class TestPage(PageLaws):
+    ready, views = READY, "#explorer canvas, #explorer select"
+    static = ("#result table", "#rss summary")
 
+    def papers(self, driver):
+        return papers(driver, "histogram")
 
-@pytest.mark.parametrize("width", [1440, 768, 390])
-def test_nothing_overflows(driver, width):
-    page, rights = extents(driver, width, "#explorer canvas, #explorer select")
-    assert page <= width
-    assert max(rights) <= width
-
-
-def test_dark_and_light(driver):
-    assert papers(driver, "histogram") == [[255, 255, 255, 255], [23, 23, 23, 255]]
-
-
-def test_with_scripts_off_the_tables_and_figures_stand(driver):
-    driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
-    try:
-        driver.refresh()
-        assert not driver.find_element("id", "explorer").is_displayed()
-        assert driver.find_element("css selector", "#result table").is_displayed()
-        assert driver.find_element("css selector", "#rss summary").is_displayed()
-    finally:
-        driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
-        reload_page(driver, READY)
+    def test_no_serious_finding_of_accessibility(self, driver):
+        driver.execute_script("mapExplorer.setDifference(true); mapExplorer.everything()")
+        super().test_no_serious_finding_of_accessibility(driver)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
 
 from ..common.gaussian import determining, gaussian_kernel
 from ..common.jsonable import fields_of
-from ..common.units import AnyArray, BoolArray, FloatArray
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
 
 OK, SHIFTED, CANNOT_TELL = "ok", "shifted", "cannot tell"
@@ -54,6 +54,9 @@ _WHITE = (0.1, 0.3, 0.9)
 _GAIN = (0.05, 0.5, 1.0, 2.0)
 """Tried for :class:`_Parts`."""
 
+_AT_ONCE = 16
+"""Lags whose systems are held in memory."""
+
 
 class _Parts(NamedTuple):
     """Memory of the residual [s], its white part and the gains, in standard deviations of the part with memory."""
@@ -87,11 +90,16 @@ class Along:
     distance_m: FloatArray
     directions: FloatArray
 
-    def tables(self) -> tuple[FloatArray, FloatArray]:
-        """Features (g, p) of offset, slope and the gains of both ends; levels (g, models)."""
+    def features(self) -> FloatArray:
+        """Features (g, p) of offset, slope and the gains of both ends."""
         ends = [_gain_features(self.directions[:, 3 * end : 3 * end + 3], _CHORDS[end]) for end in (0, 1)]
         slope = np.log10(self.distance_m) - 2.0
-        return np.column_stack([np.ones_like(slope), slope, *ends]), np.column_stack(list(self.predicted_db.values()))
+        return np.column_stack([np.ones_like(slope), slope, *ends])
+
+    @property
+    def place(self) -> tuple[float, float, bytes, bytes]:
+        """Equal where the features are."""
+        return self.start_s, self.step_s, self.distance_m.tobytes(), self.directions.tobytes()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,22 +194,28 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     lag, excludes nothing. A level that depends on no position must be less likely than that.
     """
     models = list(channels[0].along.predicted_db)
-    tables = {id(c.along): c.along.tables() for c in {id(c.along): c for c in channels}.values()}
-    bins = {c.name: b for c in channels if (b := _Bins.of(c, tables[id(c.along)], window_s)) is not None}
+    features = {place: along.features() for place, along in {c.along.place: c.along for c in channels}.items()}
+    bins = {
+        tuple(c.name for c in some): b
+        for some in _at_one_time(channels)
+        if (b := _Bins.of(some, features[some[0].along.place], window_s)) is not None
+    }
     if not bins:
         return _nothing(NO_OVERLAP, window_s)
     lags = _symmetric(window_s, _STEP_S)
-    first = np.sum([b.likelihood(lags, [_START]) for b in bins.values()], axis=0)
-    starts = {0.0, *lags[first.argmax(axis=0)].tolist()}  # of each model, and of clocks that agree
-    parts = {name: dict.fromkeys(p for lag in starts for p in b.fitted(lag)) for name, b in bins.items()}
+    first = np.sum([b.likelihood(lags, [[_START]] * len(names)).sum(axis=0) for names, b in bins.items()], axis=0)
+    starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # of each model, and of clocks that agree
+    parts = {names: b.fitted(starts) for names, b in bins.items()}
 
     def likelihood(some: FloatArray) -> FloatArray:
-        return np.stack([b.likelihood(some, list(parts[name])).T for name, b in bins.items()])
+        return np.concatenate([b.likelihood(some, parts[names]) for names, b in bins.items()])
 
     tried, own = _finer(lags, likelihood, window_s)
-    estimate = _judged(tried, own, tuple(bins), window_s)
+    names = [name for together in bins for name in together]
+    estimate = _judged(tried, own, names, window_s)
     total = own.sum(axis=0).max(axis=1)  # of each model at its likeliest lag
-    estimate = replace(estimate, model=models[int(total.argmax())], n=sum(b.n for b in bins.values()))
+    n = sum(b.n * len(together) for together, b in bins.items())
+    estimate = replace(estimate, model=models[int(total.argmax())], n=n)
     explained = total.max() - sum(b.constant() for b in bins.values())
     if explained < EVIDENCE_NAT + np.log(len(lags)):  # so much is had by trying as many lags
         return replace(estimate, verdict=CANNOT_TELL, reason=NO_DEPENDENCE)
@@ -210,6 +224,15 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
 
 NO_OVERLAP = "too few samples at which the telemetry gives a position for every lag of the window"
 NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
+
+
+def _at_one_time(channels: Sequence[ClockChannel]) -> list[list[ClockChannel]]:
+    """Channels in groups that share all but the levels: where and when they were measured, and which are missing."""
+    groups: dict[tuple[object, ...], list[ClockChannel]] = {}
+    for one in channels:
+        known = [np.isfinite(v).tobytes() for v in (one.measured_db, *one.along.predicted_db.values())]
+        groups.setdefault((one.along.place, np.asarray(one.time_s).tobytes(), *known), []).append(one)
+    return list(groups.values())
 
 
 def _finer(
@@ -272,9 +295,10 @@ def _judged(lags: FloatArray, own: FloatArray, names: Sequence[str], window_s: f
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bins:
-    """Means (n,) of a channel; the instants (s,) at which predictions are averaged, and the first of each mean.
+    """Means (n, channels); the instants (s,) at which predictions are averaged, and the first of each mean.
 
-    ``features`` of directions are averaged over as long a time about each instant.
+    ``features`` of directions are averaged over as long a time about each instant. ``predicted`` (channels, models)
+    says which of the ``levels`` (g, k) is the prediction for a channel by a model.
     """
 
     mean_db: FloatArray
@@ -284,21 +308,28 @@ class _Bins:
     along: Along
     features: FloatArray
     levels: FloatArray
+    predicted: IntArray
 
     @property
     def n(self) -> int:
         return len(self.mean_s)
 
     @classmethod
-    def of(cls, channel: ClockChannel, tables: tuple[FloatArray, FloatArray], window_s: float) -> _Bins | None:
-        """Bins whose every shift within the window has a prediction; None where there are too few."""
-        along, (features, levels) = channel.along, tables
-        t, y = np.asarray(channel.time_s), np.asarray(channel.measured_db)
+    def of(cls, channels: Sequence[ClockChannel], features: FloatArray, window_s: float) -> _Bins | None:
+        """Bins of channels that share all but the levels, and whose every shift within the window has a prediction.
+
+        None where there are too few.
+        """
+        along = channels[0].along
+        models = {id(c.along): list(c.along.predicted_db.values()) for c in channels}
+        levels = np.column_stack([table for tables in models.values() for table in tables])
+        columns = dict(zip(models, np.arange(levels.shape[1]).reshape(len(models), -1), strict=True))
+        t, y = np.asarray(channels[0].time_s), np.column_stack([c.measured_db for c in channels])
         lost = np.asarray(~(np.isfinite(features).all(axis=1) & np.isfinite(levels).all(axis=1)))
         missing = np.concatenate([[0], np.cumsum(lost)])
         with np.errstate(invalid="ignore"):
             low, high = (np.floor((t + side - along.start_s) / along.step_s) for side in (-window_s, window_s))
-            ok: BoolArray = np.isfinite(y) & (low >= 0) & (high + 1 < len(lost))
+            ok: BoolArray = np.isfinite(y).all(axis=1) & (low >= 0) & (high + 1 < len(lost))
         begin, end = (np.where(ok, side, 0).astype(np.int64) for side in (low, high))
         ok[ok] = missing[end[ok] + 2] == missing[begin[ok]]
         order = np.flatnonzero(ok)[np.argsort(t[ok], kind="stable")]
@@ -312,10 +343,11 @@ class _Bins:
         place = np.arange(len(t)) - np.repeat(first, count)
         few = place % np.repeat(-(-count // _PER_BIN), count) == 0
         starts = np.concatenate([[0], np.cumsum(few)])[first]
-        mean = [np.add.reduceat(v, first) / count for v in (y, t)]
+        mean_db = np.stack([np.add.reduceat(v, first) / count for v in y.T], axis=1)
         return cls(
-            mean_db=mean[0], mean_s=mean[1], at_s=t[few], first=starts, along=along,
+            mean_db=mean_db, mean_s=np.add.reduceat(t, first) / count, at_s=t[few], first=starts, along=along,
             features=_averaged(features, width / along.step_s), levels=levels,
+            predicted=np.stack([columns[id(c.along)] for c in channels]),
         )  # fmt: skip
 
     def _between(self, at_s: FloatArray, table: FloatArray) -> FloatArray:
@@ -324,43 +356,43 @@ class _Bins:
         share = (place - low)[:, None]
         return np.asarray(table[low] * (1.0 - share) + table[low + 1] * share)
 
-    def system(self, lag: float) -> FloatArray:
-        """Features of offset, slope and gains, then residuals of each model, at a lag: (n, p + models)."""
+    def systems(self, lags: FloatArray) -> FloatArray:
+        """Features of offset, slope and gains, then residuals of each channel and model: (n, lags, p + residuals)."""
         count = np.diff(np.append(self.first, len(self.at_s)))[:, None]
-        predicted = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
-        residual = self.mean_db[:, None] - predicted
-        # by columns, as LAPACK wants them: another order is copied at every call
-        columns = np.empty((self.n, self.features.shape[1] + residual.shape[1]), order="F")
-        np.concatenate([self._between(self.mean_s - lag, self.features), residual - residual.mean(axis=0)], 1, columns)
-        return columns
+        features, models = self.features.shape[1], self.predicted.shape[1]
+        out = np.empty((self.n, len(lags), features + self.predicted.size))
+        for row, lag in enumerate(lags):
+            level = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
+            residual = np.repeat(self.mean_db, models, axis=1) - level[:, self.predicted.ravel()]
+            out[:, row, :features] = self._between(self.mean_s - lag, self.features)
+            out[:, row, features:] = residual - residual.mean(axis=0)
+        return out
 
-    def likelihood(self, lags: FloatArray, parts: Sequence[_Parts]) -> FloatArray:
-        """Log likelihood (lags, models), of the likeliest of some parts."""
-        gains: dict[tuple[float, float], list[float]] = {}  # parts of one memory share the dearest step
-        for one in parts:
-            gains.setdefault((one.memory_s, one.white), []).append(one.gain)
-        memories = [(_Memory(self.mean_s, *memory), some) for memory, some in gains.items()]
-        systems = (self.system(lag) for lag in lags)
-        models = self.levels.shape[1]
-        tried = ([m.likelihood(c, models, some).max(axis=0) for m, some in memories] for c in systems)
-        return np.stack([np.max(each, axis=0) for each in tried])
+    def likelihood(self, lags: FloatArray, parts: Sequence[Sequence[_Parts]]) -> FloatArray:
+        """Log likelihood (channels, models, lags), of the likeliest of each channel's parts."""
+        every = list(dict.fromkeys(chain(*parts)))
+        own = np.array([[one in mine for mine in parts] for one in every])[:, None, :, None]
+        few = np.array_split(lags, -(-len(lags) // _AT_ONCE))
+        tried = [np.where(own, self._tried(some, every), -np.inf).max(axis=0) for some in few]
+        return np.moveaxis(np.concatenate(tried), 0, -1)
 
-    def fitted(self, lag: float) -> list[_Parts]:
-        """The parts of largest likelihood at a lag, of each model."""
-        return [parts for _, parts in self._fitted(self.system(lag), self.levels.shape[1], _GAIN)]
+    def fitted(self, lags: FloatArray) -> list[list[_Parts]]:
+        """The parts of largest likelihood of each channel: those of each model at some lags."""
+        parts = [_Parts(*each) for each in product(_MEMORY_S, _WHITE, _GAIN)]
+        best = self._tried(lags, parts).argmax(axis=0)
+        return [[parts[at] for at in set(best[:, channel].flat)] for channel in range(best.shape[1])]
+
+    def _tried(self, lags: FloatArray, parts: Sequence[_Parts]) -> FloatArray:
+        """Log likelihood (parts, lags, channels, models)."""
+        tried = _likelihood(self.systems(lags), self.mean_s, self.predicted.size, parts)
+        return tried.reshape(*tried.shape[:2], *self.predicted.shape)
 
     def constant(self) -> float:
-        """Largest log likelihood of a level that depends on no position."""
-        columns = np.column_stack([np.ones(self.n), np.zeros(self.n), self.mean_db - self.mean_db.mean()])
-        return self._fitted(columns, 1, (0.0,))[0][0]
-
-    def _fitted(self, columns: FloatArray, models: int, gains: Sequence[float]) -> list[tuple[float, _Parts]]:
-        """Largest log likelihood of each model, and the parts that have it."""
-        memories = list(product(_MEMORY_S, _WHITE))
-        tried = [_Memory(self.mean_s, *memory).likelihood(columns, models, gains) for memory in memories]
-        values = np.stack(tried).reshape(-1, models)  # the gain varies fastest
-        parts = [_Parts(*memory, gain) for memory, gain in product(memories, gains)]
-        return [(float(values[best, m]), parts[best]) for m, best in enumerate(values.argmax(axis=0))]
+        """Largest log likelihood of levels that depend on no position, summed over the channels."""
+        levels = self.mean_db - self.mean_db.mean(axis=0)
+        columns = np.column_stack([np.ones(self.n), np.zeros(self.n), levels])
+        parts = [_Parts(*memory, 0.0) for memory in product(_MEMORY_S, _WHITE)]
+        return float(_likelihood(columns[:, None], self.mean_s, levels.shape[1], parts).max(axis=0).sum())
 
 
 def _averaged(table: FloatArray, width: float) -> FloatArray:
@@ -397,38 +429,51 @@ def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray
     return out
 
 
-class _Memory:
-    """Covariance of a residual with memory: exp(-|dt| / memory) + white^2 on the diagonal."""
+def _whitened(
+    columns: FloatArray, time_s: FloatArray, memories: Sequence[tuple[float, float]]
+) -> tuple[FloatArray, FloatArray]:
+    """Columns (n, ...) made white: (n, memories, ...), and the log determinants (memories,) of their covariances.
 
-    def __init__(self, time_s: FloatArray, memory_s: float, white: float) -> None:
-        from scipy.linalg.lapack import dpttrf
+    A residual of some memory and white share has the covariance exp(-|dt| / memory), and white^2 more on the diagonal.
+    Each row loses what a Kalman filter expects of it after those before.
+    """
+    memory, white = np.array(memories).T
+    keeps = np.exp(-np.append(np.diff(time_s), 0.0)[:, None] / memory)
+    variances, gains, left = np.empty_like(keeps), np.empty_like(keeps), np.ones(len(memory))
+    for row, keep in enumerate(keeps):
+        variances[row] = left + white**2
+        gains[row] = keep * left / variances[row]
+        left = keep**2 * left * white**2 / variances[row] + 1.0 - keep**2
+    flat = columns.reshape(len(columns), 1, -1)
+    out = np.empty((len(columns), len(memory), flat.shape[2]))  # first what is expected of each row
+    out[0], kept = 0.0, np.empty_like(out[0])
+    np.multiply(flat[:-1], gains[:-1, :, None], out=out[1:])
+    for last, expected, keep in zip(out[:-1], out[1:], (keeps - gains)[..., None], strict=False):
+        np.add(expected, np.multiply(last, keep, out=kept), out=expected)
+    np.subtract(flat, out, out=out)
+    out /= np.sqrt(variances)[..., None]
+    return out.reshape(len(columns), len(memory), *columns.shape[1:]), np.log(variances).sum(axis=0)
 
-        keeps = np.exp(-np.diff(time_s) / memory_s)
-        loses = 1.0 - keeps**2
-        precision = np.ones(len(time_s))  # of the part with memory: tridiagonal, this is its diagonal
-        precision[:-1] += keeps**2 / loses
-        precision[1:] += keeps**2 / loses
-        # a tridiagonal L D L^T takes a third of the time of a banded Cholesky factor here
-        diagonal, below, _ = dpttrf(1.0 + white**2 * precision, -(white**2) * keeps / loses)
-        self._factor = diagonal, below
-        self._white = white
-        self.log_det = float(np.log(diagonal).sum()) + float(np.log(loses).sum())
 
-    def likelihood(self, columns: FloatArray, models: int, gains: Sequence[float]) -> FloatArray:
-        """Log likelihood (gains, models), offset, slope and gains integrated out, the scale profiled."""
-        from scipy.linalg import solve_triangular
-        from scipy.linalg.lapack import dpttrs
+def _likelihood(columns: FloatArray, time_s: FloatArray, residuals: int, parts: Sequence[_Parts]) -> FloatArray:
+    """Log likelihood (parts, lags, residuals) of systems (n, lags, p + residuals) whose rows are at ``time_s``.
 
-        gram = columns.T @ (columns - dpttrs(*self._factor, columns)[0]) / self._white**2
-        n, p = len(columns), columns.shape[1] - models
-        out = np.empty((len(gains), models))
-        for row, gain in enumerate(gains):
-            spread = np.full(p, gain)
-            spread[:2] = _FREE
-            inner = spread[:, None] * gram[:p, :p] * spread
-            inner[np.diag_indices(p)] += 1.0
-            lower = np.linalg.cholesky(inner)
-            half = solve_triangular(lower, spread[:, None] * gram[:p, p:], lower=True)
-            left = np.maximum(np.diag(gram[p:, p:]) - (half**2).sum(axis=0), np.finfo(np.float64).tiny)
-            out[row] = -0.5 * n * np.log(left / n) - np.log(np.diag(lower)).sum() - 0.5 * self.log_det
-        return out
+    Offset, slope and gains are integrated out, the scale is profiled.
+    """
+    memories = list(dict.fromkeys((one.memory_s, one.white) for one in parts))
+    white, log_det = _whitened(columns, time_s, memories)
+    lags = range(columns.shape[1])
+    gram = np.stack([[white[:, m, lag].T @ white[:, m, lag] for lag in lags] for m in range(len(memories))])
+    n, p = len(columns), columns.shape[2] - residuals
+    out = np.empty((len(parts), len(lags), residuals))
+    for row, one in enumerate(parts):
+        which = memories.index((one.memory_s, one.white))
+        spread = np.concatenate([[_FREE] * 2, np.full(p - 2, one.gain), np.ones(residuals)])
+        bordered = spread[:, None] * gram[which] * spread
+        left = np.diagonal(bordered, axis1=1, axis2=2)[:, p:]
+        # of the factor's last rows only what stands left of the diagonal counts: the 1 keeps the matrix definite
+        lower = np.linalg.cholesky(bordered + np.eye(len(spread)))
+        left = np.maximum(left - (lower[:, p:, :p] ** 2).sum(axis=2), np.finfo(np.float64).tiny)
+        determinant = np.log(np.diagonal(lower, axis1=1, axis2=2)[:, :p]).sum(axis=1)[:, None] + 0.5 * log_det[which]
+        out[row] = -0.5 * n * np.log(left / n) - determinant
+    return out

@@ -17,12 +17,13 @@ from aerpaw_cmp.flight.clock import (
     STAMPS_S,
     Along,
     ClockChannel,
+    _at_one_time,
     _averaged,
     _Bins,
     _finer,
     _gain_features,
     _judged,
-    _Memory,
+    _likelihood,
     _Parts,
     judge_clock,
 )
@@ -164,9 +165,9 @@ def test_the_likelihood_is_that_of_a_multivariate_normal():
     t = np.sort(rng.uniform(0, 90, 80))
     features = np.column_stack([np.ones(80), np.log10(50 + t), rng.normal(0, 1, (80, 9))])
     y = rng.normal(0, 3, 80)
-    memory = _Memory(t, 6.0, 0.4)
     gains = (0.3, 1.7)
-    computed = memory.likelihood(np.column_stack([features, y]), 1, gains)[:, 0]
+    parts = [_Parts(6.0, 0.4, gain) for gain in gains]
+    computed = _likelihood(np.column_stack([features, y])[:, None], t, 1, parts)[:, 0, 0]
     expected = []
     for gain in gains:
         spread = np.array([1e3, 1e3, *[gain] * 9])
@@ -215,16 +216,32 @@ def test_the_verdict_follows_from_the_lags_that_are_left(peaks, verdict):
 def test_means_of_many_samples_are_those_of_their_seconds():
     t = np.arange(40.0, 400.0, 1 / 30.0)
     one = ClockChannel(name="one", time_s=t, measured_db=np.sin(t), along=ALONG)
-    bins = _Bins.of(one, ALONG.tables(), 15.0)
+    bins = _Bins.of([one], ALONG.features(), 15.0)
     assert bins is not None
     assert bins.n == 360
     np.testing.assert_allclose(bins.mean_db[7], np.sin(t[(t >= 47) & (t < 48)]).mean())
     # and what they depend on is averaged over as long a time, half a second before and after
-    seen = bins.system(0.0)[7, 1] - bins.system(3.0)[7, 1]
+    seen = np.subtract(*bins.systems(np.array([0.0, 3.0]))[7, :, 1])
     slope = np.log10(ALONG.distance_m)
     expected = [slope[np.abs(GRID - at) <= 0.5].mean() for at in (bins.mean_s[7], bins.mean_s[7] - 3.0)]
     assert seen == pytest.approx(expected[0] - expected[1], abs=1e-3)
-    assert bins.likelihood(np.array([0.0]), [_Parts(5.0, 0.3, 1.0)]).shape == (1, 1)
+    assert bins.likelihood(np.array([0.0]), [[_Parts(5.0, 0.3, 1.0)]]).shape == (1, 1, 1)
+
+
+def test_channels_of_one_place_and_time_have_the_likelihoods_of_each_alone():
+    level = ALONG.predicted_db["free space"]
+    other = along(**{"free space": level + 3.0 * np.sin(GRID / 9.0)})  # another antenna: another prediction
+    channels = [channel(0.5, 3), channel(0.5, 4, name="two", known=other), channel(0.5, 5, name="three")]
+    (together,) = _at_one_time(channels)
+    parts = [[_Parts(5.0, 0.3, 1.0)], [_Parts(2.0, 0.1, 0.5), _Parts(15.0, 0.9, 2.0)], [_Parts(40.0, 0.3, 0.05)]]
+    lags, both = np.arange(-9.0, 9.1, 0.5), _Bins.of(together, ALONG.features(), 15.0)
+    assert both is not None
+    for one, its, expected in zip(channels, parts, both.likelihood(lags, parts), strict=True):
+        alone = _Bins.of([one], ALONG.features(), 15.0)
+        assert alone is not None
+        np.testing.assert_allclose(alone.likelihood(lags, [its])[0], expected, rtol=1e-9)
+    missing = dataclasses.replace(channels[2], measured_db=np.where(np.arange(920) == 7, np.nan, 1.0))
+    assert [len(some) for some in _at_one_time([*channels[:2], missing])] == [2, 1]
 
 
 def test_a_jittering_attitude_makes_no_sharp_optimum():
@@ -235,9 +252,9 @@ def test_a_jittering_attitude_makes_no_sharp_optimum():
     shaken = dataclasses.replace(ALONG, directions=jitter)
     t = np.arange(20.0, 480.0, 1 / 30.0)
     one = channel(0.0, 9, gain_db=12.0, memory_db=0.5, t=t, known=shaken)
-    bins = _Bins.of(one, shaken.tables(), 15.0)
+    bins = _Bins.of([one], shaken.features(), 15.0)
     assert bins is not None
-    value = bins.likelihood(np.arange(-0.6, 0.61, 0.1), [_Parts(5.0, 0.1, 1.0)])[:, 0]
+    value = bins.likelihood(np.arange(-0.6, 0.61, 0.1), [[_Parts(5.0, 0.1, 1.0)]])[0, 0]
     assert value.max() - value[0] > 4.0  # the lag is seen
     assert np.abs(np.diff(value, 2)).max() < 0.25 * np.ptp(value)  # and no lag stands out from its neighbours
 
@@ -315,7 +332,7 @@ def small_bins(t: np.ndarray, window_s: float = 5.0, start_s: float = 0.0, rows:
         start_s=start_s, step_s=0.1, predicted_db={"m": at}, distance_m=at + 1.0, directions=np.ones((rows, 6))
     )
     one = ClockChannel(name="one", time_s=t, measured_db=np.sin(t), along=table)
-    return _Bins.of(one, (np.column_stack([np.ones(rows), at]), at[:, None]), window_s)
+    return _Bins.of([one], np.column_stack([np.ones(rows), at]), window_s)
 
 
 def test_bins_are_seconds_or_nine_hundredths_and_eight_instants_of_each_are_asked() -> None:
@@ -331,11 +348,11 @@ def test_bins_are_seconds_or_nine_hundredths_and_eight_instants_of_each_are_aske
     assert dense is not None
     np.testing.assert_array_equal(np.diff(np.append(dense.first, len(dense.at_s))), 8)  # every fourth of thirty
     np.testing.assert_allclose(dense.at_s[:8], 20.0 + np.arange(8) * 4 / 30)
-    columns = dense.system(1.5)
+    columns = dense.systems(np.array([1.5]))[:, 0]
     features, residual = columns[:, :-1], columns[:, -1:]
     asked = dense.at_s.reshape(-1, 8).mean(axis=1) - 1.5
     np.testing.assert_allclose(features[:, 1], dense.mean_s - 1.5, atol=1e-6)
-    expected = dense.mean_db - asked
+    expected = dense.mean_db[:, 0] - asked
     np.testing.assert_allclose(residual[:, 0], expected - expected.mean(), atol=1e-9)
 
 
@@ -366,14 +383,17 @@ def test_lags_are_tried_finely_where_one_stands_out(bend: float, finest: float) 
 
 
 def test_the_parts_of_a_likelihood_are_the_best_of_their_grid() -> None:
-    one = _Bins.of(channel(0.0, 5, t=np.arange(20.0, 120.0, 1.0)), ALONG.tables(), 15.0)
+    one = _Bins.of([channel(0.0, 5, t=np.arange(20.0, 120.0, 1.0))], ALONG.features(), 15.0)
     assert one is not None
-    columns = one.system(0.5)
+    columns, flat = (
+        one.systems(np.array([0.5])),
+        np.column_stack([np.ones(one.n), np.zeros(one.n), one.mean_db - one.mean_db.mean()]),
+    )
     tried = {
-        (memory, white, gain): _Memory(one.mean_s, memory, white).likelihood(columns, 1, (gain,))[0, 0]
+        (memory, white, gain): _likelihood(columns, one.mean_s, 1, [_Parts(memory, white, gain)])[0, 0, 0]
         for memory in (2.0, 5.0, 15.0, 40.0) for white in (0.1, 0.3, 0.9) for gain in (0.05, 0.5, 1.0, 2.0)
     }  # fmt: skip
-    assert one.fitted(0.5) == [_Parts(*max(tried, key=tried.__getitem__))]
-    flat = np.column_stack([np.ones(one.n), np.zeros(one.n), one.mean_db - one.mean_db.mean()])
-    constant = [_Memory(one.mean_s, m, w).likelihood(flat, 1, (0.0,))[0, 0] for m, w in {key[:2] for key in tried}]
+    assert one.fitted(np.array([0.5])) == [[_Parts(*max(tried, key=tried.__getitem__))]]
+    memories = {key[:2] for key in tried}
+    constant = [_likelihood(flat[:, None], one.mean_s, 1, [_Parts(*key, 0.0)])[0, 0, 0] for key in memories]
     assert one.constant() == pytest.approx(max(constant))

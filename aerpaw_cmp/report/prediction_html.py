@@ -56,8 +56,9 @@ class PredictionPage(Made):
 
 
 def outside_share(table: pd.DataFrame) -> float:
-    """Share of the levels of a table that are flagged as outside the flown places."""
-    return float((table["flag"][table["channel"] != "rank"] == "outside_flown").mean())
+    """Share of the levels with a position that are flagged as outside the flown places."""
+    flag = table["flag"][(table["channel"] != "rank") & (table["flag"] != "no_position")]
+    return float((flag == "outside_flown").mean())
 
 
 def prediction_metrics(data: PredictionPage) -> dict[str, Any]:

@@ -37,6 +37,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     kml(folder / "small.kml", [(-20, -20), (20, -20), (20, 20), (-20, 20)])
     kml(folder / "far.kml", [(9000, 0), (9500, 0), (9500, 500), (9000, 500)])
     (folder / "points.csv").write_text("east_m,north_m,height_m\n0,100,40\n,,\n50,120,40\n")
+    (folder / "far.csv").write_text("east_m,north_m,height_m\n,,\n9000,0,40\n")
     (folder / "nowhere.csv").write_text("east_m,north_m,height_m\n,,\n")
     (folder / "torn.plan").write_text('{"fileType": "Plan", "mission": {')
     (folder / "long.csv").write_text("latitude_deg,longitude_deg,altitude_m\n35.72,-78.70,40\n35.74,-78.70,40\n")
@@ -73,7 +74,8 @@ def test_plan_writes_the_best_route_and_prefers_headings(place: Path) -> None:
     ("words", "code", "said"),
     [
         (["sphere", "--geofence", "small.kml"], 2, "no route fits"),
-        (["points.csv", "--geofence", "far.kml"], 2, "outside the area"),
+        (["far.csv"], 2, "outside the area that may be flown"),
+        (["sphere", "--geofence", "far.kml"], 2, "outside the area of site Lake Wheeler"),
         (["nowhere.csv"], 3, "no point has a position"),
         (["points.csv", "--route", "torn.plan"], 3, "damaged QGroundControl plan"),
         (["points.csv", "--route", "gone.kml"], 3, "gone.kml"),
@@ -92,7 +94,7 @@ def test_bad_input_is_one_message(
     assert not (place / "bad").exists()
 
 
-def test_points_without_a_position_are_left_out(place: Path) -> None:
+def test_points_without_a_position_are_left_out_and_counted(place: Path) -> None:
     out = place / "points_out"
     assert (
         main(["plan", str(place / "points.csv"), *SITE, "--geofence", str(place / "fence.kml"), "-o", str(out), "-q"])
@@ -101,6 +103,7 @@ def test_points_without_a_position_are_left_out(place: Path) -> None:
     table = pd.read_csv(out / "sd_map.csv")
     assert len(table) == 2 * 4  # four headings at each of two points
     assert table.notna().all().all()
+    assert "1 of 3 points have no position" in " ".join(json.loads((out / "metrics.json").read_text())["warnings"])
 
 
 def test_without_a_geofence_the_area_is_that_of_the_site() -> None:

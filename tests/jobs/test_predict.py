@@ -76,6 +76,8 @@ def test_points_without_a_position_and_outside_are_flagged(prediction):
     assert set(rows(prediction, 0)["flag"]) == {""}
     near, far = (rows(prediction, k)["sd_db"].to_numpy() for k in (0, 3))
     assert (far > near).all()
+    assert any("1 of 4 points have no position" in text for text in prediction.page.warnings)
+    assert "67 % of the points lie outside" in prediction.page.verdict  # of three with a position
 
 
 def test_columns_are_those_of_the_contract(prediction):

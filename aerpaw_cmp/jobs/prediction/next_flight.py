@@ -40,7 +40,7 @@ HEADINGS = 4
 """At points of a target whose heading is open."""
 
 FARTHEST_M = 1000.0
-"""A target that lies farther outside the geofence throughout is refused."""
+"""A target that lies farther outside the geofence throughout, or a geofence outside the site, is refused."""
 
 SHARES = (0.25, 0.5, 0.75, 1.0, 1.5)
 """Of the battery, for what a longer flight buys."""
@@ -149,7 +149,9 @@ def plan_flight(
                 "no route fits: no pattern lies within the geofence",
                 expected="a larger area, or --route FILE",
             )
-        wanted = _targets(target, site, asked, ends, area)
+        points = None if target == SPHERE else find_targets(Path(target), site, asked.target)
+        said += () if points is None else points.remarks
+        wanted = _targets(points, site, ends, area)
     with stages("learn"):
         known = _known(series)
     thin = {a: _thinned(s, MOST_TARGETS) for a, s in wanted.items()}
@@ -227,11 +229,10 @@ def _open_ends(site: Site, asked: PlanAsked) -> dict[str, tuple[str, str]]:
 
 def _area(site: Site, asked: PlanAsked) -> Any:
     """Area where a route may run."""
-    if asked.fence is None:
-        west, east, south, north = site.area_m
-        fence = shapely.box(west, south, east, north)
-    else:
-        fence = shapely.union_all(_polygons(asked.fence, site))
+    west, east, south, north = site.area_m
+    ground = shapely.box(west, south, east, north)
+    fence = ground if asked.fence is None else shapely.union_all(_polygons(asked.fence, site))
+    _check_near("geofence", shapely.distance(fence, ground), f"the area of site {site.name}")
     avoid = [one for path in asked.avoid for one in _polygons(path, site)]
     towers = np.array([t.position_m for t in site.towers.values()]).reshape(-1, 3)
     return allowed_area(fence, avoid, towers, asked.tower_distance_m)
@@ -309,13 +310,27 @@ def _leaves(route: Route, area: Any) -> bool:
 
 
 def _targets(
-    target: str, site: Site, asked: PlanAsked, ends: Mapping[str, tuple[str, str]], area: Any
+    points: Targets | None, site: Site, ends: Mapping[str, tuple[str, str]], area: Any
 ) -> dict[str, LinkSamples]:
-    """Target points at every antenna, at all headings where the heading is open."""
+    """Target points (None: all directions) at every antenna, at all headings where the heading is open.
+
+    Parameters
+    ----------
+    points : Targets or None
+    site : Site
+    ends : mapping of str to (str, str)
+        Tower and channel by antenna.
+    area : shapely area
+        That may be flown.
+
+    Returns
+    -------
+    dict of str to LinkSamples
+    """
     out = {}
-    points = None if target == SPHERE else find_targets(Path(target), site, asked.target)
     if points is not None:
-        _check_near(points, area)
+        some = points.position_m[points.known][:: max(1, len(points) // 500), :2]
+        _check_near("target", shapely.distance(area, shapely.points(some)).min(), "the area that may be flown")
     for antenna, end in ends.items():
         tower = np.asarray(site.towers[end[0]].position_m)
         if points is None:
@@ -336,13 +351,11 @@ def _targets(
     return out
 
 
-def _check_near(points: Targets, area: Any) -> None:
-    some = points.position_m[points.known][:: max(1, len(points) // 500), :2]
-    away = float(min(shapely.distance(area, shapely.points(some))))
-    if away > FARTHEST_M:
+def _check_near(what: str, away_m: float, area: str) -> None:
+    if away_m > FARTHEST_M:
         raise UsageError(
-            f"the target lies {away:.0f} m outside the area that may be flown",
-            expected=f"a target within {FARTHEST_M:g} m of it",
+            f"the {what} lies {away_m:.0f} m outside {area}",
+            expected=f"a {what} within {FARTHEST_M:g} m of it",
             cause="another site, or exchanged coordinates",
         )
 

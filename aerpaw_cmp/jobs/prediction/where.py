@@ -229,12 +229,14 @@ def _local_points(path: Path) -> Targets | None:
         raise InputError(f"no table: {error}", expected="columns east_m, north_m, height_m", path=path) from None
     numbers = table.reindex(columns=["east_m", "north_m", "height_m", "yaw_deg"]).apply(pd.to_numeric, errors="coerce")
     position = numbers[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
+    lost = int((~np.isfinite(position).all(axis=1)).sum())
     return Targets(
         kind="points",
         name=path.stem,
         position_m=position,
         yaw_deg=numbers["yaw_deg"].to_numpy(np.float64),
         time_s=np.zeros(len(position)),
+        remarks=(f"{lost} of {len(position)} points have no position: they are flagged no_position.",) if lost else (),
     )
 
 

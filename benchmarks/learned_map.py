@@ -1,11 +1,14 @@
 """Learned antennas and their residual field on real flights: errors and intervals where nothing was learned.
 
 ``flights``: dataset 12, each flight from the other two. ``blocks``: 300 m blocks (and 20 m around them) of each flight,
-the rest of it known and another flight, or both. ``lte``: 25 of a flight's samples from M others by the protocol of the
-data's authors, the other height known; 300 draws; last, all of the flight known but 20 s about the target. ``crps``:
-with the residual field and without, each flight left out, or the eighths of a single one; the field is chosen inside
-what is known. ``ranks``: log score of the receiver that another flight taught, alone and with a residual field on its
-logits (a kernel logistic, learned on the rest of the flight), in 300 m of the flight left out, for each strength.
+the rest of it known and one other flight; the same, antennas learned on the third flight too; both others known.
+``lte``: 25 of a flight's samples from M others by the protocol of the data's authors (single samples, take-off and
+landing left out, scales from another height, 300 draws), the other height known: root mean square over all draws, and
+in brackets the median over draws, which the authors print; last, all of the flight known but 20 s about the target.
+``crps``: with the residual field and without, each flight left out, or the eighths of a single one; the field is
+chosen inside what is known. ``ranks``: log score of the receiver that another flight taught, alone and with a residual
+field on its logits (a kernel logistic; a shift is the same number at all places), learned on the rest of the flight
+but 300 m and 20 s about them, on what was reported before, or on the flight that taught the receiver.
 
     AERPAW_CMP_FIELD_DATA=... python benchmarks/learned_map.py [--only flights blocks lte crps ranks] [--quick]
 """
@@ -14,24 +17,27 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
 from scipy.special import log_softmax, softmax
 
-from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.compare.direction_gain import LinkSamples
 from aerpaw_cmp.compare.entries import crps_normal
 from aerpaw_cmp.compare.learning.calibration import Observed, score
 from aerpaw_cmp.compare.learning.correction import BIN_S, OFF, Correction, choose
 from aerpaw_cmp.compare.learning.field_gp import FieldFit, FieldModel, Rows, fit_field
 from aerpaw_cmp.compare.spread import fading_of
+from aerpaw_cmp.compare.statistics import mean_interval
 from aerpaw_cmp.flight.settings import AntennaSettings
 from aerpaw_cmp.jobs.benchmarks.benchmark import Bench, Task, load_manifest, questions
-from aerpaw_cmp.jobs.benchmarks.entrants import RANK
 from aerpaw_cmp.jobs.learning.calibrate import gain_of, learned_antennas
+from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankFitSettings, RankSamples, Tried
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 
 DATASET12 = ("40m_fs10MHz", "40m_fs5MHz", "70m_fs20MHz")
@@ -44,18 +50,28 @@ NR = {
     "link": {"rss": {"carrier_hz": 3.4e9}},
 }
 """Its levels are no task of the benchmark: one flight of the folder has them with positions."""
+BLOCK_LINE = ("learned {:.3f} dB, {:.3f} about the mean error of each series (90 % holds {:.0f} %); with the chosen "
+              "field {:.3f}, {:.3f} ({:.0f} %), on in {:.0f} % of blocks")  # fmt: skip
 MEANS_S, TARGETS, GUARD_S = 3.0, 25, 20.0
-RANK_FIELDS = [(length, strength) for length in (15.0, 40.0, 100.0) for strength in (0.3, 0.6, 1.0)]
-"""Length over place [m] and strength of the residual field on a receiver's logits."""
+RANK_FIELDS = {
+    "a shift": [(np.inf, 1.0)], "0.6 over 15 m": [(15.0, 0.6)], "0.6 over 40 m": [(40.0, 0.6)],
+    "0.6 over 100 m": [(100.0, 0.6)], "1.0 over 100 m": [(100.0, 1.0)],
+    "0.6 over 100 m and a shift": [(100.0, 0.6), (np.inf, 1.0)],
+}  # fmt: skip
+"""Lengths over place [m] and strengths of the residual field on a receiver's logits; an infinite length is a shift."""
+AHEAD_S, FIRST_S = 30.0, 120.0
+"""Reports that are predicted from those before, in such parts and from this time on."""
 HEIGHT_COUNTS = 2.0
 """Times as far as places."""
 Part = tuple[FloatArray, FloatArray]
 """Errors and stated standard deviations (n,) [dB]."""
 
 
-def learned(train: Sequence[LinkSamples], titles: Sequence[str] = ()) -> Correction:
-    """Antennas learned from samples, with the residual field that they choose, or one of some."""
-    return choose(train, {"learned": lambda some: learned_antennas(some).predict}, titles)
+def learned(
+    train: Sequence[LinkSamples], titles: Sequence[str] = (), antennas: Sequence[LinkSamples] = ()
+) -> Correction:
+    """Antennas learned from samples and from those of ``antennas``, with the residual field chosen, or one of some."""
+    return choose(train, {"learned": lambda some: learned_antennas([*some, *antennas]).predict}, titles)
 
 
 def errors(correction: Correction, asked: LinkSamples, known: Sequence[LinkSamples]) -> Part:
@@ -67,9 +83,11 @@ def errors(correction: Correction, asked: LinkSamples, known: Sequence[LinkSampl
     return error - own * error.mean(), sd
 
 
-def both(train: Sequence[LinkSamples], asked: Sequence[LinkSamples]) -> tuple[str, list[Part], list[Part]]:
+def both(
+    train: Sequence[LinkSamples], asked: Sequence[LinkSamples], antennas: Sequence[LinkSamples] = ()
+) -> tuple[str, list[Part], list[Part]]:
     """Title of the chosen field; errors of each series without a field and with the chosen one."""
-    chosen, alone = learned(train), learned(train, (OFF,))
+    chosen, alone = (learned(train, titles, antennas) for titles in ((), (OFF,)))
     asked = [s for s in asked if len(s) and s.antenna in chosen.channels]
     return chosen.title, *([errors(c, s, train) for s in asked] for c in (alone, chosen))  # type: ignore[return-value]
 
@@ -108,32 +126,49 @@ def line(name: str, row: Sequence[float] | FloatArray) -> str:
 
 
 def blocks(bench: Bench, *, quick: bool) -> None:
-    pairs = [(test, (known,)) for test in DATASET12 for known in DATASET12 if known != test]
-    cases = pairs[:1] if quick else pairs + [(one, tuple(o for o in DATASET12 if o != one)) for one in DATASET12]
-    table: dict[int, list[tuple[float, ...]]] = {}
-    for test, known in cases:
-        bench.manifest.tasks["block"] = Task(title="", split="blocks", train=list(known), test=[test])
-        asked = list(questions(bench, "block", test))[:: 4 if quick else 1]
-        found = [both([o.samples for o in q.train], [o.samples for o in q.asked]) for q in asked]
-        row = []
-        for k in (1, 2):  # blocks of one series are one series again
-            series = zip(*(one[k] for one in found), strict=True)
-            parts = [tuple(map(np.concatenate, zip(*each, strict=True))) for each in series]
-            row += [rms(parts), held(parts)]  # type: ignore[arg-type]
-        on = sum(one[0] != OFF for one in found)
-        print(f"blocks of {test}, known {' + '.join(known)}: learned {row[0]:.3f} ({row[1]:.0f} %), with the chosen "
-              f"field {row[2]:.3f} ({row[3]:.0f} %), on in {on} of {len(found)}", flush=True)  # fmt: skip
-        table.setdefault(len(known), []).append(tuple(row))
-    for count, rows in table.items():
-        mean = np.mean(rows, axis=0)
-        print(f"blocks, mean of {len(rows)}, {count} known (goal 3.0): {mean[0]:.3f}, with the field {mean[2]:.3f}")
+    cases: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = []
+    for test in DATASET12:
+        first, second = (name for name in DATASET12 if name != test)
+        cases += [(test, (first,), ()), (test, (second,), ()), (test, (first,), (second,)), (test, (first, second), ())]
+    table: dict[str, list[list[float]]] = {}
+    for test, known, antennas in cases[: 1 if quick else None]:
+        row = block_errors(bench, test, known, antennas, every=4 if quick else 1)
+        said = f"{' + '.join(known)} known{''.join(f', antennas learned on {name} too' for name in antennas)}"
+        print(f"blocks of {test}, {said}: " + BLOCK_LINE.format(*row), flush=True)
+        table.setdefault(f"{len(known)} known, antennas of {len(known + antennas)}", []).append(row)
+    for title, rows in table.items():
+        print(f"blocks, mean of {len(rows)}, {title} (goal 3.0): " + BLOCK_LINE.format(*np.mean(rows, axis=0)))
+
+
+def block_errors(
+    bench: Bench, test: str, known: Sequence[str], antennas: Sequence[str], *, every: int = 1
+) -> list[float]:
+    """Numbers of :data:`BLOCK_LINE` for one flight, of every n-th block; ``antennas``: flights that teach no more."""
+    bench.manifest.tasks["block"] = Task(title="", split="blocks", train=list(known), test=[test])
+    extra = [o.samples for o in samples_of(bench, antennas)]
+    asked = list(questions(bench, "block", test))[::every]
+    found = [both([o.samples for o in q.train], [o.samples for o in q.asked], extra) for q in asked]
+    row = []
+    for k in (1, 2):  # blocks of one series are one series again
+        series = zip(*(one[k] for one in found), strict=True)
+        parts = [(np.concatenate(error), np.concatenate(sd)) for error, sd in (zip(*s, strict=True) for s in series)]
+        row += [rms(parts), rms([(error - error.mean(), sd) for error, sd in parts]), held(parts)]
+    return [*row, 100.0 * float(np.mean([one[0] != OFF for one in found]))]
+
+
+def at_height(bench: Bench, name: str) -> Observed:
+    """The series of a flight at one height, from its first sample there to its last."""
+    (one,) = bench.observed(name)
+    up = one.samples.position_m[:, 2]
+    high = np.flatnonzero(up > np.median(up) - 0.5)
+    return one.part(np.arange(high[0], high[-1] + 1))
 
 
 def lte_height(bench: Bench, name: str, other: str, *, repeats: int) -> dict[str, tuple[float, ...]]:
-    """RMSE of one height with M = 50 and 200 samples, by model."""
+    """Numbers of :func:`protocol` of one height, by model."""
     known = {end: gain_of(AntennaSettings(model="file", file=f"{file}_F3500.txt"), bench.folder / "antennas")
              for end, file in (("uav", "SA-1400-5900"), ("tower", "RM-WB1-DN-BLK_right_side_up"))}  # fmt: skip
-    (asked,), (train,) = (bench.observed(one) for one in (name, other))
+    asked, (train,) = at_height(bench, name), bench.observed(other)
     tower = bench.data(name).site.towers[asked.samples.tower]
     model = learned_antennas([train.samples])
 
@@ -151,21 +186,27 @@ def lte_height(bench: Bench, name: str, other: str, *, repeats: int) -> dict[str
 
 
 def lte(bench: Bench, *, quick: bool) -> None:
-    means = []
+    rows: list[dict[str, tuple[float, ...]]] = []
     for name, other in (LTE, LTE[::-1])[: 1 if quick else None]:
         row = lte_height(bench, name, other, repeats=20 if quick else 300)
-        (asked,), (train,) = (bench.observed(one) for one in (name, other))
-        row["learned, all but 20 s"] = (float(np.sqrt(np.mean(whole_flight(asked, train, quick) ** 2))),)
-        said = (f"{base} " + ", ".join(f"{value:.2f}" for value in values) for base, values in row.items())
-        print(f"LTE {name} from {other}:", "; ".join(said), flush=True)
-        means.append(np.concatenate(list(row.values())))
-    print("LTE, mean (M = 50, 200 of each; goal 5.4 at 50):", np.round(np.mean(means, axis=0), 2).tolist())
+        rest = whole_flight(at_height(bench, name), bench.observed(other)[0], quick)
+        row["learned, all but 20 s"] = (float(np.sqrt(np.mean(rest**2))),)
+        print(f"LTE {name} from {other}:", lte_line(row), flush=True)
+        rows.append(row)
+    print("LTE, mean (goal 5.4 at M = 50):", lte_line({base: np.mean([r[base] for r in rows], axis=0) for base in row}))
+
+
+def lte_line(row: Mapping[str, Sequence[float]]) -> str:
+    return "; ".join(
+        f"{base} M 50 {v[0]:.2f} ({v[1]:.2f}), M 200 {v[2]:.2f} ({v[3]:.2f})" if len(v) > 1 else f"{base} {v[0]:.2f}"
+        for base, v in row.items()
+    )
 
 
 def protocol(
     asked: Observed, train: Observed, gain: Callable[[Observed], FloatArray], draws: list, *, learned: bool
 ) -> tuple[float, ...]:
-    """RMSE with M = 50 and 200 samples: ordinary Kriging of what a base leaves, its scales from the other height."""
+    """Errors of ordinary Kriging of what a base leaves, from M = 50 and 200 samples: RMSE and median over draws."""
     left = [o.samples.residual_db - gain(o) for o in (train, asked)]
     rows = [Rows.of(o.samples, 0) for o in (train, asked)]
     fading, _ = fading_of([train.samples], BIN_S)
@@ -175,11 +216,12 @@ def protocol(
         some = slice(None, None, max(1, len(left[0]) // 600))
         start = FieldModel(place_sd_db=3.0, length_m=100.0, turn=np.inf, drift_sd_db=1e-3, noise_sd_db=fading)
         model = fit_field([(rows[0].part(some), left[0][some])], start, ("place_sd_db", "length_m", "noise_sd_db"))
-    out = []
+    out: list[float] = []
     for count in (50, 200):
         error = [left[1][d[200:]] - FieldFit(model, rows[1].part(d[:count]), left[1][d[:count]]).predict(
             rows[1].part(d[200:]))[0] for d in draws]  # fmt: skip
-        out.append(float(np.sqrt(np.mean(np.square(error)))))
+        square = np.mean(np.square(error), axis=1)
+        out += [float(np.sqrt(square.mean())), float(np.median(np.sqrt(square)))]
     return tuple(out)
 
 
@@ -222,27 +264,61 @@ def crps(bench: Bench, *, quick: bool) -> None:
               f"{len(found)}", flush=True)  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reports:
+    """Rank reports: place (n, 3) [m], time (n,) [s], one-hot rank and logit of the receiver (n, 4)."""
+
+    place: FloatArray
+    time: FloatArray
+    was: FloatArray
+    logit: FloatArray
+
+    @classmethod
+    def of(cls, item: RankSamples, receiver: FittedReceiver, every: int) -> Reports:
+        rows, logit = slice(None, None, every), np.log(receiver.forecast(item)[0])
+        place = item.poses.position_m * [1.0, 1.0, HEIGHT_COUNTS]
+        was = np.eye(4)[item.rank.astype(int) - 1]
+        return cls(place=place[rows], time=item.time_s[rows], was=was[rows], logit=logit[rows])
+
+    def part(self, rows: BoolArray) -> Reports:
+        return Reports(place=self.place[rows], time=self.time[rows], was=self.was[rows], logit=self.logit[rows])
+
+    def lost(self, known: Reports, terms: Sequence[tuple[float, float]]) -> FloatArray:
+        """Log loss (n,) with a field learned on other reports."""
+        own, cross = (sum(strength**2 * np.exp(-cdist(one.place, known.place) / length) for length, strength in terms)
+                      for one in (known, self))  # fmt: skip
+        shifted = self.logit + cross @ logistic(own, known.logit, known.was)
+        return np.asarray(-(self.was * log_softmax(shifted, axis=1)).sum(axis=1))
+
+
+def rank_parts(own: Reports, taught: Reports) -> dict[str, list[tuple[Reports, Reports]]]:
+    """Reports that are asked for and those that are known, by what is known, in time order."""
+    step = np.append(0.0, np.linalg.norm(np.diff(own.place, axis=0), axis=1))
+    block = np.floor(np.cumsum(step) / 300.0)
+    rest = [(own.part(block == one), own.part(np.abs(own.time[:, None] - own.time[block == one]).min(axis=1) > GUARD_S))
+            for one in np.unique(block)]  # fmt: skip
+    ahead = [(own.part((own.time > start) & (own.time <= start + AHEAD_S)), own.part(own.time <= start))
+             for start in np.arange(own.time[0] + FIRST_S, own.time[-1], AHEAD_S)]  # fmt: skip
+    return {
+        "the rest of the flight known": rest,
+        f"{AHEAD_S:.0f} s ahead": ahead,
+        "the other flight known": [(own, taught)],
+    }
+
+
 def ranks(bench: Bench, *, quick: bool) -> None:
     names = "nr_flight1", "nr_flight3"
     for test, train in (names, names[::-1])[: 1 if quick else None]:
-        (item,), (receiver,) = bench.ranks(test), RANK["learned"](bench, [train], test)
-        rows = np.flatnonzero(item.rank >= 1)[:: 20 if quick else 2]
-        place, time = item.poses.position_m[rows] * [1.0, 1.0, HEIGHT_COUNTS], item.time_s[rows]
-        was, logit = np.eye(4)[item.rank[rows].astype(int) - 1], np.log(receiver[rows])
-        step = np.append(0.0, np.linalg.norm(np.diff(item.poses.position_m[rows], axis=0), axis=1))
-        block = np.floor(np.cumsum(step) / 300.0)
-        scores = [-np.mean((was * logit).sum(axis=1))]
-        for length, strength in RANK_FIELDS[: 1 if quick else None]:
-            kernel = strength**2 * np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / length)
-            lost = np.empty(len(rows))
-            for asked in (block == one for one in np.unique(block)):
-                away = np.abs(time[:, None] - time[asked]).min(axis=1) > GUARD_S
-                weight = logistic(kernel[np.ix_(away, away)], logit[away], was[away])
-                lost[asked] = -(was * log_softmax(logit + kernel[:, away] @ weight, axis=1)).sum(axis=1)[asked]
-            scores.append(lost.mean())
-        print(f"ranks of {test}, receiver of {train}: log score {scores[0]:.3f} alone; with a field", *(
-            f"of {strength} over {length:.0f} m {score:.3f}," for (length, strength), score in
-            zip(RANK_FIELDS, scores[1:], strict=False)), flush=True)  # fmt: skip
+        (teacher,), (item,) = bench.ranks(train), bench.ranks(test)
+        receiver = Tried.of([teacher], RankFitSettings()).fit([0])
+        own, taught = (Reports.of(one, receiver, 20 if quick else 2) for one in (item, teacher))
+        for title, parts in rank_parts(own, taught).items():
+            alone = np.concatenate([-(asked.was * asked.logit).sum(axis=1) for asked, _ in parts])
+            print(f"ranks of {test}, receiver of {train}, {title}: log score {alone.mean():.3f} alone", flush=True)
+            for name, terms in RANK_FIELDS.items():
+                lost = np.concatenate([asked.lost(known, terms) for asked, known in parts])
+                low, high = mean_interval(lost - alone)
+                print(f"  {name}: {lost.mean():.3f}, {(lost - alone).mean():+.3f} (95 %: {low:+.3f} to {high:+.3f})")
 
 
 def logistic(kernel: FloatArray, logit: FloatArray, was: FloatArray) -> FloatArray:

@@ -142,7 +142,9 @@ def test_learned_antennas_need_fewer_samples_than_two_rays() -> None:
     """LTE at 50 m from 90 m: 50 samples with learned antennas leave less than 200 with two rays and patterns."""
     script = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "learned_map.py"))
     bench = script["Bench"](script["load_manifest"](), Path(ROOT))
-    rmse = script["lte_height"](bench, *script["LTE"], repeats=40)
+    rmse = script["lte_height"](bench, *script["LTE"], repeats=300)
+    # root mean square over draws of 50 samples, their median; the same of 200
     learned, two_ray, free = (rmse[name] for name in ("learned", "two-ray + patterns", "free space"))
-    assert learned[0] < min(two_ray[1], free[0])
-    assert all(many < few for few, many in (learned, two_ray, free))
+    assert learned[0] < min(two_ray[2], free[0])
+    assert learned[1] < min(two_ray[3], free[1])
+    assert all(row[2] < row[0] for row in (learned, two_ray, free))

@@ -102,14 +102,10 @@ def leave_one_out(quick, full, pairs):
     peer, peer_s = peer_leave_one_out(points, values, index, chosen)
     scaled_s = peer_s / len(chosen) * len(every)
     return {
-        "systems": len(every),
-        "ours_s": ours_s,
-        "pykrige_pairs_run": len(chosen),
-        "pykrige_s": peer_s,
-        "pykrige_scaled_s": scaled_s,
-        "kriging_vs_pykrige": scaled_s / ours_s,
+        "systems": len(every), "ours_s": ours_s, "pykrige_pairs_run": len(chosen), "pykrige_s": peer_s,
+        "pykrige_scaled_s": scaled_s, "kriging_vs_pykrige": scaled_s / ours_s,
         "largest_difference": float(np.abs(estimate[chosen[:, 0], chosen[:, 1]] - peer).max()),
-    }
+    }  # fmt: skip
 
 
 def on_the_grid(quick):

@@ -140,13 +140,9 @@ def main() -> int:
             )
     movers = [row for row in rows if not row["unseen"]]
     result = {
-        "clean": clean,
-        "faults": len(rows),
-        "caught_by_tests": sum(row["tests"] is True for row in rows),
-        "audit_must_see": len(movers),
-        "caught_by_audit": sum(bool(row["audit"]) for row in movers),
-        "rows": rows,
-    }
+        "clean": clean, "faults": len(rows), "caught_by_tests": sum(row["tests"] is True for row in rows),
+        "audit_must_see": len(movers), "caught_by_audit": sum(bool(row["audit"]) for row in movers), "rows": rows,
+    }  # fmt: skip
     print(
         json.dumps(result)
         if options.json

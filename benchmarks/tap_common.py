@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import random
 import socket
 import subprocess
 import sys
@@ -111,6 +112,27 @@ print(json.dumps({"rows": rows, "holes": holes, "connections": connections,
 def start_browser(port: int) -> subprocess.Popen[str]:
     """A reader of the page's events in its own process; SIGTERM makes it print what it got."""
     return subprocess.Popen([sys.executable, "-c", BROWSER, str(port)], stdout=subprocess.PIPE, text=True)
+
+
+def damaged(chance: random.Random) -> bytes:
+    """A request that is damaged in one of many ways."""
+    request = bytearray(b"GET /events?from=00000000-1-2-3 HTTP/1.1\r\nHost: 127.0.0.1\r\nLast-Event-ID: 1\r\n\r\n")
+    kind = chance.randrange(5)
+    if kind == 0:
+        return bytes(chance.randrange(256) for _ in range(chance.randrange(600))) + b"\r\n\r\n"
+    if kind == 1:
+        return bytes(request[: chance.randrange(len(request))])
+    if kind == 2:
+        long = chance.choice(
+            [b"GET /" + b"a" * 70_000, b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * chance.choice([50, 2000])]
+        )
+        return long + b"\r\n\r\n"
+    if kind == 3:
+        parts = [b"/", b"..", b"%2e%2e", b"%00", b"etc", b"passwd", b"?token=", b"&", b"[", b"\\", b"events", b"\xff"]
+        return b"GET " + b"".join(chance.choice(parts) for _ in range(10)) + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    for _ in range(chance.randrange(1, 12)):
+        request[chance.randrange(len(request))] = chance.randrange(256)
+    return bytes(request) + b"\r\n\r\n"
 
 
 def free_port() -> int:

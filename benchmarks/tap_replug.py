@@ -108,24 +108,14 @@ def cycles(count: int, seed: int, folder: Path, bytewise_s: float = 3e-4) -> dic
             r["mono_ns"] - r["duration_ns"] <= back and r["mono_ns"] >= back and r["mono_ns"] >= gone for r in closed
         )
     return {
-        "cycles": count,
-        "answers_read": len(read),
-        "lost": (Counter(read) - logged).total(),
-        "received_bytes": received,
-        "received_bytes_by_the_tap": ends[-1] if ends else None,
-        "line_bytes_given": size(given),
-        "line_bytes_recorded": size(kept),
+        "cycles": count, "answers_read": len(read), "lost": (Counter(read) - logged).total(),
+        "received_bytes": received, "received_bytes_by_the_tap": ends[-1] if ends else None,
+        "line_bytes_given": size(given), "line_bytes_recorded": size(kept),
         "line_bytes_in_gap_records": size(lines_recorded(r for r in records if r["kind"] == "gap")),
-        "line_bytes_missing": size(given - kept),
-        "line_bytes_invented": size(kept - given),
-        "bytes_sent": sent_bytes,
-        "bytes_never_read": sent_bytes - received,
-        "gap_records": len(closed),
-        "cycles_in_a_gap_record": covered,
-        "gaps_in_summary": summary["gaps"],
-        "nodes_used": len(nodes),
-        "bad_lines": len(bad),
-    }
+        "line_bytes_missing": size(given - kept), "line_bytes_invented": size(kept - given), "bytes_sent": sent_bytes,
+        "bytes_never_read": sent_bytes - received, "gap_records": len(closed), "cycles_in_a_gap_record": covered,
+        "gaps_in_summary": summary["gaps"], "nodes_used": len(nodes), "bad_lines": len(bad),
+    }  # fmt: skip
 
 
 def failed(result: dict[str, Any]) -> bool:

@@ -57,14 +57,10 @@ def one_kill(number: int, seed: int, folder: Path, *, web: bool = False, patienc
     elif read:
         raise RuntimeError("no log although the tap ran")
     return {
-        "answers": len(read),
-        "lost": len([answer for answer in read if answer not in set(logged)]),
-        "out_of_order": int(logged[: len(read)] != read),
-        "torn_tails": sum(line.torn_tail for line in bad),
-        "corrupt": sum(not line.torn_tail for line in bad),
-        "worst_torn": len(bad),
-        "answers_shown": shown,
-    }
+        "answers": len(read), "lost": len([answer for answer in read if answer not in set(logged)]),
+        "out_of_order": int(logged[: len(read)] != read), "torn_tails": sum(line.torn_tail for line in bad),
+        "corrupt": sum(not line.torn_tail for line in bad), "worst_torn": len(bad), "answers_shown": shown,
+    }  # fmt: skip
 
 
 def main() -> None:

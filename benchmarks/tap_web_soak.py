@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
-from tap_common import CSI, conditions, cpu_s, free_port, resident_kib, show, start_browser, start_tap
+from tap_common import CSI, conditions, cpu_s, damaged, free_port, resident_kib, show, start_browser, start_tap
 
 from aerpaw_cmp.live.log import BadLine, read_log
 from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
@@ -49,16 +49,9 @@ def soak(simulated_s: float, speed: float, folder: Path, *, web: bool) -> dict[s
     memory: list[int] = []
     with ModemSimulator(ModemSimSettings(link=link, faults=Faults(latency_s=0.0))) as modem:
         process = start_tap(
-            link,
-            log,
-            ri_hz=2.0 * speed,
-            other_hz=speed,
-            pause_s=0.0,
-            duration_s=duration_s,
-            status_s=1.0 / speed,
-            log={"sync_interval_s": 1.0 / speed, "segment_s": 3600.0 / speed / 6},
-            web=port if web else None,
-        )
+            link, log, ri_hz=2.0 * speed, other_hz=speed, pause_s=0.0, duration_s=duration_s, status_s=1.0 / speed,
+            log={"sync_interval_s": 1.0 / speed, "segment_s": 3600.0 / speed / 6}, web=port if web else None,
+        )  # fmt: skip
         start = time.monotonic()
         while process.poll() is None and time.monotonic() < start + duration_s - 0.5:
             elapsed = (time.monotonic() - start) / duration_s
@@ -104,27 +97,6 @@ def pace(seconds: float, folder: Path, *, web: bool) -> dict[str, Any]:
     seen = [json.loads(browser.communicate()[0]) for browser in browsers]
     delays = {key: round(max(s[f"{key}_s"] for s in seen), 3) for key in ("median", "p99")} if seen else {}
     return {"cpu_percent": round(100 * share, 2), **delays}
-
-
-def damaged(chance: random.Random) -> bytes:
-    """A request that is damaged in one of many ways."""
-    request = bytearray(b"GET /events?from=00000000-1-2-3 HTTP/1.1\r\nHost: 127.0.0.1\r\nLast-Event-ID: 1\r\n\r\n")
-    kind = chance.randrange(5)
-    if kind == 0:
-        return bytes(chance.randrange(256) for _ in range(chance.randrange(600))) + b"\r\n\r\n"
-    if kind == 1:
-        return bytes(request[: chance.randrange(len(request))])
-    if kind == 2:
-        long = chance.choice(
-            [b"GET /" + b"a" * 70_000, b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * chance.choice([50, 2000])]
-        )
-        return long + b"\r\n\r\n"
-    if kind == 3:
-        parts = [b"/", b"..", b"%2e%2e", b"%00", b"etc", b"passwd", b"?token=", b"&", b"[", b"\\", b"events", b"\xff"]
-        return b"GET " + b"".join(chance.choice(parts) for _ in range(10)) + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
-    for _ in range(chance.randrange(1, 12)):
-        request[chance.randrange(len(request))] = chance.randrange(256)
-    return bytes(request) + b"\r\n\r\n"
 
 
 def fuzz(requests: int, folder: Path) -> dict[str, Any]:

@@ -36,15 +36,9 @@ def observed(flight: str, offset_db: float = 0.0, seed: int = 0) -> Observed:
     unit = line / np.linalg.norm(line, axis=1, keepdims=True)
     noise = np.random.default_rng(seed).normal(0.0, 0.5, len(time))
     samples = LinkSamples(
-        flight=flight,
-        tower="LW1",
-        channel="USRP1",
-        time_s=time,
-        position_m=200.0 * line,
-        at_uav=-unit,
-        at_tower=unit,
+        flight=flight, tower="LW1", channel="USRP1", time_s=time, position_m=200.0 * line, at_uav=-unit, at_tower=unit,
         residual_db=4.0 * np.cos(azimuth) + noise + offset_db,
-    )
+    )  # fmt: skip
     return Observed(samples, np.full(len(time), -60.0), np.zeros(len(time)))
 
 
@@ -152,12 +146,8 @@ def test_pattern_and_learned_gain_together_are_the_planted_gain(floor_db: float 
 
 def test_part_and_bins_keep_or_drop_what_belongs_to_samples() -> None:
     o = observed("a")
-    whole = dataclasses.replace(
-        o,
-        samples=dataclasses.replace(o.samples, floor_db=np.arange(200.0)),
-        locked=np.arange(200.0) % 2,
-        sent_dbm=30.0,
-    )
+    samples = dataclasses.replace(o.samples, floor_db=np.arange(200.0))
+    whole = dataclasses.replace(o, samples=samples, locked=np.arange(200.0) % 2, sent_dbm=30.0)
     some = whole.part(np.arange(0, 200, 3))
     assert some.samples.floor_db is not None
     assert some.locked is not None

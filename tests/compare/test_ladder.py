@@ -84,11 +84,8 @@ def test_models_are_scored_on_the_samples_that_all_have():
 
 def test_two_channels_share_one_recommendation():
     truth, measured = planted()
-    flat = np.full(len(truth), -80.0)
-    rungs = [
-        Rung(model="flat", level_db=(flat, flat), seconds=1.0),
-        Rung(model="truth", level_db=(truth, truth), seconds=2.0),
-    ]
+    levels = {"flat": np.full(len(truth), -80.0), "truth": truth}
+    rungs = [Rung(model=name, level_db=(level, level), seconds=1.0) for name, level in levels.items()]
     ladder = climb([measured, measured - 20.0], [np.arange(2000.0)] * 2, rungs)
     rows = ladder_rows(ladder, [("LW1", "A"), ("LW1", "B")])
     assert [(r.channel, r.model) for r in rows if r.recommended] == [("A", "truth"), ("B", "truth")]
@@ -137,16 +134,12 @@ def test_a_log_distance_line_finds_its_slope_and_is_never_the_recommended_replay
     range_db = 10.0 * np.log10(np.hypot(position[:, 0], 40.0))
     measured = -20.0 - 3.5 * range_db + rng.normal(0.0, 1.0, 800)
     zeros = np.zeros(800)
-    ladder = climb(
-        [measured],
-        [np.arange(800.0)],
-        [
-            Rung(model="constant", level_db=(zeros,), seconds=0.0, regressor_db=(zeros,)),
-            Rung(model="line", level_db=(zeros,), seconds=0.0, regressor_db=(range_db,)),
-            Rung(model="free space", level_db=(-2.0 * range_db,), seconds=0.0),
-        ],
-        position_m=[position],
-    )
+    rungs = [
+        Rung(model="constant", level_db=(zeros,), seconds=0.0, regressor_db=(zeros,)),
+        Rung(model="line", level_db=(zeros,), seconds=0.0, regressor_db=(range_db,)),
+        Rung(model="free space", level_db=(-2.0 * range_db,), seconds=0.0),
+    ]
+    ladder = climb([measured], [np.arange(800.0)], rungs, position_m=[position])
     constant, line, free = ladder.rmse_db
     assert line == pytest.approx(1.0, abs=0.1)
     assert constant > free > 3.0

@@ -89,15 +89,9 @@ def _port() -> int:
 def _scheduler(port: int) -> Any:
     """A scheduler and one worker in threads of this process."""
     return distributed.LocalCluster(
-        n_workers=1,
-        threads_per_worker=1,
-        processes=False,
-        scheduler_port=port,
-        dashboard_address=None,
-        silence_logs=50,
-        protocol="tls://",
-        security=SECURITY,
-    )
+        n_workers=1, threads_per_worker=1, processes=False, scheduler_port=port, dashboard_address=None,
+        silence_logs=50, protocol="tls://", security=SECURITY,
+    )  # fmt: skip
 
 
 def gone() -> str:

@@ -35,16 +35,9 @@ def flight(name: str, seed: int, losing: bool = True) -> Observed:
     locked = random.random(len(time)) < expit(PER_DB * (level_db - HALF_DB))
     measured = np.where(locked, level_db + REFERENCE_DB + random.normal(0.0, 2.0, len(time)), -28.0)
     samples = LinkSamples(
-        flight=name,
-        tower="ROVER",
-        channel="power",
-        time_s=time,
-        position_m=reach[:, None] * line,
-        at_uav=-unit,
-        at_tower=unit,
-        residual_db=measured - path_db - SENT_DBM,
-        floor_db=LOCK_FLOOR_DB - path_db - SENT_DBM,
-    )
+        flight=name, tower="ROVER", channel="power", time_s=time, position_m=reach[:, None] * line, at_uav=-unit,
+        at_tower=unit, residual_db=measured - path_db - SENT_DBM, floor_db=LOCK_FLOOR_DB - path_db - SENT_DBM,
+    )  # fmt: skip
     kept = locked.astype(np.float64) if losing else np.ones(len(time))
     return Observed(samples, path_db + SENT_DBM, np.zeros(len(time)), locked=kept, sent_dbm=SENT_DBM)
 

@@ -34,14 +34,9 @@ def flight(seed: int) -> RankSamples:
     link = Link(3.4e9, {"T": tower_comparison_array()}, uav_comparison_array(0.0882), uav_transmits=False)
     poses = Poses(at, np.tile(np.eye(3), (400, 1, 1)))
     return RankSamples(
-        flight=f"f{seed}",
-        tower="T",
-        tower_m=np.array([0.0, 0.0, 12.0]),
-        poses=poses,
-        rank=np.zeros(400),
-        link=link,
+        flight=f"f{seed}", tower="T", tower_m=np.array([0.0, 0.0, 12.0]), poses=poses, rank=np.zeros(400), link=link,
         time_s=np.arange(400.0),
-    )
+    )  # fmt: skip
 
 
 def by_medians(ratio):

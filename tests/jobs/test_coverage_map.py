@@ -121,22 +121,6 @@ def test_opaque_crowns_reflect_as_a_replay_with_them_says(site):
     assert (found[True]["opaque"].rss_siso_dbm != found[False]["opaque"].rss_siso_dbm).any()
 
 
-def test_paths_of_infinite_loss_are_no_paths(site):
-    behind = np.array([[180.0, 0.0, 3.0], [50.0, 0.0, 3.0]])  # behind the hedge; in front of it
-    poses = Poses(behind, np.broadcast_to(np.eye(3), (2, 3, 3)))
-    one = Link(CARRIER_HZ, {"A": single_element()}, single_element(), 40.0)
-
-    def loss(paths, source, target):
-        return foliage_loss_db(source[paths.tower], paths.vertices_m, target[paths.pose], site.trees, Opaque())
-
-    result = replay(site, one, poses, field=Field(loss=loss))
-    assert result.has_path[:, 0].tolist() == [False, True]
-    assert np.isnan(result.rss_dbm[0, 0])
-    assert np.isnan(result.rss_power_dbm[0, 0])
-    assert (result.h[0] == 0).all()
-    assert np.isfinite(result.rss_dbm[1, 0])
-
-
 def test_a_broadside_beam_gains_the_number_of_elements():
     # free space far away: 4 elements in phase, each with a quarter of the power, give 4 times the power broadside
     # (east of a line along north) and next to nothing along the line
@@ -354,14 +338,6 @@ def test_wrong_wishes_are_one_message(words, said, tmp_path):
 
     with pytest.raises(UsageError, match=said):
         main(["map", "lake_wheeler", "-o", str(tmp_path / "out"), *words])
-
-
-def test_an_unknown_site_is_one_message(tmp_path):
-    from aerpaw_cmp.cli import main
-
-    with pytest.raises(Exception, match="nowhere") as caught:
-        main(["map", "nowhere.yaml", "-o", str(tmp_path)])
-    assert isinstance(caught.value, UsageError) or type(caught.value).__name__ == "InputError"
 
 
 def test_the_notes_say_where_p833_is_continued():

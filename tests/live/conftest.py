@@ -176,13 +176,9 @@ def tap(tmp_path, request):
 
     def make(port, *, options=None, **settings):
         values = {
-            "ri_hz": 20.0,
-            "other_hz": 2.0,
-            "pause_s": 0.0,
-            "status_s": 0.1,
-            "probe_timeout_s": 3.0,
+            "ri_hz": 20.0, "other_hz": 2.0, "pause_s": 0.0, "status_s": 0.1, "probe_timeout_s": 3.0,
             "folder": tmp_path / "log",
-        } | settings
+        } | settings  # fmt: skip
         watch = {} if feed is None else {"watch": lambda item: feed.put(0, item)}
         session = Session(TapSettings(port=str(port), **values), **watch, **(options or {}))
         running.append(session)

@@ -20,7 +20,7 @@ from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, find_candida
 from aerpaw_cmp.live.session import TapSettings
 from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.tap import run_tap
-from tests.live.terminals import held
+from tests.live.terminals import held, until
 
 
 @pytest.mark.parametrize(
@@ -158,10 +158,7 @@ def test_what_waits_in_the_queue_at_open_is_not_lost():
 def test_two_taps_on_one_port(modem, child, tmp_path):
     sim = modem(faults=Faults(latency_s=0.005))
     first = child(sim.port)
-    until = time.monotonic() + 15
-    while len(sim.journal) < 5:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: len(sim.journal) >= 5)
     second = child(sim.port, folder=str(tmp_path / "second"))
     _, err = second.communicate(timeout=20)
     assert second.returncode == 3
@@ -169,10 +166,7 @@ def test_two_taps_on_one_port(modem, child, tmp_path):
     assert "Traceback" not in err
     assert first.poll() is None
     count = len(sim.journal)
-    until = time.monotonic() + 10
-    while len(sim.journal) < count + 5:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: len(sim.journal) >= count + 5, 10.0)
 
 
 def test_two_taps_in_one_process(modem, tap, tmp_path):
@@ -198,10 +192,7 @@ def test_modem_manager_is_named_with_the_line_that_frees_the_port(modem, tmp_pat
     with held(sim.node) as node:
         process = modem_manager(node)
     try:
-        until = time.monotonic() + 10
-        while not any(h.pid == process.pid and h.name == "ModemManager" for h in holders(sim.node)):
-            assert time.monotonic() < until
-            time.sleep(0.02)
+        until(lambda: any(h.pid == process.pid and h.name == "ModemManager" for h in holders(sim.node)), 10.0)
         with pytest.raises(InputError, match="systemctl stop ModemManager") as caught:
             run_tap(TapSettings(tmp_path / "log", str(sim.port)))
         assert "ID_MM_DEVICE_IGNORE" in str(caught.value)

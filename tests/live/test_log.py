@@ -29,6 +29,7 @@ from aerpaw_cmp.live.log import (
 from aerpaw_cmp.live.writer import LogWriter
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER, SCHEMA, decode_line
+from tests.live.terminals import until
 
 
 def header():
@@ -244,10 +245,7 @@ def test_a_disk_that_stalls_does_not_hold_the_polling(tmp_path, monkeypatch):
     assert written.is_set()
     assert not any(writer.append({"kind": "x", "i": i}) for i in range(4, 34))
     hang.set()
-    until = time.monotonic() + 10
-    while not writer.append({"kind": "y"}):
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    until(lambda: writer.append({"kind": "y"}), 10.0)
     writer.close()
     assert [r["i"] for r in read_log(tmp_path) if r["kind"] == "x"] == list(range(34))
     assert writer.lost == 0

@@ -236,14 +236,9 @@ def test_export(modem, tap, tmp_path):
 def test_export_holds_no_formula(tmp_path):
     evil = '=cmd|"/C calc"!A0'
     record = {
-        "kind": "exchange",
-        "query": "servingcell",
-        "sent_utc_ns": 1,
-        "last_utc_ns": 2,
-        "status": "ok",
-        "lines": [evil],
-        "n": 1,
-    }
+        "kind": "exchange", "query": "servingcell", "sent_utc_ns": 1, "last_utc_ns": 2, "status": "ok",
+        "lines": [evil], "n": 1,
+    }  # fmt: skip
     record |= {"decoded": {"state": evil, "rat": "@SUM(1)"}, "flags": ["-1+1", evil]}
     (tmp_path / "tap_x.jsonl").write_bytes(encode_record(record) + b"torn")
     summary = export_csv(tmp_path, tmp_path / "out.csv")

@@ -21,6 +21,7 @@ from aerpaw_cmp.live.simulator import Faults
 from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status, run_tap
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER
+from tests.live.terminals import until
 
 
 def kinds(records):
@@ -247,10 +248,7 @@ def test_silent_modem_is_a_gap(modem, tap, tools, tmp_path):
 def test_signals_end_it_cleanly(modem, child, tools, tmp_path, name):
     sim = modem(csi_on=False, faults=Faults(latency_s=0.005))
     process = child(sim.port, enable_csi=True)
-    until = time.monotonic() + 15
-    while len(served_and_read(sim, CSI)) < 3:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: len(served_and_read(sim, CSI)) >= 3)
     process.send_signal(getattr(signal, name))
     out, err = process.communicate(timeout=10)
     assert (process.returncode, err) == (0, "")
@@ -265,10 +263,7 @@ def test_signals_end_it_cleanly(modem, child, tools, tmp_path, name):
 def test_sigkill_loses_no_answer(modem, child, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0))
     process = child(sim.port, ri_hz=100.0)
-    until = time.monotonic() + 15
-    while len(served_and_read(sim, CSI)) < 20:
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    until(lambda: len(served_and_read(sim, CSI)) >= 20)
     process.kill()
     process.wait()
     read = served_and_read(sim, CSI)

@@ -26,6 +26,8 @@ from aerpaw_cmp.live.predict import RunningInterval
 from aerpaw_cmp.live.session import TapStatus
 from aerpaw_cmp.live.stop import Stop
 from aerpaw_cmp.live.web import Address, Limits, WebServer
+from benchmarks.tap_common import damaged
+from tests.live.terminals import until
 
 SECOND = 1_000_000_000
 QUIET = Limits(per_second=1e6, burst=1e6, connections=200)
@@ -198,43 +200,13 @@ def test_an_address_of_another_computer(tools):
         WebServer(Feed(["modem"]), tools.page, Address("192.0.2.77", 8765))
 
 
-def fuzzed(random):
-    """A request that is damaged in one of many ways."""
-    lines = [
-        b"GET /events?from=00000000-1-2-3 HTTP/1.1",
-        b"Host: 127.0.0.1",
-        b"Last-Event-ID: 00000000-1-2-3",
-        b"",
-        b"",
-    ]
-    data = bytearray(b"\r\n".join(lines))
-    kind = random.randrange(6)
-    if kind == 0:
-        return bytes(random.randrange(256) for _ in range(random.randrange(400))) + b"\r\n\r\n"
-    if kind == 1:
-        return bytes(data[: random.randrange(len(data))]) + b"\r\n\r\n"
-    if kind == 2:
-        return b"GET /" + b"a" * random.choice([10, 70_000]) + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
-    if kind == 3:
-        return b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * random.choice([90, 3000]) + b"\r\n"
-    if kind == 4:
-        path = b"".join(
-            random.choice([b"/", b"..", b"%2e", b"%00", b"etc", b"passwd", b"?token=", b"&", b"[", b"\\"])
-            for _ in range(12)
-        )
-        return b"GET " + path + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
-    for _ in range(random.randrange(1, 20)):
-        data[random.randrange(len(data))] = random.randrange(256)
-    return bytes(data) + b"\r\n\r\n"
-
-
 def test_damaged_requests_get_the_page_or_nothing(server, tools):
     chance, threads = random.Random(3), threading.active_count()
     kinds = set()
     for _ in range(300):
         head = body = b""
         with socket.create_connection(("127.0.0.1", server.address.port), 5) as link, contextlib.suppress(OSError):
-            link.sendall(fuzzed(chance))
+            link.sendall(damaged(chance))
             link.shutdown(socket.SHUT_WR)
             head, _, body = link.makefile("rb").read(500).partition(b"\r\n\r\n")
         kinds.add(head[9:12])
@@ -244,10 +216,7 @@ def test_damaged_requests_get_the_page_or_nothing(server, tools):
             or len(body) < 60
         )
     assert {b"404", b"400"} <= kinds
-    until = time.monotonic() + 10
-    while threading.active_count() > threads + 2 and time.monotonic() < until:
-        time.sleep(0.05)
-    assert threading.active_count() <= threads + 2
+    until(lambda: threading.active_count() <= threads + 2, 10.0)
     assert ask(server)[0] == 200
 
 
@@ -289,10 +258,7 @@ def test_a_flood_of_connections_is_bounded(tools):
                 link.sendall(b"G")
             except OSError:
                 continue
-        until = time.monotonic() + 10
-        while threading.active_count() > threads:
-            assert time.monotonic() < until
-            time.sleep(0.05)
+        until(lambda: threading.active_count() <= threads, 10.0)
         for link in links:
             link.close()
         time.sleep(2.0)

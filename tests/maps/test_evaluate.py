@@ -110,13 +110,9 @@ def test_kriging_wins_where_its_model_holds_and_its_variance_is_honest():
     values = simulated_field(GRID.points_m, 2, fields=40, noise=0.1)
     model = OrdinaryKriging(lambda d: 0.9 * exponential(d), sill=1.0)
     models = {
-        "kriging": model,
-        "idw": InverseDistance(),
-        "nearest": Nearest(),
-        "spline": IndexInterpolation("spline", GRID),
-        "makima": IndexInterpolation("makima", GRID),
-        "tower": ServingTowerMean([[100.0, 100.0], [500.0, 400.0]]),
-    }
+        "kriging": model, "idw": InverseDistance(), "nearest": Nearest(), "spline": IndexInterpolation("spline", GRID),
+        "makima": IndexInterpolation("makima", GRID), "tower": ServingTowerMean([[100.0, 100.0], [500.0, 400.0]]),
+    }  # fmt: skip
     table = {name: evaluate.leave_one_out(one, GRID.points_m, values) for name, one in models.items()}
     rmse = {name: float(s.rmse.mean()) for name, s in table.items()}
     assert min(rmse, key=lambda name: rmse[name]) == "kriging", rmse

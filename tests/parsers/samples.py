@@ -305,18 +305,14 @@ def mat_flight(**changes: object) -> bytes:
     count = 5
     wall = np.datetime64("2025-03-02T10:00:00.250") + np.arange(count) * np.timedelta64(260, "ms")
     table: dict[str, object] = {
-        "mX": np.linspace(-78.700, -78.699, count)[:, None],
-        "mY": np.linspace(35.730, 35.731, count)[:, None],
-        "mZ": np.linspace(0.5, 40.5, count)[:, None],
-        "mRoll": np.full((count, 1), 1.0),
-        "mPitch": np.full((count, 1), -3.0),
-        "mYaw": np.linspace(350.0, 370.0, count)[:, None] % 360,
-        "mSpeedX": np.full((count, 1), 2.0),
-        "mpower1": np.array([-40.0, -41.0, -800.0, -43.0, -44.0])[:, None],
+        "mX": np.linspace(-78.700, -78.699, count)[:, None], "mY": np.linspace(35.730, 35.731, count)[:, None],
+        "mZ": np.linspace(0.5, 40.5, count)[:, None], "mRoll": np.full((count, 1), 1.0),
+        "mPitch": np.full((count, 1), -3.0), "mYaw": np.linspace(350.0, 370.0, count)[:, None] % 360,
+        "mSpeedX": np.full((count, 1), 2.0), "mpower1": np.array([-40.0, -41.0, -800.0, -43.0, -44.0])[:, None],
         "mpower2": np.linspace(-45.0, -46.0, count)[:, None],
         "timestamp_power": (wall.astype(np.int64) / 1e3)[:, None],
         "timestamp_power_for_csv": np.array([str(time).replace("T", " ") for time in wall]),
-    }
+    }  # fmt: skip
     table.update(changes)
     return saved({name: value for name, value in table.items() if value is not None})
 
@@ -326,34 +322,24 @@ def lte_flight() -> bytes:
     count = 5
     seconds = 1740927600.25 + 0.1 * np.arange(count)
     table = {
-        "GPSx": np.full((2, 1), -78.7),
-        "GPSy": np.full((2, 1), 35.73),
-        "mX": np.linspace(-78.700, -78.699, count)[:, None],
-        "mY": np.linspace(35.730, 35.731, count)[:, None],
-        "mZ": np.linspace(0.5, 40.5, count)[:, None],
-        "RSRP": np.array([[17.5, 17.25, np.nan, -150.0, 16.5]]),
-        "RSRP2": np.array([[17.5, 17.25, 17.0, -150.0, 16.5]]),
-        "RSSI": np.full((1, count), 31.5),
+        "GPSx": np.full((2, 1), -78.7), "GPSy": np.full((2, 1), 35.73),
+        "mX": np.linspace(-78.700, -78.699, count)[:, None], "mY": np.linspace(35.730, 35.731, count)[:, None],
+        "mZ": np.linspace(0.5, 40.5, count)[:, None], "RSRP": np.array([[17.5, 17.25, np.nan, -150.0, 16.5]]),
+        "RSRP2": np.array([[17.5, 17.25, 17.0, -150.0, 16.5]]), "RSSI": np.full((1, count), 31.5),
         "RSRQ": np.full((1, count), -6.5),
         "timestamp_for_csv": np.array([f"2025-03-02 10:00:00.{250 + 100 * i:03d}" for i in range(count)]),
         "timestamp_meas": seconds[:, None],
-    }
+    }  # fmt: skip
     return saved(table)
 
 
 def processed_flight() -> bytes:
     """What the authors of the LTE flights make of one: no clock, heading in radians, other tables beside."""
     table = {
-        "RSRP_s": np.linspace(-80.0, -90.0, 4)[:, None],
-        "acceler_s": np.zeros((4, 1)),
-        "azim_s": np.zeros((4, 1)),
-        "elev_s": np.zeros((4, 1)),
-        "height_s": np.full((4, 1), 30.0),
-        "lat_s": np.full((4, 1), 35.73),
-        "lon_s": np.full((4, 1), -78.70),
-        "ori_s": np.full((4, 1), np.pi / 2),
-        "x_f": np.zeros((9, 1)),
-    }
+        "RSRP_s": np.linspace(-80.0, -90.0, 4)[:, None], "acceler_s": np.zeros((4, 1)), "azim_s": np.zeros((4, 1)),
+        "elev_s": np.zeros((4, 1)), "height_s": np.full((4, 1), 30.0), "lat_s": np.full((4, 1), 35.73),
+        "lon_s": np.full((4, 1), -78.70), "ori_s": np.full((4, 1), np.pi / 2), "x_f": np.zeros((9, 1)),
+    }  # fmt: skip
     return saved(table)
 
 

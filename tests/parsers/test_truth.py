@@ -493,19 +493,11 @@ CASES |= {
 # --- binary logs, MATLAB and the tap: the bytes are those of tests/parsers/autopilots.py and samples.py -------------------
 
 POSE = {
-    "time": [0.25 + i for i in range(5)],
-    "latitude_deg": [35.73] * 5,
-    "longitude_deg": [-78.7] * 5,
-    "altitude_m": [0.0, 1.0, 2.0, 3.0, 4.0],
-    "roll_deg": [1.5] * 5,
-    "pitch_deg": [-2.5] * 5,
-    "yaw_deg": [90.0] * 5,
-    "velocity_north_mps": [1.5] * 5,
-    "velocity_east_mps": [2.5] * 5,
-    "velocity_down_mps": [-0.5] * 5,
-    "fix": [4] * 5,
+    "time": [0.25 + i for i in range(5)], "latitude_deg": [35.73] * 5, "longitude_deg": [-78.7] * 5,
+    "altitude_m": [0.0, 1.0, 2.0, 3.0, 4.0], "roll_deg": [1.5] * 5, "pitch_deg": [-2.5] * 5, "yaw_deg": [90.0] * 5,
+    "velocity_north_mps": [1.5] * 5, "velocity_east_mps": [2.5] * 5, "velocity_down_mps": [-0.5] * 5, "fix": [4] * 5,
     "satellites": [14] * 5,
-}
+}  # fmt: skip
 OLD_FLASH = autopilots.dataflash().replace(b"POS\0", b"PXX\0").replace(b"XKF1", b"NKF1")
 MERGED_FLIGHT: Truth = {
     "vehicle": {

@@ -83,16 +83,8 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     targets = np.column_stack([rng.uniform(-150, 150, (40, 2)), rng.uniform(1.5, 60, 40)])
     source = np.array([[0.0, 0.0, 30.0]])
     words: list[str] = []
-    found = [
-        grow_paths(
-            surfaces,
-            Links(source, targets),
-            SearchRun(on_estimate=lambda said: words.append(str(said))),
-            max_depth=2,
-            shadows=on,
-        )
-        for on in (True, False)
-    ]
+    run = SearchRun(on_estimate=lambda said: words.append(str(said)))
+    found = [grow_paths(surfaces, Links(source, targets), run, max_depth=2, shadows=on) for on in (True, False)]
     assert len(words) == 2
     assert "first faces" in words[0]
     assert "MiB" in words[0]

@@ -19,6 +19,14 @@ def search(site, targets, max_depth=2, excluded=None, **settings_):
     return faces, find_paths(faces, links, max_depth=max_depth, **settings_)
 
 
+def by_brute_force(scenes, site, faces, targets, depth):
+    return {
+        (i, 0, *sequence)
+        for i, target in enumerate(targets)
+        for sequence in scenes.brute_force(site, faces, SOURCE[0], target, depth)
+    }
+
+
 @pytest.mark.parametrize(("seed", "holes"), [(1, False), (2, False), (3, True), (4, True)])
 def test_same_paths_as_brute_force_at_depth_2(scenes, seed, holes):
     rng = np.random.default_rng(seed)
@@ -26,25 +34,15 @@ def test_same_paths_as_brute_force_at_depth_2(scenes, seed, holes):
     targets = np.column_stack([rng.uniform(-80, 80, (12, 2)), rng.uniform(1.0, 25, 12)])
     targets = targets[~inside_solids(site, targets)]
     faces, paths = search(site, targets)
-    expected = {
-        (i, 0, *sequence)
-        for i, t in enumerate(targets)
-        for sequence in scenes.brute_force(site, faces, SOURCE[0], t, 2)
-    }
-    assert scenes.keys(paths) == expected
-    assert len(expected) > 1.5 * len(targets)  # the scene has reflections to find
+    assert scenes.keys(paths) == by_brute_force(scenes, site, faces, targets, 2)
+    assert len(paths) > 1.5 * len(targets)  # the scene has reflections to find
 
 
 def test_same_paths_as_brute_force_at_depth_3(scenes):
     site = scenes.site([Building("a", box(-20, 15, 40, 18), 12.0), Building("b", box(-20, -18, 40, -15), 12.0)])
     targets = np.array([[22.0, 3.0, 4.0], [30.0, -8.0, 6.0], [35.0, 1.0, 20.0]])
     faces, paths = search(site, targets, 3)
-    expected = {
-        (i, 0, *sequence)
-        for i, t in enumerate(targets)
-        for sequence in scenes.brute_force(site, faces, SOURCE[0], t, 3)
-    }
-    assert scenes.keys(paths) == expected
+    assert scenes.keys(paths) == by_brute_force(scenes, site, faces, targets, 3)
     assert paths.depth.max() == 3
 
 

@@ -49,11 +49,8 @@ def test_same_paths_as_rational_arithmetic_on_aligned_geometry(scenes, boxes):
         buildings = [Building(f"b{i}", f, float(b[4])) for i, (f, b) in enumerate(zip(footprints, solids, strict=True))]
         faces, found = paths_of(scenes, buildings, source, targets)
         for pose, target in enumerate(targets):
-            assert exact.planes_found(found, faces, pose) == exact.paths(solids, source, target), (
-                solids,
-                source,
-                target,
-            )
+            where = (solids, source, target)
+            assert exact.planes_found(found, faces, pose) == exact.paths(*where), where
     assert touching or boxes < 3
 
 

@@ -105,15 +105,11 @@ def test_tables(maps_data):
 def test_hostile_names_are_escaped(maps_data):
     text = "<script>alert(1)</script>"
     data = dataclasses.replace(
-        maps_data,
-        title=text,
-        name=text,
-        warnings=(text,),
-        notes=(text,),
+        maps_data, title=text, name=text, warnings=(text,), notes=(text,),
         site=dataclasses.replace(maps_data.site, name=text),
         errors=(dataclasses.replace(maps_data.errors[0], method=text, evaluation=text),),
         paper=(dataclasses.replace(maps_data.paper[0], what=text, figure=text),),
-    )
+    )  # fmt: skip
     page = maps_html.maps_page(data, pictures(data), [text])
     assert "alert(1)</script>" not in page
     assert page.count("<script") == 2

@@ -140,6 +140,12 @@ def figure(size: tuple[float, float] = WIDE) -> Figure:
     return Figure(figsize=size, layout="constrained")
 
 
+def subplots(size: tuple[float, float], *shape: int, **options: Any) -> tuple[Figure, Any]:
+    """An empty figure [inch] and its axes, as :meth:`matplotlib.figure.Figure.subplots` makes them."""
+    fig = figure(size)
+    return fig, fig.subplots(*shape, **options)
+
+
 def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
     """The figure in some of :data:`FORMATS`; on paper as wide as two columns of an IEEE page."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -572,8 +578,7 @@ def _draw_crowns(ax: Axes, trees: Trees, label: str) -> None:
 def plan_axes(ax: Axes) -> None:
     """Labels and equal scale of a plan."""
     ax.set_aspect("equal", adjustable="box")
-    ax.set_xlabel("East of the site origin [m]")
-    ax.set_ylabel("North of the site origin [m]")
+    ax.set(xlabel="East of the site origin [m]", ylabel="North of the site origin [m]")
 
 
 def frame_around(

@@ -85,8 +85,7 @@ def _figures(data: PlanPage) -> Iterator[FigureSpec]:
 
 
 def _draw_map(data: PlanPage) -> Figure:
-    fig = canvas.figure((9.2, 4.8))
-    axes = fig.subplots(1, 2, sharex=True, sharey=True)
+    fig, axes = canvas.subplots((9.2, 4.8), 1, 2, sharex=True, sharey=True)
     _, first, member = np.unique(data.place_m[:, :2].round(1), axis=0, return_index=True, return_inverse=True)
     count = np.bincount(member.ravel())
     both = [np.sqrt(np.bincount(member.ravel(), v**2) / count) for v in (data.before_db, data.after_db)]
@@ -110,11 +109,9 @@ def _draw_map(data: PlanPage) -> Figure:
 
 
 def _draw_curve(data: PlanPage) -> Figure:
-    fig = canvas.figure((7.0, 3.6))
-    ax = fig.subplots()
+    fig, ax = canvas.subplots((7.0, 3.6))
     ax.plot([p["minutes"] for p in data.curve], [p["sd_db"] for p in data.curve], "o-", color=canvas.SIMULATED)
     ax.axhline(float(np.sqrt(np.mean(data.before_db**2))), linestyle="--", color="0.5")
-    ax.set_xlabel("flight time [min]")
-    ax.set_ylabel("standard deviation over the target [dB]")
+    ax.set(xlabel="flight time [min]", ylabel="standard deviation over the target [dB]")
     ax.set_ylim(bottom=0.0)
     return fig

@@ -177,8 +177,7 @@ MOST_DOTS = 50_000
 
 
 def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
-    fig = canvas.figure((9.2, 5.2))
-    axes = fig.subplots(1, 2, sharex=True, sharey=True)
+    fig, axes = canvas.subplots((9.2, 5.2), 1, 2, sharex=True, sharey=True)
     east, north = part["east_m"].to_numpy(), part["north_m"].to_numpy()
     for ax, column, label, colours in (
         (axes[0], "level_db", "level [dB]", "viridis"),
@@ -203,15 +202,13 @@ def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
 
 
 def _draw_profile(data: PredictionPage, name: str, part: pd.DataFrame) -> Figure:
-    fig = canvas.figure((9.2, 3.2))
-    ax = fig.subplots()
+    fig, ax = canvas.subplots((9.2, 3.2))
     time = part["time_s"].to_numpy()
     ax.fill_between(time, part["q05_db"], part["q95_db"], color=canvas.SIMULATED, alpha=0.25, linewidth=0,
                     label="90 % interval of one sample")  # fmt: skip
     ax.plot(time, part["level_db"], color=canvas.SIMULATED, linewidth=1.2, label="median")
     if data.threshold_db is not None:
         ax.axhline(data.threshold_db, color="0.4", linestyle="--", linewidth=1, label="threshold")
-    ax.set_xlabel("time along the route [s]")
-    ax.set_ylabel(f"level [{data.units.get(name, 'dB')}]")
+    ax.set(xlabel="time along the route [s]", ylabel=f"level [{data.units.get(name, 'dB')}]")
     canvas.legend_below(ax, 3)
     return fig

@@ -57,8 +57,7 @@ def plan(site: Site, track: Track | None = None) -> Figure:
     limits = view_limits(site, track)
     width, height = np.ptp(limits[:2], axis=1)
     shape = float(np.clip(width / height, 0.45, 2.2))
-    fig = canvas.figure((7.0 * min(shape, 1.0) + 2.4, 7.0 / max(shape, 1.0) + 0.6))
-    ax = fig.subplots()
+    fig, ax = canvas.subplots((7.0 * min(shape, 1.0) + 2.4, 7.0 / max(shape, 1.0) + 0.6))
     canvas.draw_site(ax, site)
     if track is not None and len(track.time):
         ax.plot(

@@ -56,8 +56,7 @@ def share_seen(antenna: AntennaMap, within_deg: float = 10.0) -> float:
 
 def draw_antenna(antenna: AntennaMap) -> Figure:
     """Gain and its standard deviation over azimuth and elevation, with the directions flown."""
-    fig = canvas.figure((9.2, 6.4))
-    axes = fig.subplots(2, 1, sharex=True)
+    fig, axes = canvas.subplots((9.2, 6.4), 2, 1, sharex=True)
     elevation = 90.0 - antenna.theta_deg
     azimuth = np.append(antenna.azimuth_deg, 360.0)
 
@@ -92,8 +91,7 @@ def draw_scores(data: CalibrationData) -> Figure:
     rows += [(SPLIT_TITLE.get(k, k), _mean(v)) for k, v in data.scores.items()]
     rows += [(f"control: {k}", _mean(v)) for k, v in data.controls.items()]
     rows = [(name, value) for name, value in rows if np.isfinite(value)]
-    fig = canvas.figure((9.2, 0.4 * len(rows) + 1.0))
-    ax = fig.subplots()
+    fig, ax = canvas.subplots((9.2, 0.4 * len(rows) + 1.0))
     names, values = [r[0] for r in rows][::-1], [r[1] for r in rows][::-1]
     beside = [n in BASELINES.values() or "control" in n for n in names]
     colours = [canvas.OUT_OF_COVERAGE if pale else canvas.SIMULATED for pale in beside]
@@ -106,8 +104,7 @@ def draw_scores(data: CalibrationData) -> Figure:
 
 def draw_curve(data: CalibrationData) -> Figure:
     """Error on flights left out against the number of flights learned from, and what one more would bring."""
-    fig = canvas.figure((7.0, 3.8))
-    ax = fig.subplots()
+    fig, ax = canvas.subplots((7.0, 3.8))
     flights = [p["flights"] for p in data.curve]
     for key, label, colour in (
         ("rmse_db", "as logged", canvas.SIMULATED),
@@ -119,22 +116,18 @@ def draw_curve(data: CalibrationData) -> Figure:
         color=canvas.SIMULATED, label="one flight more (extrapolated)",
     )  # fmt: skip
     ax.set_xticks([*flights, flights[-1] + 1])
-    ax.set_xlabel("flights learned from")
-    ax.set_ylabel("RMSE on a flight left out [dB]")
+    ax.set(xlabel="flights learned from", ylabel="RMSE on a flight left out [dB]")
     ax.legend()
     return fig
 
 
 def draw_place(place: Mapping[str, Any], name: str) -> Figure:
     """The field over places that the fit with one has, along the flights."""
-    fig = canvas.figure((7.0, 6.0))
-    ax = fig.subplots()
+    fig, ax = canvas.subplots((7.0, 6.0))
     points = ax.scatter(place["east_m"], place["north_m"], c=place["gain_db"], s=4, cmap="coolwarm", rasterized=True)
     fig.colorbar(points, ax=ax, label="field over places [dB]")
     ax.set_aspect("equal")
-    ax.set_xlabel("east [m]")
-    ax.set_ylabel("north [m]")
-    ax.set_title(name)
+    ax.set(xlabel="east [m]", ylabel="north [m]", title=name)
     return fig
 
 

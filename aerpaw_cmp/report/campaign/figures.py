@@ -19,10 +19,10 @@ from ..canvas import (
     beyond,
     colour_bar,
     draw_site,
-    figure,
     frame_around,
     plan_axes,
     plan_shape,
+    subplots,
     thinned,
     thinned_plan,
 )
@@ -57,8 +57,7 @@ TALLEST = 40.0
 
 def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
     """RSS after the offset against distance, and its difference to the simulation below, all flights on one axis."""
-    fig = figure((9.2, 6.4))
-    top, low = fig.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
+    fig, (top, low) = subplots((9.2, 6.4), 2, 1, sharex=True, height_ratios=(1.5, 1.0))
     edges = np.linspace(0.0, max(float(np.nanmax(row.distance_m)) for row in rows), DISTANCE_BINS + 1)
     for row in rows:
         name, style = row.flight, curve_style(numbers[row.flight])
@@ -74,8 +73,7 @@ def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
         )  # fmt: skip
     low.axhline(0.0, color="black", linewidth=0.8)
     top.set_ylabel("RSS [dBm]")
-    low.set_ylabel("Measured − simulated [dB]")
-    low.set_xlabel("Distance tower to UAV [m]")
+    low.set(ylabel="Measured − simulated [dB]", xlabel="Distance tower to UAV [m]")
     fig.legend(*top.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return fig
 
@@ -94,8 +92,7 @@ def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
     """All flights on the plan, and their heights over time."""
     firsts = data.tracks
     towers = dict.fromkeys([*(row.tower for row in data.rss), *(row.tower for row in data.rank)])
-    fig = figure((9.2, 4.9))
-    plan, height = fig.subplots(1, 2, width_ratios=(1.15, 1.0))
+    fig, (plan, height) = subplots((9.2, 4.9), 1, 2, width_ratios=(1.15, 1.0))
     draw_site(plan, site)
     for row in firsts:
         number = numbers[row.flight]
@@ -110,8 +107,7 @@ def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
     north = np.concatenate([north, [t.north_m for t in used]])
     frame_around(plan, east, north)
     plan.set_title("Plan")
-    height.set_title("Height")
-    height.set_xlabel("Time after the first radio sample of each flight [s]")
+    height.set(title="Height", xlabel="Time after the first radio sample of each flight [s]")
     height.set_ylabel("Height above ground [m]")
     handles, labels = plan.get_legend_handles_labels()
     if len(firsts) <= MOST_FLIGHTS:
@@ -122,8 +118,7 @@ def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
 def season_errors(data: CampaignData) -> Figure:
     """Errors of the flights under every setting: 10 to 90 %, 25 to 75 %, median and mean, best setting on top."""
     ranking = data.season.over_all()[:MOST_SETTINGS]
-    fig = figure((9.2, 1.2 + 0.27 * len(ranking)))
-    ax = fig.subplots()
+    fig, ax = subplots((9.2, 1.2 + 0.27 * len(ranking)))
     for y, entry in enumerate(ranking):
         q = entry.quantiles_db
         ax.plot([q[1], q[5]], [y, y], color="#555555", linewidth=1.2, label="10 to 90 %" if not y else None)
@@ -142,8 +137,7 @@ def season_errors(data: CampaignData) -> Figure:
 
 def season_drift(data: CampaignData) -> Figure:
     """Own offset of every flight over its date, the first setting, a colour and marker per tower and channel."""
-    fig = figure((9.2, 3.6))
-    ax = fig.subplots()
+    fig, ax = subplots((9.2, 3.6))
     dated = len(data.season.started) >= len(data.flights) / 2 and len(data.season.started) > 1
     numbers = {name: number for number, name in enumerate(data.flights)}
     slopes = {
@@ -220,8 +214,7 @@ def season_places(data: CampaignData) -> Figure:
     cells = shown.cells
     reach = max(float(np.percentile(np.abs(shown.mean_db), 98)), 0.1)
     towers = list(dict.fromkeys(row.tower for row in data.reference_rows))
-    fig = figure((7.0, 5.0))
-    ax = fig.subplots()
+    fig, ax = subplots((7.0, 5.0))
     mesh = _cells(ax, data, cells, shown.mean_db, reach, towers)
     _frame(ax, data, cells, towers)
     colour_bar(fig, mesh, [ax], "Mean of measured − simulated [dB]", beyond(shown.mean_db, -reach, reach))
@@ -238,8 +231,8 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
     lines = -(-len(rows) // columns)
     shape = plan_shape(*(cells.T + 0.5) * data.cell_m)
     width = (7.2 - 0.2 * columns) / columns  # what labels and the colour bar leave
-    fig = figure((9.2, 1.0 + lines * min(width / shape + 0.45, 6.0)))
-    axes = fig.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
+    size = 9.2, 1.0 + lines * min(width / shape + 0.45, 6.0)
+    fig, axes = subplots(size, lines, columns, squeeze=False, sharex=True, sharey=True)
     mesh: Any = None
     for ax in axes.ravel()[len(rows) :]:
         ax.set_visible(False)
@@ -263,8 +256,7 @@ Scored: TypeAlias = "tuple[str, float, Interval | None]"
 def _by_setting(names: Sequence[str], groups: Mapping[str, Sequence[Scored]]) -> tuple[Figure, Axes, list[FloatArray]]:
     """Errors with intervals, a group of rows one below the other and a row per setting; also the rows of each group."""
     step = len(names) + 1.0
-    fig = figure((9.2, min(1.6 + 0.24 * step * len(groups), TALLEST)))
-    ax = fig.subplots()
+    fig, ax = subplots((9.2, min(1.6 + 0.24 * step * len(groups), TALLEST)))
     places = [np.arange(len(names), dtype=np.float64) + index * step for index in range(len(groups))]
     shown: set[str] = set()
     for index, (at, rows) in enumerate(zip(places, groups.values(), strict=True)):
@@ -317,8 +309,7 @@ def rank_tv(data: CampaignData) -> Figure:
         for (flight, tower, k), rows in grouped(data.rank, lambda r: (r.flight, r.tower, r.k)).items()
     }
     fig, ax, _ = _by_setting(list(data.settings), groups)
-    ax.set_xlim(0.0, 1.02)
-    ax.set_xlabel("Total variation, measured against simulated rank")
+    ax.set(xlim=(0.0, 1.02), xlabel="Total variation, measured against simulated rank")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return fig
 

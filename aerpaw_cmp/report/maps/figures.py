@@ -11,7 +11,7 @@ import numpy as np
 from ...common.units import FloatArray, spread_out
 from ...site.scenes import drawn_buildings
 from ...site.site import Site
-from ..canvas import RANK_HATCH, TOWER, FigureSpec, beyond, colour_bar, figure, plain_ticks, rank_colour
+from ..canvas import RANK_HATCH, TOWER, FigureSpec, beyond, colour_bar, plain_ticks, rank_colour, subplots
 from ..data import RANKS
 from ..names import k_key, safe_name
 from .data import JOINT, Correlation, LearningCurve, MapError, MapLayer, MapsData, RankMap, RssMap
@@ -85,8 +85,7 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
         ax.plot(line[:, 0], line[:, 1], color="white", linewidth=1.8, zorder=3)
         ax.plot(line[:, 0], line[:, 1], color="black", linewidth=0.9, linestyle=(0, (4, 2)), zorder=3.1)
     west, east, south, north = extent_m(data)
-    ax.set_xlim(west, east)
-    ax.set_ylim(south, north)
+    ax.set(xlim=(west, east), ylim=(south, north))
     ax.set_aspect("equal", adjustable="box")
     ax.grid(visible=False)
     ax.tick_params(labelsize=7)
@@ -137,8 +136,7 @@ def map_axes(data: MapsData, count: int) -> tuple[Figure, list[Axes]]:
     columns = -(-count // rows)
     width = min((7.4 - 0.15 * columns) / columns, 3.2)  # what a colour bar and the labels leave
     height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
-    fig = figure((9.2, rows * (height + 0.35) + 1.0))
-    grid = fig.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    fig, grid = subplots((9.2, rows * (height + 0.35) + 1.0), rows, columns, squeeze=False, sharex=True, sharey=True)
     axes: list[Axes] = list(grid.ravel())
     for ax in axes[count:]:
         ax.set_visible(False)
@@ -212,8 +210,7 @@ def layer_maps(data: MapsData, layers: Sequence[MapLayer]) -> Figure:
 def cdfs(maps: Sequence[RssMap]) -> Figure:
     """Distribution of RSS per tower and jointly: a panel per height, positions out of coverage counted as below."""
     panels = grouped(maps, lambda one: one.altitude_m)
-    fig = figure((9.2, 3.4))
-    axes = fig.subplots(1, len(panels), sharey=True, sharex=True, squeeze=False)[0]
+    fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, sharex=True, squeeze=False)
     for ax, (height, members) in zip(axes, panels.items(), strict=True):
         for number, one in enumerate(members):
             level = np.sort(one.rss_dbm[np.isfinite(one.rss_dbm)])
@@ -225,9 +222,7 @@ def cdfs(maps: Sequence[RssMap]) -> Figure:
                 level[shown], share[shown], **curve_style(number),
                 linewidth=2.0 if joint else 1.2, label=f"tower {one.tower}" if one.tower.startswith("_") else one.tower,
             )  # fmt: skip
-        ax.set_title(f"{height:g} m")
-        ax.set_xlabel("RSS [dBm]")
-        ax.set_ylim(0, 1.0)
+        ax.set(title=f"{height:g} m", xlabel="RSS [dBm]", ylim=(0, 1.0))
     axes[0].set_ylabel("Share of positions below")
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     return fig
@@ -236,8 +231,7 @@ def cdfs(maps: Sequence[RssMap]) -> Figure:
 def rank_shares(maps: Sequence[RankMap]) -> Figure:
     """Shares of Z and rank 1 to 4 against height, a panel per K and learned receiver."""
     panels = grouped(maps, lambda one: one.source)
-    fig = figure((9.2, 3.4))
-    axes = fig.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, squeeze=False)
     for ax, (source, members) in zip(axes, panels.items(), strict=True):
         at = np.arange(len(members))
         share = 100 * np.array([member.share for member in members])
@@ -252,8 +246,7 @@ def rank_shares(maps: Sequence[RankMap]) -> Figure:
             )  # fmt: skip
             below = below + share[:, column]
         ax.set_xticks(at, [f"{member.altitude_m:g}" for member in members], fontsize=7)
-        ax.set_title(source)
-        ax.set_xlabel("Height [m]")
+        ax.set(title=source, xlabel="Height [m]")
         ax.grid(visible=False)
     axes[0].set_ylabel("Share of positions [%]")
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
@@ -264,20 +257,17 @@ def correlations(curves: Sequence[Correlation]) -> Figure:
     """Correlation against distance and its model, a panel per kind, at most three in a row."""
     columns = min(len(curves), 3)
     rows = -(-len(curves) // columns)
-    fig = figure((9.2, 0.2 + 3.0 * rows))
-    axes = fig.subplots(rows, columns, squeeze=False).ravel()
-    for ax in axes[len(curves) :]:
+    fig, axes = subplots((9.2, 0.2 + 3.0 * rows), rows, columns, squeeze=False)
+    for ax in axes.flat[len(curves) :]:
         ax.set_visible(False)
-    for ax, curve in zip(axes[: len(curves)], curves, strict=True):
+    for ax, curve in zip(axes.flat, curves, strict=False):
         ax.plot(
             curve.distance_m, curve.correlation, marker="o", markersize=5, linestyle="none", color="#0072B2",
             label="data",
         )  # fmt: skip
         if curve.fit is not None and curve.fit_distance_m is not None:
             ax.plot(curve.fit_distance_m, curve.fit, color="#111111", linewidth=1.3, label=curve.fit_label or "model")
-        ax.set_title(curve.title)
-        ax.set_xlabel("Distance [m]")
-        ax.set_ylabel("Correlation")
+        ax.set(title=curve.title, xlabel="Distance [m]", ylabel="Correlation")
         ax.legend(loc="best", fontsize=7.5)
     return fig
 
@@ -285,8 +275,7 @@ def correlations(curves: Sequence[Correlation]) -> Figure:
 def error_curves(errors: Sequence[MapError]) -> Figure:
     """MAE against height for every method, a panel per K."""
     panels = grouped(errors, lambda one: one.k)
-    fig = figure((9.2, 3.4))
-    axes = fig.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, squeeze=False)
     for ax, (k, members) in zip(axes, panels.items(), strict=True):
         for number, (method, rows) in enumerate(grouped(members, lambda one: one.method).items()):
             rows = sorted(rows, key=lambda one: one.altitude_m)
@@ -294,8 +283,7 @@ def error_curves(errors: Sequence[MapError]) -> Figure:
                 [entry.altitude_m for entry in rows], [entry.mae for entry in rows], **curve_style(number, marked=True),
                 linewidth=1.2, label=method,
             )  # fmt: skip
-        ax.set_title(f"K = {k_key(k)}")
-        ax.set_xlabel("Height [m]")
+        ax.set(title=f"K = {k_key(k)}", xlabel="Height [m]")
     worst = max((error.mae for error in errors if np.isfinite(error.mae)), default=1.0)
     axes[0].set_ylim(0.0, 1.08 * worst if worst > 0 else 1.0)  # shared by all panels
     axes[0].set_ylabel("Mean absolute error of the rank")
@@ -305,16 +293,14 @@ def error_curves(errors: Sequence[MapError]) -> Figure:
 
 def learning_curves(curves: Sequence[LearningCurve]) -> Figure:
     """MAE against the number of samples."""
-    fig = figure((9.2, 3.0))
-    ax = fig.subplots()
+    fig, ax = subplots((9.2, 3.0))
     for number, curve in enumerate(curves):
         ax.semilogx(
             curve.samples, curve.mae, **curve_style(number, marked=True), label=curve.method,
         )  # fmt: skip
     ax.set_ylim(bottom=0)
     plain_ticks(ax.xaxis)
-    ax.set_xlabel("Number of samples")
-    ax.set_ylabel("Mean absolute error of the rank")
+    ax.set(xlabel="Number of samples", ylabel="Mean absolute error of the rank")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return fig
 

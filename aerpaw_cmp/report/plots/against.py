@@ -40,8 +40,7 @@ def against_specs(against: Against) -> Iterator[FigureSpec]:
 
 
 def _over_time(s: AgainstSeries) -> Figure:
-    fig = canvas.figure((9.2, 3.4))
-    ax = fig.subplots()
+    fig, ax = canvas.subplots((9.2, 3.4))
     ax.fill_between(s.time_s, s.low_db, s.high_db, color=canvas.SIMULATED, alpha=0.22, linewidth=0, label="90 %")
     ax.plot(s.time_s, s.measured_db, ".", markersize=2, color=canvas.MEASURED, label="measured", rasterized=True)
     ax.plot(s.time_s, s.level_db, color=canvas.SIMULATED, linewidth=1.2, label="predicted")
@@ -52,15 +51,12 @@ def _over_time(s: AgainstSeries) -> Figure:
 
 
 def _reliability(against: Against) -> Figure:
-    fig = canvas.figure((9.2, 3.6))
-    left, right = fig.subplots(1, 2)
+    fig, (left, right) = canvas.subplots((9.2, 3.6), 1, 2)
     left.plot([0, 100], [0, 100], color="0.6", linewidth=1)
     for s in against.series:
         left.plot(100 * SHARES, [100 * s.coverage(share) for share in SHARES], "o-", markersize=3, label=s.name)
         right.hist(s.sd_db, bins=30, histtype="step", label=s.name)
-    left.set_xlabel("nominal [%]")
-    left.set_ylabel("observed [%]")
+    left.set(xlabel="nominal [%]", ylabel="observed [%]")
     left.legend(fontsize=8)
-    right.set_xlabel("standard deviation of one sample [dB]")
-    right.set_ylabel("samples")
+    right.set(xlabel="standard deviation of one sample [dB]", ylabel="samples")
     return fig

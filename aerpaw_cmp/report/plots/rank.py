@@ -20,7 +20,6 @@ from ..canvas import (
     draw_out_of_coverage,
     draw_site,
     draw_waypoints,
-    figure,
     frame_around,
     legend_below,
     legend_of,
@@ -29,6 +28,7 @@ from ..canvas import (
     rank_colour,
     seconds_since,
     start_of,
+    subplots,
     time_axis,
 )
 from ..data import RANKS, ReportData
@@ -87,8 +87,7 @@ def rank_maps(data: ReportData, panel: RankResult) -> Figure:
     rows = -(-len(maps) // columns)
     east, north, _ = panel.position_m.T
     shape = plan_shape(east, north)
-    fig = figure((9.2, rows * (3.9 / shape + 1.1)))
-    axes = fig.subplots(rows, columns, squeeze=False)
+    fig, axes = subplots((9.2, rows * (3.9 / shape + 1.1)), rows, columns, squeeze=False)
     for ax, (title, rank) in zip(axes.ravel(), maps, strict=False):
         rank_map(ax, data.site, east, north, rank, title)
         frame_around(ax, east, north, shape=shape)
@@ -99,8 +98,7 @@ def rank_maps(data: ReportData, panel: RankResult) -> Figure:
 
 def rank_histograms(panel: RankResult) -> Figure:
     """Shares of rank 1 to 4, measured beside every K, with intervals where known."""
-    fig = figure((9.2, 3.4))
-    ax = fig.subplots()
+    fig, ax = subplots((9.2, 3.4))
     reported = int(np.isfinite(panel.measured).sum())
     score = panel.score
     series = [(f"measured ({count(reported)} samples)", score.histogram, score.histogram_ci95)]
@@ -121,8 +119,7 @@ def rank_histograms(panel: RankResult) -> Figure:
         if np.isfinite(spread).any():
             ax.errorbar(at, 100 * share, spread, fmt="none", ecolor="#D55E00", elinewidth=1.3, capsize=2.5)
     ax.set_xticks(RANKS, [f"{r}" for r in RANKS])
-    ax.set_xlabel("Channel rank")
-    ax.set_ylabel("Share of the samples in coverage [%]")
+    ax.set(xlabel="Channel rank", ylabel="Share of the samples in coverage [%]")
     ax.grid(axis="x", visible=False)
     legend_below(ax)
     return fig
@@ -141,8 +138,7 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
     rows = 1 + len(panel.rank)
     below = [1.3] * (panel.sinr_db is not None) + [2.2]
     ratios = [1.0] * rows + below
-    fig = figure((9.2, 1.1 * sum(ratios) + 0.5))
-    axes = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
+    fig, axes = subplots((9.2, 1.1 * sum(ratios) + 0.5), len(ratios), 1, sharex=True, height_ratios=ratios)
     draw_measured_rank(axes[0], seconds, panel)
     for ax, (k, rank) in zip(axes[1:], panel.rank.items(), strict=False):
         ax.plot(
@@ -153,8 +149,7 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
     for number, ax in enumerate(axes[:rows]):
         draw_waypoints(ax, data, start, names=number == 0)
         ax.set_yticks(RANKS)
-        ax.set_ylim(0.5, 4.5)
-        ax.set_ylabel("Rank")
+        ax.set(ylim=(0.5, 4.5), ylabel="Rank")
         ax.legend(*legend_of(ax, lambda label: label != "waypoint"), loc="center left", bbox_to_anchor=(1.0, 0.5))
     if panel.sinr_db is not None:
         dots(axes[rows], seconds, panel.sinr_db, color="#0072B2", label="SINR")
@@ -180,20 +175,17 @@ def rank_forecast(data: ReportData, panel: RankResult) -> Figure:
     parts = np.array_split(order, min(_FORECAST_COLUMNS, max(len(order), 1)))
     at = np.array([seconds[part].mean() for part in parts if len(part)])
     mean = np.array([probability[part].mean(axis=0) for part in parts if len(part)])
-    fig = figure((9.2, 4.2))
-    upper, lower = fig.subplots(2, 1, sharex=True, height_ratios=[2.4, 1.0])
+    fig, (upper, lower) = subplots((9.2, 4.2), 2, 1, sharex=True, height_ratios=[2.4, 1.0])
     if len(at):
         labels = [f"rank {rank}" for rank in RANKS]
         upper.stackplot(at, *(100 * mean.T), colors=[rank_colour(rank) for rank in RANKS], labels=labels, linewidth=0.4,
                         edgecolor="#222222")  # fmt: skip
-    upper.set_ylim(0, 100)
-    upper.set_ylabel("Probability [%]")
+    upper.set(ylim=(0, 100), ylabel="Probability [%]")
     upper.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
     draw_measured_rank(lower, seconds, panel)
     draw_waypoints(upper, data, start, names=True)
     lower.set_yticks(RANKS)
-    lower.set_ylim(0.5, 4.5)
-    lower.set_ylabel("Rank")
+    lower.set(ylim=(0.5, 4.5), ylabel="Rank")
     lower.legend(*legend_of(lower, lambda label: label != "waypoint"), loc="center left", bbox_to_anchor=(1.0, 0.5))
     time_axis(lower, start)
     return fig
@@ -264,8 +256,7 @@ def draw_counts(ax: Axes, counts: FloatArray) -> Any:
 def confusion(panel: RankResult) -> Figure:
     """Measured rank against simulated rank for every K, as counts and shares of the measured rank."""
     fits = panel.score.simulated
-    fig = figure((9.2, 3.3))
-    axes = fig.subplots(1, len(fits), sharey=True, squeeze=False)[0]
+    fig, (axes,) = subplots((9.2, 3.3), 1, len(fits), sharey=True, squeeze=False)
     image = None
     for ax, (k, fit) in zip(axes, fits.items(), strict=True):
         table = np.asarray(fit.confusion[1:], dtype=float)  # no report is no row
@@ -287,8 +278,7 @@ def confusion(panel: RankResult) -> Figure:
 def agreement_curve(panel: RankResult) -> Figure:
     """Agreement and total variation against continuous K."""
     curve, best = panel.score.curve, panel.score.best_k
-    fig = figure((9.2, 3.4))
-    ax = fig.subplots()
+    fig, ax = subplots((9.2, 3.4))
     ax.semilogx(curve.k, curve.agreement, color=SIMULATED, linewidth=1.3, label="agreement by pose (higher is better)")
     ax.semilogx(
         curve.k, curve.total_variation, color="#D55E00", linestyle=(0, (5, 2)), linewidth=1.3,
@@ -302,7 +292,6 @@ def agreement_curve(panel: RankResult) -> Figure:
         ax.axvline(k, color=WAYPOINT, linestyle=":", linewidth=0.9, label="K of the report" if number == 0 else None)
     ax.set_ylim(0.0, 1.02)
     plain_ticks(ax.xaxis)
-    ax.set_xlabel("K (ratio of singular values)")
-    ax.set_ylabel("Agreement, total variation")
+    ax.set(xlabel="K (ratio of singular values)", ylabel="Agreement, total variation")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return fig

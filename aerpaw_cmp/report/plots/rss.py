@@ -23,7 +23,6 @@ from ..canvas import (
     draw_out_of_coverage,
     draw_site,
     draw_waypoints,
-    figure,
     frame_around,
     legend_below,
     legend_of,
@@ -31,6 +30,7 @@ from ..canvas import (
     robust_limits,
     seconds_since,
     start_of,
+    subplots,
     thinned,
     thinned_plan,
     time_axis,
@@ -46,8 +46,7 @@ if TYPE_CHECKING:
 
 def overview(data: ReportData, panel: RssResult) -> Figure:
     """The flight coloured by residual beside level and residual over time, of one channel."""
-    fig = figure((9.2, 4.0))
-    plan, right = fig.subplots(1, 2, width_ratios=(1.0, 1.5))
+    fig, (plan, right) = subplots((9.2, 4.0), 1, 2, width_ratios=(1.0, 1.5))
     residual = panel.residual_db
     draw_site(plan, data.site, towers=[panel.tower])
     few = cloud(residual)
@@ -82,8 +81,7 @@ def draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
 
 def trajectory(data: ReportData, track: Track) -> Figure:
     """The flight on the plan of the whole site, and closer, coloured by height."""
-    fig = figure((9.2, 5.4))
-    whole, close = fig.subplots(1, 2, width_ratios=(1.0, 1.35))
+    fig, (whole, close) = subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
     draw_site(whole, data.site)
     draw_site(close, data.site)
     nodes = {item.tower: item for item in data.series}.values()
@@ -128,8 +126,7 @@ def altitude(data: ReportData, track: Track) -> Figure:
     """Height over time, with waypoints and the ground speed below."""
     start = start_of(data)
     seconds = seconds_since(track.time, start)
-    fig = figure((9.2, 2.9))
-    ax = fig.subplots()
+    fig, ax = subplots((9.2, 2.9))
     ax.plot(*thinned(seconds, track.up_m), color=SIMULATED, linewidth=1.2, label="height of the UAV")
     draw_waypoints(ax, data, start)
     time_axis(ax, start)
@@ -146,8 +143,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     """Calibrated measurement, simulation and baselines over time, and the residual under them."""
     start, score = start_of(data), panel.score
     seconds = seconds_since(panel.time, start)
-    fig = figure((9.2, 5.6))
-    ax, below = fig.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
+    fig, (ax, below) = subplots((9.2, 5.6), 2, 1, sharex=True, height_ratios=(2.6, 1.0))
     draw_out_of_coverage(ax, seconds, panel.simulated_out_of_coverage, "Z: no path in the simulation")
     draw_out_of_coverage(
         ax, seconds, panel.measured_out_of_coverage, "no signal in the measurement", height=0.05, hatch="xxxxx"
@@ -202,17 +198,13 @@ def _offset(offset_db: float) -> str:
 def detection_reliability(score: DetectionScore) -> Figure:
     """Share of detected samples over the probability that the predicted level gave them; area: samples."""
     said, seen, n = np.array(score.reliability, dtype=np.float64).T
-    fig = figure((4.8, 3.6))
-    ax = fig.subplots()
+    fig, ax = subplots((4.8, 3.6))
     ax.plot([0, 100], [0, 100], color="0.6", linewidth=1, label="calibrated")
     ax.plot(100 * said, 100 * seen, color=SIMULATED, linewidth=1)
     ax.scatter(
         100 * said, 100 * seen, s=12 + 120 * n / n.max(), color=SIMULATED, zorder=3, label="fifths of the samples"
     )
-    ax.set_xlabel("Predicted probability of detection [%]")
-    ax.set_ylabel("Detected samples [%]")
-    ax.set_xlim(0, 100)
-    ax.set_ylim(0, 100)
+    ax.set(xlabel="Predicted probability of detection [%]", ylabel="Detected samples [%]", xlim=(0, 100), ylim=(0, 100))
     ax.legend(loc="upper left")
     return fig
 
@@ -221,8 +213,7 @@ def ladder(rows: Sequence[LadderRow]) -> Figure:
     """RMSE of each model on held-out segments, a marker per tower and channel."""
     models = list(dict.fromkeys(row.model for row in rows))
     channels = list(dict.fromkeys((row.tower, row.channel) for row in rows))
-    fig = figure((9.2, 0.36 * len(models) + 1.5))
-    ax = fig.subplots()
+    fig, ax = subplots((9.2, 0.36 * len(models) + 1.5))
     for number, (tower, channel) in enumerate(channels):
         own = [row for row in rows if (row.tower, row.channel) == (tower, channel) and np.isfinite(row.rmse_heldout_db)]
         at = np.array([models.index(row.model) for row in own]) + 0.5 * ((number + 0.5) / len(channels) - 0.5)

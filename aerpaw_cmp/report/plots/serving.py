@@ -8,7 +8,7 @@ import numpy as np
 
 from ...common.units import AnyArray
 from ...compare.serving import ServingComparison
-from ..canvas import TOWER, FigureSpec, colour_bar, figure
+from ..canvas import TOWER, FigureSpec, colour_bar, subplots
 from ..words import count
 from .rank import draw_counts
 
@@ -41,8 +41,7 @@ def confusion(serving: ServingComparison) -> Any:
     """Cell that served against cell predicted strongest: counts, coloured by their share of the row."""
     names, table = shown_confusion(serving)
     longest = max((len(name) for name in names), default=0)
-    fig = figure((min(9.2, 3.6 + 0.62 * len(names) + 0.05 * longest), 1.9 + 0.42 * len(names)))
-    ax = fig.subplots()
+    fig, ax = subplots((min(9.2, 3.6 + 0.62 * len(names) + 0.05 * longest), 1.9 + 0.42 * len(names)))
     image = draw_counts(ax, table.astype(np.float64))
     for row, name in enumerate(names):
         if name != OTHER:
@@ -50,8 +49,7 @@ def confusion(serving: ServingComparison) -> Any:
     ax.set_xticks(range(len(names) + 1), [*names, NONE], rotation=45 if len(names) > 4 else 0,
                   ha="right" if len(names) > 4 else "center", fontsize=8)  # fmt: skip
     ax.set_yticks(range(len(names)), names, fontsize=8)
-    ax.set_xlabel("Cell predicted strongest")
-    ax.set_ylabel("Cell that served")
+    ax.set(xlabel="Cell predicted strongest", ylabel="Cell that served")
     colour_bar(fig, image, [ax], "Share of the cell that served [%]")
     return fig
 

@@ -41,7 +41,7 @@ def flight(samples: int):
 
 def one(name: str, samples: int) -> None:
     """Write one format and print its numbers."""
-    from aerpaw_cmp.report.exports.write import write_exports
+    from aerpaw_cmp.report.exports.formats import write_exports
 
     export = flight(samples)
     with tempfile.TemporaryDirectory() as folder:
@@ -53,7 +53,7 @@ def one(name: str, samples: int) -> None:
 
 
 def main() -> None:
-    from aerpaw_cmp.report.exports.write import FORMATS
+    from aerpaw_cmp.report.exports.formats import FORMATS
 
     parser = argparse.ArgumentParser()
     parser.add_argument("--samples", type=int, default=100_000)

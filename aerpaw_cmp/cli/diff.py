@@ -50,7 +50,7 @@ _SHOWN = 20
 
 
 def _print_diff(comparison: Any) -> None:
-    from ..report.diff.words import verdict
+    from ..report.diff.html import verdict
 
     print(verdict(comparison))
     for text in comparison.remarks:

@@ -53,8 +53,7 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Rank candidate flights by the standard deviation that they would leave."""
-    from ..jobs.prediction.next_flight import PlanAsked
-    from ..jobs.prediction.next_flight_run import run_plan
+    from ..jobs.prediction.next_flight import PlanAsked, run_plan
     from ..jobs.prediction.where import Asked
 
     asked = PlanAsked(

@@ -70,10 +70,8 @@ def fit_biexponential(
     correlation: ArrayLike,
     *,
     weights: ArrayLike | None = None,
-    amplitude_bounds: tuple[float, float] = (0.0, np.inf),
-    greatest_at_zero: float = 1.0,
 ) -> BiExponential:
-    """Least-squares bi-exponential by variable projection.
+    """Least-squares bi-exponential by variable projection, with c1 and c3 of at least 0 and c1 + c3 of at most 1.
 
     Source: arXiv 2502.10324 eq. 14.
 
@@ -87,11 +85,6 @@ def fit_biexponential(
         The points; NaN pairs do not count.
     weights : (n,), optional
         Such as the number of pairs of each bin; the paper's fit has none. ``rmse`` is weighted likewise.
-    amplitude_bounds : (low, high)
-        Of c1 and c3. Amplitudes of at least 0 keep the curve a valid covariance in any dimension.
-    greatest_at_zero : float
-        Bound of c1 + c3. A correlation is at most 1; without the bound, data that begin beyond distance 0 let the
-        fast exponential shoot up between 0 and the first point. Infinite for a free fit.
 
     Returns
     -------
@@ -102,13 +95,18 @@ def fit_biexponential(
     Raises
     ------
     UsageError
-        With fewer than two usable points, or bounds that hold nothing.
+        With fewer than two usable points.
+
+    Notes
+    -----
+    Amplitudes of at least 0 keep the curve a valid covariance in any dimension. A correlation is at most 1: data that
+    begin beyond distance 0 would let a free fast exponential shoot up between 0 and the first point.
 
     References
     ----------
     .. [1] Golub and Pereyra, Inverse Problems 19 (2003) R1, doi:10.1088/0266-5611/19/2/201
     """
-    problem = _Projection.of(distance_m, correlation, weights, (*amplitude_bounds, greatest_at_zero))
+    problem = _Projection.of(distance_m, correlation, weights)
     if len(problem.d) < 4:
         single = problem.single()
         return problem.result(single, f"{len(problem.d)} points cannot tell four coefficients")
@@ -123,29 +121,11 @@ class _Projection:
     d: FloatArray
     y: FloatArray
     root_weight: FloatArray
-    low: float
-    high: float
-    total: float
     log_rates: tuple[float, float]
 
     @classmethod
-    def of(
-        cls,
-        distance_m: ArrayLike,
-        correlation: ArrayLike,
-        weights: ArrayLike | None,
-        bounds: tuple[float, float, float],
-    ) -> _Projection:
-        """The problem of one curve: pairs without a number or a weight take no part.
-
-        Parameters
-        ----------
-        distance_m, correlation : array_like, (n,)
-        weights : array_like, (n,), optional
-            Relative; 1 each without.
-        bounds : (low, high, total)
-            Of each amplitude, and of their sum.
-        """
+    def of(cls, distance_m: ArrayLike, correlation: ArrayLike, weights: ArrayLike | None) -> _Projection:
+        """The problem of one curve: pairs without a number or a weight take no part."""
         d = np.asarray(distance_m, dtype=np.float64).ravel()
         y = np.asarray(correlation, dtype=np.float64).ravel()
         w = np.ones_like(d) if weights is None else np.asarray(weights, dtype=np.float64).ravel()
@@ -156,24 +136,13 @@ class _Projection:
         if len(d) < 2 or not d.max() > 0:
             raise UsageError(f"{len(d)} usable points for a curve", expected="at least two, at different distances")
         slow, fast = 1e-6 / d.max(), 10.0 / d[d > 0].min()  # flat over the data; gone at the first bin
-        low, high, total = bounds
-        if not (low < high and total > max(2 * low, low)):
-            raise UsageError(f"bounds {bounds}", expected="bounds that leave room")
-        return cls(
-            d=d,
-            y=y,
-            root_weight=np.sqrt(w / w.mean()),
-            low=low,
-            high=high,
-            total=total,
-            log_rates=(float(np.log(slow)), float(np.log(fast))),
-        )
+        return cls(d, y, np.sqrt(w / w.mean()), (float(np.log(slow)), float(np.log(fast))))
 
     def amplitudes(self, log_rates: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Best bounded amplitudes (..., 2) and weighted residuals (..., n) for logarithms of rates (..., 2)."""
         basis = np.exp(-np.exp(log_rates)[..., None, :] * self.d[:, None]) * self.root_weight[:, None]
         target = self.y * self.root_weight
-        candidates = _candidate_amplitudes(basis, target, self.low, self.high, self.total)
+        candidates = _candidate_amplitudes(basis, target)
         residual = (basis[..., None, :, :] @ candidates[..., :, :, None])[..., 0] - target
         pick = np.argmin((residual**2).sum(axis=-1), axis=-1)[..., None, None]
         chosen = np.take_along_axis(candidates, pick, axis=-2)[..., 0, :]
@@ -225,7 +194,7 @@ class _Projection:
     def _single_amplitude(self, log_rate: float) -> float:
         basis = np.exp(-np.exp(log_rate) * self.d) * self.root_weight
         amplitude = float(basis @ (self.y * self.root_weight) / max(basis @ basis, TINY))
-        return min(max(amplitude, self.low), self.high, self.total)
+        return min(max(amplitude, 0.0), 1.0)
 
     def _single_cost(self, log_rate: float) -> float:
         curve = self._single_amplitude(log_rate) * np.exp(-np.exp(log_rate) * self.d)
@@ -267,37 +236,27 @@ class _Projection:
         )
 
 
-def _candidate_amplitudes(basis: FloatArray, target: FloatArray, low: float, high: float, total: float) -> FloatArray:
-    """Best points (..., candidates, 2) of a two-column least-squares problem inside its bounds and on each edge.
+def _candidate_amplitudes(basis: FloatArray, target: FloatArray) -> FloatArray:
+    """Best points (..., 4, 2) of a two-column least-squares problem inside its bounds and on each edge.
 
-    The bounds are ``low <= c <= high`` for both and ``c1 + c3 <= total``; the least cost among the candidates is the
-    bounded optimum, because a convex cost has it inside or on an edge.
+    The bounds are ``c1, c3 >= 0`` and ``c1 + c3 <= 1``; the least cost among the candidates is the bounded optimum,
+    because a convex cost has it inside or on an edge.
     """
     gram = np.swapaxes(basis, -1, -2) @ basis
     right = (np.swapaxes(basis, -1, -2) @ target[:, None])[..., 0]
     a, b, c = gram[..., 0, 0], gram[..., 0, 1], gram[..., 1, 1]
     p, q = right[..., 0], right[..., 1]
-    edges = []
-    for edge in {low, min(high, total - low)}:
-        if np.isfinite(edge):
-            top = min(high, total - edge)
-            edges.append((np.full_like(p, edge), _clipped(q - b * edge, c, low, top)))
-            edges.append((_clipped(p - b * edge, a, low, top), np.full_like(p, edge)))
-    if total <= 2 * high and np.isfinite(total):
-        # c3 = total - c1
-        first = _clipped(p - q + (c - b) * total, a - 2 * b + c, max(low, total - high), min(high, total - low))
-        edges.append((first, total - first))
+    none, slope = np.zeros_like(p), _clipped(p - q + c - b, a - 2 * b + c)
+    edges = [(none, _clipped(q, c)), (_clipped(p, a), none), (slope, 1.0 - slope)]
     determinant = a * c - b * b
     regular = determinant > 1e-14 * a * c + TINY
     safe = np.where(regular, determinant, 1.0)
     first, second = (c * p - b * q) / safe, (a * q - b * p) / safe
-    inside = regular & (np.minimum(first, second) >= low) & (np.maximum(first, second) <= high)
-    inside &= first + second <= total
-    fallback = edges[0] if edges else (np.zeros_like(p), _clipped(q, c, low, high))
-    free = (np.where(inside, first, fallback[0]), np.where(inside, second, fallback[1]))
-    return np.stack([np.stack(pair, axis=-1) for pair in (free, fallback, *edges)], axis=-2)
+    inside = regular & (np.minimum(first, second) >= 0.0) & (first + second <= 1.0)
+    free = (np.where(inside, first, 0.0), np.where(inside, second, edges[0][1]))
+    return np.stack([np.stack(pair, axis=-1) for pair in (free, *edges)], axis=-2)
 
 
-def _clipped(right: FloatArray, square: FloatArray, low: float, high: float) -> FloatArray:
-    """Minimum over [low, high] of square * x^2 - 2 * right * x."""
-    return np.asarray(np.clip(right / np.maximum(square, TINY), low, high))
+def _clipped(right: FloatArray, square: FloatArray) -> FloatArray:
+    """Minimum over [0, 1] of square * x^2 - 2 * right * x."""
+    return np.asarray(np.clip(right / np.maximum(square, TINY), 0.0, 1.0))

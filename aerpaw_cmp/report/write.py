@@ -75,8 +75,8 @@ def write_report(
         pictures, paths = write_figures(specs, folder / "figures", formats, style, stages.progress)
     written += paths
     if exports:
+        from .exports.formats import write_exports
         from .exports.points import of_report
-        from .exports.write import write_exports
 
         with stages("exports"):
             written += write_exports(of_report(data), folder, exports, stages.progress)

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.jsonable import json_safe
 from aerpaw_cmp.compare.direction_gain import LinkSamples
 from aerpaw_cmp.compare.learning import correction
 from aerpaw_cmp.flight.data import load_data
@@ -26,7 +27,7 @@ from aerpaw_cmp.jobs.prediction.where import Asked, Targets, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.html import coded
-from aerpaw_cmp.report.plots.against import against_specs
+from aerpaw_cmp.report.plots.flight import against_specs
 from aerpaw_cmp.report.prediction_html import write_prediction
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted
@@ -200,7 +201,7 @@ def test_predicted_ranks_are_scored_where_they_were_flown(said, levels):
     assert score.constant_log_score > score.log_score
     assert len(against.series) == int(levels)
     assert f"Rank at {ranked.tower}, predicted before this flight: kappa" in against.metrics()["sentence"]
-    assert against.metrics()["rank"][ranked.tower]["kappa"] == score.kappa
+    assert json_safe(against.metrics())["rank"][ranked.tower]["kappa"] == score.kappa
     assert len(list(against_specs(against))) >= int(levels)
 
 

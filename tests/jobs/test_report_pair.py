@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.report.exports.write import FORMATS
+from aerpaw_cmp.report.exports.formats import FORMATS
 from tests.simulated import planned, simulate, write_yaml
 
 SETTINGS = planned(

@@ -14,8 +14,7 @@ from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.outputs import OutputFolder
 from aerpaw_cmp.compare.report_difference import pooled_difference
 from aerpaw_cmp.jobs.diff_reports import run_diff
-from aerpaw_cmp.report.diff.html import diff_page
-from aerpaw_cmp.report.diff.words import verdict
+from aerpaw_cmp.report.diff.html import diff_page, verdict
 from aerpaw_cmp.report.write import write_report
 from tests.json_page import unlisted
 

@@ -17,7 +17,7 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.compare.spread import NO_SPREAD, StatedSpread
 from aerpaw_cmp.flight.settings import ReportSettings
 from aerpaw_cmp.report import export
-from aerpaw_cmp.report.exports import formats, kmz, points, write
+from aerpaw_cmp.report.exports import formats, kmz, points
 
 ODD = 'LW<4> & "ö"'
 DBM = "0.1 lg(re 1 mW)"
@@ -220,9 +220,9 @@ def checked(name, folder, frames, data):
     CHECKS[name](folder / formats.FOLDER, frames, *more)
 
 
-@pytest.mark.parametrize("name", write.FORMATS)
+@pytest.mark.parametrize("name", formats.FORMATS)
 def test_an_independent_reader_finds_what_the_csvs_hold(name, data, frames, tmp_path):
-    written = write.write_exports(points.of_report(data), tmp_path, [name])
+    written = formats.write_exports(points.of_report(data), tmp_path, [name])
     assert written
     assert all(path.is_file() and path.parent.name == "exports" for path in written)
     checked(name, tmp_path, frames, data)
@@ -265,7 +265,7 @@ WITHOUT_UNITS = ("kmz",)
 """Its lines show no missing value either."""
 
 
-SHOWN = [(name, fault) for fault in (swap_places, shift_time, wrong_unit, zeros_for_missing) for name in write.FORMATS
+SHOWN = [(name, fault) for fault in (swap_places, shift_time, wrong_unit, zeros_for_missing) for name in formats.FORMATS
          if fault in (swap_places, shift_time) or name not in WITHOUT_UNITS]  # fmt: skip
 
 
@@ -273,13 +273,13 @@ SHOWN = [(name, fault) for fault in (swap_places, shift_time, wrong_unit, zeros_
 def test_a_planted_fault_is_seen(name, fault, data, frames, tmp_path, monkeypatch):
     export = fault(monkeypatch, data)
     monkeypatch.setattr(kmz, "_legend", lambda _: b"")
-    write.write_exports(export, tmp_path, [name])
+    formats.write_exports(export, tmp_path, [name])
     with pytest.raises((AssertionError, KeyError, IndexError)):
         checked(name, tmp_path, frames, data)
 
 
 def test_netcdf_passes_the_checker_of_the_conventions_it_claims(data, tmp_path, cf_faults):
-    write.write_exports(points.of_report(data), tmp_path, ["netcdf"])
+    formats.write_exports(points.of_report(data), tmp_path, ["netcdf"])
     assert cf_faults(tmp_path / "exports" / "rss.nc") == []
     assert cf_faults(tmp_path / "exports" / "rank.nc") == []
 
@@ -289,7 +289,7 @@ def test_the_checker_of_the_conventions_sees_a_unit_that_is_none(data, tmp_path,
     rss, rank = export.sets
     wrong = [dataclasses.replace(c, unit="decibels of something") for c in rss.columns]
     wrong = dataclasses.replace(export, sets=(dataclasses.replace(rss, columns=tuple(wrong)), rank))
-    write.write_exports(wrong, tmp_path, ["netcdf"])
+    formats.write_exports(wrong, tmp_path, ["netcdf"])
     assert any("decibels" in text for text in cf_faults(tmp_path / "exports" / "rss.nc"))
 
 
@@ -308,7 +308,7 @@ def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatc
     )
     export = points.of_report(relative)
     assert not export.clock
-    write.write_exports(export, tmp_path, ["kmz"])
+    formats.write_exports(export, tmp_path, ["kmz"])
     with zipfile.ZipFile(tmp_path / "exports" / "samples.kmz") as archive:
         text = archive.read("doc.kml").decode()
     assert "TimeSpan" not in text
@@ -319,12 +319,12 @@ def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypat
     monkeypatch.setattr(kmz, "_legend", lambda _: b"")
     alone = dataclasses.replace(data, rss=())
     (tmp_path / "a").mkdir()
-    names = {p.name for p in write.write_exports(points.of_report(alone), tmp_path / "a", write.FORMATS)}
+    names = {p.name for p in formats.write_exports(points.of_report(alone), tmp_path / "a", formats.FORMATS)}
     assert "rank.nc" in names
     assert "rss.nc" not in names
     nothing = dataclasses.replace(data, rss=(), rank=(), track=None)
     (tmp_path / "b").mkdir()
-    assert write.write_exports(points.of_report(nothing), tmp_path / "b", write.FORMATS)
+    assert formats.write_exports(points.of_report(nothing), tmp_path / "b", formats.FORMATS)
     silent = dataclasses.replace(
         data.rss[0],
         measured_db=np.full(len(data.rss[0].time), np.nan),
@@ -332,15 +332,15 @@ def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypat
         position_m=np.full((len(data.rss[0].time), 3), np.nan),
     )
     (tmp_path / "c").mkdir()
-    assert write.write_exports(
-        points.of_report(dataclasses.replace(data, rss=(silent,), rank=())), tmp_path / "c", write.FORMATS
+    assert formats.write_exports(
+        points.of_report(dataclasses.replace(data, rss=(silent,), rank=())), tmp_path / "c", formats.FORMATS
     )
 
 
 def test_same_flight_same_kmz(data, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        write.write_exports(points.of_report(data), tmp_path / name, ["kmz", "geojson"])
+        formats.write_exports(points.of_report(data), tmp_path / name, ["kmz", "geojson"])
     for path in sorted((tmp_path / "a" / "exports").iterdir()):
         assert path.read_bytes() == (tmp_path / "b" / "exports" / path.name).read_bytes()
 
@@ -367,12 +367,12 @@ def test_a_long_flight_is_thinned_with_its_extremes(data, tmp_path, monkeypatch)
 
 def test_formats_are_chosen_by_name():
     assert formats.chosen_formats(["GeoJSON, kmz", "kmz"]) == ("geojson", "kmz")
-    assert formats.chosen_formats(["all"]) == write.FORMATS
+    assert formats.chosen_formats(["all"]) == formats.FORMATS
     assert formats.chosen_formats([]) == ()
     with pytest.raises(UsageError, match=r"'shapefile'.*netcdf"):
         formats.chosen_formats(["shapefile"])
     asked = typing.get_args(typing.get_args(ReportSettings.model_fields["export"].annotation)[0])
-    assert set(asked) == {*write.FORMATS, formats.ALL}
+    assert set(asked) == {*formats.FORMATS, formats.ALL}
 
 
 def test_a_missing_library_is_named_with_its_extra(data, tmp_path, monkeypatch):
@@ -380,25 +380,25 @@ def test_a_missing_library_is_named_with_its_extra(data, tmp_path, monkeypatch):
     with pytest.raises(UsageError, match=r"netCDF4.*aerpaw-cmp\[geo\]"):
         formats.chosen_formats(["netcdf"])
     told = []
-    write.write_exports(
+    formats.write_exports(
         points.of_report(data), tmp_path, formats.chosen_formats(["kmz", "all"]), lambda text, *_: told.append(text)
     )
     assert any("netCDF4" in text and "aerpaw-cmp[geo]" in text for text in told)
     assert not list((tmp_path / "exports").glob("*.nc"))
 
 
-@pytest.mark.parametrize("name", write.FORMATS)
+@pytest.mark.parametrize("name", formats.FORMATS)
 def test_a_limit_of_the_disk_is_an_oserror_in_every_format(name, data, tmp_path, monkeypatch):
     """A library that writes by itself must not end the process or keep silent."""
     resource = pytest.importorskip("resource")
     monkeypatch.setattr(kmz, "_legend", lambda _: b"")
     export = points.of_report(data)
-    write.write_exports(export, tmp_path, [name])  # what it loads is loaded now
+    formats.write_exports(export, tmp_path, [name])  # what it loads is loaded now
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # it would be cut, and kept
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
         with pytest.raises(OSError, match=r"(?i)large|disk"):
-            write.write_exports(export, tmp_path, [name])
+            formats.write_exports(export, tmp_path, [name])
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

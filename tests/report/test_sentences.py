@@ -23,13 +23,13 @@ ROOT = Path(__file__).parents[2] / "aerpaw_cmp" / "report"
 TABLE = Path(__file__).with_name("sentences.md")
 GAP = "…"
 SOURCES = {
-    "report": ("words.py", "first_screen.py", "plots/against.py", "plots/flight.py", "plots/rss.py", "plots/rank.py",
-               "plots/serving.py", "templates/report.html.jinja", "templates/explorer.html.jinja",
+    "report": ("words.py", "first_screen.py", "plots/flight.py", "plots/rss.py", "plots/rank.py",
+               "templates/report.html.jinja", "templates/explorer.html.jinja",
                "templates/method.html.jinja", "templates/plates.html.jinja", "templates/site_view.html.jinja"),
     "map": ("maps/words.py", "maps/figures.py", "templates/map.html.jinja", "templates/map_explorer.html.jinja"),
     "campaign": ("campaign/words.py", "campaign/figures.py", "templates/campaign.html.jinja"),
     "calibration": ("calibration/words.py", "calibration/html.py", "templates/calibration.html.jinja"),
-    "diff": ("diff/words.py", "diff/data.py", "templates/diff.html.jinja"),
+    "diff": ("diff/html.py", "diff/data.py", "templates/diff.html.jinja"),
     "prediction": ("prediction_words.py", "prediction_html.py", "templates/prediction.html.jinja"),
 }  # fmt: skip
 WORD = re.compile(r"[A-Za-z][A-Za-z'-]*")

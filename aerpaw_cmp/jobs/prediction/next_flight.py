@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 
 from ...common.errors import InputError, UsageError
+from ...common.outputs import OutputFolder
 from ...common.stages import Stages
 from ...common.units import FloatArray
 from ...compare.direction_gain import GainModel, LinkSamples
@@ -22,11 +23,13 @@ from ...flight.patterns import NOSES, Pattern, Route, Waypoint, allowed_area, cu
 from ...flight.route_files import kml_text, plan_text, waypoints_csv
 from ...flight.training import counted_once
 from ...logs.route import read_areas
-from ...report.plan_html import PlanPage
+from ...report.names import safe_name
+from ...report.plan_html import PlanPage, plan_metrics, write_plan
 from ...site.site import Site
 from ..learning.calibrate import learned_antennas, observe
+from ..options import DEFAULT, JobOutcome, RunOptions
 from .predict import site_of
-from .sources import NamedFlight, sources_of
+from .sources import NamedFlight, files_of, named_flights, sources_of
 from .where import Asked, Targets, find_targets, level_samples
 
 SPHERE = "sphere"
@@ -425,3 +428,38 @@ def _of_length(one: Ranked, share: float, area: Any, asked: PlanAsked) -> Route 
         return route_of(one.pattern, area, asked.speed_mps, 60.0 * share * asked.minutes)
     whole = flown(one.route.name, one.route.waypoints, asked.speed_mps)
     return cut(whole, share * whole.duration_s, asked.speed_mps) if share <= 1.0 else None
+
+
+def run_plan(target: str, flights: Sequence[Path], asked: PlanAsked, options: RunOptions = DEFAULT) -> JobOutcome:
+    """Rank flights and write ``plan.html``, the chosen route, ``sd_map.csv``, ``metrics.json`` and figures.
+
+    Parameters
+    ----------
+    target : str
+        As for :func:`.next_flight.plan_flight`.
+    flights : sequence of Path
+    asked : PlanAsked
+    options : RunOptions
+        ``out`` is ``reports/plan-TARGET`` by default.
+
+    Returns
+    -------
+    JobOutcome
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
+    """
+    inputs = [p for p in (Path(target), asked.fence, *asked.avoid, *asked.routes) if p is not None and p.is_file()]
+    known = named_flights(flights)
+    inputs += files_of(known, options.logs_root)
+    stages = Stages(options.progress)
+    folder = options.out or Path("reports") / f"plan-{safe_name(Path(target).stem)}"
+    with OutputFolder(folder, job="plan", inputs=inputs, force=options.force) as output:
+        record = plan_flight(target, known, asked, logs_root=options.logs_root, stages=stages)
+        with output.filling() as place:
+            options.progress("page")
+            written = write_plan(record, place)
+    files = tuple(folder / path.relative_to(place) for path in written)
+    return JobOutcome(folder=folder, metrics=plan_metrics(record), files=files)

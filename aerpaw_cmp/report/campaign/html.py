@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -15,17 +15,15 @@ from ...common.jsonable import fields_of, json_safe, named
 from ...common.stages import Progress, silent
 from ...compare.passes import Repeated
 from .. import canvas
-from ..campaign_data import CampaignData, RssRow
+from ..campaign_data import CampaignData, RankPairing, Repeat, RssRow
 from ..canvas import Picture
 from ..export import json_text, write_file
+from ..exports.formats import write_exports
 from ..exports.points import of_campaign
-from ..exports.write import write_exports
 from ..html import by_section, rendered
 from ..made import about
 from ..words import pretty
 from . import figures as campaign_figures
-from .pairs import TABLE as PAIR_TABLE
-from .pairs import by_link, cells, pair_frame, telling
 from .words import (
     FEW,
     beside_baselines,
@@ -210,3 +208,65 @@ def write_campaign(
     written += exported
     page = write_file(folder / "campaign.html", campaign_page(data, drawn, files))
     return [page, *written]
+
+
+# --- pairs of flights at the same places -----------------------------------------------------------------------------
+
+LISTED_PAIRS = 1000
+"""Pairs of each kind that campaign.json lists; of more, those with the most places."""
+
+PAIR_TABLE = "pairs"
+"""The file with all of them, less its ending."""
+
+
+Pair = TypeVar("Pair", Repeat, RankPairing)
+
+
+def telling(pairs: Sequence[Pair], most: int = LISTED_PAIRS) -> list[Pair]:
+    """All pairs, or of more than ``most`` those with the most places, in their order."""
+    chosen = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))[:most]
+    return [pairs[i] for i in sorted(chosen)]
+
+
+def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
+    """Per tower and channel: pairs of flights, those that meet, their places, and how much they differ [dB]."""
+    groups: dict[tuple[str, str], list[Repeat]] = {}
+    for pair in pairs:
+        groups.setdefault((pair.tower, pair.channel), []).append(pair)
+    rows = []
+    for (tower, channel), members in groups.items():
+        meeting = [pair for pair in members if pair.n]
+        rmse = np.array([pair.rmse_db for pair in meeting if np.isfinite(pair.rmse_db)])
+        low, median, high = np.quantile(rmse, (0.1, 0.5, 0.9)).tolist() if len(rmse) else (float("nan"),) * 3
+        rows.append(
+            {
+                "tower": tower,
+                "channel": channel,
+                "pairs": len(members),
+                "meeting": len(meeting),
+                "n": sum(pair.n for pair in meeting),
+                "rmse_mean_db": float(rmse.mean()) if len(rmse) else float("nan"),
+                "rmse_quantiles_db": {"10": low, "50": median, "90": high},
+            }
+        )
+    return rows
+
+
+def pair_frame(data: CampaignData) -> pd.DataFrame:
+    """One row per pair of flights, tower and channel (``kind`` rss), or tower (``kind`` rank)."""
+    kinds: dict[str, Sequence[Any]] = {"rss": data.repeats, "rank": data.rank_repeats}
+    table: pd.DataFrame = pd.DataFrame([{"kind": kind, **cells(p)} for kind, pairs in kinds.items() for p in pairs])
+    return table
+
+
+def cells(record: Any) -> dict[str, Any]:
+    """Fields of a record as cells of a table; an interval ``x_ci95`` becomes ``x_low`` and ``x_high``."""
+    out: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if "ci95" in field.name:
+            low, high = value or (float("nan"), float("nan"))
+            out |= {field.name.replace("ci95", "low"): low, field.name.replace("ci95", "high"): high}
+        else:
+            out[field.name] = value
+    return out

@@ -1,11 +1,17 @@
-"""Export formats that there are, and those that are asked for; loads none of their writers."""
+"""Export formats: those that are asked for, and their files; loads a writer where one is wanted."""
 
 from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ...common.errors import UsageError
+from ...common.stages import Progress, silent
+
+if TYPE_CHECKING:
+    from .points import Export
 
 FORMATS = ("geojson", "kmz", "netcdf")
 _NEEDS = {"netcdf": ("netCDF4", "xarray")}
@@ -52,3 +58,41 @@ def _installed(module: str) -> bool:
         return importlib.util.find_spec(module) is not None
     except ValueError:  # a module that is set to None, as an import of it would fail
         return False
+
+
+def write_exports(export: Export, folder: Path, formats: Iterable[str], progress: Progress = silent) -> list[Path]:
+    """Write the files of some formats into ``folder / "exports"``.
+
+    Parameters
+    ----------
+    export : Export
+    folder : Path
+        Of the results; the folder of the exports is made when missing.
+    formats : iterable of str
+        Of :data:`FORMATS`.
+    progress : Progress
+        Told of a format whose library is missing (asked for as ``all``).
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    OSError
+        If the disk does not take a file.
+    """
+    from .geojson import write_geojson
+    from .kmz import write_kmz
+    from .netcdf import write_netcdf
+
+    writers = {"geojson": write_geojson, "kmz": write_kmz, "netcdf": write_netcdf}
+    place = folder / FOLDER
+    written: list[Path] = []
+    for name in formats:
+        if missing := missing_module(name):
+            progress(f"export {name} left out: {missing} is not installed (pip install 'aerpaw-cmp[geo]')")
+            continue
+        place.mkdir(exist_ok=True)
+        written += writers[name](export, place)
+    return written

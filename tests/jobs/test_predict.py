@@ -28,7 +28,7 @@ from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.html import coded
 from aerpaw_cmp.report.plots.flight import against_specs
-from aerpaw_cmp.report.prediction_html import write_prediction
+from aerpaw_cmp.report.prediction_html import prediction_metrics, write_prediction
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted
 
@@ -79,6 +79,23 @@ def test_points_without_a_position_and_outside_are_flagged(prediction):
     assert (far > near).all()
     assert any("1 of 4 points have no position" in text for text in prediction.page.warnings)
     assert "67 % of the points lie outside" in prediction.page.verdict  # of three with a position
+    shares = [one["share_outside_flown"] for one in prediction_metrics(prediction.page)["series"].values()]
+    np.testing.assert_allclose(shares, 2 / 3)
+
+
+def test_levels_of_a_known_flight_without_a_position_are_counted(small, tmp_path):
+    """40 of the flight's 326 s have no fix: an eighth of the levels."""
+    folder = shutil.copytree(small, tmp_path / "flight")
+    (log,) = (folder / "UAV").glob("*vehicleOut.txt")
+    lines = log.read_text().splitlines()
+    lines[100:140] = [re.sub(r"^(\d+),[^,]+,[^,]+", r"\1,nan,nan", line) for line in lines[100:140]]
+    log.write_text("\n".join(lines) + "\n")
+    _, said = observe([flight.load(None) for flight in named_flights([folder / "a.yaml"])])
+    counts = [int(text.split(": ")[2].split(" %")[0]) for text in said if "have no position and are left out" in text]
+    assert len(counts) == 4  # two towers of two channels
+    assert all(11 <= count <= 14 for count in counts)
+    _, said = observe([flight.load(None) for flight in named_flights([small / "a.yaml"])])
+    assert not any("no position" in text for text in said)
 
 
 def test_columns_are_those_of_the_contract(prediction):

@@ -312,17 +312,19 @@ def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | Non
         said.append(
             f"{data.settings.flight.name}: {series.tower} {SNR} stands for a level: the noise is taken as constant"
         )
-    one, guessed = _observe(data, series)
+    one, guessed, lost = _observe(data, series)
     if not np.isfinite(one.samples.residual_db).any():
         return None, [*said, f"{name} has no level at a known pose and is left out"]
     if guessed > 0.01:
         share = f"{100 * guessed:.0f} % of the attitudes at {series.tower} {series.channel} are unknown"
         said.append(f"{data.settings.flight.name}: {share}: heading from the track, level flight")
+    if lost > 0.01:
+        said.append(f"{name}: {100 * lost:.0f} % of the levels have no position and are left out")
     return one, said
 
 
-def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:
-    """One series, and which share of its attitudes stands for an unknown one."""
+def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float, float]:
+    """One series, the share of its attitudes that stand for an unknown one, and of its levels without a position."""
     if data.track is None:
         raise InputError(f"flight {data.settings.flight.name} has no telemetry", expected="positions and attitude")
     place, known = data.tower_at(series.tower, series.time)
@@ -362,7 +364,7 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:
         locked=None if series.locked is None else series.locked[keep],
         sent_dbm=series.link.transmit_power_dbm,
     )
-    return observed.part(order), guessed
+    return observed.part(order), guessed, 1.0 - float(np.mean(pose.valid))
 
 
 # --- what is learned -----------------------------------------------------------------------------------------------

@@ -5,8 +5,6 @@ Walls that touch, ends on faces, segments through edges and corners and along wa
 Run: python benchmarks/aligned_paths.py [--links N] [--seed S] [--json]     (20 000 links take some minutes)
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

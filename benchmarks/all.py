@@ -13,8 +13,6 @@ sizes mean nothing and are not kept. What needs the field data is left out where
 takes some twenty minutes.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -8,8 +8,6 @@ for that, so an interval that lies beside a small lag is not counted; "called sh
     python benchmarks/clock_power.py FOLDER [--timezone America/New_York] [--only TEXT] [--quiet]
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

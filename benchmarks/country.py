@@ -9,8 +9,6 @@ Seconds are of the wall, imports, store and page included; MiB are the peaks of 
 process.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -11,8 +11,6 @@ width over the truth (offset: over the shadowing). Every flight is given an inte
     python benchmarks/coverage_of_intervals.py [--flights 400] [--json]
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 

@@ -11,8 +11,6 @@ Run: python benchmarks/diffraction.py [--poses 10000] [--pairs 3] [--town] [--si
      python benchmarks/diffraction.py --flights FILE... --logs-root DIR [--json]
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

@@ -7,8 +7,6 @@ draft together, a sample of --others.
     python benchmarks/drafts.py FOLDER [--timezone America/New_York] [--pairs] [--others 100]
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import sys

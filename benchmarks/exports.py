@@ -6,8 +6,6 @@ A made-up flight: one link with positions, four levels and a residual, random nu
 the writing alone, in CPU time; the peak is that of the whole process, beside one that makes the samples and no file.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

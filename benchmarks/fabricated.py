@@ -4,8 +4,6 @@ Nothing is replayed. What is put in is known (offsets that drift, settings that 
 page made from it can be checked against it; the size is a season's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any

@@ -9,8 +9,6 @@ sets and ranks are equal, levels lie within 1e-9 dB and H within 1e-9 of the lar
 difference of each is printed, and the exit code is 1 where a bound is broken.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

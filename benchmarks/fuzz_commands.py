@@ -11,8 +11,6 @@ A call is in order when it ends within its time with a code of the table in ``ae
 says why where the code is not 0 and standard error is open, and leaves no hidden place beside an output.
 """
 
-from __future__ import annotations
-
 import argparse
 import collections
 import gzip

@@ -11,8 +11,6 @@ seed, the target and ``i`` alone, so a violation is made again with ``--reproduc
 Each row is printed as soon as it is done, so that what an interrupted run has done counts.
 """
 
-from __future__ import annotations
-
 import argparse
 import fnmatch
 import gc

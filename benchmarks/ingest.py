@@ -6,8 +6,6 @@ Every contestant is a process of its own. Ours gives UTC times, values and flags
 peer gives columns with their times converted.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -7,8 +7,6 @@ of the intervals and for weights that are not smooth over the rate. Prints the t
     python benchmarks/interval_weights.py mean|power|ratio [--sequences 300]
 """
 
-from __future__ import annotations
-
 import argparse
 
 import numpy as np

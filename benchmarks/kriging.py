@@ -10,8 +10,6 @@ exponential) at targets off the grid: totals, and the marginal cost of a target.
     python benchmarks/kriging.py [--quick] [--full] [--pairs N] [--json]
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -39,11 +37,7 @@ def pykrige_model(points, values):
     from pykrige.ok import OrdinaryKriging as Peer
 
     return Peer(
-        *points.T,
-        values,
-        variogram_model="custom",
-        variogram_parameters=[0.0],
-        variogram_function=peer_semivariogram,
+        *points.T, values, variogram_model="custom", variogram_parameters=[0.0], variogram_function=peer_semivariogram
     )
 
 

@@ -7,8 +7,6 @@ RMSE as logged and over 4 s, share inside the 90 % interval, all samples with th
     python benchmarks/left_out_reports.py FIELD [--only TEXT] [--keep FOLDER] [--recipes FOLDER]
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import html

@@ -21,8 +21,6 @@ cleared by the next run.
 In the end the first job is tried with a planted fault, writing in place as the tool once did: the checks must fail.
 """
 
-from __future__ import annotations
-
 import argparse
 import collections
 import contextlib

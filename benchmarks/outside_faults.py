@@ -9,8 +9,6 @@ has the reason.
 """
 
 # ruff: noqa: E501 (one fault a line)
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -11,8 +11,6 @@ campaign 5 MB, all below 2 s.
 ``map`` makes the paper's map without its study (minutes), or opens the page given by ``--map``.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -6,8 +6,6 @@ PyKrige is benchmarks/kriging.py.
     python benchmarks/peers.py [--quick]
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any

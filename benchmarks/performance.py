@@ -7,8 +7,6 @@ peers' ratios over time. Extrapolations are one line each: the largest measured 
 that is asked about; how far that is beyond what was measured stands beside it.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -7,8 +7,6 @@ the named cause against the planted one; exit code 1 where fewer than 90 % are r
 flights are accused.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections import Counter

@@ -10,8 +10,6 @@ Run: python benchmarks/planted_faults.py [--only TEXT] [--no-sionna] [--markdown
 """
 
 # ruff: noqa: E501 (one fault a line)
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import importlib

@@ -6,8 +6,6 @@ known and the third is predicted. Scales are learned on the two known flights al
     python benchmarks/planted_fields.py [--sets 67] [--targets 20000] [--json]
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json
@@ -64,9 +62,7 @@ def main() -> None:
     rows = flown(rng, 20, 400)
     targets = rows.part(rng.integers(0, len(rows), args.targets))
     targets = dataclasses.replace(
-        targets,
-        position_m=targets.position_m + rng.normal(0, 20, (args.targets, 3)),
-        flight=np.full(args.targets, -1),
+        targets, position_m=targets.position_m + rng.normal(0, 20, (args.targets, 3)), flight=np.full(args.targets, -1)
     )
     start = time.process_time()
     FieldFit(PLANTED, rows, rng.normal(size=len(rows))).predict(targets)

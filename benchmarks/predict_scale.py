@@ -7,8 +7,6 @@ field is worth having. The points are drawn over the area of the flights and bey
     python benchmarks/predict_scale.py [--points 100000] [--heading 90] [--no-field] [--keep DIR] [--json]
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

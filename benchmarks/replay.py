@@ -8,8 +8,6 @@ Run: python benchmarks/replay.py [--quick] [--json] [--no-sionna]
 ``aerpaw-cmp bench`` prints speed against error and the ratio to PathSolver.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import platform

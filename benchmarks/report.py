@@ -12,8 +12,6 @@
     python benchmarks/report.py [--quick] [--json]
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

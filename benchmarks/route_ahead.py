@@ -3,8 +3,6 @@
 python benchmarks/route_ahead.py [--minutes 20] [--points 600] [--json]
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

@@ -14,8 +14,6 @@ Seconds of the processor, and of the wall where work is shared out, without impo
 A power is that between the two largest sizes; a size that is refused is told with its reason.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json

@@ -15,8 +15,6 @@ transmitter, half at street level, half 30 to 60 m up.
 --limits, --slots   its max_num_paths_per_src and its table of candidates (2 to this power): each with each
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json

@@ -1,7 +1,5 @@
 """What the benchmarks of the tap share: a tap in its own process on a simulated modem."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform

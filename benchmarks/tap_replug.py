@@ -7,8 +7,6 @@ modem sends byte by byte, so that cables are pulled in the middle of lines. What
 before anybody read it is neither: it is counted as ``bytes_never_read``.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import random

@@ -6,8 +6,6 @@ quarter of a second, what waits in memory at the kill is lost, as docs/tap.md sa
 any other loss.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import random
@@ -70,12 +68,7 @@ def main() -> None:
     parser.add_argument("--parallel", type=int, default=8)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--web", action="store_true", help="with the page open in a browser's stead")
-    parser.add_argument(
-        "--patience-s",
-        type=float,
-        default=0.25,
-        help="longer: the polling waits for a slow disk",
-    )
+    parser.add_argument("--patience-s", type=float, default=0.25, help="longer: the polling waits for a slow disk")
     parser.add_argument("--quick", action="store_true", help="20 kills")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()

@@ -6,8 +6,6 @@ page and its readers. *Fuzz*: damaged requests while the tap runs. The modem run
 readers in their own.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import random

@@ -1,7 +1,5 @@
 """Frames compared: told apart by pandas' own assertion, which takes milliseconds, only where they are not the same."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pandas as pd

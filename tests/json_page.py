@@ -1,7 +1,5 @@
 """Keys that docs/reference/json.md lists for a command."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from pathlib import Path

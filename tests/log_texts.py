@@ -1,7 +1,5 @@
 """Texts of logs that no command writes, for tests of their readers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

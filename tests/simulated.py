@@ -1,7 +1,5 @@
 """Logs of planned flights, as if they had been flown."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Flights whose logs are small tables: what a test plants stands in the columns."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Every bad input is one clear message and exit code 2 or 3, through the command line; never a traceback."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

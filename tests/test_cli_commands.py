@@ -1,7 +1,5 @@
 """The commands as a user types them, small: what they print with --json, and what they leave on disk."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

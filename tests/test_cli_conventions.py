@@ -1,7 +1,5 @@
 """One convention for all commands: ``-o`` says what it takes and its default, a missing input is exit code 3."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

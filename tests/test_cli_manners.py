@@ -1,7 +1,5 @@
 """What every command has: -h, examples that parse, --quiet, --json; completion; what is said when it is interrupted."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -1,7 +1,5 @@
 """The documentation: every command in it is parsed by the real parser, the tutorial's are run, the pages build strictly."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

@@ -1,7 +1,5 @@
 """docs/equations.md against the code: every function is there and names its equation back."""
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import re

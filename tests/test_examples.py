@@ -1,7 +1,5 @@
 """The notebooks of docs/examples run as they stand, and hold the outputs of a run."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Whole reports on real logs; skipped, saying so, where AERPAW_CMP_FIELD_DATA names none."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The way into the program: light help, one message per failure, exit codes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 python -m tests.test_messages        writes docs/reference/messages.md, the table of all of them
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

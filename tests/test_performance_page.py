@@ -1,7 +1,5 @@
 """docs/performance.md is what the history of benchmark runs says, and nothing else."""
 
-from __future__ import annotations
-
 import copy
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the project says about itself is true: documents against code."""
 
-from __future__ import annotations
-
 import ast
 import email
 import functools

@@ -1,7 +1,5 @@
 """The public face: every name of ``__all__`` is there, is documented, and does what docs/api.md says."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re

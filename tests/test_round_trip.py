@@ -1,7 +1,5 @@
 """Simulate, ingest, report: what was planted must come back, through the command line and the real formats."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

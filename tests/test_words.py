@@ -1,7 +1,5 @@
 """Words of user-visible text: field terms, no private metaphors (docs/vocabulary.md)."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Messages are for people: what a file holds does not reach the terminal as a command."""
 
-from __future__ import annotations
-
 from aerpaw_cmp.common.errors import InputError, UsageError
 
 

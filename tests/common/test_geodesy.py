@@ -1,7 +1,5 @@
 """The site frame: against geodesics, there and back, and in the shape that was asked for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from pyproj import Geod

@@ -1,7 +1,5 @@
 """Interrupts that Python swallows or wraps are raised again; held ones come at the end, once."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

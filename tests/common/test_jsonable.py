@@ -1,7 +1,5 @@
 """What JSON cannot hold becomes null, text or a mapping, and nothing else changes."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Fifty hostile files of native formats: none makes the reader open, or show, anything but the file itself."""
 
-from __future__ import annotations
-
 import ctypes
 import io
 import os

@@ -1,7 +1,5 @@
 """A short part of benchmarks/output_faults.py: kills and disk errors under two commands, and a planted fault."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

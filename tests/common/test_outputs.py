@@ -1,7 +1,5 @@
 """Outputs replace no input and nothing of others, and are whole."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -1,7 +1,5 @@
 """One timer and one progress: stages add up, a share is a number, and a terminal shows the time left."""
 
-from __future__ import annotations
-
 import sys
 import time
 

@@ -1,7 +1,5 @@
 """Constants against the relations that define them; conversions against their inverses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Splits of a calibration: nothing is scored where it was learned, many flights in groups, offsets shared or own."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The likely cause of an error: named where it was planted, silent where nothing was."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

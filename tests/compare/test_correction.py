@@ -1,7 +1,5 @@
 """The choice of a base and its correction: folds, scores and standard deviations a second way, by plain NumPy."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

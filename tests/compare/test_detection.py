@@ -1,7 +1,5 @@
 """A level that is detected or lost: probabilities that are calibrated, and offsets with a floor."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import expit

@@ -1,7 +1,5 @@
 """Scores of an entry of the benchmark: every number by hand, the interval of a pair from the same draws."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

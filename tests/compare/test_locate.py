@@ -1,7 +1,5 @@
 """Where a node stands, by levels: the evidence a second way, and regions over simulated flights."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Memories of a sequence: covariances by numerical integration, likelihoods by SciPy, and what draws owe to the sequence."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import brentq

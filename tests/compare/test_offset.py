@@ -1,7 +1,5 @@
 """The offset search against its closed form, brute force and SciPy's likelihoods, and its hard cases."""
 
-from __future__ import annotations
-
 import math
 from decimal import ROUND_HALF_DOWN, Decimal
 

@@ -1,7 +1,5 @@
 """Every pair of a season's passes: those of brute force, exactly; intervals as the bootstrap gives them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

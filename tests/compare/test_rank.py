@@ -1,7 +1,5 @@
 """Ranks, their distances and statistics against plain loops, and the rules that might explain a modem."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

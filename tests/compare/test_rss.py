@@ -1,7 +1,5 @@
 """Comparison of levels: hard cases, the same footing, residuals and spans."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

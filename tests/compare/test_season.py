@@ -1,7 +1,5 @@
 """Numbers over a season: against closed forms, brute force, and the coverage of their intervals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import linregress

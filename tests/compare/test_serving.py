@@ -1,7 +1,5 @@
 """Serving cells: hits, confusion, and what a planted fault does to them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Error bars of a learned prediction hold what they say."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -3,8 +3,6 @@
 python -m tests.compare.test_verdicts        prints the shares over 200 cases of each kind
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 

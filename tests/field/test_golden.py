@@ -5,8 +5,6 @@ for a file that is none, ``no log`` and what it is. The counts of the text logs 
 SciPy).
 """
 
-from __future__ import annotations
-
 import csv
 import os
 from pathlib import Path

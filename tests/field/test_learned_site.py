@@ -1,7 +1,5 @@
 """The first report knows the site: drafts use what flights taught, on real logs, and say where they were learned."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The surveyed rover of real flights, by their levels alone."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Cells of a phone's log: flight.yaml gives them to towers, the others are left out, and who serves is compared."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Radio clock against telemetry clock: likelihood, verdict, and what is done with it."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """What contradicts a log is a question with both values; what agrees is none."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

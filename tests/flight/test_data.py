@@ -1,7 +1,5 @@
 """From logs to the series of one flight."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

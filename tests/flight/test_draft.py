@@ -1,7 +1,5 @@
 """A first flight.yaml from logs alone."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

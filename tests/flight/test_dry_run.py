@@ -1,7 +1,5 @@
 """Why a series would not be compared: the first of the reasons that holds, or none."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A flight.yaml of an earlier release is read as it stands: its sample flight, and the page that lists every key."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

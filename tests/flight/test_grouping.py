@@ -1,7 +1,5 @@
 """Folders of several flights: one draft each, and origins of relative times from tracks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

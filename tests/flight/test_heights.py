@@ -1,7 +1,5 @@
 """Logs without altitude: the flight file says the height, and nothing is guessed in silence."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Clocks that are off by whole hours."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """When a sounder's receiver was in lock: which streams say so, and at which times."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -1,7 +1,5 @@
 """A draft says which tower, or which place, the levels of a log fit."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Dotted keys that change checked settings: copies that are begun from others, elements of lists, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

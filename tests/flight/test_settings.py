@@ -1,7 +1,5 @@
 """Limits of flight.yaml: the last value that is taken and the first that is not."""
 
-from __future__ import annotations
-
 from functools import reduce
 from typing import Any
 

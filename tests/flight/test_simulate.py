@@ -1,7 +1,5 @@
 """Logs of flights that nobody flew: routes by hand, noise and faults by their shares."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Poses at any instant."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Flights past a sector antenna that their files do not know, and a calibration as the command makes it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A Dask scheduler and its worker in one process, for test_map_cluster.py: prints its address, stays until killed."""
 
-from __future__ import annotations
-
 import sys
 import time
 

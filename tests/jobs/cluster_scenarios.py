@@ -3,8 +3,6 @@
 A process of its own, since killed workers leave open sockets to the collector, which would warn in somebody else's test.
 """
 
-from __future__ import annotations
-
 import json
 import socket
 import sys

@@ -1,7 +1,5 @@
 """Workers for tests: two at a time as far as the caller can tell, in this process."""
 
-from __future__ import annotations
-
 import pickle
 from typing import Any
 

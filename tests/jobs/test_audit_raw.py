@@ -1,7 +1,5 @@
 """The audit from raw bytes: silent on a right flight, loud on each fault planted between the bytes and the levels."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

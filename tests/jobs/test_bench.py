@@ -1,7 +1,5 @@
 """What the ratios of ``bench`` stand for; the times themselves are not tested."""
 
-from __future__ import annotations
-
 import pytest
 
 from aerpaw_cmp.jobs import bench

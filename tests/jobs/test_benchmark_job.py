@@ -1,7 +1,5 @@
 """The public benchmark on made-up flights: splits, entries, scores by a second way, refusals."""
 
-from __future__ import annotations
-
 import csv
 import gzip
 import hashlib

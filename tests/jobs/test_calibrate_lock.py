@@ -1,7 +1,5 @@
 """P(lock) of a predicted level: learned on flights, scored on those left out, used for a flight that is unseen."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

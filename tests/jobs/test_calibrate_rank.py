@@ -1,7 +1,5 @@
 """A receiver and the geometry of its antennas, planted and learned again."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

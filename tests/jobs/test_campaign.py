@@ -1,7 +1,5 @@
 """Campaigns: many flights and settings, pooled offsets, held-out fits, repeatability, failures as rows."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

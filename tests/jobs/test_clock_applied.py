@@ -1,7 +1,5 @@
 """``rss.lag: apply`` corrects a clock whose difference is shown, and says before anything else where it did not."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Hard flights through reading, replay and comparison: no number where there is none, no exception, no silence."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

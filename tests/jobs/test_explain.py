@@ -1,7 +1,5 @@
 """``aerpaw-cmp explain``: terms add up to what the report writes, and each reason is the true one."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The ladder of models on a flight whose truth is planted, from logs to page and recommended flight file."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The rank that the tap predicts at the present pose, from a telemetry log that still grows."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

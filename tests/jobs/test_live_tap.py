@@ -1,7 +1,5 @@
 """``tap`` as a job: several modems at once, the page's address, commands for the report."""
 
-from __future__ import annotations
-
 import threading
 import time
 from urllib.request import Request, urlopen

@@ -1,7 +1,5 @@
 """What a long flight is cut into for memory's sake gives the numbers of the whole."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

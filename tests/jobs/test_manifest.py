@@ -1,7 +1,5 @@
 """Every file that a report was made from is named with its SHA-256."""
 
-from __future__ import annotations
-
 from hashlib import sha256
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A map in tiles on a real Dask cluster that vanishes half-way."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Below the receiver's noise floor a link is out of coverage."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

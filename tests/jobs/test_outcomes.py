@@ -1,7 +1,5 @@
 """Outcomes of tasks: kept, taken again under any name, never taken when damaged or stale; tried twice, then told."""
 
-from __future__ import annotations
-
 import io
 import json
 import multiprocessing

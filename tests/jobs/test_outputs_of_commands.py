@@ -1,7 +1,5 @@
 """What the commands write: inputs stay, others' files stay, sets are of one run, a bad ``-o`` is told first."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """What is said of several flights: which pairs are searched, and what a campaign holds in memory."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``--dry-run``: what would run is what runs, the time follows the work, nothing is written."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

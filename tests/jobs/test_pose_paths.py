@@ -1,7 +1,5 @@
 """Paths that the report's 3-D view draws."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

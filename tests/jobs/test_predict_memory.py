@@ -1,7 +1,5 @@
 """Prediction from what a site remembers: planted tables, and a flight that nobody named, against its planted offset."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

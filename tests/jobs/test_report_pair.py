@@ -1,7 +1,5 @@
 """Two runs of ``report`` on one small flight, end to end: their exports, and what ``diff`` says of them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The sample flight as files of one's own, from a checkout and from a wheel."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import zipfile

@@ -1,7 +1,5 @@
 """A season from the rows of a campaign: held-out errors against brute force, planted drift and hill found again."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

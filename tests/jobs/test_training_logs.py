@@ -1,7 +1,5 @@
 """Nothing learned is scored on a log that it was learned from, whatever that log is called or packed in."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import json

@@ -1,7 +1,5 @@
 """Workers of every kind give one result; what they lose, see or run differently is told."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Tasks for workers of every kind, and what a crew makes of them."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """A tap on a simulated modem, on a real pseudo-terminal, in this process or in its own."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket

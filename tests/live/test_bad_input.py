@@ -1,7 +1,5 @@
 """Each bad input of the tap: one message, the right exit code, within the promised time."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty

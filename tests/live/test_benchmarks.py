@@ -1,7 +1,5 @@
 """The benchmarks of the tap run, small; what they measure is theirs to say."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Framing: the same events however the bytes are cut, a bounded buffer, nothing lost."""
 
-from __future__ import annotations
-
 import os
 from itertools import pairwise
 from pathlib import Path
@@ -10,15 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.live.framing import (
-    Answer,
-    Framer,
-    Late,
-    TranscriptFramer,
-    Unsolicited,
-    frame_transcript,
-    unglue,
-)
+from aerpaw_cmp.live.framing import Answer, Framer, Late, TranscriptFramer, Unsolicited, frame_transcript, unglue
 
 CSI = ('AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',))
 QENG = ('AT+QENG="servingcell"', ("+QENG:",))

@@ -1,7 +1,5 @@
 """The durable log: checksums, rotation, a full disk that comes back, a kill, and its reader."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal
@@ -18,14 +16,7 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.live import log as log_module
-from aerpaw_cmp.live.log import (
-    Clock,
-    LogSettings,
-    SegmentLog,
-    decode_record,
-    encode_record,
-    read_log,
-)
+from aerpaw_cmp.live.log import Clock, LogSettings, SegmentLog, decode_record, encode_record, read_log
 from aerpaw_cmp.live.writer import LogWriter
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER, SCHEMA, decode_line

@@ -1,7 +1,5 @@
 """Commands by allow-list, answers by token, personal data out."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The simulated modem, the followed telemetry and the CSV export."""
 
-from __future__ import annotations
-
 import csv
 import os
 import threading

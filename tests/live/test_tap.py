@@ -1,7 +1,5 @@
 """The tap on real pseudo-terminals: what it writes, what it survives, how it ends."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

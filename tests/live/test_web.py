@@ -1,7 +1,5 @@
 """The tap's page without a browser: what the server answers and refuses, what the feed keeps, how a log is played."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import http.client

@@ -1,7 +1,5 @@
 """The tap's page in a real browser, on a simulated modem and on logs that are played."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

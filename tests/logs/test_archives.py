@@ -1,7 +1,5 @@
 """Archives and folders of pieces: read as folders, bounded, members named like files."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import struct

@@ -1,7 +1,5 @@
 """The one law of large logs: pieces of any size give what one piece gives; rejected lines are bounded."""
 
-from __future__ import annotations
-
 import hashlib
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The flight file: what goes in comes out, whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import io

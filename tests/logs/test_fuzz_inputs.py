@@ -1,7 +1,5 @@
 """A short, seeded part of the fuzz driver: every target, in this process; and the driver sees planted faults."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 from dataclasses import replace

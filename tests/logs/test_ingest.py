@@ -1,7 +1,5 @@
 """Finding and naming logs, and what bad input says."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import os

@@ -1,7 +1,5 @@
 """What cannot be is flagged in one place, whatever the reader, and no comparison scores it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -1,7 +1,5 @@
 """The MATLAB reader gives what SciPy gives on whole files, and a message on damaged ones."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

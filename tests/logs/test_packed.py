@@ -1,7 +1,5 @@
 """Logs packed by gzip, bzip2 or xz are what they are unpacked, large or small, or one message."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import hashlib

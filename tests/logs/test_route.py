@@ -1,7 +1,5 @@
 """Routes of plans, maps, tables and logs: the same points whatever the file."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the writers write, the readers read: the round trip is the specification."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The checks of the machine, each seen well and unwell."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Choosing an LLVM: names, order, refusals, and trials that end badly. The libraries are empty files, the children real."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

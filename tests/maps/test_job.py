@@ -15,12 +15,7 @@ from aerpaw_cmp.maps.job import (
     map_job,
     rank_of_singular_values,
 )
-from aerpaw_cmp.maps.study import (
-    altitude_variance,
-    held_out_study,
-    interpolation_study,
-    rank_fields,
-)
+from aerpaw_cmp.maps.study import altitude_variance, held_out_study, interpolation_study, rank_fields
 
 GRID = Grid.over_area((-300.0, 300.0, -300.0, 300.0))
 TOWERS = {"A": np.array([-200.0, 0.0, 10.0]), "B": np.array([200.0, 50.0, 10.0])}

@@ -1,7 +1,5 @@
 """Kriging target by target from its definition, PyKrige, fifty digits, closed forms, and where textbooks break."""
 
-from __future__ import annotations
-
 import itertools
 from importlib.util import find_spec
 

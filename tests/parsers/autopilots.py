@@ -1,7 +1,5 @@
 """Synthetic logs of autopilots, written message by message from their formats' descriptions."""
 
-from __future__ import annotations
-
 import math
 import struct
 

@@ -3,8 +3,6 @@
 ``SAMPLES`` maps a reader's name to its samples: name of the sample to (bytes, accepted lines, rejected lines).
 """
 
-from __future__ import annotations
-
 import io
 import zlib
 

@@ -1,7 +1,5 @@
 """Damaged logs of autopilots, and what peers' libraries say of the same bytes; their poses are in test_truth.py."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np
@@ -12,11 +10,7 @@ from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from tests.parsers import autopilots
 from tests.parsers.autopilots import COUNT
 
-LOGS = {
-    "ardupilot_bin": autopilots.dataflash(),
-    "mavlink_tlog": autopilots.tlog(2),
-    "px4_ulog": autopilots.ulog(),
-}
+LOGS = {"ardupilot_bin": autopilots.dataflash(), "mavlink_tlog": autopilots.tlog(2), "px4_ulog": autopilots.ulog()}
 
 
 def test_damage_costs_a_message_and_not_the_log() -> None:

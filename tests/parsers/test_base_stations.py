@@ -1,7 +1,5 @@
 """Base stations, UEs, SigMF, bursts and our own exports: base and averaging of RI, and what each value means."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The readers on real logs; skipped, saying so, where AERPAW_CMP_FIELD_DATA names none."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

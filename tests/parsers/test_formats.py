@@ -1,7 +1,5 @@
 """What each format means: units, order, sentinels, clocks."""
 
-from __future__ import annotations
-
 import gzip
 from dataclasses import replace
 
@@ -236,10 +234,7 @@ def test_mat_of_another_kind_is_not_sniffed() -> None:
     assert not by_name("flight_mat").sniff(file.getvalue())
 
 
-@pytest.mark.parametrize(
-    ("reader", "data"),
-    [("nemo_csv", samples.NEMO_CSV), ("nemo_kml", samples.NEMO_KML)],
-)
+@pytest.mark.parametrize(("reader", "data"), [("nemo_csv", samples.NEMO_CSV), ("nemo_kml", samples.NEMO_KML)])
 def test_nemo_relative_times(reader: str, data: bytes) -> None:
     result = read(reader, data)
     frame = result.streams[0].frame

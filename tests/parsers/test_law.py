@@ -1,7 +1,5 @@
 """What every reader owes: it knows its own format only, accounts for each line, and never fails raw."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

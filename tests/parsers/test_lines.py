@@ -1,7 +1,5 @@
 """Lines as byte ranges: what is blank, what is cut, what is taken at once."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

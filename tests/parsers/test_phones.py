@@ -1,7 +1,5 @@
 """Phones, drive tests, tables of positions and consoles: what each value means."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

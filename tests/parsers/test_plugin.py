@@ -1,7 +1,5 @@
 """docs/adding_a_reader.md as it stands: a reader in a package of its own, found through the entry point."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

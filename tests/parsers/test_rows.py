@@ -1,7 +1,5 @@
 """Columns of line formats: numbers with SI suffix, ranks as written, times up to the range of datetime64, line numbers."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

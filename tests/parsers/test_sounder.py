@@ -1,7 +1,5 @@
 """Sounder logs: the fast way takes od's own lines and no other, runs of '*' have the length their ends say."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

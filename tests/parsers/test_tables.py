@@ -1,7 +1,5 @@
 """Tables with named columns: widths of rows, what whole columns decide, cells of phones, exports read back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

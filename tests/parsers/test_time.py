@@ -1,7 +1,5 @@
 """One conversion of wall clocks, checked against the zone database through pandas and datetime."""
 
-from __future__ import annotations
-
 from datetime import datetime, timezone
 from zoneinfo import ZoneInfo
 

@@ -4,8 +4,6 @@ A case is a file's name, its bytes and, for each stream that it must give, colum
 seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What editors, spreadsheets and shells make of a log on its way: the same records."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

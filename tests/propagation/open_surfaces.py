@@ -4,8 +4,6 @@ Each triangle is a mirror of its own, in its own plane; every sequence of them i
 whether it cuts a segment. Paths are told apart by where they reflect.
 """
 
-from __future__ import annotations
-
 import itertools
 from functools import lru_cache
 from importlib.util import find_spec

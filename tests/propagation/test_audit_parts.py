@@ -1,7 +1,5 @@
 """Parts of the audit: what counts as a missing path, and how explanations say lengths and faces."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Closed-form baselines of recommendations against their own limits and hand-worked values."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

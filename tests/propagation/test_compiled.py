@@ -1,7 +1,5 @@
 """Compiled kernels against NumPy: the same numbers, whatever the arrays, threads and chunks; and doing without them."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import importlib.util

@@ -1,7 +1,5 @@
 """Paths over building edges: a second way to paths and fields, continuity, reciprocity, hard cases."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

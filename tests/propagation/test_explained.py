@@ -1,7 +1,5 @@
 """Why a sequence of faces makes no path."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -11,13 +9,7 @@ from shapely.geometry import Polygon, box
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import single_element
 from aerpaw_cmp.propagation.check import reference
-from aerpaw_cmp.propagation.check.explain import (
-    explain_paths,
-    power_sum_dbm,
-    simple_paths,
-    wall_path_lines,
-    why_not,
-)
+from aerpaw_cmp.propagation.check.explain import explain_paths, power_sum_dbm, simple_paths, wall_path_lines, why_not
 from aerpaw_cmp.propagation.check.field_audit import Expected
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.options import Search

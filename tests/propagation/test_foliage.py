@@ -1,7 +1,5 @@
 """Chords by sampling and bisection of the solids themselves, tangents and grid edges; models against their tables."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

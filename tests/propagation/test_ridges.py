@@ -1,7 +1,5 @@
 """Knife edges of the terrain against closed forms and the ITU's validation examples."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ Lengths in wavelengths, time as e^{jwt}. On the surface ``du/dn = j k admittance
 soft (E along them). Points inside, where the field must vanish, keep resonances of the inside out (CHIEF).
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import hankel2

@@ -1,7 +1,5 @@
 """Forests as a medium against closed forms and against counting points along the rays."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

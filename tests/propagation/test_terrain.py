@@ -1,7 +1,5 @@
 """An elevation model shapes the ground: mirrors, shadows and ridges."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Paths through walls: laws of the slab, closed forms, reciprocity."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from typing import Any

@@ -1,7 +1,5 @@
 """Diffraction at one wedge: exact half-plane, series of the wedge, continuity, reciprocity, limits."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A real browser for the pages: started, asked, looked at. Tests skip where it is not installed."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from importlib import resources

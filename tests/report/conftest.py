@@ -1,7 +1,5 @@
 """A flight that never was: free space and one ground reflection, seeded noise, every part of a report filled."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

@@ -1,7 +1,5 @@
 """The six pages as HTML, from made-up records: for the tests of words and of first screens."""
 
-from __future__ import annotations
-
 import dataclasses
 import tempfile
 from collections.abc import Callable

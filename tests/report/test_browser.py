@@ -1,7 +1,5 @@
 """The page in a real browser: numbers, links between the views, keyboard, accessibility, widths, no network."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 

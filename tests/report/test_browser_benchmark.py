@@ -1,7 +1,5 @@
 """The page of the benchmark in a real browser: a model that is chosen is marked in every task."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

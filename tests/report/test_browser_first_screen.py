@@ -1,7 +1,5 @@
 """The first words of every page stand above the fold, wide and narrow: how well, where, why, what next."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The map page in a real browser: layers, values under the pointer, difference, profile, numbers against the record."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -10,15 +8,7 @@ import pytest
 from aerpaw_cmp.report.maps import explorer as map_explorer
 from aerpaw_cmp.report.maps import html as maps_html
 from aerpaw_cmp.report.maps.data import JOINT
-from tests.report.browsing import (
-    PageLaws,
-    choose,
-    frame,
-    needs_browser,
-    open_page,
-    papers,
-    start,
-)
+from tests.report.browsing import PageLaws, choose, frame, needs_browser, open_page, papers, start
 
 pytest.importorskip("selenium", reason="selenium is not installed")
 pytestmark = needs_browser

@@ -1,7 +1,5 @@
 """campaign.html at the size of a season: what stands on it, what is left to the files, and how large it gets."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -1,7 +1,5 @@
 """Two reports compared: a planted change is found, where it is and how large; equal reports give no difference."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

@@ -1,7 +1,5 @@
 """The data of the linked views: what the script gets is what the record holds."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """Exports are read back with the programs that others use, compared with the CSVs, and faults planted in them are seen."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import sys

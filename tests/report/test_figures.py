@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 import io
 import re
@@ -47,13 +45,7 @@ def test_every_figure_has_labels_with_units_and_a_legend(small_report):
         )
         assert has_legend, spec.name
         assert all((spec.caption, spec.title)), spec.name
-    assert {
-        "trajectory",
-        "altitude",
-        "rss_LW4_USRP1",
-        "rank_map_LW1",
-        "rank_histogram_LW1",
-    } <= set(seen)
+    assert {"trajectory", "altitude", "rss_LW4_USRP1", "rank_map_LW1", "rank_histogram_LW1"} <= set(seen)
     assert len(seen) == len(set(seen))
 
 

@@ -1,7 +1,5 @@
 """The verdict of the first screen, and its numbers, against records whose answer is known."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

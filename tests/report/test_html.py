@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import base64
 import dataclasses
 import hashlib
@@ -166,8 +164,7 @@ def test_any_text_keeps_the_page_well_formed(report_data, text):
 
 
 @pytest.mark.parametrize(
-    "missing",
-    ["track", "waypoints", "rss", "rank", "pairs", "engine", "inputs", "settings", "versions", "stages_s"],
+    "missing", ["track", "waypoints", "rss", "rank", "pairs", "engine", "inputs", "settings", "versions", "stages_s"]
 )
 def test_a_part_may_be_missing(report_data, missing):
     empty = {"track": None, "engine": None, "settings": {}, "versions": {}, "stages_s": {}}.get(missing, ())

@@ -1,7 +1,5 @@
 """The data of the map page's script: what it gets is what the maps hold, in steps that are said, within a size."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json

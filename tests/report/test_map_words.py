@@ -1,7 +1,5 @@
 """First words of a map: the gaps of coverage are explained by what was put in."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Sentences of a prediction: each follows from an interval on what was left out, or on the flight that followed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

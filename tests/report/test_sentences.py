@@ -6,8 +6,6 @@ The table is made from the modules of words, the captions of figures and the tem
 the table does not have, or a table that is not that of the code, fails.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

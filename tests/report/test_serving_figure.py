@@ -1,7 +1,5 @@
 """The matrix of serving cells as a figure: its cells, its words, and that it reaches the page."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

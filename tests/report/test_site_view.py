@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 import json
 import re
@@ -96,9 +94,7 @@ def test_holes_stay_empty_and_fences_are_drawn(report_data):
     east, north = line.T
     assert abs(np.sum(east * np.roll(north, -1) - np.roll(east, -1) * north)) / 2 == pytest.approx(ring.area)
     site = dataclasses.replace(
-        report_data.site,
-        forests=(Forest("wood", ring),),
-        geofences=(Geofence("fence", box(-900, -900, 900, 1900)),),
+        report_data.site, forests=(Forest("wood", ring),), geofences=(Geofence("fence", box(-900, -900, 900, 1900)),)
     )
     scene = scene_of(site_view.viewer(site))
     assert scene["forests"] == [line.tolist()]

@@ -223,10 +223,7 @@ def test_bad_gain_grids_are_explained(tmp_path: Path) -> None:
 @pytest.mark.skipif(not os.environ.get("AERPAW_CMP_FIELD_DATA"), reason="AERPAW_CMP_FIELD_DATA is not set")
 @pytest.mark.parametrize(
     ("file", "grid", "peak_dbi"),
-    [
-        ("RM-WB1-DN-BLK_right_side_up_F3300.txt", "RMWB3300_normal", 4.05),
-        ("SA-1400-5900_F3300.txt", "SA3300", -1.22),
-    ],
+    [("RM-WB1-DN-BLK_right_side_up_F3300.txt", "RMWB3300_normal", 4.05), ("SA-1400-5900_F3300.txt", "SA3300", -1.22)],
 )
 def test_measured_patterns_of_the_field(file: str, grid: str, peak_dbi: float) -> None:
     folder = Path(os.environ["AERPAW_CMP_FIELD_DATA"]) / "antennas"

@@ -1,7 +1,5 @@
 """Stands, trees and heights of buildings from rasters of known shapes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a site remembers: written, found by name, refused where it does not fit."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The gain towards both ends at once: kept in the comments of a file, interpolated, and used only with its own UAV."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

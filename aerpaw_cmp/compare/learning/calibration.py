@@ -119,9 +119,13 @@ class Learned:
         angles = (0.0, 0.0, 0.0) if mount is None else (mount.azimuth_deg, mount.pitch_deg, mount.roll_deg)
         return pattern(direction @ self.recipe.rotation(*angles))
 
+    def patterns_db(self, samples: LinkSamples) -> FloatArray:
+        """Gain (n,) of the measured patterns of both ends."""
+        return self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
+
     def predict(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
         """Gain of both ends and its standard deviation (n,) [dB], about a mean that the offset takes."""
-        known = self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
+        known = self.patterns_db(samples)
         if self.fit is None:
             return known, np.zeros(len(known))
         gain, sd = self.fit.predict(samples)
@@ -134,10 +138,8 @@ class Learned:
 
     def mean(self, samples: LinkSamples) -> FloatArray:
         """The gain of :meth:`predict` alone, along a flight in the order of time."""
-        known = self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
-        if self.fit is None:
-            return known
-        return known + _mean_along(self.fit, samples)
+        known = self.patterns_db(samples)
+        return known if self.fit is None else known + _mean_along(self.fit, samples)
 
 
 FINE_S = 0.5

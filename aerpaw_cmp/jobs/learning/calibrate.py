@@ -441,15 +441,8 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
         whole = np.stack(out, axis=1)
         return np.asarray(whole - whole.mean(axis=0))
 
-    left = [
-        dataclasses.replace(
-            o.samples,
-            residual_db=o.samples.residual_db
-            - learned.pattern_db("uav", o.samples.at_uav)
-            - learned.pattern_db(o.samples.antenna, o.samples.at_tower),
-        )
-        for o in observed
-    ]
+    series = [o.samples for o in observed]
+    left = [dataclasses.replace(s, residual_db=s.residual_db - learned.patterns_db(s)) for s in series]
     form = column_forms(left, learned.model, columns)
     value = np.diag(form)[1:] - 2.0 * form[0, 1:]
     likelihood = -0.5 * (value - value[-1])

@@ -153,8 +153,10 @@ def plan_flight(
                 expected="a larger area, or --route FILE",
             )
         points = None if target == SPHERE else find_targets(Path(target), site, asked.target)
-        said += () if points is None else points.remarks
-        wanted = _targets(points, site, ends, area)
+        if points is not None:
+            said += points.remarks
+            _check_near("target", shapely.multipoints(points.position_m[points.known]), area, "that may be flown")
+        wanted = _targets(points, site, ends)
     with stages("learn"):
         known = _known(series)
     thin = {a: _thinned(s, MOST_TARGETS) for a, s in wanted.items()}
@@ -235,7 +237,7 @@ def _area(site: Site, asked: PlanAsked) -> Any:
     west, east, south, north = site.area_m
     ground = shapely.box(west, south, east, north)
     fence = ground if asked.fence is None else shapely.union_all(_polygons(asked.fence, site))
-    _check_near("geofence", shapely.distance(fence, ground), f"the area of site {site.name}")
+    _check_near("geofence", fence, ground, f"of site {site.name}")
     avoid = [one for path in asked.avoid for one in _polygons(path, site)]
     towers = np.array([t.position_m for t in site.towers.values()]).reshape(-1, 3)
     return allowed_area(fence, avoid, towers, asked.tower_distance_m)
@@ -312,28 +314,9 @@ def _leaves(route: Route, area: Any) -> bool:
     return not bool(shapely.covers(shapely.buffer(area, ALLOWED_OUTSIDE_M + 3.0), line))
 
 
-def _targets(
-    points: Targets | None, site: Site, ends: Mapping[str, tuple[str, str]], area: Any
-) -> dict[str, LinkSamples]:
-    """Target points (None: all directions) at every antenna, at all headings where the heading is open.
-
-    Parameters
-    ----------
-    points : Targets or None
-    site : Site
-    ends : mapping of str to (str, str)
-        Tower and channel by antenna.
-    area : shapely area
-        That may be flown.
-
-    Returns
-    -------
-    dict of str to LinkSamples
-    """
+def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, str]]) -> dict[str, LinkSamples]:
+    """Target points (None: all directions) at every antenna, at all headings where the heading is open."""
     out = {}
-    if points is not None:
-        some = points.position_m[points.known][:: max(1, len(points) // 500), :2]
-        _check_near("target", shapely.distance(area, shapely.points(some)).min(), "the area that may be flown")
     for antenna, end in ends.items():
         tower = np.asarray(site.towers[end[0]].position_m)
         if points is None:
@@ -354,10 +337,12 @@ def _targets(
     return out
 
 
-def _check_near(what: str, away_m: float, area: str) -> None:
-    if away_m > FARTHEST_M:
+def _check_near(what: str, place: Any, area: Any, which: str) -> None:
+    """UsageError where a shape lies farther than :data:`FARTHEST_M` outside the area."""
+    away = shapely.distance(area, place)
+    if away > FARTHEST_M:
         raise UsageError(
-            f"the {what} lies {away_m:.0f} m outside {area}",
+            f"the {what} lies {away:.0f} m outside the area {which}",
             expected=f"a {what} within {FARTHEST_M:g} m of it",
             cause="another site, or exchanged coordinates",
         )

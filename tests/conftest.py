@@ -162,7 +162,6 @@ def blank_pictures() -> Iterator[None]:
     real = canvas.save_as
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(canvas, "save_as", save_as)
-        patch.setattr(canvas, "smaller", cache(canvas.smaller))
         yield
 
 

@@ -211,7 +211,7 @@ def test_drawing_without_the_unseen_pass_gives_the_same_picture(small_report):
         ours = canvas.save_as(spec.draw(), ("svg", "png"))["png"]
         theirs = io.BytesIO()
         spec.draw().savefig(theirs, format="png")
-    one, two = (np.asarray(Image.open(io.BytesIO(png))) for png in (ours, theirs.getvalue()))
+    one, two = (np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) for png in (ours, theirs.getvalue()))
     np.testing.assert_array_equal(one, two)
 
 

@@ -352,8 +352,9 @@ class _Finder:
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
         self.limit, self.slots = MAXIMUM_PATHS, _slots(built, batch * len(elements_m))
         self.candidates: Any = None  # PathSolver fills it
-        if not synthetic:  # each element of a tower is a source, with a table of its own
-            self.slots //= 2 ** int(np.ceil(np.log2(len(sources.elements_m))))
+        if not synthetic:  # each element of a tower is a source, with a table and room of its own
+            elements = 2 ** int(np.ceil(np.log2(len(sources.elements_m))))
+            self.slots, self.limit = self.slots // elements, self.limit // elements
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = self.slots
         self.sources = sources.arguments(synthetic)
         self.targets = _Ends.points(np.zeros((batch, 3))).arguments(True)

@@ -12,16 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..common.units import FloatArray, IntArray
+from . import statistics
 from .rank import MAX_RANK, agreement, cohen_kappa, kappa_of_means, kappa_parts
-from .statistics import (
-    NO_INTERVAL,
-    Interval,
-    PairedDifference,
-    autocorrelation,
-    bootstrap_means,
-    interval,
-    paired_difference,
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,7 +23,7 @@ class Changed:
     first: float
     second: float
     difference: float
-    ci95: Interval = NO_INTERVAL
+    ci95: statistics.Interval = statistics.NO_INTERVAL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +75,7 @@ class LevelDifference:
     simulated_max_db: float
     simulated_rms_db: float
     offset_db: Changed
-    rmse: PairedDifference
+    rmse: statistics.PairedDifference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,7 +131,7 @@ def level_difference(
         simulated_max_db=_largest(moved),
         simulated_rms_db=float(np.sqrt(np.mean(moved**2))) if len(moved) else float("nan"),
         offset_db=_changed(*offsets_db),
-        rmse=paired_difference(second_error, first_error),
+        rmse=statistics.paired_difference(second_error, first_error),
     )
 
 
@@ -157,7 +149,7 @@ def _changed(first: float, second: float) -> Changed:
     return Changed(first=first, second=second, difference=second - first)
 
 
-def pooled_difference(links: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> PairedDifference:
+def pooled_difference(links: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> statistics.PairedDifference:
     """RMSE of the second report against the first over all links, each link about its own offset.
 
     Parameters
@@ -177,7 +169,9 @@ def pooled_difference(links: Sequence[tuple[FloatArray, FloatArray, FloatArray]]
             errors.append(first[both] - first[both].mean())
             other_errors.append(second[both] - second[both].mean())
     order = np.argsort(np.concatenate(time), kind="stable")
-    return paired_difference(np.concatenate(other_errors)[order], np.concatenate(errors)[order], free_offset=False)
+    return statistics.paired_difference(
+        np.concatenate(other_errors)[order], np.concatenate(errors)[order], free_offset=False
+    )
 
 
 def rank_difference(
@@ -227,10 +221,10 @@ def _agreement_change(first: IntArray, second: IntArray) -> tuple[Changed, Chang
     both, width = np.column_stack([columns, other_columns]), columns.shape[1]
 
     def change(of: list[float], influence: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -> Changed:
-        known = autocorrelation(influence)
-        drawn = bootstrap_means(both, known.block_length)
+        known = statistics.autocorrelation(influence)
+        drawn = statistics.bootstrap_means(both, known.block_length)
         shift = statistic(drawn[:, width:]) - statistic(drawn[:, :width])
-        return replace(_changed(*of), ci95=interval(of[1] - of[0], shift, known))
+        return replace(_changed(*of), ci95=statistics.interval(of[1] - of[0], shift, known))
 
     return (
         change(agree, other_columns[:, 0] - columns[:, 0], lambda means: means[:, 0]),

@@ -13,18 +13,7 @@ from ..common.errors import InputError, UsageError
 from ..common.units import FloatArray
 from ..compare.direction_gain import LinkSamples
 from ..compare.spread import NO_SPREAD, Spread
-from ..site.learned import (
-    Entry,
-    Errors,
-    Learned,
-    LearnedLevel,
-    LearnedLock,
-    LearnedSeries,
-    Named,
-    find_named,
-    folder_of,
-    read_learned,
-)
+from ..site import learned
 from ..site.sphere_pattern import SpherePattern, read_sphere_csv
 from .data import FlightData, RssSeries, site_place
 from .learned_gain import pair_and_sd_db, sphere_angles
@@ -35,13 +24,13 @@ from .settings import FlightFile, check_logs, with_learned
 class Remembered:
     """Antennas of one tower and channel that a site remembers."""
 
-    entry: Entry
-    series: LearnedSeries
+    entry: learned.Entry
+    series: learned.LearnedSeries
     tower: SpherePattern
     uav: SpherePattern
 
     @property
-    def level(self) -> LearnedLevel:
+    def level(self) -> learned.LearnedLevel:
         """Level of the log; only of memories that keep it."""
         assert self.series.level is not None
         return self.series.level
@@ -71,11 +60,11 @@ def remembered(site: str | Path) -> dict[str, Remembered]:
     UsageError, InputError
         A memory or a table that is damaged.
     """
-    folder, out = folder_of(site), {}
-    for entry in sorted(read_learned(site).entries.values(), key=lambda entry: entry.made):
+    folder, out = learned.folder_of(site), {}
+    for entry in sorted(learned.read_learned(site).entries.values(), key=lambda entry: entry.made):
         for series in entry.series:
             tower, uav = (read_sphere_csv(folder / file) for file in (series.tower_file, series.uav_file))
-            named = Named(entry=entry, part="", folder=folder)
+            named = learned.Named(entry=entry, part="", folder=folder)
             check_logs((*tower.trained_on, *uav.trained_on), named, folder / series.tower_file)
             out[f"{series.tower}.{series.channel}"] = Remembered(entry=entry, series=series, tower=tower, uav=uav)
     return out
@@ -104,7 +93,7 @@ class Nodes:
     fixed: Sequence[str] = ()
 
 
-def propose(known: Learned, site: str, series: Sequence[SeriesKey], nodes: Nodes = Nodes()) -> Proposal:
+def propose(known: learned.Learned, site: str, series: Sequence[SeriesKey], nodes: Nodes = Nodes()) -> Proposal:
     """The entry that fits most series: tower antennas where the tower fits too, else the airframe alone.
 
     The antenna of a node that flights placed themselves goes with any such node: it was learned over several places.
@@ -177,10 +166,10 @@ def searching_airframe(
     SpherePattern or None
     """
     with suppress(InputError, UsageError):
-        others = (entry for entry in read_learned(site).entries.values() if log not in entry.trained_on)
+        others = (entry for entry in learned.read_learned(site).entries.values() if log not in entry.trained_on)
         every = (s for entry in others for s in entry.series if s.tower not in towers)
         file = next((s.uav_file for s in every if (s.channel, s.reader) == series), None)
-        return None if file is None else read_sphere_csv(folder_of(site) / file)
+        return None if file is None else read_sphere_csv(learned.folder_of(site) / file)
     return None
 
 
@@ -193,7 +182,7 @@ def offered(data: FlightData) -> FlightFile | None:
     series = [(s.tower, s.channel, data.files[int(number)].result.reader)
               for s in data.rss for number in np.unique(s.log)]  # fmt: skip
     try:
-        known = propose(read_learned(site_place(site, data.folder)), str(Path(site).with_suffix("")), series)
+        known = propose(learned.read_learned(site_place(site, data.folder)), str(Path(site).with_suffix("")), series)
     except (InputError, UsageError):
         return None
     if len(known.antennas) < 2:
@@ -202,21 +191,21 @@ def offered(data: FlightData) -> FlightFile | None:
     return settings if settings.link != data.settings.link else None
 
 
-def errors_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> Errors | None:
+def errors_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> learned.Errors | None:
     """Errors on flights left out of the learned antennas of a tower and channel; None where no such are used."""
     name = antennas.get(f"{series.tower}.{series.channel}")
     if name is None or "uav" not in antennas:
         return None
     try:
-        return find_named(name, folder).entry.errors
+        return learned.find_named(name, folder).entry.errors
     except (InputError, UsageError):
         return None
 
 
-def lock_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> LearnedLock | None:
+def lock_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> learned.LearnedLock | None:
     """P(lock) that other flights taught with the airframe of a flight; None without one for such a channel."""
     try:
-        named = find_named(antennas["uav"], folder)
+        named = learned.find_named(antennas["uav"], folder)
     except (KeyError, InputError, UsageError):
         return None
     locks = [s.lock for s in named.entry.series if s.channel == series.channel and s.lock is not None]
@@ -227,18 +216,18 @@ SOUNDER = {"flight_mat", "sounder_log"}
 """Readers of one receiver: merged flights of the sounder hold the readings of its own logs."""
 
 
-def _placed(one: LearnedSeries, tower: str, nodes: Nodes) -> bool:
+def _placed(one: learned.LearnedSeries, tower: str, nodes: Nodes) -> bool:
     return tower in nodes.placed and one.tower not in nodes.fixed
 
 
-def _alike(one: LearnedSeries, key: SeriesKey, nodes: Nodes) -> bool:
+def _alike(one: learned.LearnedSeries, key: SeriesKey, nodes: Nodes) -> bool:
     """Check whether a series has the channel and the receiver of one that was learned from, whatever its tower."""
     tower, channel, reader = key
     same = one.reader == reader or (_placed(one, tower, nodes) and {one.reader, reader} <= SOUNDER)
     return one.channel == channel and same
 
 
-def _fits(entry: Entry, series: Sequence[SeriesKey], nodes: Nodes) -> tuple[int, int]:
+def _fits(entry: learned.Entry, series: Sequence[SeriesKey], nodes: Nodes) -> tuple[int, int]:
     """Series of an entry that fit exactly, and those of another tower."""
     exact = sum((s.tower, s.channel, s.reader) in series for s in entry.series)
     return exact, sum(any(_alike(s, key, nodes) for key in series) for s in entry.series)

@@ -17,14 +17,7 @@ from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.outputs import OutputFolder, changed_files
 from ..common.provenance import KEY
 from ..common.units import FloatArray
-from ..compare.report_difference import (
-    LevelDifference,
-    Overlap,
-    RankDifference,
-    level_difference,
-    pooled_difference,
-    rank_difference,
-)
+from ..compare import report_difference
 from ..report.diff.data import Entry, InputEntry, ReportDiff, ReportSide
 from ..report.names import RANK_COLUMNS, RSS_COLUMNS, links_of
 
@@ -263,7 +256,7 @@ def compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float =
         numbers=tuple(_numbers(first.metrics, second.metrics, tolerance_db)),
         levels=tuple(levels),
         ranks=tuple(_ranks(first, second)),
-        pooled=pooled_difference(residuals) if residuals else None,
+        pooled=report_difference.pooled_difference(residuals) if residuals else None,
         new_warnings=tuple(text for text in second_warnings if text not in first_warnings),
         gone_warnings=tuple(text for text in first_warnings if text not in second_warnings),
         links_first_only=tuple(alone[0]),
@@ -340,15 +333,10 @@ def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterat
 
 def _numbers(first: Mapping[str, Any], second: Mapping[str, Any], tolerance_db: float) -> Iterator[Entry]:
     """Reported numbers that differ by more than the tolerance; words, and numbers of time, take no part."""
-    first_numbers, second_numbers = (
-        dict(flat({k: v for k, v in side.items() if k not in _VOLATILE})) for side in (first, second)
-    )
-    for key in dict.fromkeys([*first_numbers, *second_numbers]):
-        a, b = first_numbers.get(key), second_numbers.get(key)
-        if "seconds" in key or ((key in first_numbers) != (key in second_numbers) and (a is None and b is None)):
-            continue
-        if _apart(a, b, tolerance_db):
-            yield Entry(key=key, first=a, second=b)
+    reported = ({key: value for key, value in side.items() if key not in _VOLATILE} for side in (first, second))
+    for entry in _entries(*reported):
+        if "seconds" not in entry.key and _apart(entry.first, entry.second, tolerance_db):
+            yield entry
 
 
 def _apart(a: Any, b: Any, tolerance: float) -> bool:
@@ -365,7 +353,7 @@ def _apart(a: Any, b: Any, tolerance: float) -> bool:
 # --- samples --------------------------------------------------------------------------------------------------------
 
 
-def _matched(mine: Any, theirs: Any) -> tuple[Overlap, Any, Any]:
+def _matched(mine: Any, theirs: Any) -> tuple[report_difference.Overlap, Any, Any]:
     """Rows of two tables of one link at the same instant, in time order; several at one instant in their order."""
 
     def keyed(table: Any) -> Any:
@@ -375,9 +363,9 @@ def _matched(mine: Any, theirs: Any) -> tuple[Overlap, Any, Any]:
 
     first, second = keyed(mine), keyed(theirs)
     if first.index.equals(second.index):
-        return Overlap(first=len(first), second=len(second), common=len(first)), first, second
+        return report_difference.Overlap(first=len(first), second=len(second), common=len(first)), first, second
     common = first.index.intersection(second.index, sort=False)
-    overlap = Overlap(first=len(first), second=len(second), common=len(common))
+    overlap = report_difference.Overlap(first=len(first), second=len(second), common=len(common))
     return overlap, first.loc[common], second.loc[common]
 
 
@@ -398,9 +386,9 @@ def _instants(table: Any) -> FloatArray:
     return np.asarray(seconds.fillna(table["time_s"]), dtype=np.float64)
 
 
-def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[LevelDifference], list[_Residuals]]:
+def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[report_difference.LevelDifference], list[_Residuals]]:
     """Each link that both have, and the residuals of its common samples."""
-    differences: list[LevelDifference] = []
+    differences: list[report_difference.LevelDifference] = []
     residuals: list[_Residuals] = []
     names = ("measured_db", "simulated_dbm", "residual_db")
     for (tower, channel), numbers in links_of(mine.metrics["rss"]).items():
@@ -414,7 +402,7 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[LevelDifference]
         scored = [int(table["residual_db"].notna().sum()) for table in tables]
         residuals.append((_instants(a), first[2], second[2]))
         differences.append(
-            level_difference(
+            report_difference.level_difference(
                 tower, channel, overlap, first, second,
                 scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]),
             )
@@ -422,7 +410,7 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[LevelDifference]
     return differences, residuals
 
 
-def _ranks(first: ReadReport, second: ReadReport) -> Iterator[RankDifference]:
+def _ranks(first: ReadReport, second: ReadReport) -> Iterator[report_difference.RankDifference]:
     ks = [
         c.removeprefix(_SIMULATED) for c in first.rank.columns if c.startswith(_SIMULATED) and c in second.rank.columns
     ]
@@ -432,4 +420,4 @@ def _ranks(first: ReadReport, second: ReadReport) -> Iterator[RankDifference]:
         overlap, a, b = _matched(*(s.rank[s.rank["tower"] == tower] for s in (first, second)))
         for k in ks:
             pairs = [(_values(t, "measured_rank"), _values(t, f"{_SIMULATED}{k}")) for t in (a, b)]
-            yield rank_difference(tower, k, overlap, pairs[0], pairs[1])
+            yield report_difference.rank_difference(tower, k, overlap, pairs[0], pairs[1])

@@ -10,33 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.units import FloatArray
-from .evaluate import (
-    IntervalCoverage,
-    Predictor,
-    Score,
-    along_trajectory,
-    altitude_held_out,
-    blocked,
-    interval_coverage,
-    learning_curve,
-    leave_one_out,
-    leave_one_out_estimate,
-    score,
-)
+from . import evaluate, variogram
 from .grid import Grid, without_coverage_as_nan
 from .interpolate import IndexInterpolation, InverseDistance, Nearest, ServingTowerMean
 from .job import MapResult
 from .kriging import OrdinaryKriging
-from .variogram import (
-    PAPER_BIEXPONENTIAL,
-    BiExponential,
-    BinnedCorrelation,
-    field_correlation,
-    fit_biexponential,
-    fit_vertical_scale,
-    vector_correlation,
-    vertical_correlation,
-)
 
 LOWEST_M = 30.0
 
@@ -60,11 +38,11 @@ class Study:
         With the paper's v^2, the variance over the altitudes at each position; positions with v^2 = 0 do not count.
     """
 
-    correlation: BinnedCorrelation
-    fit: BiExponential
-    scores: Mapping[str, Score]
-    intervals: IntervalCoverage
-    intervals_paper: IntervalCoverage
+    correlation: variogram.BinnedCorrelation
+    fit: variogram.BiExponential
+    scores: Mapping[str, evaluate.Score]
+    intervals: evaluate.IntervalCoverage
+    intervals_paper: evaluate.IntervalCoverage
 
 
 def rank_fields(
@@ -111,27 +89,27 @@ def interpolation_study(
         The correlation and its fit, scores of every interpolator, coverage of Kriging's intervals.
     """
     points = grid.points_m
-    correlation = vector_correlation(points, values, width_m=grid.spacing_m, missing="pairwise")
+    correlation = variogram.vector_correlation(points, values, width_m=grid.spacing_m, missing="pairwise")
     fit = _curve(correlation)
     kriging = OrdinaryKriging(fit, neighbours, radius_m, selection=selection, seed=seed)
-    estimate, variance = leave_one_out_estimate(kriging, points, values)
-    peers: dict[str, Predictor] = {
+    estimate, variance = evaluate.leave_one_out_estimate(kriging, points, values)
+    peers: dict[str, evaluate.Predictor] = {
         "makima": IndexInterpolation("makima", grid, neighbours, radius_m, selection=selection, seed=seed),
         "spline": IndexInterpolation("spline", grid, neighbours, radius_m, selection=selection, seed=seed),
         "nearest": Nearest(radius_m),
         "inverse distance": InverseDistance(neighbours, radius_m),
         "serving-tower mean": ServingTowerMean(towers_m),
     }
-    scores = {"Kriging": score(values, estimate)}
-    scores |= {name: leave_one_out(peer, points, values) for name, peer in peers.items()}
+    scores = {"Kriging": evaluate.score(values, estimate)}
+    scores |= {name: evaluate.leave_one_out(peer, points, values) for name, peer in peers.items()}
     sill = kriging.sill_.reshape(values.shape[1:])
     relative = np.where(sill > 0, variance / np.where(sill > 0, sill, 1.0), np.nan)
     return Study(
         correlation,
         fit,
         scores,
-        interval_coverage(values, estimate, variance),
-        interval_coverage(values, estimate, relative * altitude_variance(values)[:, None, :]),
+        evaluate.interval_coverage(values, estimate, variance),
+        evaluate.interval_coverage(values, estimate, relative * altitude_variance(values)[:, None, :]),
     )
 
 
@@ -144,11 +122,11 @@ def altitude_variance(values: FloatArray) -> FloatArray:
     return np.asarray(np.where(count > 1, squares.sum(axis=1) / np.maximum(count - 1, 1), np.nan))
 
 
-def _curve(correlation: BinnedCorrelation) -> BiExponential:
+def _curve(correlation: variogram.BinnedCorrelation) -> variogram.BiExponential:
     if np.isfinite(correlation.correlation[1:]).any():
-        return fit_biexponential(correlation.distance_m, correlation.correlation)
+        return variogram.fit_biexponential(correlation.distance_m, correlation.correlation)
     reason = "no two positions have varying rank vectors: the paper's curve stands in"
-    return replace(PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)
+    return replace(variogram.PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,10 +149,10 @@ class HeldOutStudy:
         MAE at the other positions.
     """
 
-    blocked: Score
-    altitude_held_out: Score
+    blocked: evaluate.Score
+    altitude_held_out: evaluate.Score
     vertical_scale: float
-    trajectory: Score | None
+    trajectory: evaluate.Score | None
     learning_sizes: tuple[int, ...]
     learning_mae: FloatArray
 
@@ -186,7 +164,7 @@ def held_out_study(
     grid: Grid,
     altitudes_m: Sequence[float],
     values: FloatArray,
-    fit: BiExponential,
+    fit: variogram.BiExponential,
     *,
     trajectory_m: ArrayLike | None = None,
     block_m: float = 300.0,
@@ -218,18 +196,18 @@ def held_out_study(
     """
     points = grid.points_m
     wide = OrdinaryKriging(fit, neighbours, outside="nearest")
-    horizontal = field_correlation(points, values, width_m=grid.spacing_m)
-    across = vertical_correlation(altitudes_m, np.moveaxis(values, 0, -1))
+    horizontal = variogram.field_correlation(points, values, width_m=grid.spacing_m)
+    across = variogram.vertical_correlation(altitudes_m, np.moveaxis(values, 0, -1))
     in_space = _curve(horizontal)
     varies = np.isfinite(across.correlation[1:]).any()
-    scale = fit_vertical_scale(in_space, across) if varies else 1.0
+    scale = variogram.fit_vertical_scale(in_space, across) if varies else 1.0
     space = OrdinaryKriging(in_space, neighbours, np.inf, vertical_scale=scale)
     sizes = tuple(size for size in LEARNING_SIZES if size < len(grid))
     return HeldOutStudy(
-        blocked=blocked(wide, points, values, block_m),
-        altitude_held_out=altitude_held_out(space, points, altitudes_m, values),
+        blocked=evaluate.blocked(wide, points, values, block_m),
+        altitude_held_out=evaluate.altitude_held_out(space, points, altitudes_m, values),
         vertical_scale=scale,
-        trajectory=None if trajectory_m is None else along_trajectory(wide, grid, values, trajectory_m),
+        trajectory=None if trajectory_m is None else evaluate.along_trajectory(wide, grid, values, trajectory_m),
         learning_sizes=sizes,
-        learning_mae=learning_curve(wide, points, values, sizes, seed=seed),
+        learning_mae=evaluate.learning_curve(wide, points, values, sizes, seed=seed),
     )

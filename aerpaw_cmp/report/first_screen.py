@@ -11,25 +11,8 @@ from ..compare.forecast import ForecastScore
 from ..compare.memory import FEWEST
 from ..compare.result import AuditResult, RankResult, RssResult
 from ..compare.statistics import Interval, PairedDifference
+from . import words
 from .data import ReportData
-from .words import (
-    NOTHING_COMPARED,
-    TOO_FEW_COMPARED,
-    Judged,
-    audit_paths,
-    cause_sentence,
-    count,
-    expected_sentence,
-    first_sentence,
-    local_error,
-    lock_sentence,
-    nearest_k,
-    next_step,
-    pooled_db,
-    pretty,
-    training_sentence,
-    trust,
-)
 
 NO_INTERVAL = "no interval can be given"
 
@@ -51,17 +34,17 @@ def verdict(data: ReportData) -> tuple[str, ...]:
     """Two sentences: how good against which baseline; where it fails, and whether to trust it."""
     scored = _scored(data.rss)
     found = judged(scored)
-    first = first_sentence(found) if found is not None else _rank_sentence(data.rank)
+    first = words.first_sentence(found) if found is not None else _rank_sentence(data.rank)
     if learned := _training(data):
-        learned = " ".join(part for part in (learned, expected_sentence(data.rss)) if part)
-        return learned, " ".join(part for part in (_baseline_sentence(data.rss), first, trust(data)) if part)
+        learned = " ".join(part for part in (learned, words.expected_sentence(data.rss)) if part)
+        return learned, " ".join(part for part in (_baseline_sentence(data.rss), first, words.trust(data)) if part)
     if not first:
         most = max([panel.score.n for panel in data.rss], default=0)
-        return (NOTHING_COMPARED if not most else TOO_FEW_COMPARED.format(n=most), trust(data))
-    first = " ".join(part for part in (lock_sentence(scored), first, expected_sentence(scored)) if part)
+        return (words.NOTHING_COMPARED if not most else words.TOO_FEW_COMPARED.format(n=most), words.trust(data))
+    first = " ".join(part for part in (words.lock_sentence(scored), first, words.expected_sentence(scored)) if part)
     cause = _causes(scored)
-    where = (cause,) if cause else (_fails(scored), next_step(data))
-    return first, " ".join(part for part in (*where, trust(data)) if part)
+    where = (cause,) if cause else (_fails(scored), words.next_step(data))
+    return first, " ".join(part for part in (*where, words.trust(data)) if part)
 
 
 def _training(data: ReportData) -> str:
@@ -70,14 +53,14 @@ def _training(data: ReportData) -> str:
         learned = [panel for panel in panels if panel.further.trained_on]
         if learned:
             names = [panel.name if isinstance(panel, RssResult) else panel.tower for panel in learned]
-            return training_sentence(names, what, union(*(panel.further.trained_on or () for panel in learned)))
+            return words.training_sentence(names, what, union(*(panel.further.trained_on or () for panel in learned)))
     return ""
 
 
 def _baseline_sentence(panels: Sequence[RssResult]) -> str:
     """Sentence on what a model without anything learned leaves on the panels of a training flight."""
     best = best_baseline([panel for panel in panels if panel.training])
-    return "" if best is None else f"For comparison, {pretty(best[0])}: RMSE {best[1]:.1f} dB."
+    return "" if best is None else f"For comparison, {words.pretty(best[0])}: RMSE {best[1]:.1f} dB."
 
 
 def _scored(panels: Sequence[RssResult]) -> list[RssResult]:
@@ -90,7 +73,7 @@ def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
     for name in panels[0].baselines if panels else ():
         known = [p.baselines[name].rmse_db for p in panels if name in p.baselines]
         if len(known) == len(panels) and all(map(math.isfinite, known)):
-            errors[name] = pooled_db(known, [panel.score.n for panel in panels])
+            errors[name] = words.pooled_db(known, [panel.score.n for panel in panels])
     return errors
 
 
@@ -101,7 +84,7 @@ def best_baseline(panels: Sequence[RssResult]) -> tuple[str, float] | None:
 
 def _pooled(panels: Sequence[RssResult]) -> float:
     """RMSE of the ray tracing over all samples of several series [dB]."""
-    return pooled_db([p.score.rmse_db for p in panels], [p.score.n for p in panels])
+    return words.pooled_db([p.score.rmse_db for p in panels], [p.score.n for p in panels])
 
 
 def _paired(panels: Sequence[RssResult], name: str) -> list[PairedDifference]:
@@ -109,7 +92,7 @@ def _paired(panels: Sequence[RssResult], name: str) -> list[PairedDifference]:
     return [p.further.compared_with[name] for p in panels if name in p.further.compared_with]
 
 
-def judged(panels: Sequence[RssResult]) -> Judged | None:
+def judged(panels: Sequence[RssResult]) -> words.Judged | None:
     """Ray tracing against the baseline that matters most; None without a scored channel."""
     if not panels:
         return None
@@ -123,7 +106,7 @@ def judge(
     baselines_db: Mapping[str, float],
     verdicts: Sequence[Mapping[str, str]],
     unit: str = "channels",
-) -> Judged:
+) -> words.Judged:
     """Ray tracing against the baseline that matters most: the best of those that it loses to, else the best of all.
 
     Parameters
@@ -141,16 +124,16 @@ def judge(
     -------
     Judged
     """
-    total, count_of = pooled_db(*map(list, zip(*scored, strict=True))), len(scored)
+    total, count_of = words.pooled_db(*map(list, zip(*scored, strict=True))), len(scored)
     every = []
     for name, error in baselines_db.items():
         said = [own[name] for own in verdicts if own.get(name, "no interval") != "no interval"]
-        every.append(Judged(ray_db=total, channels=count_of, name=name, other_db=error, judged=len(said),
+        every.append(words.Judged(ray_db=total, channels=count_of, name=name, other_db=error, judged=len(said),
                             better=said.count("better"), worse=said.count("worse"), unit=unit))  # fmt: skip
-    return most_telling(every) if every else Judged(ray_db=total, channels=count_of, unit=unit)
+    return most_telling(every) if every else words.Judged(ray_db=total, channels=count_of, unit=unit)
 
 
-def most_telling(every: Sequence[Judged]) -> Judged:
+def most_telling(every: Sequence[words.Judged]) -> words.Judged:
     """The comparison to be said first: the best baseline that ray tracing loses to, else the best one."""
     lost = [entry for entry in every if entry.worse > entry.better]
     return min(lost or every, key=lambda one: one.other_db)
@@ -190,7 +173,7 @@ def _rank_sentence(panels: Sequence[RankResult]) -> str:
     for panel in panels:
         if score := _forecast_of(panel):
             return _forecast_sentence(panel, score)
-        k = nearest_k(panel)
+        k = words.nearest_k(panel)
         if k is not None:
             at, commonest = panel.score.simulated[k], panel.further.commonest
             beside = (
@@ -213,7 +196,7 @@ LONG_S = 5.0
 def _causes(panels: Sequence[RssResult]) -> str:
     """The cause that explains most of a channel's error; nothing where no channel shows one."""
     gains = [(one.gain, i) for i, panel in enumerate(panels) if (one := panel.further.likely_cause) is not None]
-    return cause_sentence(panels[max(gains)[1]]) if gains else ""
+    return words.cause_sentence(panels[max(gains)[1]]) if gains else ""
 
 
 def _fails(panels: Sequence[RssResult]) -> str:
@@ -227,7 +210,7 @@ def _fails(panels: Sequence[RssResult]) -> str:
     if not spans:
         return f"Largest error of a channel: {worst.name}, {worst.score.rmse_db:.1f} dB." if len(panels) > 1 else ""
     panel, span = max(spans, key=lambda item: abs(item[1].mean_db))
-    return local_error(panel, span)
+    return words.local_error(panel, span)
 
 
 def headlines(data: ReportData) -> list[Headline]:
@@ -237,7 +220,7 @@ def headlines(data: ReportData) -> list[Headline]:
     if panels:
         lines += [_error(panels), *_difference(panels)]
     for panel in data.rank:
-        score, k = _forecast_of(panel), nearest_k(panel)
+        score, k = _forecast_of(panel), words.nearest_k(panel)
         if score is not None:
             lines.append(_forecast_card(panel, score))
             break
@@ -253,13 +236,13 @@ def headlines(data: ReportData) -> list[Headline]:
 def _audit(audit: AuditResult) -> Headline:
     """Failed checks of the audit; paths that the other engine did not sample are no fault of ours."""
     fields = audit.fields
-    beside = f"{count(audit.links)} links against {audit.reference}"
+    beside = f"{words.count(audit.links)} links against {audit.reference}"
     if fields is None:
-        value = f"{count(audit.missing_paths)} paths missing"
+        value = f"{words.count(audit.missing_paths)} paths missing"
     else:
-        value = f"{count(len(fields.failures))} failed"
-        beside += f"; {count(fields.raw_poses)} poses, {count(fields.raw_levels)} levels from raw bytes"
-    return Headline(label="Audit", value=value, interval=audit_paths(audit), beside=beside)
+        value = f"{words.count(len(fields.failures))} failed"
+        beside += f"; {words.count(fields.raw_poses)} poses, {words.count(fields.raw_levels)} levels from raw bytes"
+    return Headline(label="Audit", value=value, interval=words.audit_paths(audit), beside=beside)
 
 
 def _error(panels: Sequence[RssResult]) -> Headline:
@@ -268,7 +251,7 @@ def _error(panels: Sequence[RssResult]) -> Headline:
         label="RMSE of the level" if len(panels) == 1 else f"RMSE of the level, {len(panels)} channels",
         value=f"{total:.1f} dB",
         interval=_ends(panels),
-        beside="no baseline" if best is None else f"{pretty(best[0])}: {best[1]:.1f} dB",
+        beside="no baseline" if best is None else f"{words.pretty(best[0])}: {best[1]:.1f} dB",
     )
 
 
@@ -291,12 +274,12 @@ def _difference(panels: Sequence[RssResult]) -> list[Headline]:
     paired = _paired(panels, name)
     if not paired:
         return []
-    words = [entry.verdict for entry in paired]
-    undecided = len(words) - words.count("better") - words.count("worse")
+    said = [entry.verdict for entry in paired]
+    undecided = len(said) - said.count("better") - said.count("worse")
     if len(paired) == 1:
         return [
             Headline(
-                label=f"Against {pretty(name)}, same samples",
+                label=f"Against {words.pretty(name)}, same samples",
                 value=f"{paired[0].difference_db:+.1f} dB".replace("-", "−"),
                 interval=_interval(paired[0].difference_ci95_db, "+.1f", " dB"),
                 beside="negative: smaller error of ray tracing",
@@ -304,9 +287,9 @@ def _difference(panels: Sequence[RssResult]) -> list[Headline]:
         ]
     return [
         Headline(
-            label=f"Better than {pretty(name)}",
-            value=f"{words.count('better')} of {len(words)}",
-            interval=f"worse: {words.count('worse')}, not significant: {undecided}",
+            label=f"Better than {words.pretty(name)}",
+            value=f"{said.count('better')} of {len(said)}",
+            interval=f"worse: {said.count('worse')}, not significant: {undecided}",
             beside="channels, by paired 95 % intervals",
         )
     ]

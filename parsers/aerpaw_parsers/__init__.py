@@ -1,84 +1,33 @@
-"""One module per log format; ``READERS`` is the catalogue that aerpaw-cmp finds by its entry point."""
+"""One module per log format; ``READERS`` is the catalogue that aerpaw-cmp finds by its entry point.
+
+A module holds its reader as ``READER``, or several as ``READERS``.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from importlib import import_module
 
 from aerpaw_cmp.logs.readers import Reader
 
-from . import (
-    _origins,
-    aadm_snr,
-    amarisoft,
-    ardupilot_bin,
-    controller_log,
-    drive_test,
-    flight_mat,
-    generic_csv,
-    gnettrack_kml,
-    gpx,
-    iq_burst,
-    mavlink_tlog,
-    nemo_csv,
-    nemo_kml,
-    no_log,
-    oai_log,
-    own_csv,
-    pawprints,
-    pose_csv,
-    px4_ulog,
-    quectel_console,
-    quectel_csv,
-    quectel_ri,
-    sigmf,
-    sounder_log,
-    srsenb_log,
-    srsran_gnb,
-    srsue_log,
-    tap_jsonl,
-    vehicle_log,
-    vehicle_out,
-)
+from ._origins import CLOCKS, HEIGHTS
 
-_READERS: tuple[Reader, ...] = (
-    vehicle_out.READER,
-    sounder_log.READER,
-    flight_mat.READER,
-    quectel_csv.READER,
-    quectel_ri.READER,
-    nemo_csv.READER,
-    nemo_kml.READER,
-    drive_test.READER,
-    gnettrack_kml.READER,
-    pose_csv.READER,
-    aadm_snr.READER,
-    controller_log.READER,
-    srsenb_log.READER,
-    tap_jsonl.READER,
-    gpx.READER,
-    pawprints.READER,
-    srsue_log.READER,
-    vehicle_log.READER,
-    quectel_console.READER,
-    srsran_gnb.READER,
-    srsran_gnb.JSON_READER,
-    oai_log.READER,
-    amarisoft.READER,
-    amarisoft.JSON_READER,
-    ardupilot_bin.READER,
-    mavlink_tlog.READER,
-    px4_ulog.READER,
-    sigmf.READER,
-    iq_burst.READER,
-    own_csv.READER,
-    generic_csv.READER,
-    *no_log.READERS,
-)
-READERS: tuple[Reader, ...] = tuple(
-    replace(
-        reader,
-        clock_from=_origins.CLOCKS.get(reader.name, reader.clock_from),
-        height_from=_origins.HEIGHTS.get(reader.name, reader.height_from),
-    )
-    for reader in _READERS
-)
+_FORMATS = (
+    "vehicle_out", "sounder_log", "flight_mat", "quectel_csv", "quectel_ri", "nemo_csv", "nemo_kml", "drive_test",
+    "gnettrack_kml", "pose_csv", "aadm_snr", "controller_log", "srsenb_log", "tap_jsonl", "gpx", "pawprints",
+    "srsue_log", "vehicle_log", "quectel_console", "srsran_gnb", "oai_log", "amarisoft", "ardupilot_bin",
+    "mavlink_tlog", "px4_ulog", "sigmf", "iq_burst", "own_csv", "generic_csv", "no_log",
+)  # fmt: skip
+"""Modules in the order in which ``aerpaw-cmp formats`` lists them."""
+
+
+def _readers() -> Iterator[Reader]:
+    for name in _FORMATS:
+        module = import_module(f".{name}", __name__)
+        for reader in getattr(module, "READERS", None) or (module.READER,):
+            clock, height = CLOCKS.get(reader.name, reader.clock_from), HEIGHTS.get(reader.name, reader.height_from)
+            yield replace(reader, clock_from=clock, height_from=height)
+
+
+READERS: tuple[Reader, ...] = tuple(_readers())

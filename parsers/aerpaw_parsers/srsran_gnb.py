@@ -134,3 +134,5 @@ JSON_READER = Reader(
     sniff=sniff_json,
     read=read_json,
 )
+
+READERS = (READER, JSON_READER)

@@ -18,7 +18,7 @@ from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs.mapping import coverage_map as mapping
 from aerpaw_cmp.jobs.mapping.paper_table import paper_rows
 from aerpaw_cmp.maps.grid import Grid
-from aerpaw_cmp.maps.job import rank_of_singular_values
+from aerpaw_cmp.maps.job import RATIO_LIMIT_DB, rank_of_singular_values
 from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL
 from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.field.foliage import CrownIndex, Opaque, foliage_loss_db
@@ -239,7 +239,7 @@ def test_files_agree_with_each_other_and_with_the_page(made):
     assert shown["share"]["Z"] == pytest.approx(share)
     ratios = table[[name for name in table if name.startswith(("condition", "spread"))]].to_numpy()
     assert np.nanmin(ratios) >= 0
-    assert np.nanmax(ratios) == mapping.RATIO_LIMIT_DB  # two collinear paths: what is below is rounding
+    assert np.nanmax(ratios) == RATIO_LIMIT_DB  # two collinear paths: what is below is rounding
     content = json.loads((folder / "maps.json").read_text())
     level = np.array(content["layers"]["rss_siso_h030m_joint_opaque"]["values"], dtype=float)
     np.testing.assert_allclose(level, table["rss_siso_h030m_joint_opaque"], atol=0.006)

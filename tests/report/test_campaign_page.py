@@ -10,6 +10,7 @@ import pytest
 from aerpaw_cmp.report import canvas
 from aerpaw_cmp.report.campaign import figures as campaign_figures
 from aerpaw_cmp.report.campaign import html as campaign_html
+from aerpaw_cmp.report.campaign import words as campaign_words
 from aerpaw_cmp.report.campaign_data import RankPairing, Repeat
 from benchmarks import fabricated
 
@@ -28,13 +29,13 @@ def test_the_page_stays_small_and_tells_what_it_does_not_show(data):
 
 
 def test_the_best_setting_is_named_in_words(data):
-    words = " ".join(campaign_html.headline(data))
+    words = " ".join(campaign_words.headline(data))
     assert "setting 02 has the smallest error" in words
     assert words.count("dB;") < 4  # not all settings in one sentence
 
 
 def test_two_flights_show_no_difference_and_the_words_say_so():
-    words = " ".join(campaign_html.headline(fabricated.season(2, 3, 1, 1)))
+    words = " ".join(campaign_words.headline(fabricated.season(2, 3, 1, 1)))
     assert "Too few flights" in words
     assert "Not significantly worse" not in words
 
@@ -114,7 +115,7 @@ def test_the_page_opens_with_a_verdict_against_the_baselines_and_explains_its_me
     )  # fmt: skip
     shown = dataclasses.replace(data, rss=rows)
     n = sum(row.setting == first for row in rows)
-    said, means, stands_out = campaign_html.verdict(shown)
+    said, means, stands_out = campaign_words.verdict(shown)
     assert said == (
         "Ray tracing: RMSE 7.0 dB; free space: 6.0 dB. "
         f"Ray tracing is significantly worse on {n} of {n} flights x channels (95 %)."
@@ -138,7 +139,7 @@ def test_a_flight_with_another_gain_is_named_with_its_interval_and_what_to_do(da
         for row in data.rss
     )
     shown = dataclasses.replace(data, rss=rows)
-    cause = campaign_html.cause(shown)
+    cause = campaign_words.cause(shown)
     assert (cause.cause, cause.where) == ("outlying offset", odd)
     assert cause.interval[0] < 9.0 < cause.interval[1]
-    assert f"Next: check transmit power, receiver gain and cables of {odd}." in campaign_html.verdict(shown)[2]
+    assert f"Next: check transmit power, receiver gain and cables of {odd}." in campaign_words.verdict(shown)[2]

@@ -13,8 +13,8 @@ from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
 from aerpaw_cmp.compare.rss import ErrorSpan
 from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.report.diff.html import DIFFERENCE
-from aerpaw_cmp.report.first_screen import headlines, pooled_db, verdict
-from aerpaw_cmp.report.words import CAUSES, Judged, first_sentence, pretty, ranking_sentence
+from aerpaw_cmp.report.first_screen import headlines, verdict
+from aerpaw_cmp.report.words import CAUSES, Judged, first_sentence, pooled_db, pretty, ranking_sentence
 from benchmarks.fabricated import with_numbers
 
 

@@ -23,20 +23,7 @@ from ...common.jsonable import json_object
 from ...common.outputs import OutputFile, OutputFolder, is_sealed
 from ...common.stages import Progress, begin_peak, peak_mib, silent
 from ...common.versions import utc_now
-from . import entrants
-from .benchmark import (
-    BASELINES,
-    Bench,
-    Entry,
-    Manifest,
-    check_training,
-    leaderboard_row,
-    load_manifest,
-    read_entry,
-    read_leaderboard,
-    score_task,
-    truth,
-)
+from . import benchmark, entrants
 
 Scores = dict[str, dict[str, dict[str, Any]]]
 """By task and entrant."""
@@ -55,12 +42,12 @@ class BenchmarkResult:
         return json_object(scores=self.scores, skipped=self.skipped)
 
 
-def open_bench(data: Path, manifest: Path | None = None) -> Bench:
+def open_bench(data: Path, manifest: Path | None = None) -> benchmark.Bench:
     """The benchmark with the logs below a folder."""
-    return Bench(load_manifest(manifest), data)
+    return benchmark.Bench(benchmark.load_manifest(manifest), data)
 
 
-def chosen_tasks(manifest: Manifest, names: Sequence[str]) -> list[str]:
+def chosen_tasks(manifest: benchmark.Manifest, names: Sequence[str]) -> list[str]:
     """The named tasks, or all; UsageError for an unknown one."""
     for name in names:
         if name not in manifest.tasks:
@@ -122,16 +109,16 @@ def run_benchmark(
             for name in [name for name in names if written[name]]:
                 path = folder / "predictions" / f"{name}.csv"
                 path.write_text(_entry_text(name, written[name]), encoding="utf-8")
-                entries[name] = read_entry(path)
+                entries[name] = benchmark.read_entry(path)
             scores = _score_all(bench, entries, cost)
-            rows = [leaderboard_row(bench, e, _of(scores, n), __version__) for n, e in entries.items()]
+            rows = [benchmark.leaderboard_row(bench, e, _of(scores, n), __version__) for n, e in entries.items()]
             (folder / "leaderboard.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
             (folder / "scores.csv").write_text(_scores_csv(scores), encoding="utf-8")
             (folder / "benchmark.html").write_text(_page(bench, scores), encoding="utf-8")
     return BenchmarkResult(scores, skipped, out)
 
 
-def _predicted(bench: Bench, task: str, name: str) -> Any:
+def _predicted(bench: benchmark.Bench, task: str, name: str) -> Any:
     try:
         return entrants.predict(bench, task, name)
     except ImportError as error:
@@ -147,13 +134,15 @@ def _entry_text(name: str, frames: Sequence[Any]) -> str:
     return f"# entrant: {name}\n# who: aerpaw-cmp {__version__}\n{text}"
 
 
-def _score_all(bench: Bench, entries: dict[str, Entry], cost: dict[tuple[str, str], dict[str, float]]) -> Scores:
+def _score_all(
+    bench: benchmark.Bench, entries: dict[str, benchmark.Entry], cost: dict[tuple[str, str], dict[str, float]]
+) -> Scores:
     scores: Scores = {}
     for task in bench.manifest.tasks:
         mine = {n: e for n, e in entries.items() if (e.frame["task"] == task).any()}
-        baselines = {n: mine[n] for n in BASELINES if n in mine}
+        baselines = {n: mine[n] for n in benchmark.BASELINES if n in mine}
         for name, entry in mine.items():
-            row = score_task(bench, task, entry, baselines, accept_levels=True)
+            row = benchmark.score_task(bench, task, entry, baselines, accept_levels=True)
             scores.setdefault(task, {})[name] = row | cost.get((task, name), {})
     return scores
 
@@ -179,7 +168,7 @@ def _cell(value: Any) -> str:
     return "" if value is None else repr(float(value)) if isinstance(value, float) else str(value)
 
 
-def _page(bench: Bench, scores: Scores) -> str:
+def _page(bench: benchmark.Bench, scores: Scores) -> str:
     from ...report.benchmark_html import benchmark_page, task_table
 
     tables = []
@@ -219,12 +208,12 @@ def score_predictions(
         One entrant.
     """
     bench = open_bench(data, manifest)
-    entry = read_entry(predictions)
+    entry = benchmark.read_entry(predictions)
     given = list(dict.fromkeys(entry.frame["task"]))
     chosen_tasks(bench.manifest, given)
     wanted = [task for task in chosen_tasks(bench.manifest, tasks) if task in given]
     skipped = {task: bench.skipped(task, training=False) for task in wanted}
-    check_training(bench, entry, wanted)
+    benchmark.check_training(bench, entry, wanted)
     scores: Scores = {}
     name = entry.head.get("entrant", predictions.stem)
     for task in wanted:
@@ -232,9 +221,9 @@ def score_predictions(
             continue
         baselines = {}
         if bench.manifest.tasks[task].kind == "level" and not bench.skipped(task, training=True):
-            made = {b: entrants.predict(bench, task, b) for b in BASELINES}
-            baselines = {b: Entry(frame, {}, "") for b, frame in made.items() if frame is not None}
-        scores[task] = {name: score_task(bench, task, entry, baselines, accept_levels=accept_levels)}
+            made = {b: entrants.predict(bench, task, b) for b in benchmark.BASELINES}
+            baselines = {b: benchmark.Entry(frame, {}, "") for b, frame in made.items() if frame is not None}
+        scores[task] = {name: benchmark.score_task(bench, task, entry, baselines, accept_levels=accept_levels)}
     if not scores:
         lacking = "; ".join(text for texts in skipped.values() for text in texts)
         raise InputError(
@@ -243,7 +232,10 @@ def score_predictions(
             path=predictions,
         )
     if leaderboard is not None:
-        rows = [*read_leaderboard(leaderboard), leaderboard_row(bench, entry, _of(scores, name), __version__)]
+        rows = [
+            *benchmark.read_leaderboard(leaderboard),
+            benchmark.leaderboard_row(bench, entry, _of(scores, name), __version__),
+        ]
         with OutputFile(leaderboard, own=_is_leaderboard, inputs=[predictions]) as output:
             output.write((json.dumps(rows, indent=1) + "\n").encode())
     return BenchmarkResult(scores, {task: texts for task, texts in skipped.items() if texts})
@@ -251,7 +243,7 @@ def score_predictions(
 
 def _is_leaderboard(path: Path) -> bool:
     try:
-        return bool(read_leaderboard(path)) or is_sealed(path)
+        return bool(benchmark.read_leaderboard(path)) or is_sealed(path)
     except InputError:
         return False
 
@@ -281,8 +273,8 @@ def write_template(
 
     bench = open_bench(data, manifest)
     wanted = chosen_tasks(bench.manifest, tasks)
-    asked = [truth(bench, task) for task in wanted]
-    known = [truth(bench, task, training=True) for task in wanted]
+    asked = [benchmark.truth(bench, task) for task in wanted]
+    known = [benchmark.truth(bench, task, training=True) for task in wanted]
     test = pd.concat(asked, ignore_index=True).drop(columns="measured")
     test["level_db"], test["sd_db"] = "", ""
     if any(bench.manifest.tasks[task].kind == "rank" for task in wanted):
@@ -307,7 +299,7 @@ def fetch(out: Path, *, manifest: Path | None = None, progress: Progress = silen
     InputError
         A file whose content is not the published one.
     """
-    listing = load_manifest(manifest)
+    listing = benchmark.load_manifest(manifest)
     out.mkdir(parents=True, exist_ok=True)
     made = []
     for name, one in listing.files.items():

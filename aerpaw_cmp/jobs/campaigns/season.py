@@ -15,13 +15,7 @@ import numpy as np
 from ...common.errors import InputError
 from ...common.files import LARGEST_TABLE, read_bounded
 from ...common.units import FloatArray
-from ...compare.season import (
-    error_at_offset,
-    left_out_offsets,
-    mean_of_flights,
-    trend,
-    verdict_of,
-)
+from ...compare import season
 from ...logs.records import has_wall_clock
 from ...report.campaign_data import CampaignData, Drift, PlaceMap, RssRow, Season, SettingRank, place_means
 
@@ -87,13 +81,13 @@ def held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
     for members in groups.values():
         mine = [rows[i] for i in members]
         mean = np.array([row.moments.mean_db for row in mine])
-        offset = left_out_offsets(
+        offset = season.left_out_offsets(
             [row.n if np.isfinite(m) else 0 for row, m in zip(mine, mean, strict=True)],
             mean,
             step_db=min(row.step_db for row in mine),
             span_db=(min(row.span_db[0] for row in mine), max(row.span_db[1] for row in mine)),
         )
-        error = error_at_offset(offset, [row.rmse_db for row in mine], [row.offset_db for row in mine], mean)
+        error = season.error_at_offset(offset, [row.rmse_db for row in mine], [row.offset_db for row in mine], mean)
         for i, o, e in zip(members, offset, error, strict=True):
             done[i] = dataclasses.replace(rows[i], held_out_offset_db=float(o), held_out_rmse_db=float(e))
     return done
@@ -135,7 +129,7 @@ def rank_settings(
     known = sorted((name for name in settings if len(means[name])), key=lambda name: float(means[name].mean()))
     choices = []
     for name in known:
-        difference = mean_of_flights(_paired(table[name], table[known[0]], flights))
+        difference = season.mean_of_flights(_paired(table[name], table[known[0]], flights))
         low, *middle, high = (float(v) for v in np.quantile(means[name], (0.0, *QUANTILES, 1.0)))
         choices.append(
             SettingRank(
@@ -147,7 +141,7 @@ def rank_settings(
                 difference_db=difference.mean,
                 difference_ci95_db=None if name == known[0] else (difference.low, difference.high),
                 n_paired=difference.n,
-                verdict="first" if name == known[0] else verdict_of(difference),
+                verdict="first" if name == known[0] else season.verdict_of(difference),
             )
         )
     return choices
@@ -175,7 +169,7 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
         # not the offsets themselves: three flights whose rounded offsets lie on a line would have no uncertainty
         exact = np.array([row.moments.mean_db for row in members])
         offsets = np.array([row.offset_db for row in members])
-        line = trend(days, exact)
+        line = season.trend(days, exact)
         made.append(
             Drift(
                 setting=setting,

@@ -17,16 +17,7 @@ from ...common.provenance import union
 from ...common.stages import Stages
 from ...common.units import FloatArray
 from ...common.yamlfile import load_yaml
-from ...compare.direction_gain import (
-    ANTENNA_TERMS,
-    PLACE_TERM,
-    TOWER_TERMS,
-    UAV_TERMS,
-    GainModel,
-    LinkSamples,
-    Term,
-    column_forms,
-)
+from ...compare import direction_gain
 from ...compare.learning import calibration
 from ...compare.learning.calibration import Learned, Observed, Recipe, Score
 from ...compare.learning.correction import BIN_S
@@ -192,7 +183,7 @@ def calibrate(
         learned = calibration.learn(series, recipe)
         place = None
         if settings.fit.place:
-            with_place = calibration.only_terms(recipe, (*recipe.model.terms, PLACE_TERM))
+            with_place = calibration.only_terms(recipe, (*recipe.model.terms, direction_gain.PLACE_TERM))
             place = calibration.learn(series, with_place)
     with stages("ground"):
         ground = fit_ground(flights, observed, learned) if settings.fit.ground else None
@@ -342,7 +333,7 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float, floa
     time = series.time[keep]
     seconds = (time - time.min()) / np.timedelta64(1, "s") if len(time) else np.zeros(0)
     order = np.argsort(seconds, kind="stable")
-    samples = LinkSamples(
+    samples = direction_gain.LinkSamples(
         flight=data.settings.flight.name,
         tower=series.tower,
         channel=series.channel,
@@ -375,16 +366,19 @@ def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
     return rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, pitch_deg, roll_deg]))
 
 
-def learned_antennas(train: Sequence[LinkSamples]) -> Learned:
+def learned_antennas(train: Sequence[direction_gain.LinkSamples]) -> Learned:
     """Antennas of both ends from means over the bins of a correction, with the model's own strengths to start from."""
-    return calibration.learn(train, Recipe(model=GainModel(bin_s=BIN_S), rotation=rotation))
+    return calibration.learn(train, Recipe(model=direction_gain.GainModel(bin_s=BIN_S), rotation=rotation))
 
 
 def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
     """Terms and patterns as calibration.yaml asks."""
-    terms: dict[str, tuple[Term, ...]] = {
-        "both": ANTENNA_TERMS, "uav": UAV_TERMS, "tower": TOWER_TERMS, "none": ()
-    }  # fmt: skip
+    terms: dict[str, tuple[direction_gain.Term, ...]] = {
+        "both": direction_gain.ANTENNA_TERMS,
+        "uav": direction_gain.UAV_TERMS,
+        "tower": direction_gain.TOWER_TERMS,
+        "none": (),
+    }
     patterns: dict[str, GainOf] = {}
     if settings.patterns.uav is not None:
         patterns["uav"] = gain_of(settings.patterns.uav, folder)
@@ -393,7 +387,7 @@ def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: P
         if chosen is not None:
             patterns[antenna] = gain_of(chosen, folder)
     return Recipe(
-        model=GainModel(terms=terms[settings.fit.gain], bin_s=settings.fit.bin_s),
+        model=direction_gain.GainModel(terms=terms[settings.fit.gain], bin_s=settings.fit.bin_s),
         rotation=rotation,
         patterns=patterns,
         mount=settings.fit.mount != "none",
@@ -419,7 +413,7 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
     by_name = {data.settings.flight.name: data for data in flights}
     kept = {(o.samples.flight, o.samples.antenna): o for o in observed}
 
-    def columns(samples: LinkSamples, bin_s: float) -> FloatArray:
+    def columns(samples: direction_gain.LinkSamples, bin_s: float) -> FloatArray:
         data = by_name[samples.flight]
         o = kept[samples.flight, samples.antenna]
         link = next(s.link for s in data.rss if f"{s.tower}.{s.channel}" == samples.antenna)
@@ -443,7 +437,7 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
 
     series = [o.samples for o in observed]
     left = [dataclasses.replace(s, residual_db=s.residual_db - learned.patterns_db(s)) for s in series]
-    form = column_forms(left, learned.model, columns)
+    form = direction_gain.column_forms(left, learned.model, columns)
     value = np.diag(form)[1:] - 2.0 * form[0, 1:]
     likelihood = -0.5 * (value - value[-1])
     return GroundFit(roughness_m=ROUGHNESS_M, log_likelihood=tuple(map(float, likelihood)))
@@ -494,9 +488,9 @@ def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple
         "world frame at the UAV": left_out(calibration.world_frame(observed), bare),
         "heading turned the wrong way": left_out(calibration.wrong_way(observed), bare),
         "body frame, no patterns": left_out(observed, bare),
-        "UAV end only": left_out(observed, only(bare, UAV_TERMS)),
-        "tower end only": left_out(observed, only(bare, TOWER_TERMS)),
-        "field over places only": left_out(observed, only(bare, (PLACE_TERM,))),
+        "UAV end only": left_out(observed, only(bare, direction_gain.UAV_TERMS)),
+        "tower end only": left_out(observed, only(bare, direction_gain.TOWER_TERMS)),
+        "field over places only": left_out(observed, only(bare, (direction_gain.PLACE_TERM,))),
     }
     return scores | (
         {"patterns with fitted mounts only": left_out(observed, only(recipe, ()))} if recipe.patterns else {}

@@ -21,19 +21,8 @@ from ...common.errors import InputError, UsageError
 from ...common.jsonable import json_safe
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, IntArray
+from ...compare import receiver
 from ...compare.forecast import ForecastScore, constant_forecast, score_forecast
-from ...compare.receiver import (
-    FeatureChoice,
-    Receiver,
-    ReceiverMixture,
-    choose_features,
-    fit_mixture,
-    mixture_loss,
-    out_of_group,
-    sector_groups,
-    stream_features,
-    time_means,
-)
 from ...compare.rss import seconds
 from ...flight.data import FlightData, RankSeries, rank_positions
 from ...flight.replay import attitude_rotation
@@ -122,7 +111,7 @@ class FittedReceiver:
     """Names of those that it was fitted on."""
     trained_on: tuple[str, ...] = ()
     """SHA-256 of their logs: no score there is worth anything; receivers of 0.3 have none."""
-    mixture: ReceiverMixture
+    mixture: receiver.ReceiverMixture
     timing: Timing = Timing()
 
     def knows(self, samples: RankSamples) -> bool:
@@ -158,8 +147,8 @@ class FittedReceiver:
             tied=int(one["tied"]),
             flights=tuple(str(name) for name in one["flights"]),
             trained_on=tuple(str(digest) for digest in one.get(KEY, ())),
-            mixture=ReceiverMixture(
-                members=tuple(Receiver.from_dict(m) for m in one["members"]),
+            mixture=receiver.ReceiverMixture(
+                members=tuple(receiver.Receiver.from_dict(m) for m in one["members"]),
                 decision_weight=np.asarray(one["decision_weight"], dtype=np.float64),
             ),
             timing=Timing(shift_s=float(one.get("shift_s", 0.0)), average_s=float(one.get("average_s", 0.0))),
@@ -262,7 +251,9 @@ def features_of(geometries: Sequence[Geometry], samples: RankSamples, timing: Ti
 
 
 def _features(power: FloatArray, samples: RankSamples, timing: Timing) -> FloatArray:
-    return stream_features(np.sqrt(time_means(power, samples.time_s, timing.shift_s, timing.average_s)))
+    return receiver.stream_features(
+        np.sqrt(receiver.time_means(power, samples.time_s, timing.shift_s, timing.average_s))
+    )
 
 
 def candidates(settings: RankFitSettings, samples: RankSamples) -> tuple[Geometry, ...]:
@@ -325,9 +316,9 @@ def fit_rank(flights: Sequence[FlightData], settings: RankFitSettings) -> RankCa
 def _sectors(one: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> ForecastScore:
     """Each sector forecast from the others of the same flight, with the geometries of the other flights."""
     good = one.part(one.rank >= 1)
-    groups = sector_groups(good.poses.position_m, good.tower_m)
+    groups = receiver.sector_groups(good.poses.position_m, good.tower_m)
     penalty = fitted.mixture.members[0].penalty
-    forecast = out_of_group(
+    forecast = receiver.out_of_group(
         features_of(fitted.geometries[:1], good, fitted.timing)[0], good.rank.astype(np.int64), groups, penalty
     )
     return score_forecast(good.rank, forecast, forecast.argmax(axis=1) + 1, constant)
@@ -361,7 +352,7 @@ class Tried:
         choice = first if timing.shift_s == timing.average_s == 0.0 else self.choose(flights, timing)
         kept = tuple(self.geometries[i] for i in choice.tied[: self.settings.members])
         whole = [self.samples[i] for i in flights]
-        mixture = fit_mixture(
+        mixture = receiver.fit_mixture(
             np.concatenate([features_of(kept, item, timing) for item in whole], axis=1),
             np.concatenate([item.rank for item in whole]),
             _groups(whole),
@@ -377,10 +368,10 @@ class Tried:
             timing=timing,
         )
 
-    def choose(self, flights: Sequence[int] | range, timing: Timing) -> FeatureChoice:
+    def choose(self, flights: Sequence[int] | range, timing: Timing) -> receiver.FeatureChoice:
         """Compare all geometries on sectors left out within the flights."""
         thin = [self.thin[i] for i in flights]
-        return choose_features(
+        return receiver.choose_features(
             self.features(flights, timing), np.concatenate([item.rank for item in thin]), _groups(thin)
         )
 
@@ -392,7 +383,7 @@ class Tried:
             Timing(
                 shift_s=shift_s,
                 average_s=average_s,
-                log_score=mixture_loss(
+                log_score=receiver.mixture_loss(
                     self.features(flights, Timing(shift_s=shift_s, average_s=average_s), which), rank, groups
                 ),
             )
@@ -411,4 +402,4 @@ class Tried:
 def _groups(samples: Sequence[RankSamples]) -> IntArray:
     """Sectors of directions; a sector is left out of all flights at once."""
     whole = np.concatenate([sample.poses.position_m for sample in samples])
-    return sector_groups(whole, samples[0].tower_m)
+    return receiver.sector_groups(whole, samples[0].tower_m)

@@ -24,7 +24,7 @@ from ...common.stages import Progress, Stages, share_of
 from ...common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray, db_from_power, finite_mean, wavelength_m
 from ...common.versions import utc_now, versions
 from ...compare.rank import singular_values
-from ...maps import export
+from ...maps import export, job
 from ...maps import grid as cells
 from ...maps.evaluate import (
     Predictor,
@@ -36,20 +36,6 @@ from ...maps.evaluate import (
 )
 from ...maps.grid import Grid
 from ...maps.interpolate import InverseDistance, Nearest, ServingTowerMean
-from ...maps.job import (
-    PAPER_KS,
-    PAPER_RANK_ALTITUDES_M,
-    PAPER_RSS_ALTITUDES_M,
-    RATIO_LIMIT_DB,
-    Antennas,
-    Evaluate,
-    Evaluation,
-    FoliageDifference,
-    MapResult,
-    foliage_difference,
-    layers_of,
-    map_job,
-)
 from ...maps.netcdf import write_netcdf
 from ...maps.store import TileStore
 from ...maps.study import HeldOutStudy, Study, held_out_study, interpolation_study, rank_fields
@@ -132,9 +118,9 @@ class MapSettings:
     foliage: tuple[str, ...] = FOLIAGE
     crown_reflections: bool = True
     spacing_m: float = cells.PAPER_SPACING_M
-    rss_altitudes_m: tuple[float, ...] = PAPER_RSS_ALTITUDES_M
-    rank_altitudes_m: tuple[float, ...] = PAPER_RANK_ALTITUDES_M
-    ks: tuple[float, ...] = PAPER_KS
+    rss_altitudes_m: tuple[float, ...] = job.PAPER_RSS_ALTITUDES_M
+    rank_altitudes_m: tuple[float, ...] = job.PAPER_RANK_ALTITUDES_M
+    ks: tuple[float, ...] = job.PAPER_KS
     carrier_hz: float = 3.4e9
     transmit_power_dbm: float = 40.0
     elements: int = 4
@@ -215,7 +201,7 @@ class SiteChannels:
         cast = settings.engine != "image"
         self.reach = Reach(site, budget, max_depth=settings.max_depth, every=cast, crowns=reflect)
         self.paths = self.paths_off_crowns = 0
-        self._kept: dict[tuple[str, bytes], Evaluation] = {}
+        self._kept: dict[tuple[str, bytes], job.Evaluation] = {}
         self._look_at(site)
 
     def _look_at(self, site: Site) -> None:
@@ -230,10 +216,10 @@ class SiteChannels:
         towers = dict.fromkeys(self.site.towers, array)
         return Link(self.settings.carrier_hz, towers, array, self.settings.transmit_power_dbm, uav_transmits=False)
 
-    def of(self, mode: str) -> Evaluate:
+    def of(self, mode: str) -> job.Evaluate:
         """The evaluation of one foliage mode."""
 
-        def evaluate(position_m: FloatArray, towers: tuple[str, ...]) -> Evaluation:
+        def evaluate(position_m: FloatArray, towers: tuple[str, ...]) -> job.Evaluation:
             if towers != self.names:
                 raise ValueError(f"towers {towers} are not those of the site")
             chunk = position_m.tobytes()
@@ -254,27 +240,27 @@ class SiteChannels:
         maps = self._maps(grid, progress)
         return TileDone(maps=maps, paths=self.paths, paths_off_crowns=self.paths_off_crowns)
 
-    def _maps(self, grid: Grid, progress: Callable[[float], None] | None = None) -> dict[str, MapResult]:
+    def _maps(self, grid: Grid, progress: Callable[[float], None] | None = None) -> dict[str, job.MapResult]:
         s = self.settings
         towers = {name: tower.position_m for name, tower in self.reach.site.towers.items()}
         return {
-            mode: map_job(
+            mode: job.map_job(
                 grid, towers, self.of(mode), rss_altitudes_m=s.rss_altitudes_m, rank_altitudes_m=s.rank_altitudes_m,
                 ks=s.ks, progress=progress if mode == s.foliage[0] else None,
             )
             for mode in s.foliage
         }  # fmt: skip
 
-    def empty(self, grid: Grid) -> dict[str, MapResult]:
+    def empty(self, grid: Grid) -> dict[str, job.MapResult]:
         """Maps by foliage mode without any coverage."""
         self._look_at(replace(self.reach.site, towers={}))
         return self._maps(grid)
 
-    def _all_modes(self, position_m: FloatArray) -> dict[str, Evaluation]:
+    def _all_modes(self, position_m: FloatArray) -> dict[str, job.Evaluation]:
         s, n = self.settings, len(position_m)
         if not self.site.towers:
             none = np.empty((n, 0))
-            nothing = Evaluation(none, none, none, np.empty((n, 0, s.elements)))
+            nothing = job.Evaluation(none, none, none, np.empty((n, 0, s.elements)))
             return dict.fromkeys(s.foliage, self._for_all_towers(nothing))
         poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (n, 3, 3)))
         search = Search(s.engine, max_depth=s.max_depth, samples=s.samples)
@@ -294,10 +280,10 @@ class SiteChannels:
             covered = np.isfinite(level)
             spread = np.where(covered, level_sd_db(many), np.nan)
             sigma = np.where(covered[..., None], singular_values(many), 0.0)
-            result[mode] = self._for_all_towers(Evaluation(self._rss_dbm(one), level, spread, sigma))
+            result[mode] = self._for_all_towers(job.Evaluation(self._rss_dbm(one), level, spread, sigma))
         return result
 
-    def _for_all_towers(self, some: Evaluation) -> Evaluation:
+    def _for_all_towers(self, some: job.Evaluation) -> job.Evaluation:
         """The evaluation of the towers that reach a tile, with the others out of coverage."""
         if len(self.site.towers) == len(self.names):
             return some
@@ -309,7 +295,7 @@ class SiteChannels:
             return every
 
         siso, mimo, spread = (placed(level) for level in some.levels)
-        return Evaluation(siso, mimo, spread, placed(some.singular_values))
+        return job.Evaluation(siso, mimo, spread, placed(some.singular_values))
 
     def _with_bounces(
         self, mirrors: Crowns, poses: Poses, siso: ComplexArray, mimo: ComplexArray
@@ -376,7 +362,7 @@ class TileOrder:
 class TileDone:
     """Answer of a worker: maps by foliage mode, and how many paths there were."""
 
-    maps: Mapping[str, MapResult]
+    maps: Mapping[str, job.MapResult]
     paths: int
     paths_off_crowns: int
 
@@ -418,7 +404,7 @@ class MapOutcome:
 
     site: Site
     settings: MapSettings
-    maps: dict[str, MapResult] = field(default_factory=dict)
+    maps: dict[str, job.MapResult] = field(default_factory=dict)
     studies: dict[str, Study] = field(default_factory=dict)
     held_out: HeldOutStudy | None = None
     peers: dict[str, dict[str, Score]] = field(default_factory=dict)
@@ -432,11 +418,11 @@ class MapOutcome:
     corrected: CorrectedMaps | None = None
 
     @property
-    def shown(self) -> MapResult:
+    def shown(self) -> job.MapResult:
         """The maps of the paper's mode."""
         return self.maps[self.settings.shown]
 
-    def ordered(self) -> list[tuple[str, MapResult]]:
+    def ordered(self) -> list[tuple[str, job.MapResult]]:
         """Modes and maps, the paper's mode first."""
         return sorted(self.maps.items(), key=lambda item: -FOLIAGE.index(item[0]))
 
@@ -492,7 +478,7 @@ def make_maps(
             book = TileStore(store, tiling, job_of(name, settings), force=force)
             _write_tiles(outcome, book, channels, partial(crew.run, evaluate), order, stages.progress)
             return outcome
-        parts: dict[int, Mapping[str, MapResult]] = {}
+        parts: dict[int, Mapping[str, job.MapResult]] = {}
 
         def done(number: int, result: TileDone | Lost) -> None:
             if isinstance(result, Lost):
@@ -593,7 +579,7 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
             outcome.learning[name] = learning_curve(peer, result.grid.points_m, rank, sizes, seed=s.seed)
 
 
-def wide_peers(result: MapResult, neighbours: int) -> dict[str, Predictor]:
+def wide_peers(result: job.MapResult, neighbours: int) -> dict[str, Predictor]:
     """Interpolators that reach as far as they must, to stand beside Kriging where samples are far."""
     return {
         "nearest": Nearest(np.inf),
@@ -673,8 +659,8 @@ def maps_record(
     )
 
 
-def _rss_maps(result: MapResult, mode: str) -> Iterator[page.RssMap]:
-    kinds: tuple[Antennas, ...] = ("mimo", "siso")
+def _rss_maps(result: job.MapResult, mode: str) -> Iterator[page.RssMap]:
+    kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
     for antennas in kinds:
         for row, height in enumerate(result.rss_altitudes_m):
             for tower in (*result.tower_names, None):
@@ -689,7 +675,7 @@ def _rss_maps(result: MapResult, mode: str) -> Iterator[page.RssMap]:
                 )
 
 
-def _rank_maps(result: MapResult, mode: str, tower: str | None = None) -> Iterator[page.RankMap]:
+def _rank_maps(result: job.MapResult, mode: str, tower: str | None = None) -> Iterator[page.RankMap]:
     """Rank to the serving tower, or to one."""
     ranks, shares = result.ranks(tower), result.rank_shares(tower)
     for (column, k), (row, height) in itertools.product(enumerate(result.ks), enumerate(result.rank_altitudes_m)):
@@ -713,7 +699,7 @@ def _rank_versions(outcome: MapOutcome) -> Iterator[page.RankMap]:
 
 def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
     """Layers of the linked map alone: how many towers cover a position, at what share of heights, which one serves."""
-    kinds: tuple[Antennas, ...] = ("mimo", "siso")
+    kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
     for mode, result in outcome.ordered():
         raster = result.grid.raster
         for antennas in kinds:
@@ -744,11 +730,11 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
     raster = result.grid.raster
     for name, label, values in (
         ("Singular-value spread", "σ1/σ2 [dB]", result.spread_db),
-        ("Condition number", f"σ1/σ{s.elements} [dB], at most {RATIO_LIMIT_DB:g}", result.condition_db),
+        ("Condition number", f"σ1/σ{s.elements} [dB], at most {job.RATIO_LIMIT_DB:g}", result.condition_db),
     ):
         joint = values[..., result.serving, np.arange(len(result.grid))]
         for row, height in enumerate(result.rank_altitudes_m):
-            shown = raster(np.minimum(joint[row], RATIO_LIMIT_DB))
+            shown = raster(np.minimum(joint[row], job.RATIO_LIMIT_DB))
             yield page.MapLayer(
                 quantity=f"{name}, foliage {s.shown}",
                 label=label,
@@ -772,10 +758,12 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
                 )  # fmt: skip
 
 
-def _foliage_changes(outcome: MapOutcome) -> Iterator[tuple[str, MapResult, FoliageDifference]]:
+def _foliage_changes(outcome: MapOutcome) -> Iterator[tuple[str, job.MapResult, job.FoliageDifference]]:
     """Effect of each foliage mode, where a map without foliage is there to compare with."""
     if (clear := outcome.maps.get("none")) is not None:
-        yield from ((mode, maps, foliage_difference(clear, maps)) for mode, maps in outcome.ordered() if mode != "none")
+        yield from (
+            (mode, maps, job.foliage_difference(clear, maps)) for mode, maps in outcome.ordered() if mode != "none"
+        )
 
 
 def _correlation_panels(outcome: MapOutcome) -> Iterator[page.Correlation]:
@@ -926,13 +914,13 @@ def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:
     """Layers of all modes, with the mode in their names; the serving tower once."""
     result: list[cells.Layer] = []
     for mode, maps in outcome.ordered():
-        serving, *others = layers_of(maps, towers_too=towers_too)
+        serving, *others = job.layers_of(maps, towers_too=towers_too)
         result += [] if result else [serving]
         for other in others:
             # a hundredth of a dB is more than the site's data hold, and a third of the bytes
             values = other.values if other.classes else np.round(other.values, 2)
             if other.name.startswith(RATIOS):
-                values = np.minimum(values, RATIO_LIMIT_DB)
+                values = np.minimum(values, job.RATIO_LIMIT_DB)
             title = f"{other.title}, foliage {mode}"
             result.append(replace(other, name=f"{other.name}_{mode}", title=title, values=values))
     return result

@@ -26,20 +26,10 @@ from ...flight.replay import Replayed, attitude_rotation, part_of
 from ...flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ...logs.ingest import IngestedFile
 from ...propagation.arrays import Poses
+from ...propagation.check import reference
 from ...propagation.check.audit import Audit, Second, audit
 from ...propagation.check.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
 from ...propagation.check.raw import gain_table
-from ...propagation.check.reference import (
-    C_MPS,
-    PATTERNS,
-    ExpectedArray,
-    ExpectedLink,
-    ExpectedLoss,
-    Pattern,
-    aircraft,
-    layout_positions,
-    turned,
-)
 from ...propagation.drivers.moving import site_with_tower_at
 from ...propagation.options import Field, Run, Search
 from ...propagation.search.sionna import free_memory
@@ -223,9 +213,9 @@ def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected
     ]
 
 
-def expected_loss(rt: RtSettings) -> ExpectedLoss:
+def expected_loss(rt: RtSettings) -> reference.ExpectedLoss:
     """Foliage and reflection loss as ``rt`` has them."""
-    return ExpectedLoss(
+    return reference.ExpectedLoss(
         model=rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
         gamma_db_per_m=rt.advanced.gamma_db_per_m,
         maximum_db=rt.advanced.maximum_loss_db,
@@ -235,10 +225,10 @@ def expected_loss(rt: RtSettings) -> ExpectedLoss:
     )
 
 
-def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -> ExpectedLink:
+def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -> reference.ExpectedLink:
     """A link of flight.yaml."""
-    wavelength = C_MPS / settings.carrier_hz
-    return ExpectedLink(
+    wavelength = reference.C_MPS / settings.carrier_hz
+    return reference.ExpectedLink(
         **named(settings, "carrier_hz transmit_power_dbm uav_transmits"),
         towers={name: expected_array(settings.towers.get(name, settings.tower), wavelength, folder) for name in towers},
         uav=expected_array(settings.uav, wavelength, folder),
@@ -253,31 +243,31 @@ def _floor_dbm(settings: LinkSettings) -> float:
     return 10 * math.log10(1.380649e-23 * 290 * (settings.bandwidth_hz or 1.0) * 1e3) + (settings.noise_figure_db or 0)
 
 
-def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> ExpectedArray:
+def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> reference.ExpectedArray:
     """An array of flight.yaml, laid out a second time."""
-    positions = layout_positions(settings.layout, wavelength, settings.elements, settings.positions_m)
+    positions = reference.layout_positions(settings.layout, wavelength, settings.elements, settings.positions_m)
     slants = settings.slant_deg if isinstance(settings.slant_deg, list) else [settings.slant_deg]
     antennas = settings.antennas or [settings.antenna]
 
     def per_element(values: Sequence[object]) -> list[object]:
         return list(values) * len(positions) if len(values) == 1 else list(values)
 
-    return ExpectedArray(
+    return reference.ExpectedArray(
         positions_m=positions,
         slants_deg=tuple(float(x) for x in per_element(slants)),  # type: ignore[arg-type]
-        patterns=tuple(_pattern(a, folder, C_MPS / wavelength) for a in per_element(antennas)),  # type: ignore[arg-type]
-        mount=turned(settings.yaw_deg, settings.pitch_deg, settings.roll_deg),
+        patterns=tuple(_pattern(a, folder, reference.C_MPS / wavelength) for a in per_element(antennas)),  # type: ignore[arg-type]
+        mount=reference.turned(settings.yaw_deg, settings.pitch_deg, settings.roll_deg),
     )
 
 
-def _pattern(settings: AntennaSettings, folder: Path, carrier_hz: float) -> Pattern:
+def _pattern(settings: AntennaSettings, folder: Path, carrier_hz: float) -> reference.Pattern:
     """A formula or a table of gain a second time; other antenna files are taken as the replay reads them."""
-    if settings.model in PATTERNS:
-        return PATTERNS[settings.model]
+    if settings.model in reference.PATTERNS:
+        return reference.PATTERNS[settings.model]
     if settings.model == "sphere":
         content = (folder / str(settings.file)).read_bytes()
         return gain_table(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
-    pattern: Pattern = scalar_pattern(load_pattern(settings, folder, carrier_hz))
+    pattern: reference.Pattern = scalar_pattern(load_pattern(settings, folder, carrier_hz))
     return pattern
 
 
@@ -301,7 +291,7 @@ def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudi
     worst = 0.0
     for index in used:
         roll, pitch, yaw = (float(x) for x in angles[rows[index]])
-        expected = np.array(aircraft(*((roll, pitch) if mode == "logged" else (0.0, 0.0)), yaw))
+        expected = np.array(reference.aircraft(*((roll, pitch) if mode == "logged" else (0.0, 0.0)), yaw))
         worst = max(worst, float(np.abs(expected - rotation[index]).max()))
     failures = (
         (f"rotations differ from the logged attitude by {worst:.2g} rad",) if worst > ATTITUDE_TOLERANCE_RAD else ()

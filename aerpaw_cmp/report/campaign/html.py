@@ -24,17 +24,7 @@ from ..html import by_section, rendered
 from ..made import about
 from ..words import pretty
 from . import figures as campaign_figures
-from .words import (
-    FEW,
-    beside_baselines,
-    cause,
-    headline,
-    mean_rmse,
-    rss_flights,
-    verdict,
-    warnings,
-    worst_flights,
-)
+from . import words
 
 MANY = 200
 """Warnings that stand on the page at all."""
@@ -66,8 +56,8 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             {"flight": name, "ok": name not in failed, "synthetic": name in data.synthetic} for name in data.flights
         ],
         "failures": _entries(data.failures, ("traceback",)),
-        "mean_rmse_db": mean_rmse(data),
-        "likely_cause": fields_of(cause(data)),
+        "mean_rmse_db": words.mean_rmse(data),
+        "likely_cause": fields_of(words.cause(data)),
         "rss": _entries(data.rss, (*ARRAYS, "difference")),
         "calibration": {"per": data.calibration, "groups": data.pooled},
         "repeatability": {
@@ -141,23 +131,23 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         "campaign",
         data=data,
         sections=by_section(pictures),
-        mean_rmse=mean_rmse(data),
+        mean_rmse=words.mean_rmse(data),
         beside=repeatability_beside(data),
         halves=halves(data),
-        headline=headline(data),
-        verdict=verdict(data),
-        beside_baselines=beside_baselines,
-        warnings=warnings(data),
+        headline=words.headline(data),
+        verdict=words.verdict(data),
+        beside_baselines=words.beside_baselines,
+        warnings=words.warnings(data),
         baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
-        rss_flights=rss_flights(data),
+        rss_flights=words.rss_flights(data),
         pretty=pretty,
         files=files,
         season=data.season.over_all(),
-        worst=worst_flights(data),
+        worst=words.worst_flights(data),
         worst_rows=sorted(data.rss, key=lambda r: -np.nan_to_num(r.rmse_db, nan=-1.0))[:ROWS_SHOWN]
         if len(data.rss) > ROWS_SHOWN
         else data.rss,
-        few=FEW,
+        few=words.FEW,
         many=MANY,
         few_flights=FEW_FLIGHTS,
         rows_shown=ROWS_SHOWN,

@@ -4,7 +4,8 @@ Dataset 12 holds ``mpower1 mpower2`` (channels USRP1, USRP2), AFAR's exp-288 fil
 ``mX mY mZ`` (longitude, latitude, height above take-off), ``mRoll mPitch mYaw`` in degrees and two clocks:
 ``timestamp_power_for_csv`` (text, local) and ``timestamp_power``, **local wall clock stored as if it were UTC**.
 The LTE flights hold ``RSRP RSRP2 RSRQ RSSI`` beside ``mX mY mZ``, with ``timestamp_for_csv`` (text, local) and
-``timestamp_meas``, which **is UTC**: it is taken. Their levels are dB re full scale (the authors take 98 dB off for
+``timestamp_meas``, which **is UTC**: it is taken. Where ``succes`` is 0 no cell was decoded: ``RSRP2`` then says -60,
+the others -inf. Their levels are dB re full scale (the authors take 98 dB off for
 dBm). Their authors' processed files (``lat_s lon_s height_s RSRP_s ori_s``; ``lat_all lon_all h_all power_all
 ori_all``) have no clock: rows are counted at the rate of the raw flights, from 1970. MATLAB 7.3 files (HDF5) are
 read as the older ones are. The lines of the account are rows.
@@ -65,7 +66,7 @@ LEVELS = {
 KPIS = {"RSRQ": ("RSRQ", "dB")}
 _TEXTS = ("timestamp_power_for_csv", "timestamp_for_csv")
 _EPOCHS = ("timestamp_power", "timestamp_meas")
-_UTC = "timestamp_meas"
+_UTC, _DECODED = "timestamp_meas", "succes"
 _PROCESSED = {"RSRP_s": 0.1, "power_all": 0.03276}
 """Levels of files without a clock, and the seconds between rows of the flights that they were made of."""
 _NAMES = {*TELEMETRY, *LEVELS, *KPIS, *_TEXTS, *_EPOCHS, "mSpeed"}
@@ -124,7 +125,7 @@ def sniff(head: bytes) -> bool:
 
 def _load(data: bytes) -> dict[str, AnyArray]:
     """Variables of a flight as flat arrays, in the file's order of rows."""
-    return {name: np.asarray(values).ravel() for name, values in read_arrays(data, _NAMES).items()}
+    return {name: np.asarray(values).ravel() for name, values in read_arrays(data, {*_NAMES, _DECODED}).items()}
 
 
 def _numeric(values: AnyArray, name: str) -> FloatArray:
@@ -244,9 +245,10 @@ def _track(rows: _rows.Rows, table: dict[str, AnyArray], clock: str) -> Stream |
 
 
 def _measured(rows: _rows.Rows, table: dict[str, AnyArray]) -> Iterator[Stream | None]:
+    silent = _numeric(table[_DECODED], _DECODED) == 0 if _DECODED in table else np.zeros(len(rows), dtype=bool)
     for name, channel in LEVELS.items():
         if name in table:
-            level, flag = rows.level(_numeric(table[name], name))
+            level, flag = rows.level(np.where(silent, -np.inf, _numeric(table[name], name)))
             unit = (
                 "dB" if name == "mquality" else rows.options.unit or ("dBm" if name == "RSRP_s" else "dB re full scale")
             )

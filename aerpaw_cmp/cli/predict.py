@@ -49,7 +49,7 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Predict level and rank with error bars where nobody has flown yet."""
-    from ..jobs.prediction.predict_run import run_predict
+    from ..jobs.prediction.predict import run_predict
     from ..jobs.prediction.where import Asked
 
     outcome = run_predict(

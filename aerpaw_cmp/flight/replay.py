@@ -258,7 +258,8 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
 def _along(data: FlightData, series: RssSeries, instants: Times, step_s: float) -> Along:
     """Predictors of the level of a series along the telemetry; the replay has at most one reflection."""
     link = series.link.build([series.tower], data.folder)
-    parts = [_levels_along(data, link, series.tower, part) for part in _in_blocks(instants)]
+    blocks = np.array_split(instants, max(1, -(-len(instants) // BLOCK)))  # of about one size
+    parts = [_levels_along(data, link, series.tower, part) for part in blocks]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     distance, directions = columns.pop("distance_m"), columns.pop("directions")
     if learned_here(data, series, link):  # antennas that were learned from this very log know its lag
@@ -286,11 +287,6 @@ def _levels_along(data: FlightData, link: Link, tower: str, instants: Times) -> 
         "distance_m": distance,
         "directions": np.column_stack([unit, body]),
     }
-
-
-def _in_blocks(times: Any) -> list[Any]:
-    """Instants (n,) in as few parts of about one size as :data:`BLOCK` allows, one at least."""
-    return np.array_split(times, max(1, -(-len(times) // BLOCK)))
 
 
 def _clock_levels(data: FlightData, series: RssSeries) -> FloatArray:

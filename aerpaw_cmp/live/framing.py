@@ -198,14 +198,10 @@ class _Open:
     too_many: int = 0
 
 
-def _normal(text: str) -> str:
-    return text.replace(" ", "")
-
-
 def _matches(text: str, prefixes: tuple[str, ...] | None) -> bool:
     if prefixes is None:
         return not is_unsolicited(text)
-    return _normal(text).startswith(prefixes)
+    return text.replace(" ", "").startswith(prefixes)
 
 
 class Framer:

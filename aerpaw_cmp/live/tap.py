@@ -207,42 +207,30 @@ class Tap:
         self._flush_noise()
         self._leave_framer()
         duration_s = (self._clock.mono_ns() - self._start_ns) / 1e9
-        answers = {name: dict(counts) for name, counts in self._answers.items()}
-        rates = {name: round(counts["ok"] / max(duration_s, 1e-9), 4) for name, counts in self._answers.items()}
-        record = {
-            "kind": "end",
+        said: dict[str, Any] = {
             "reason": self._stop.reason or "error",
-            "answers": answers,
-            "rates_hz": rates,
+            "answers": {name: dict(counts) for name, counts in self._answers.items()},
+            "rates_hz": {n: round(counts["ok"] / max(duration_s, 1e-9), 4) for n, counts in self._answers.items()},
             "missed": dict(self._schedule.missed),
             "gaps": self._gaps,
             "gap_s": self._gap_ns / 1e9,
             "duration_s": duration_s,
             "redacted": self._redactor.count,
-            "received_bytes": self._received,
-            "csi_restored": restored,
-            **self._now(),
         }
         if self._log_open:
-            self._append(record)
+            received = {"received_bytes": self._received, "csi_restored": restored}
+            self._append({"kind": "end", **said, **received, **self._now()})
             self._log.close()
             for text in self._log.messages():
                 self._say(text)
         if self._notifier is not None:
             self._notifier.close()
         return TapSummary(
-            reason=record["reason"],
+            **said,
             exit_code=1 if self._stop.reason == "no_csi" or self._log.lost else 0,
             segments=self._log.paths,
-            answers=answers,
-            rates_hz=rates,
-            missed=record["missed"],
-            gaps=self._gaps,
-            gap_s=record["gap_s"],
-            duration_s=duration_s,
             records=self._log.records,
             lost_records=self._log.lost,
-            redacted=self._redactor.count,
             alarms=self._alarms,
         )
 

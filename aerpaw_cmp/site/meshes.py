@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from shapely.geometry import Polygon
 
 from ..common.units import FloatArray, IntArray
 from .materials import CROWN, material
@@ -64,7 +63,8 @@ def building_mesh(building: Building) -> tuple[FloatArray, IntArray]:
         walls = np.concatenate([np.stack([a, b, b + n], axis=1), np.stack([a, b + n, a + n], axis=1)])
         triangles.append(walls + count)
         count += 2 * n
-    roof = np.stack([np.asarray(t.exterior.coords)[:3, :2] for t in _triangulated(footprint)])
+    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(footprint))
+    roof = np.stack([np.asarray(part.exterior.coords)[:3, :2] for part in parts])
     flat = roof.reshape(-1, 2)
     edge, other_edge = roof[:, 1] - roof[:, 0], roof[:, 2] - roof[:, 0]
     turn = edge[:, 0] * other_edge[:, 1] < edge[:, 1] * other_edge[:, 0]
@@ -73,10 +73,6 @@ def building_mesh(building: Building) -> tuple[FloatArray, IntArray]:
     vertices.append(np.column_stack([flat, np.full(len(flat), high)]))
     triangles.append(order + count)
     return np.concatenate(vertices), np.concatenate(triangles).astype(np.int64)
-
-
-def _triangulated(footprint: Polygon) -> list[Polygon]:
-    return list(shapely.get_parts(shapely.constrained_delaunay_triangles(footprint)))
 
 
 def _bodies(

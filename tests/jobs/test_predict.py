@@ -21,7 +21,7 @@ from aerpaw_cmp.jobs.learning.calibrate_rank import rank_samples
 from aerpaw_cmp.jobs.prediction import corrected_map
 from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.against import score_against
-from aerpaw_cmp.jobs.prediction.predict_run import write_maps
+from aerpaw_cmp.jobs.prediction.predict import write_maps
 from aerpaw_cmp.jobs.prediction.sources import named_flights
 from aerpaw_cmp.jobs.prediction.where import Asked, Targets, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element

@@ -6,7 +6,7 @@ What the script shows of a layer (share covered, median, shares of ranks) it com
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -125,7 +125,8 @@ def _is_joint(layer: MapLayer) -> bool:
 def _packed(data: MapsData, layers: Sequence[MapLayer], stride: int) -> dict[str, Any]:
     arrays = PackedArrays()
     east, north = data.east_m[::stride], data.north_m[::stride]
-    quantities = [_quantity(name, members, arrays, stride) for name, members in _by_quantity(layers).items()]
+    by_quantity = grouped(layers, lambda one: one.quantity)
+    quantities = [_quantity(name, members, arrays, stride) for name, members in by_quantity.items()]
     return {
         "east": arrays.add(east, "f8"),
         "north": arrays.add(north, "f8"),
@@ -140,10 +141,6 @@ def _packed(data: MapsData, layers: Sequence[MapLayer], stride: int) -> dict[str
         "ramps": {"level": ramp("viridis"), "difference": ramp("RdBu_r")},
         "packed": arrays.content(),
     }  # fmt: skip
-
-
-def _by_quantity(layers: Iterable[MapLayer]) -> dict[str, list[MapLayer]]:
-    return grouped(layers, lambda one: one.quantity)
 
 
 def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, stride: int) -> dict[str, Any]:

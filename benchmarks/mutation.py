@@ -77,7 +77,7 @@ _OVER_EDGES = (
     f"{_EDGES}the_border_of_a_sheet_is_a_half_plane", f"{_EDGES}a_link_turned_round_is_the_same",
     f"{_EDGES}a_box_of_triangles_diffracts_as_a_prism",
     f"{_EDGES}compiled_search_and_field_are_those_of_numpy",
-    f"{_EDGES}paths_of_every_kind_by_force[2-all]",
+    f"{_EDGES}paths_of_every_kind_by_force[2-all]", "tests/propagation/test_roof.py",
 )  # fmt: skip
 COMPILED = {
     "aerpaw_cmp/maps/triangle_kernels.py": (

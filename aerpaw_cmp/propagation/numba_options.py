@@ -36,6 +36,6 @@ def part(function: Callable[..., Any]) -> Any:
     return kernel(function, **_PART)
 
 
-def law(function: Callable[..., Any]) -> None:
-    """Let kernels call a law of plain Python, which NumPy evaluates as it is."""
-    register_jitable(**_MATHS, forceinline=True)(function)
+def law(function: Callable[..., Any], *, inline: bool = True) -> None:
+    """Let kernels call a law of plain Python, which NumPy evaluates as it is; in place of the call, or by a call."""
+    register_jitable(**_MATHS, forceinline=inline)(function)

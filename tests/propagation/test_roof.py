@@ -119,7 +119,7 @@ def over_roof(width: float, source: FloatArray, target: FloatArray, face: tuple[
     return field
 
 
-@pytest.mark.parametrize(("face", "most_db"), [(CONCRETE, (2.5, 1.2)), (CONDUCTOR, (3.3, 2.3))])
+@pytest.mark.parametrize(("face", "most_db"), [(CONCRETE, (0.8, 0.9)), (CONDUCTOR, (0.5, 0.7))])
 def test_two_edges_of_a_roof_by_the_boundary_integral(
     face: tuple[float, float, float], most_db: tuple[float, float]
 ) -> None:
@@ -133,4 +133,5 @@ def test_two_edges_of_a_roof_by_the_boundary_integral(
         exact = behind_box((10.0, 28.0), source, targets, admittance)
         off = 20 * np.log10(np.abs(ours[:, pole] / exact))
         assert np.abs(off).max() < most_db[pole], off
-        assert abs(off[-1]) < 0.5, off
+        assert abs(off[-1]) < 0.25, off
+        assert abs(off[4] - off[3]) < 0.05, "no step in the plane of the roof"

@@ -31,12 +31,14 @@ EACH = 6 * LANES
 """Rows of an element: its field along beta and phi, its place along the edge and its distance from it."""
 
 for _one in (
-    dyads.arctangent, wedge.transition, wedge.edge_term, wedge.both_ways, wedge.obliquity, wedge.matrix,
-    wedge.at_face, wedge.along_face, wedge.ground_wave, edges.dot, edges.unit, edges.mirrored,
+    dyads.arctangent, wedge.transition, wedge.pole, wedge.edge_term, wedge.obliquity, wedge.matrix, wedge.coupled,
+    wedge.of_wave, wedge.along_face, wedge.ground_wave, edges.dot, edges.distance, edges.unit, edges.mirrored,
     edges.round_edge, edges.element_place, edges.angle_round, edges.end_parts, edges.after_mirror,
     edges.element_parts, edges.into_face, edges.over_one, edges.over_two,
 ):  # fmt: skip
     law(_one)
+for _long in (wedge.sector, wedge.quadrant, wedge.at_face):  # called some times each
+    law(_long, inline=False)
 
 
 class Rows(NamedTuple):

@@ -23,12 +23,9 @@ from .dyads import Number, Rotation, Vector
 from .fresnel import FaceMaterials, coefficients
 from .geometry import parts_of, pattern_fields, plain, rows_of
 from .sum import parts_between_poses
-from .wedge import along_face, at_face, wedge
+from .wedge import along_face, at_face, coupled, wedge
 
 PATHS_PER_CHUNK = 4096
-
-STEP_RAD = 1e-6
-"""Step of the derivative of a diffraction matrix at a face: a shadow boundary within it would be taken for a slope."""
 
 
 class Tables(NamedTuple):
@@ -269,6 +266,11 @@ def dot(a: Vector, b: Vector) -> Number:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def distance(start: Vector, end: Vector) -> Number:
+    """Distance between two points."""
+    return np.sqrt((end[0] - start[0]) ** 2 + (end[1] - start[1]) ** 2 + (end[2] - start[2]) ** 2)
+
+
 def unit(start: Vector, end: Vector) -> Vector:
     """Unit vector from one point to another."""
     x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
@@ -419,8 +421,8 @@ def over_two(
 ) -> Any:  # fmt: skip
     """A path over two edges of one plane face, along that face between them.
 
-    Sources: Luebbers, IEEE Trans. Antennas Propag. 37 (1989) 206, doi 10.1109/8.18707 (slope term); Andersen, IEEE
-    Trans. Antennas Propag. 45 (1997) 654, doi 10.1109/8.564091 (edges in a row).
+    Sources: Luebbers, IEEE Trans. Antennas Propag. 37 (1989) 206, doi 10.1109/8.18707 (slope term); Albani, Capolino,
+    Maci and Tiberio, IEEE AP-S Symposium 1999, vol. 4, "Double diffraction at a pair of coplanar skew wedges".
 
     Parameters
     ----------
@@ -446,11 +448,12 @@ def over_two(
     Notes
     -----
     ``(S_1 (1 - W) + X H_1) (S_2 (1 - W) + X H_2) / (2 j k s) / k / sqrt(s_0 s s_2 (s_0 + s + s_2))`` for each
-    polarisation, with :func:`at_face` (S and H by the height of the ray over the face) and :func:`along_face`. On a
-    perfect conductor that is half of two hard wedges, ``2 H_1 H_2``; on a face where waves cancel the slope carries on.
+    polarisation, with :func:`at_face` (S and H by the height of the ray over the face), :func:`along_face` and, for
+    the products, :func:`coupled`. On a perfect conductor that is half of two hard wedges, ``2 H_1 H_2``; on a face
+    where waves cancel the slope carries on.
     """
     way, (shared_1, shared_2) = unit(point_1, point_2), shared
-    gap = np.sqrt((point_2[0] - point_1[0]) ** 2 + (point_2[1] - point_1[1]) ** 2 + (point_2[2] - point_1[2]) ** 2)
+    gap = distance(point_1, point_2)
     here, there = round_edge(source, edge_1), round_edge(target, edge_2)
     near, far = np.sqrt(here[1] ** 2 + here[2] ** 2), np.sqrt(there[1] ** 2 + there[2] ** 2)
     cos_1, cos_2 = dot(way, edge_1[1]), dot(way, edge_2[1])
@@ -461,23 +464,24 @@ def over_two(
         dyads.select(on_n, edge_1[7][0], edge_1[6][0]), dyads.select(on_n, edge_1[7][1], edge_1[6][1]),
         dyads.select(on_n, edge_1[7][2], edge_1[6][2]),
     )  # fmt: skip
-    te_1, tm_1, slope_1 = at_face(
-        angle_round(here), shared_1 * np.pi * edge_1[5], (1.0 - 2.0 * shared_1) * STEP_RAD, edge_1[5],
-        wave_number * first * gap * sin_1 * sin_1 / (first + gap), sin_1, material,
+    one = at_face(
+        np.abs(shared_1 * np.pi * edge_1[5] - angle_round(here)), edge_1[5],
+        wave_number * first * gap * sin_1 * sin_1 / (first + gap), sin_1, first / distance(source, point_2), material,
     )  # fmt: skip
-    te_2, tm_2, slope_2 = at_face(
-        angle_round(there), shared_2 * np.pi * edge_2[5], (1.0 - 2.0 * shared_2) * STEP_RAD, edge_2[5],
-        wave_number * last * gap * sin_2 * sin_2 / (last + gap), sin_2, material,
+    two = at_face(
+        np.abs(shared_2 * np.pi * edge_2[5] - angle_round(there)), edge_2[5],
+        wave_number * last * gap * sin_2 * sin_2 / (last + gap), sin_2, last / distance(point_1, target), material,
     )  # fmt: skip
     # matrices lack one factor 1 / sine each, bases another, and the height of a ray over the face gains one
     spread = 1.0 / (2.0 * wave_number**2 * (sin_1 * sin_2) ** 2 * np.sqrt(first * gap * last))
     # the bases of both edges lie in the face and across it: they differ by a sign
     spread = dyads.select(dot(edge_1[1], edge_2[1]) - cos_1 * cos_2 < 0.0, -spread, spread) / (2j * wave_number * gap)
     te, tm = along_face(wave_number * gap, material)
-    slope_1, slope_2, whole = slope_1 / sin_1, slope_2 / sin_2, 4.0 * wave_number * gap
-    soft_te, soft_tm = 1.0 - np.abs(te * te) / whole, 1.0 - np.abs(tm * tm) / whole
-    beta = spread * (slope_1 * soft_te + te * te_1) * (slope_2 * soft_te + te * te_2)
-    phi = spread * (slope_1 * soft_tm + tm * tm_1) * (slope_2 * soft_tm + tm * tm_2)
+    coupling, whole = np.sqrt(first * last / ((first + gap) * (gap + last))), 4j * wave_number * gap
+    soft, (mixed_te, hard_te), (mixed_tm, hard_tm) = coupled(one, two, coupling)
+    soft_te, soft_tm = 1.0 - te * te / whole, 1.0 - tm * tm / whole
+    beta = spread * (soft_te * (soft_te * soft + te * mixed_te) + te * te * hard_te)
+    phi = spread * (soft_tm * (soft_tm * soft + tm * mixed_tm) + tm * tm * hard_tm)
     joined = beta, 0.0 * beta, 0.0 * phi, phi
     inward_1, inward_2 = into_face(edge_1, shared_1), into_face(edge_2, shared_2)
     apart = edge_2[0][0] - edge_1[0][0], edge_2[0][1] - edge_1[0][1], edge_2[0][2] - edge_1[0][2]

@@ -9,6 +9,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.jobs import bench
 from aerpaw_cmp.machine import llvm
+from tests.geojson import collection, feature, polygon
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "sample_logs"
@@ -65,12 +66,9 @@ def test_doctor_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
 def test_site_import_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     barn = [[-78.6975, 35.7280], [-78.6972, 35.7280], [-78.6972, 35.7282], [-78.6975, 35.7282], [-78.6975, 35.7280]]
     wood = [[-78.6990, 35.7290], [-78.6980, 35.7290], [-78.6980, 35.7298], [-78.6990, 35.7298], [-78.6990, 35.7290]]
-    features = [
-        {"type": "Feature", "properties": {"building": "yes", "height": "7"}, "geometry": polygon(barn)},
-        {"type": "Feature", "properties": {"natural": "wood"}, "geometry": polygon(wood)},
-    ]
+    features = feature(polygon(barn), building="yes", height="7"), feature(polygon(wood), natural="wood")
     source = tmp_path / "map.geojson"
-    source.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    source.write_text(json.dumps(collection(*features)))
     site = tmp_path / "site.yaml"
     out_of(capsys, "site", "import", source, "-o", site)
     from aerpaw_cmp.site.siteyaml import load_site
@@ -97,10 +95,6 @@ def test_site_show_takes_the_flights_own_site(tmp_path: Path, capsys: pytest.Cap
     )
     other.write_text(f"name: Other\norigin: {{latitude_deg: 35.7275, longitude_deg: -78.696}}\ntowers:\n{towers}")
     assert "Other_plan.png" in out_of(capsys, "site", "show", other, "-o", tmp_path / "other", *flight)
-
-
-def polygon(ring: list[list[float]]) -> dict[str, object]:
-    return {"type": "Polygon", "coordinates": [ring]}
 
 
 @pytest.mark.parametrize("command", [["report", SAMPLE / "flight.yaml", "--audit", "none"], ["site", "show"]])

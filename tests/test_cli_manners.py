@@ -17,6 +17,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.cli.app import app
 from aerpaw_cmp.common.commands import COMMANDS
 from aerpaw_cmp.common.outputs import OutputFolder
+from tests.geojson import collection, feature, polygon
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "sample_logs"
@@ -86,9 +87,7 @@ def test_a_wrong_example_would_be_seen(words: str) -> None:
 def cheap(tmp: Path) -> dict[str, tuple[list[str], list[str]]]:
     """Commands that are cheap to run: their line, and what puts their input there."""
     barn = [[-78.6975, 35.7280], [-78.6972, 35.7280], [-78.6972, 35.7282], [-78.6975, 35.7280]]
-    polygon = {"type": "Polygon", "coordinates": [barn]}
-    shape = {"type": "Feature", "properties": {"building": "yes"}, "geometry": polygon}
-    (tmp / "map.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [shape]}))
+    (tmp / "map.geojson").write_text(json.dumps(collection(feature(polygon(barn), building="yes"))))
     return {
         "formats": [],
         "sample": ["-o", f"{tmp}/sample"],

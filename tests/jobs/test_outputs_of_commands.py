@@ -16,25 +16,15 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.outputs import SUMS, changed_files, read_sums
 from aerpaw_cmp.flight.settings import load_flight
+from tests.geojson import collection, feature, polygon
 from tests.simulated import simulate
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 ZONE = ["--timezone", "America/New_York"]
-MAP = {
-    "type": "FeatureCollection",
-    "features": [
-        {
-            "type": "Feature",
-            "properties": {"building": "yes"},
-            "geometry": {
-                "type": "Polygon",
-                "coordinates": [[[-78.7, 35.727], [-78.6999, 35.727], [-78.6999, 35.7271], [-78.7, 35.727]]],
-            },
-        }
-    ],
-}
+RING = [[-78.7, 35.727], [-78.6999, 35.727], [-78.6999, 35.7271], [-78.7, 35.727]]
+MAP = json.dumps(collection(feature(polygon(RING), building="yes")))
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -85,7 +75,7 @@ def test_ingest_replaces_its_own_flight_file_only(logs: Path, capsys: pytest.Cap
 
 def test_site_import_never_replaces_the_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     place, site = tmp_path / "g.json", tmp_path / "site.yaml"
-    place.write_text(json.dumps(MAP))
+    place.write_text(MAP)
     assert "would replace an input" in refused(capsys, tmp_path, "site", "import", place, "-o", place, "--force")
     assert main(["site", "import", str(place), "-o", str(site)]) == 0
     assert main(["site", "import", str(place), "-o", str(site)]) == 0
@@ -128,7 +118,7 @@ def commands(logs: Path) -> dict[str, list[str]]:
     (logs / "campaign.yaml").write_text("campaign: c\nflights: [flight.yaml]\n")
     site = logs.parent / "site.yaml"
     place = logs.parent / "g.json"
-    place.write_text(json.dumps(MAP))
+    place.write_text(MAP)
     assert main(["site", "import", str(place), "-o", str(site)]) == 0
     return {
         "report": ["report", str(logs / "flight.yaml"), "--audit", "none"],

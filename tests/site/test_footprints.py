@@ -15,6 +15,7 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site import footprints
 from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, site_yaml
 from aerpaw_cmp.site.siteyaml import build_site, load_site
+from tests.geojson import collection, feature, polygon
 
 FRAME = SiteFrame(35.7275, -78.696)
 Ring = list[tuple[float, float]]
@@ -30,19 +31,10 @@ def lonlat(ring: Ring, frame: SiteFrame = FRAME) -> list[list[float]]:
 
 
 def geojson(path: Path, *features: tuple[list[Ring], dict[str, object]]) -> Path:
-    content = {
-        "type": "FeatureCollection",
-        "features": [
-            {
-                "type": "Feature",
-                "id": f"f{n}",
-                "properties": tags,
-                "geometry": {"type": "Polygon", "coordinates": [lonlat(ring) for ring in rings]},
-            }
-            for n, (rings, tags) in enumerate(features)
-        ],
-    }
-    path.write_text(json.dumps(content))
+    shapes = [
+        feature(polygon(*map(lonlat, rings)), **tags) | {"id": f"f{n}"} for n, (rings, tags) in enumerate(features)
+    ]
+    path.write_text(json.dumps(collection(*shapes)))
     return path
 
 

@@ -17,6 +17,7 @@ from aerpaw_cmp.site import mapfiles
 from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, site_yaml
 from aerpaw_cmp.site.mapfiles import MAX_TAGS, read_map_file
 from aerpaw_cmp.site.siteyaml import load_site
+from tests.geojson import collection, feature, polygon
 
 FRAME = SiteFrame(35.7275, -78.696)
 Ring = list[tuple[float, float]]
@@ -29,23 +30,11 @@ def square(east: float, north: float, size: float = 20.0) -> Ring:
     return [(float(x), float(y)) for x, y in zip(longitude, latitude, strict=True)]
 
 
-def feature(geometry: Any, **tags: Any) -> dict[str, Any]:
-    return {"type": "Feature", "properties": tags, "geometry": geometry}
-
-
-def polygon(*rings: Any) -> dict[str, Any]:
-    return {"type": "Polygon", "coordinates": list(rings)}
-
-
 def read(tmp_path: Path, content: Any, name: str = "m.json", **options: Any) -> Footprints:
     path = tmp_path / name
     text = content if isinstance(content, str | bytes) else json.dumps(content, indent=1)
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return import_footprints([path], FRAME, **options)
-
-
-def collection(*features: Any) -> dict[str, Any]:
-    return {"type": "FeatureCollection", "features": list(features)}
 
 
 def said(found: Footprints, words: str) -> bool:

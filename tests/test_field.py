@@ -1,7 +1,6 @@
 """Whole reports on real logs; skipped, saying so, where AERPAW_CMP_FIELD_DATA names none."""
 
 import json
-import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -14,13 +13,9 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.result import BASELINE_TITLE
 from aerpaw_cmp.logs.ingest import Ingested
 from aerpaw_cmp.logs.readers import ReadOptions
+from tests.real_logs import REAL
 
-ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
-pytestmark = [
-    pytest.mark.usefixtures("few_pictures"),
-    pytest.mark.field,
-    pytest.mark.skipif(not ROOT or not Path(ROOT).is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set: no real logs"),
-]
+pytestmark = [pytest.mark.usefixtures("few_pictures"), pytest.mark.field]
 FLIGHTS = {path.stem: path for path in sorted((Path(__file__).parent / "field").glob("*.yaml"))}
 OPTIONS = ReadOptions(timezone="America/New_York")
 RANK = ("nr_rank_flight1", "nr_rank_flight3")
@@ -45,7 +40,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
         flight = folder / "flight.yaml"
         flight.write_text(yaml.safe_dump(settings), encoding="utf-8")
         audit = "none" if variant else "20"
-        arguments = ["report", str(flight), "--logs-root", ROOT, "-o", str(folder / "out"), "--audit", audit]
+        arguments = ["report", str(flight), "--logs-root", str(REAL), "-o", str(folder / "out"), "--audit", audit]
         assert main(arguments) == 0
         page = (folder / "out" / "report.html").read_text(encoding="utf-8")
         assert "</html>" in page
@@ -132,7 +127,7 @@ def test_every_folder_is_read_and_accounted_for(everything: Ingested) -> None:
 def test_what_no_reader_takes_is_named_with_a_reason(everything: Ingested) -> None:
     read = {Path(file.path).resolve() for file in everything}
     skipped = {Path(file.path).resolve(): file.reason for file in everything.skipped}
-    there = {path.resolve() for path in Path(ROOT).rglob("*") if path.is_file() and not path.name.startswith(".")}
+    there = {path.resolve() for path in REAL.rglob("*") if path.is_file() and not path.name.startswith(".")}
     # a member of an archive stands for it
     outside = {next(p for p in (path, *path.parents) if p.exists()) for path in read | set(skipped)}
     assert outside == there
@@ -146,11 +141,11 @@ def test_ingest_of_the_whole_folder_through_the_command_line(
     """What is read was read above; here it is asked for as there, told and written."""
 
     def read_above(paths: list[Path], *, options: ReadOptions, reader: str | None) -> Ingested:
-        assert (paths, options, reader) == ([Path(ROOT)], OPTIONS, None)
+        assert (paths, options, reader) == ([REAL], OPTIONS, None)
         return everything
 
     monkeypatch.setattr("aerpaw_cmp.logs.ingest.ingest", read_above)
-    assert main(["ingest", ROOT, "--timezone", "America/New_York", "-o", str(tmp_path / "all.h5"), "--json"]) == 0
+    assert main(["ingest", str(REAL), "--timezone", "America/New_York", "-o", str(tmp_path / "all.h5"), "--json"]) == 0
     files = json.loads(capsys.readouterr().out)["files"]
     assert len(files) > 15
     assert all(f["lines"] == f["accepted"] + f["rejected"] + f["blank"] for f in files)

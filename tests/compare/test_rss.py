@@ -2,9 +2,7 @@
 
 import itertools
 import json
-import os
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +25,7 @@ from aerpaw_cmp.compare.rss import (
     stretches,
 )
 from aerpaw_cmp.compare.statistics import autocorrelation, error_intervals
+from tests.real_logs import dataset12
 
 NAN = float("nan")
 
@@ -230,29 +229,15 @@ def test_empty_and_constant_quantities():
 @pytest.mark.field
 @pytest.mark.parametrize("name", ["40m_fs10MHz", "70m_fs20MHz"])
 def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
-    folder = os.environ.get("AERPAW_CMP_FIELD_DATA")
-    if not folder:
-        pytest.skip("AERPAW_CMP_FIELD_DATA is not set")
-    from scipy.io import loadmat
-
     from aerpaw_cmp.common.geodesy import SiteFrame
 
-    data = {
-        k: np.ravel(v)
-        for k, v in loadmat(Path(folder) / "dataset12" / f"{name}.mat").items()
-        if k[0] == "m" or "power" in k
-    }
-    longitude, latitude = data["mX"].astype(float), data["mY"].astype(float)
-    if np.abs(longitude).mean() < np.abs(latitude).mean():
-        longitude, latitude = latitude, longitude
-    east, north = SiteFrame(35.72750947, -78.69595819).to_local(latitude, longitude)
-    up = np.maximum(data["mZ"].astype(float), 0.5)
+    data = dataset12(name)
+    east, north = SiteFrame(35.72750947, -78.69595819).to_local(data["latitude"], data["longitude"])
+    up = np.maximum(data["mZ"], 0.5)
     flown = up > 20.0
     free_space = np.where(flown, -20 * np.log10(np.sqrt(east**2 + north**2 + (up - 10) ** 2)), NAN)
     for channel in ("mpower1", "mpower2"):
-        found = compare_rss(
-            data["timestamp_power"].astype(float), data[channel].astype(float), free_space, span_db=(-100, 100)
-        )
+        found = compare_rss(data["timestamp_power"], data[channel], free_space, span_db=(-100, 100))
         assert 4.5 < found.rmse_db < 7.2
         assert (
             found.intervals.autocorrelation.n_effective < 0.05 * found.n

@@ -12,12 +12,9 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.logs.ingest import Ingested
+from tests.real_logs import REAL
 
-ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
-pytestmark = [
-    pytest.mark.field,
-    pytest.mark.skipif(not Path(ROOT).is_dir() or not ROOT, reason="AERPAW_CMP_FIELD_DATA is not set"),
-]
+pytestmark = pytest.mark.field
 TABLE = list(csv.reader((Path(__file__).parent / "golden.csv").read_text().splitlines()))[1:]
 
 
@@ -27,9 +24,9 @@ def rows_of(found: Ingested) -> dict[str, list[str]]:
         result = file.result
         counts = (result.lines, result.accepted, len(result.rejected), len(result.streams))
         total = sum(len(one.frame) for one in result.streams)
-        rows[os.path.relpath(file.path, ROOT)] = [result.reader, *map(str, (*counts, total))]
+        rows[os.path.relpath(file.path, REAL)] = [result.reader, *map(str, (*counts, total))]
     for left in found.skipped:
-        rows[os.path.relpath(left.path, ROOT)] = ["no log", left.reason.removeprefix("no log: ")]
+        rows[os.path.relpath(left.path, REAL)] = ["no log", left.reason.removeprefix("no log: ")]
     return rows
 
 

@@ -15,14 +15,10 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.site.learned import folder_of, read_learned, read_table
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
+from tests.real_logs import REAL
 
-ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
 HERE = Path(__file__).parent / "learned"
-pytestmark = [
-    pytest.mark.usefixtures("few_pictures"),
-    pytest.mark.field,
-    pytest.mark.skipif(not ROOT or not Path(ROOT).is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set: no real logs"),
-]
+pytestmark = [pytest.mark.usefixtures("few_pictures"), pytest.mark.field]
 
 
 def calibrated(name: str, folder: Path, flights: list[str]) -> Path:
@@ -34,7 +30,7 @@ def calibrated(name: str, folder: Path, flights: list[str]) -> Path:
     packaged = Path(str(folder_of("lake_wheeler"))).with_suffix(".yaml")
     site.write_bytes(packaged.read_bytes())
     assert main([
-        "calibrate", str(folder / f"{name}.yaml"), "--into-site", str(site), "--logs-root", ROOT,
+        "calibrate", str(folder / f"{name}.yaml"), "--into-site", str(site), "--logs-root", str(REAL),
         "-o", str(folder / "calibrated.yaml"),
     ]) == 0  # fmt: skip
     return site
@@ -55,7 +51,7 @@ def first_words(folder: Path, site: Path, log: str) -> tuple[str, dict]:
     """First sentences and numbers of a log that is drafted and reported, not a line edited."""
     draft = folder / f"{Path(log).stem}.yaml"
     zone = ["--timezone", "America/New_York"]
-    assert main(["ingest", str(Path(ROOT) / log), *zone, "--site", str(site), "--draft", str(draft), "--force"]) == 0
+    assert main(["ingest", str(REAL / log), *zone, "--site", str(site), "--draft", str(draft), "--force"]) == 0
     out = folder / draft.stem
     assert main(["report", str(draft), "-o", str(out), "--audit", "none", "--figures", "none"]) == 0
     page = (out / "report.html").read_text(encoding="utf-8")
@@ -78,9 +74,9 @@ def test_a_drafted_flight_opens_with_what_other_flights_taught(tmp_path: Path) -
 
 def test_an_unseen_flight_of_the_sounder_is_told_its_lock_by_other_flights(tmp_path: Path) -> None:
     left_out = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "left_out_reports.py"))
-    site = left_out["site_without"](HERE / "afar.yaml", "../calibrations/afar300_loc_2.yaml", Path(ROOT), tmp_path)
+    site = left_out["site_without"](HERE / "afar.yaml", "../calibrations/afar300_loc_2.yaml", REAL, tmp_path)
     sentence, metrics = left_out["reported"](
-        Path(ROOT) / "afar/results_useful_ori_exp_300_loc_2.mat", site, tmp_path
+        REAL / "afar/results_useful_ori_exp_300_loc_2.mat", site, tmp_path
     )  # fmt: skip
     (numbers,) = (one for _, one in left_out["rows"](metrics))
     assert "P(locked), learned on other flights" in sentence
@@ -130,7 +126,7 @@ def test_packaged_numbers_are_what_the_command_gives(name: str, tmp_path: Path) 
 @pytest.mark.parametrize("name", ["afar", "nr_rank"])
 def test_packaged_entries_name_the_logs_of_the_field_folder(name: str) -> None:
     """Their commands take minutes (``make learned``): here only that they are of these very logs."""
-    known = {hashlib.sha256(path.read_bytes()).hexdigest() for path in Path(ROOT).rglob("*") if path.is_file()}
+    known = {hashlib.sha256(path.read_bytes()).hexdigest() for path in REAL.rglob("*") if path.is_file()}
     entry = read_learned("lake_wheeler").entries[name]
     assert len(entry.trained_on) >= 2
     assert set(entry.trained_on) <= known
@@ -139,7 +135,7 @@ def test_packaged_entries_name_the_logs_of_the_field_folder(name: str) -> None:
 def test_learned_antennas_need_fewer_samples_than_two_rays() -> None:
     """LTE at 50 m from 90 m: 50 samples with learned antennas leave less than 200 with two rays and patterns."""
     script = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "learned_map.py"))
-    bench = script["Bench"](script["load_manifest"](), Path(ROOT))
+    bench = script["Bench"](script["load_manifest"](), REAL)
     rmse = script["lte_height"](bench, *script["LTE"], repeats=300)
     # root mean square over draws of 50 samples, their median; the same of 200
     learned, two_ray, free = (rmse[name] for name in ("learned", "two-ray + patterns", "free space"))

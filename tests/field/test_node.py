@@ -1,8 +1,5 @@
 """The surveyed rover of real flights, by their levels alone."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,20 +9,20 @@ from aerpaw_cmp.flight.node import ListedPlace, Placer, listed_places
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.site.siteyaml import load_site
+from tests.real_logs import REAL
 
-ROOT = Path(os.environ.get("AERPAW_CMP_FIELD_DATA", "/nowhere"))
-pytestmark = [pytest.mark.field, pytest.mark.skipif(not ROOT.is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set")]
+pytestmark = pytest.mark.field
 FLIGHTS = ("sounder/*_288_loc_1.mat", "afar/*_300_loc_1.mat", "afar/*_300_loc_2.mat", "afar/*_309_loc_2.mat",
            "afar/*_328_loc_1.mat", "afar/*_328_loc_3.mat")  # fmt: skip
 
 
 def test_the_rover_is_found_within_its_region() -> None:
     site = load_site("lake_wheeler")
-    listed = listed_places([ROOT / "sounder"])
+    listed = listed_places([REAL / "sounder"])
     assert [place.line for place in listed[:3]] == [1, 2, 3]
     errors, inside, right = [], 0, 0
     for name in FLIGHTS:
-        (path,) = ROOT.glob(name)
+        (path,) = REAL.glob(name)
         (file,) = ingest([path], options=ReadOptions(timezone="America/New_York"))
         vehicle, power = (next(s for s in file.result.streams if s.name == n) for n in ("vehicle", "power"))
         placer = Placer(site, vehicle, listed[:3])

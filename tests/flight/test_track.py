@@ -1,8 +1,5 @@
 """Poses at any instant."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,6 +9,7 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.flight import track as tracks
 from aerpaw_cmp.flight.track import Track, good_positions
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft
+from tests.real_logs import dataset12
 
 FRAME = SiteFrame(35.7275, -78.6960)
 
@@ -289,32 +287,16 @@ def test_a_gap_limit_must_be_positive():
         Track(telemetry([0.0], 0, 0, 1), FRAME, maximum_gap_s=0)
 
 
-def real_flight(name):
-    """Track, epoch seconds and channels of a real flight, or skip."""
-    folder = os.environ.get("AERPAW_CMP_FIELD_DATA")
-    if not folder:
-        pytest.skip("AERPAW_CMP_FIELD_DATA is not set")
-    from scipy.io import loadmat
-
-    found = loadmat(Path(folder) / "dataset12" / f"{name}.mat")
-    data = {k: np.ravel(v).astype(float) for k, v in found.items() if k[0] == "m" or k == "timestamp_power"}
-    epoch = data["timestamp_power"]
-    frame = telemetry(np.zeros(len(epoch)), 0, 0, 0)
-    frame["time"] = pd.to_datetime(epoch, unit="s")
-    # the authors' x and y are not the same axis in all their files: longitudes of Lake Wheeler are the negative ones
-    east, north = ("mX", "mY") if data["mX"].mean() < 0 else ("mY", "mX")
-    columns = {"longitude_deg": east, "latitude_deg": north, "altitude_m": "mZ"}
-    columns |= {"roll_deg": "mRoll", "pitch_deg": "mPitch", "yaw_deg": "mYaw"}
-    for ours, theirs in columns.items():
-        frame[ours] = data[theirs]
-    return Track(frame, SiteFrame(35.72750947, -78.69595819)), epoch, [data["mpower1"], data["mpower2"]]
-
-
 @pytest.mark.field
 @pytest.mark.parametrize(("name", "height"), [("40m_fs10MHz", 40), ("70m_fs20MHz", 70)])
 def test_track_of_a_real_flight(name, height):
-    track, epoch, _ = real_flight(name)
-    poses = track.pose_at(epoch)
+    data = dataset12(name)
+    frame = telemetry(np.zeros(len(data["mZ"])), 0, 0, 0)
+    frame["time"] = pd.to_datetime(data["timestamp_power"], unit="s")
+    columns = {"longitude_deg": "longitude", "latitude_deg": "latitude", "altitude_m": "mZ"}
+    for ours, theirs in (columns | {"roll_deg": "mRoll", "pitch_deg": "mPitch", "yaw_deg": "mYaw"}).items():
+        frame[ours] = data[theirs]
+    poses = Track(frame, SiteFrame(35.72750947, -78.69595819)).pose_at(data["timestamp_power"])
     assert poses.valid.mean() > 0.99
     assert np.nanmax(poses.position_m[:, 2]) == pytest.approx(height, abs=3)
     speed = np.linalg.norm(poses.velocity_mps[:, :2], axis=1)

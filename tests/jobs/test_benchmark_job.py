@@ -5,7 +5,6 @@ import gzip
 import hashlib
 import json
 import math
-import os
 import re
 import shutil
 import threading
@@ -19,6 +18,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.jobs.benchmarks import benchmark, benchmark_run, entrants
+from tests.real_logs import REAL
 
 TOWER = np.array([0.0, 0.0, 10.0])
 FLIGHT = """
@@ -282,13 +282,9 @@ def test_packaged_manifest_is_whole() -> None:
         assert {*task.train, *task.test} <= set(manifest.flights)
 
 
-FIELD = Path(os.environ.get("AERPAW_CMP_FIELD_DATA", "/nowhere"))
-
-
 @pytest.mark.field
-@pytest.mark.skipif(not FIELD.is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set")
 def test_real_tasks_on_the_files_at_hand() -> None:
-    real = benchmark_run.open_bench(FIELD)
+    real = benchmark_run.open_bench(REAL)
     at_hand = [t for t in real.manifest.tasks if not real.skipped(t, training=True)]
     assert {"level_dataset12_heading", "level_dataset12_sector", "level_dataset12_map", "snr_aadm"} <= set(at_hand)
     frame = entrants.predict(real, "level_dataset12_heading", "learned")
@@ -309,12 +305,11 @@ RANK_TASK = """
 
 
 @pytest.mark.field
-@pytest.mark.skipif(not FIELD.is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set")
 def test_a_rank_task_reaches_the_page(tmp_path: Path) -> None:
     packaged = (Path(benchmark.__file__).parent / "benchmark.yaml").read_text()
     manifest = tmp_path / "manifest.yaml"
     manifest.write_text(packaged[: packaged.index("tasks:")] + "tasks:" + RANK_TASK)
-    result = benchmark_run.run_benchmark(FIELD, tmp_path / "out", manifest=manifest, only=["constant"])
+    result = benchmark_run.run_benchmark(REAL, tmp_path / "out", manifest=manifest, only=["constant"])
     score = result.scores["ranks"]["constant"]
     # a constant forecast that says one rank has no kappa to speak of, and its log score is that of the constant
     assert score["log_score"] == pytest.approx(score["constant_log_score"], abs=1e-3)

@@ -1,7 +1,6 @@
 """The calibrate command on simulated flights: planted antennas come back, replay in a report, refusals."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
 from tests.jobs.calibrated import YAW_DEG, calibrated, past_sector_antenna, settings
 from tests.json_page import unlisted
+from tests.real_logs import REAL
 from tests.simulated import write_yaml
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -159,11 +159,7 @@ def test_one_flight_is_learned_and_not_scored(folder: Path) -> None:
     assert any("one flight alone" in text for text in found.warnings)
 
 
-ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
-
-
 @pytest.mark.field
-@pytest.mark.skipif(not ROOT, reason="AERPAW_CMP_FIELD_DATA is not set: no real logs")
 def test_dataset12_each_way(tmp_path: Path) -> None:
     """Everything but the offset learned on the other flight: 3.53 dB here; free space 6.37."""
     from aerpaw_cmp.compare.learning import calibration
@@ -174,9 +170,9 @@ def test_dataset12_each_way(tmp_path: Path) -> None:
     patterns = {"uav": grid | {"variable": "SA3300"}, "tower": grid | {"variable": "RMWB3300_normal"}}
     path = write_yaml(tmp_path / "c.yaml", {"calibration": "d12", "flights": flights, "patterns": patterns})
     found = load_calibration(path)
-    flown, _ = read_flights(found, tmp_path, Path(ROOT))
+    flown, _ = read_flights(found, tmp_path, REAL)
     observed, _ = observe(flown)
-    scores = calibration.flight_left_out(observed, recipe_of(found, observed, Path(ROOT)))
+    scores = calibration.flight_left_out(observed, recipe_of(found, observed, REAL))
     assert mean_rmse(scores) < 3.75
     assert mean_rmse(scores, "rmse_4s_db") < 3.0
     assert mean_rmse(scores, "free_space_rmse_db") == pytest.approx(6.37, abs=0.05)

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import shutil
 import sys
 import zipfile
@@ -22,6 +21,7 @@ from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets,
 from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 from tests.json_page import unlisted
+from tests.real_logs import REAL
 from tests.simulated import planned, simulate, write_yaml
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -399,11 +399,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
     assert "K chosen on the other flights" in page
 
 
-FIELD = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
 CAMPAIGNS = Path(__file__).parents[1] / "field" / "campaigns"
-needs_logs = pytest.mark.skipif(
-    not FIELD or not Path(FIELD).is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set: no real logs"
-)
 
 
 def real(name: str, folder: Path, **changes: Any) -> dict[str, Any]:
@@ -416,13 +412,12 @@ def real(name: str, folder: Path, **changes: Any) -> dict[str, Any]:
         setting["rss.lag"] = "off"  # tests/test_field.py estimates the lags of these flights
     write_yaml(folder / "campaign.yaml", entries)
     out = folder / "out"
-    assert main(["campaign", str(folder / "campaign.yaml"), "-o", str(out), "--logs-root", FIELD, "--strict"]) == 0
+    assert main(["campaign", str(folder / "campaign.yaml"), "-o", str(out), "--logs-root", str(REAL), "--strict"]) == 0
     found: dict[str, Any] = json.loads((out / "campaign.json").read_text(encoding="utf-8"))
     return found
 
 
 @pytest.mark.field
-@needs_logs
 def test_two_real_flights(tmp_path: Path) -> None:
     """The measured patterns at the paper's azimuths, and what two flights differ by at the same places."""
     found = real("dataset12", tmp_path)
@@ -435,7 +430,6 @@ def test_two_real_flights(tmp_path: Path) -> None:
 
 
 @pytest.mark.field
-@needs_logs
 def test_two_real_rank_flights_choose_one_k_when_slanted(tmp_path: Path) -> None:
     found = real("nr_rank", tmp_path)
     transferred = {(t["setting"], t["flight"]): t for t in found["rank_transfers"]}

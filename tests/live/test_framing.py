@@ -1,14 +1,13 @@
 """Framing: the same events however the bytes are cut, a bounded buffer, nothing lost."""
 
-import os
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.live.framing import Answer, Framer, Late, TranscriptFramer, Unsolicited, frame_transcript, unglue
+from tests.real_logs import REAL
 
 CSI = ('AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',))
 QENG = ('AT+QENG="servingcell"', ("+QENG:",))
@@ -47,10 +46,7 @@ def test_transcripts_at_every_cut(name):
 
 @pytest.mark.field
 def test_recorded_transcripts_at_every_cut():
-    root = os.environ.get("AERPAW_CMP_FIELD_DATA")
-    if not root:
-        pytest.skip("AERPAW_CMP_FIELD_DATA is unset")
-    files = sorted(Path(root, "modem").glob("at_*.txt"))
+    files = sorted((REAL / "modem").glob("at_*.txt"))
     assert len(files) >= 11
     for path in files:
         data = path.read_bytes()

@@ -1,8 +1,5 @@
 """Commands by allow-list, answers by token, personal data out."""
 
-import os
-from pathlib import Path
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,6 +7,7 @@ from hypothesis import strategies as st
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.framing import Answer, frame_transcript
 from aerpaw_cmp.live.modem import QUERIES, Redactor, csi_write, decode, encode, query_of
+from tests.real_logs import REAL
 
 SA = '+QENG: "servingcell","NOCONN","NR5G-SA","TDD",999,99,0002A4001,77,1F,633984,78,12,-80,-11,25,1,-'
 ENDC = (
@@ -139,11 +137,8 @@ def test_antennas():
 
 @pytest.mark.field
 def test_recorded_answers_decode():
-    root = os.environ.get("AERPAW_CMP_FIELD_DATA")
-    if not root:
-        pytest.skip("AERPAW_CMP_FIELD_DATA is unset")
     ranks, cells = [], []
-    for path in sorted(Path(root, "modem").glob("at_*.txt")):
+    for path in sorted((REAL / "modem").glob("at_*.txt")):
         for event in frame_transcript(path.read_bytes()):
             if not isinstance(event, Answer):
                 continue

@@ -1,9 +1,7 @@
 """The simulated modem, the followed telemetry and the CSV export."""
 
 import csv
-import os
 import threading
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -21,6 +19,7 @@ from aerpaw_cmp.logs.readers import Reader
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
 from aerpaw_cmp.logs.records import ReadResult, Stream
 from tests.live.terminals import held
+from tests.real_logs import REAL
 
 TRANSCRIPT = b"""AT+QNWCFG="nr5g_csi"
 +QNWCFG: "nr5g_csi",21,3,9,11
@@ -52,10 +51,7 @@ def test_transcript_as_a_modem(tmp_path):
 
 @pytest.mark.field
 def test_recorded_transcripts_as_modems():
-    root = os.environ.get("AERPAW_CMP_FIELD_DATA")
-    if not root:
-        pytest.skip("AERPAW_CMP_FIELD_DATA is unset")
-    modem = load_recorded(Path(root, "modem/at_csi_teltonika_5568.txt"))
+    modem = load_recorded(REAL / "modem/at_csi_teltonika_5568.txt")
     ranks = [decode("nr5g_csi", modem.reply('AT+QNWCFG="nr5g_csi"')[:-1]).values["rank"] for _ in range(2)]
     assert ranks == [2, 2]
 

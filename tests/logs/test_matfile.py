@@ -2,8 +2,6 @@
 
 import contextlib
 import io
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs.matfile import read_arrays
+from tests.real_logs import REAL
 
 KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8")
 
@@ -88,12 +87,9 @@ def test_a_huge_claim_is_refused_before_memory_is_taken() -> None:
 
 @pytest.mark.field
 def test_real_files_equal_scipy() -> None:
-    root = os.environ.get("AERPAW_CMP_FIELD_DATA")
-    if not root:
-        pytest.skip("AERPAW_CMP_FIELD_DATA is not set")
     from scipy.io import loadmat
 
-    files = sorted(Path(root).rglob("*.mat"))
+    files = sorted(REAL.rglob("*.mat"))
     assert len(files) >= 4
     for path in files:
         ours = read_arrays(path.read_bytes(), None)

@@ -15,7 +15,10 @@ def test_every_unwell_check_has_a_remedy_and_the_whole_is_json(monkeypatch: pyte
     monkeypatch.setattr(llvm, "candidates", lambda: [library])
     monkeypatch.setattr(llvm, "try_library", lambda one: llvm.Trial(one, True))
     found = doctor.checks()
-    asked = ["Python", "Sionna RT", "Mitsuba", "Dr.Jit", "LLVM", "GPU", "CPU", "Memory", "Disk", "Cache", "Readers", "Serial"]
+    asked = [
+        "Python", "Sionna RT", "Mitsuba", "Dr.Jit", "LLVM", "GPU", "CPU", "Memory", "Disk", "Cache", "Readers",
+        "Serial",
+    ]  # fmt: skip
     assert set(asked) <= {check.name for check in found}
     for check in found:
         assert check.status in ("ok", "warn", "fail")

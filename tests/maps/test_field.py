@@ -1,8 +1,5 @@
 """Kriging of measured rank and RSS: real flights, when the logs are there."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,17 +8,15 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.maps import evaluate
 from aerpaw_cmp.maps.kriging import OrdinaryKriging
 from aerpaw_cmp.maps.variogram import field_correlation, fit_biexponential
+from tests.real_logs import REAL, dataset12
 
-pytestmark = [
-    pytest.mark.field,
-    pytest.mark.skipif("AERPAW_CMP_FIELD_DATA" not in os.environ, reason="AERPAW_CMP_FIELD_DATA is not set"),
-]
+pytestmark = pytest.mark.field
 FRAME = SiteFrame(35.72750947, -78.69595819)
 
 
 def rank_flight(number):
     """Positions (n, 3) and measured rank above 10 m."""
-    table = pd.read_csv(Path(os.environ["AERPAW_CMP_FIELD_DATA"]) / f"nr_rank/july2_2024_flight{number}_nemo_nr.csv")
+    table = pd.read_csv(REAL / f"nr_rank/july2_2024_flight{number}_nemo_nr.csv")
     table = table[(table["alt_m"] > 10) & table["pdsch_rank"].notna()]
     east, north = FRAME.to_local(table["lat"], table["lon"])
     return np.column_stack([east, north, table["alt_m"]]), table["pdsch_rank"].to_numpy()
@@ -29,14 +24,8 @@ def rank_flight(number):
 
 def rss_flight():
     """Positions (n, 3), power of both channels [dB re full scale] and seconds, above 10 m."""
-    import scipy.io
-
-    data = scipy.io.loadmat(Path(os.environ["AERPAW_CMP_FIELD_DATA"]) / "dataset12/40m_fs10MHz.mat")
-    column = {name: np.asarray(data[name], dtype=float).ravel() for name in ("mX", "mY", "mZ", "mpower1", "mpower2")}
-    longitude, latitude = column["mX"], column["mY"]
-    if abs(longitude[0]) < abs(latitude[0]):
-        longitude, latitude = latitude, longitude
-    east, north = FRAME.to_local(latitude, longitude)
+    column = dataset12("40m_fs10MHz")
+    east, north = FRAME.to_local(column["latitude"], column["longitude"])
     high = column["mZ"] > 10
     power = np.column_stack([column["mpower1"], column["mpower2"]])
     return np.column_stack([east, north, column["mZ"]])[high], power[high]

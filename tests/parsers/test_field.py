@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import re
 from pathlib import Path
 
@@ -13,14 +12,10 @@ import scipy.io
 from aerpaw_cmp.logs.ingest import Ingested, ingest
 from aerpaw_cmp.logs.limits import LIMITS, UNSCORED
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
+from tests.real_logs import REAL
 
-ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
-pytestmark = [
-    pytest.mark.field,
-    pytest.mark.skipif(not Path(ROOT).is_dir() or not ROOT, reason="AERPAW_CMP_FIELD_DATA is not set"),
-]
+pytestmark = pytest.mark.field
 OPTIONS = ReadOptions(timezone="America/New_York")
-FIELD = Path(ROOT)
 
 
 @pytest.fixture
@@ -29,7 +24,7 @@ def everything(field_logs: Ingested) -> Ingested:
 
 
 def test_every_known_log_is_read_to_the_last_line(everything: Ingested) -> None:
-    found = {str(Path(file.path).relative_to(FIELD)): file.result for file in everything}
+    found = {str(Path(file.path).relative_to(REAL)): file.result for file in everything}
     expected = {
         "telemetry/2022-01-13_13_57_23_vehicleOut.txt": ("vehicle_out", 1089, 0),
         "telemetry/2022-06-10_19_52_44_vehicleOut.txt": ("vehicle_out", 1662, 0),
@@ -71,7 +66,7 @@ def test_no_real_value_is_beyond_the_limits(everything: Ingested) -> None:
 
 
 def test_other_files_are_not_taken_for_logs(everything: Ingested) -> None:
-    skipped = {str(Path(file.path).relative_to(FIELD)) for file in everything.skipped}
+    skipped = {str(Path(file.path).relative_to(REAL)) for file in everything.skipped}
     assert {"telemetry/AERPAW_Big_Geofence.kml", "antennas/rad_pat.mat", "sounder/rover_positions.txt"} <= skipped
     (ue,) = [file for file in everything if file.path.endswith("2022-06-10_19_52_44_radio_log.txt")]
     assert {one.kind for one in ue.result.streams} == {"rss", "kpi"}, "srsUE prints no rank"
@@ -79,7 +74,7 @@ def test_other_files_are_not_taken_for_logs(everything: Ingested) -> None:
 
 def test_the_power_log_holds_the_merged_flight_exactly() -> None:
     """Two independent routes to 20 523 levels: our reader of the raw log, the authors' own merge."""
-    folder = FIELD / "sounder"
+    folder = REAL / "sounder"
     (log,) = ingest(folder / "2023-12-13_12_33_02_power_log.txt", options=OPTIONS)
     (mat,) = ingest(folder / "results_useful_ori_exp_288_loc_1.mat", options=OPTIONS)
     raw = log.result.streams[0].frame.set_index("time")["rss_db"]
@@ -93,7 +88,7 @@ def test_the_power_log_holds_the_merged_flight_exactly() -> None:
 
 @pytest.mark.parametrize("flight", ["40m_fs10MHz.mat", "70m_fs20MHz.mat"])
 def test_velocity_of_merged_flights_is_north_east_down(flight: str) -> None:
-    (file,) = ingest(FIELD / "dataset12" / flight, options=OPTIONS)
+    (file,) = ingest(REAL / "dataset12" / flight, options=OPTIONS)
     frame = file.result.streams[0].frame
     seconds = frame["time"].to_numpy().astype(np.int64) / 1e9
     for position, velocity, sign in (
@@ -107,7 +102,7 @@ def test_velocity_of_merged_flights_is_north_east_down(flight: str) -> None:
 
 
 def test_vehicle_out_velocity_and_attitude() -> None:
-    (file,) = ingest(FIELD / "telemetry" / "2024-07-02_flight3_vehicleOut.txt", options=OPTIONS)
+    (file,) = ingest(REAL / "telemetry" / "2024-07-02_flight3_vehicleOut.txt", options=OPTIONS)
     frame = file.result.streams[0].frame
     seconds = frame["time"].to_numpy().astype(np.int64) / 1e9
     east = np.gradient(frame["longitude_deg"].to_numpy(), seconds)
@@ -120,8 +115,8 @@ def test_vehicle_out_velocity_and_attitude() -> None:
 
 
 def test_the_two_nemo_formats_tell_the_same_ranks() -> None:
-    (table,) = ingest(FIELD / "nr_rank" / "july2_2024_flight3_nemo_nr.csv")
-    (kml,) = ingest(FIELD / "nr_rank" / "flight3_pdsch_rank.kml.gz")
+    (table,) = ingest(REAL / "nr_rank" / "july2_2024_flight3_nemo_nr.csv")
+    (kml,) = ingest(REAL / "nr_rank" / "flight3_pdsch_rank.kml.gz")
     one = table.result.streams[0].frame.dropna(subset="rank")
     other = kml.result.streams[0].frame
     assert one["rank"].tolist() == other["rank"].tolist()
@@ -137,7 +132,7 @@ def test_the_two_nemo_formats_tell_the_same_ranks() -> None:
 
 
 def test_controller_console_and_its_csv_agree() -> None:
-    console, table = ingest([FIELD / "aadm" / "controller_log.txt", FIELD / "aadm" / "snr_log.csv"], options=OPTIONS)
+    console, table = ingest([REAL / "aadm" / "controller_log.txt", REAL / "aadm" / "snr_log.csv"], options=OPTIONS)
     spoken = next(one for one in console.result.streams if one.name == "LW1").frame["rss_db"]
     written = next(one for one in table.result.streams if one.name == "LW1").frame["rss_db"]
     assert spoken.between(written.min() - 5, written.max() + 5).mean() > 0.9
@@ -145,7 +140,7 @@ def test_controller_console_and_its_csv_agree() -> None:
 
 @pytest.mark.parametrize("name", ["2023-12-13_12_31_07_power_log.txt"])
 def test_real_logs_cut_at_every_byte_of_their_end(name: str) -> None:
-    data = (FIELD / "sounder" / name).read_bytes()
+    data = (REAL / "sounder" / name).read_bytes()
     for end in range(len(data) - 120, len(data)):
         result = by_name("sounder_log").read(data[:end], OPTIONS)
         assert result.lines == result.accepted + len(result.rejected) + result.blank
@@ -153,7 +148,7 @@ def test_real_logs_cut_at_every_byte_of_their_end(name: str) -> None:
 
 def _numbers(path: str, wanted: str, separator: str) -> int:
     """Numeric cells of the columns whose names a pattern finds, counted by Python's csv module."""
-    with (FIELD / path).open(encoding="utf-8-sig", newline="") as file:
+    with (REAL / path).open(encoding="utf-8-sig", newline="") as file:
         rows = list(csv.reader(file, delimiter=separator))
     head = next(i for i, row in enumerate(rows) if len(row) > 10)
     columns = [i for i, name in enumerate(rows[head]) if re.search(wanted, name)]
@@ -164,7 +159,7 @@ def _numbers(path: str, wanted: str, separator: str) -> int:
 def _json_cells(path: str) -> int:
     """Levels of all cells and NR legs of a PawPrints session."""
     count = 0
-    for line in (FIELD / path).read_text().splitlines():
+    for line in (REAL / path).read_text().splitlines():
         one = json.loads(line)
         for leg in [*one.get("cells", []), one.get("nr_signal_strength") or {}]:
             count += re.fullmatch(r"-\d+", str(leg.get("rsrp", leg.get("ss_rsrp")))) is not None
@@ -174,8 +169,8 @@ def _json_cells(path: str) -> int:
 READINGS = {
     "urban_lte/120m.csv": lambda path: _numbers(path, "^RSRP", ","),
     "urban_lte/60m.csv": lambda path: _numbers(path, "^RSRP", ","),
-    "gnettrack/Orange_log.txt": lambda path: len(re.findall(r"\t4G\t-\d+\t", (FIELD / path).read_text())),
-    "pawprints/2023-08-26_test2_log.txt": lambda path: (FIELD / path).read_text().count("BS_INFO_START"),
+    "gnettrack/Orange_log.txt": lambda path: len(re.findall(r"\t4G\t-\d+\t", (REAL / path).read_text())),
+    "pawprints/2023-08-26_test2_log.txt": lambda path: (REAL / path).read_text().count("BS_INFO_START"),
     "pawprints/2024-04-09_flight1_pawprints.jsonl": _json_cells,
     "pawprints/2024-07-02_flight1_pawprints.jsonl": _json_cells,
 }
@@ -190,7 +185,7 @@ def test_every_reading_of_the_file_is_a_record(everything: Ingested, path: str) 
 
 
 def test_clocks_and_heights_of_the_new_dialects(everything: Ingested) -> None:
-    files = {str(Path(file.path).relative_to(FIELD)): file.result for file in everything}
+    files = {str(Path(file.path).relative_to(REAL)): file.result for file in everything}
     merged = files["aadm/vehicleOut_snr_merged.csv"].streams[0]
     assert merged.frame["altitude_m"][0] == pytest.approx(24.3002636, abs=1e-6), "above take-off, begun in the air"
     assert merged.attributes["height_from"] == "program"

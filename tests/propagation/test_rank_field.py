@@ -1,8 +1,5 @@
 """Measured NR ranks of two flights against line of sight + ground (needs the real logs)."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -14,6 +11,7 @@ from aerpaw_cmp.propagation.arrays import tower_comparison_array, uav_comparison
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Site, Tower
+from tests.real_logs import REAL
 
 pytestmark = pytest.mark.field
 
@@ -23,17 +21,9 @@ ALTERNATE = (45.0, -45.0, 45.0, -45.0)
 VERTICAL = (0.0, 0.0, 0.0, 0.0)
 
 
-@pytest.fixture(scope="module")
-def logs():
-    folder = os.environ.get("AERPAW_CMP_FIELD_DATA")
-    if not folder:
-        pytest.skip("AERPAW_CMP_FIELD_DATA is not set: no real logs")
-    return Path(folder) / "nr_rank"
-
-
-def shares(logs, scenes, flight, k, tower_slant=ALTERNATE, uav_slant=None):
+def shares(scenes, flight, k, tower_slant=ALTERNATE, uav_slant=None):
     """Measured and simulated shares of rank 1 to 4 above 10 m."""
-    log = pd.read_csv(logs / f"july2_2024_flight{flight}_nemo_nr.csv")
+    log = pd.read_csv(REAL / f"nr_rank/july2_2024_flight{flight}_nemo_nr.csv")
     log = log[(log.alt_m > 10) & log.pdsch_rank.notna()]
     measured = np.bincount(log.pdsch_rank.astype(int), minlength=5)[1:5] / len(log)
     frame = SiteFrame(*LW1)
@@ -51,20 +41,20 @@ def total_variation(measured, simulated):
 
 
 @pytest.mark.parametrize(("flight", "expected"), [(1, (0.0, 0.79, 0.19, 0.02)), (3, (0.0, 0.77, 0.21, 0.02))])
-def test_slants_alternating_along_the_numbering_give_the_known_shares(logs, scenes, flight, expected):
-    measured, simulated = shares(logs, scenes, flight, 10, uav_slant=ALTERNATE)
+def test_slants_alternating_along_the_numbering_give_the_known_shares(scenes, flight, expected):
+    measured, simulated = shares(scenes, flight, 10, uav_slant=ALTERNATE)
     assert simulated == pytest.approx(expected, abs=0.01)
     assert total_variation(measured, simulated) < 0.11
 
 
 @pytest.mark.parametrize(("flight", "limit"), [(1, 0.07), (3, 0.10)])
-def test_default_arrays_come_within_a_total_variation_of_a_tenth(logs, scenes, flight, limit):
-    assert total_variation(*shares(logs, scenes, flight, 10)) <= limit
+def test_default_arrays_come_within_a_total_variation_of_a_tenth(scenes, flight, limit):
+    assert total_variation(*shares(scenes, flight, 10)) <= limit
 
 
 @pytest.mark.parametrize("flight", [1, 3])
-def test_vertical_elements_miss_the_measured_ranks(logs, scenes, flight):
-    at_10 = shares(logs, scenes, flight, 10, VERTICAL, VERTICAL)
+def test_vertical_elements_miss_the_measured_ranks(scenes, flight):
+    at_10 = shares(scenes, flight, 10, VERTICAL, VERTICAL)
     assert total_variation(*at_10) > 0.7
-    at_1000 = shares(logs, scenes, flight, 1000, VERTICAL, VERTICAL)
+    at_1000 = shares(scenes, flight, 1000, VERTICAL, VERTICAL)
     assert total_variation(*at_1000) > 0.15

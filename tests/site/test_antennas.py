@@ -1,7 +1,6 @@
 """Patterns against fields known in closed form: a crossed, tilted short dipole radiates e . p in every direction."""
 
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from aerpaw_cmp.site.antennas import (
     read_pattern_text,
 )
 from aerpaw_cmp.site.pattern_files import read_pattern_file
+from tests.real_logs import REAL
 
 MOMENT = np.array([0.8 + 0.1j, -0.3 + 0.5j, 0.6 - 0.2j])
 MOMENT = MOMENT * math.sqrt(1.5) / np.linalg.norm(MOMENT)  # efficiency 1
@@ -220,13 +220,12 @@ def test_bad_gain_grids_are_explained(tmp_path: Path) -> None:
 
 
 @pytest.mark.field
-@pytest.mark.skipif(not os.environ.get("AERPAW_CMP_FIELD_DATA"), reason="AERPAW_CMP_FIELD_DATA is not set")
 @pytest.mark.parametrize(
     ("file", "grid", "peak_dbi"),
     [("RM-WB1-DN-BLK_right_side_up_F3300.txt", "RMWB3300_normal", 4.05), ("SA-1400-5900_F3300.txt", "SA3300", -1.22)],
 )
 def test_measured_patterns_of_the_field(file: str, grid: str, peak_dbi: float) -> None:
-    folder = Path(os.environ["AERPAW_CMP_FIELD_DATA"]) / "antennas"
+    folder = REAL / "antennas"
     pattern = read_pattern_text(folder / file)
     assert pattern.peak_gain_dbi == pytest.approx(peak_dbi, abs=0.01)
     assert 0.1 < pattern.efficiency < 1
@@ -301,10 +300,9 @@ def test_damaged_gain_grids(
 
 
 @pytest.mark.field
-@pytest.mark.skipif(not os.environ.get("AERPAW_CMP_FIELD_DATA"), reason="AERPAW_CMP_FIELD_DATA is not set")
 def test_the_headers_of_one_lab_tell_one_antenna() -> None:
     """The file at 3.5 GHz, the cut at phi = 0 and the gain over frequency are three views of the UAV's antenna."""
-    folder = Path(os.environ["AERPAW_CMP_FIELD_DATA"]) / "antennas"
+    folder = REAL / "antennas"
     gain = np.loadtxt(folder / "SA-1400-5900_gain.txt", skiprows=2)
     (at_3500,) = gain[gain[:, 0] == 3.5e9, 1]
     assert read_pattern_file(folder / "SA-1400-5900_F3500.txt").peak_gain_dbi == pytest.approx(at_3500, abs=0.01)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from aerpaw_cmp.site import footprints
 from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, site_yaml
 from aerpaw_cmp.site.siteyaml import build_site, load_site
 from tests.geojson import collection, feature, polygon
+from tests.real_logs import REAL
 
 FRAME = SiteFrame(35.7275, -78.696)
 Ring = list[tuple[float, float]]
@@ -342,9 +342,8 @@ def test_nothing_named() -> None:
 
 
 @pytest.mark.field
-@pytest.mark.skipif(not os.environ.get("AERPAW_CMP_FIELD_DATA"), reason="AERPAW_CMP_FIELD_DATA is not set")
 def test_geofence_of_the_field() -> None:
-    path = Path(os.environ["AERPAW_CMP_FIELD_DATA"]) / "telemetry" / "AERPAW_Big_Geofence.kml"
+    path = REAL / "telemetry" / "AERPAW_Big_Geofence.kml"
     site = load_site("lake_wheeler")
     found = import_footprints([path], site.frame)
     assert (len(found.geofences), len(found.buildings), found.actions) == (1, 0, [])

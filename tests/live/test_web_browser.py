@@ -115,6 +115,21 @@ def text(driver, element):
     return driver.execute_script(f"return document.getElementById('{element}').textContent")
 
 
+def choose(driver, element, value):
+    script = (
+        "const e = document.getElementById(arguments[0]); e.value = arguments[1]; e.dispatchEvent(new Event('change'))"
+    )
+    driver.execute_script(script, element, value)
+
+
+def flown(driver, fly, poses, **options):
+    """A flight over the made-up map that the page shows."""
+    flight = fly(background=made_map())
+    flight.fly(poses, **options)
+    until(driver, f"live.state.modems[0].rows.columns.t.length === {poses}")
+    return flight
+
+
 def rows(driver, modem=0):
     return driver.execute_script(f"return live.state.modems[{modem}].rows.columns.t.length")
 
@@ -158,14 +173,10 @@ def test_the_map_shows_the_flight_over_the_prediction_and_is_linked(driver, fly)
         or driver.execute_script("return document.documentElement.dataset.theme") == "dark"
     )
     below = pixel(driver, "map", x, y + 40)
-    driver.execute_script(
-        "document.getElementById('layer').value = 'none'; document.getElementById('layer').dispatchEvent(new Event('change'))"
-    )
+    choose(driver, "layer", "none")
     assert pixel(driver, "map", x, y + 40) != below  # what was under it came from the prediction
     assert "at 90 m" not in text(driver, "map-words")
-    driver.execute_script(
-        "document.getElementById('layer').value = 'level'; document.getElementById('layer').dispatchEvent(new Event('change'))"
-    )
+    choose(driver, "layer", "level")
     frame(driver)
     assert "level predicted for tower" in text(driver, "map-words")
     assert "at 90 m" in text(driver, "map-words")  # of 30 and 90 m the nearer to the UAV at 80 m
@@ -176,9 +187,7 @@ def test_the_map_shows_the_flight_over_the_prediction_and_is_linked(driver, fly)
     assert driver.execute_script("return live.state.pose") == t
     assert "24, 20, 80 m" in text(driver, "pose")
     before = pixel(driver, "map", x, y)
-    driver.execute_script(
-        "document.getElementById('colour').value = 'residual-rsrp'; document.getElementById('colour').dispatchEvent(new Event('change'))"
-    )
+    choose(driver, "colour", "residual-rsrp")
     assert pixel(driver, "map", x, y) != before
     driver.execute_script("document.getElementById('closer').click()")
     frame(driver)
@@ -245,9 +254,7 @@ def test_alarms_are_shown_kept_and_heard(driver, fly):
 
 
 def test_it_comes_back_by_itself_and_refills(driver, fly):
-    flight = fly(background=made_map())
-    flight.fly(6)
-    until(driver, "live.state.modems[0].rows.columns.t.length === 6")
+    flight = flown(driver, fly, 6)
     driver.execute_script("live.drop()")  # the connection is gone
     flight.fly(7)
     until(driver, "live.state.modems[0].rows.columns.t.length === 13")
@@ -270,9 +277,7 @@ def browsers_of(driver):
 
 
 def test_a_browser_that_is_stopped_misses_nothing(driver, fly):
-    flight = fly(background=made_map())
-    flight.fly(6)
-    until(driver, "live.state.modems[0].rows.columns.t.length === 6")
+    flight = flown(driver, fly, 6)
     stopped = browsers_of(driver)
     assert stopped
     try:
@@ -290,9 +295,7 @@ def test_a_browser_that_is_stopped_misses_nothing(driver, fly):
 
 
 def test_a_tap_that_is_started_anew_goes_on_in_the_same_page(driver, fly):
-    flight = fly(background=made_map())
-    flight.fly(6)
-    until(driver, "live.state.modems[0].rows.columns.t.length === 6")
+    flight = flown(driver, fly, 6)
     port = flight.server.address.port
     driver.execute_script("window.same = true")
     flight.server.close(wait_s=0.1)
@@ -346,9 +349,7 @@ def test_nothing_is_asked_of_another_place(driver, fly):
     import json
 
     driver.get_log("performance")
-    flight = fly(background=made_map())
-    flight.fly(3)
-    until(driver, "live.state.modems[0].rows.columns.t.length === 3")
+    flight = flown(driver, fly, 3)
     messages = [json.loads(entry["message"])["message"] for entry in driver.get_log("performance")]
     asked = {
         m["params"]["request"]["url"].partition("?")[0] for m in messages if m["method"] == "Network.requestWillBeSent"

@@ -130,6 +130,14 @@ def test_what_sionna_wants_of_typing_is_there() -> None:
     assert hasattr(typing, "Self")
 
 
+def as_root_on_debian(monkeypatch: pytest.MonkeyPatch, libraries: Path) -> None:
+    """Without a library but those of a folder."""
+    monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(libraries))
+    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "os_families", lambda: {"debian"})
+    monkeypatch.setattr(setup, "root_prefix", list)
+
+
 def test_what_drjit_itself_lacks_is_named_and_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a minimal Debian: the loader's message comes first, an unrelated NameError last."""
     program = (
@@ -143,10 +151,7 @@ def test_what_drjit_itself_lacks_is_named_and_installed(tmp_path: Path, monkeypa
     assert trial.reason == "Dr.Jit cannot be loaded, the system has no libatomic.so.1"
     fake_tool(tmp_path, "apt-get", f'[ "$1" = install ] && touch "{tmp_path}/installed"; exit 0')
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(tmp_path))
-    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "os_families", lambda: {"debian"})
-    monkeypatch.setattr(setup, "root_prefix", list)
+    as_root_on_debian(monkeypatch, tmp_path)
     said: list[str] = []
     again = setup.install(said.append, lambda library: llvm.Trial(library, (tmp_path / "installed").exists()))
     assert again is not None
@@ -202,9 +207,7 @@ def test_prepare_points_drjit_to_what_works(
 
 
 def test_prepare_without_any_gives_the_line_that_mends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(tmp_path))
-    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "os_families", lambda: {"debian"})
+    as_root_on_debian(monkeypatch, tmp_path)
     monkeypatch.setattr(llvm, "known_to_apt", lambda: "libllvm19 - x\n")
     llvm._trials.cache_clear()
     with pytest.raises(CheckError, match=r"no libLLVM was found.*apt-get install -y libllvm19") as caught:
@@ -232,10 +235,7 @@ def test_install_takes_the_newest_and_falls_back_when_its_trial_fails(
         f'for p in "$@"; do case $p in libllvm*) touch "{libraries}/libLLVM.so.${{p#libllvm}}";; esac; done',
     )
     monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(libraries))
-    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "os_families", lambda: {"debian"})
-    monkeypatch.setattr(setup, "root_prefix", list)
+    as_root_on_debian(monkeypatch, libraries)
     said: list[str] = []
 
     def attempt(library: llvm.Library) -> llvm.Trial:

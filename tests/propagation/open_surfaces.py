@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from aerpaw_cmp.site.mitsuba import TriangleScene
 
@@ -19,7 +20,10 @@ CLEARANCE_M = 2e-3
 def shipped(name: str) -> Path:
     """A scene that the installed Sionna RT ships; nothing is imported."""
     folder = find_spec("sionna").submodule_search_locations[0]
-    return Path(folder) / "rt" / "scenes" / name / f"{name}.xml"
+    path = Path(folder) / "rt" / "scenes" / name / f"{name}.xml"
+    if not path.exists():
+        pytest.skip("this Sionna RT ships no scenes")
+    return path
 
 
 def paths(corners, sources, targets, depth):

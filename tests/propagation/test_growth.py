@@ -58,10 +58,7 @@ def test_tilted_overlapping_open_quads_against_enumeration(seed):
 
 @pytest.mark.parametrize(("name", "middle", "count"), [("munich", (8, 21), 200), ("florence", (0, 0), 200)])
 def test_cropped_scenes_against_enumeration(name, middle, count):
-    path = enumerate_.shipped(name)
-    if not path.exists():
-        pytest.skip("this Sionna RT ships no scenes")
-    scene = read_scene(path)
+    scene = read_scene(enumerate_.shipped(name))
     corners = scene.vertices_m[scene.triangles]
     near = np.argsort(np.linalg.norm(corners.mean(axis=1)[:, :2] - middle, axis=1))[:count]
     crop = replace(scene, triangles=scene.triangles[near], shape=scene.shape[near])
@@ -75,10 +72,7 @@ def test_cropped_scenes_against_enumeration(name, middle, count):
 
 
 def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
-    path = enumerate_.shipped("etoile")
-    if not path.exists():
-        pytest.skip("this Sionna RT ships no scenes")
-    surfaces = merged(read_scene(path))
+    surfaces = merged(read_scene(enumerate_.shipped("etoile")))
     rng = np.random.default_rng(2)
     targets = np.column_stack([rng.uniform(-150, 150, (40, 2)), rng.uniform(1.5, 60, 40)])
     source = np.array([[0.0, 0.0, 30.0]])
@@ -179,12 +173,14 @@ def test_flipped_and_degenerate_triangles_change_nothing():
     assert np.allclose(paths.vertices_m, expected.vertices_m, equal_nan=True)
 
 
+def town(rng, count, half_m):
+    spot = rng.uniform(-half_m, half_m, (count, 2))
+    return [Building(f"b{k}", box(e, n, e + 14, n + 11), float(rng.uniform(5, 15))) for k, (e, n) in enumerate(spot)]
+
+
 def test_the_estimate_of_a_search_comes_without_the_search(scenes):
     rng = np.random.default_rng(12)
-    spot = rng.uniform(-900, 900, (400, 2))
-    buildings = [
-        Building(f"b{k}", box(e, n, e + 14, n + 11), float(rng.uniform(5, 15))) for k, (e, n) in enumerate(spot)
-    ]
+    buildings = town(rng, 400, 900)
     site = scenes.site(buildings, ((0.0, 0.0, 30.0), (50.0, 0.0, 30.0)))
     poses = scenes.poses(rng.uniform([-200, -200, 20], [200, 200, 60], (20, 3)))
     told = []
@@ -201,10 +197,7 @@ def test_the_estimate_of_a_search_comes_without_the_search(scenes):
 
 def test_the_estimate_holds_whichever_faces_are_tried():
     """Few first faces lead to most of three reflections: 64 plain draws are off by 0.6 to 1.6 here."""
-    path = enumerate_.shipped("munich")
-    if not path.exists():
-        pytest.skip("this Sionna RT ships no scenes")
-    scene, source = read_scene(path), np.array([[8.5, 21.0, 27.0]])
+    scene, source = read_scene(enumerate_.shipped("munich")), np.array([[8.5, 21.0, 27.0]])
     away = np.linalg.norm(scene.vertices_m[scene.triangles].mean(axis=1)[:, :2] - source[0, :2], axis=1)
     near = np.argsort(away)[:2500]
     surfaces = merged(replace(scene, triangles=scene.triangles[near], shape=scene.shape[near]))
@@ -279,11 +272,7 @@ def test_prisms_by_beams_have_the_paths_of_the_image_engine(scenes, aligned):
 
 def test_a_thousand_buildings_are_searched_not_refused(scenes):
     rng = np.random.default_rng(12)
-    spot = rng.uniform(-1500, 1500, (1000, 2))
-    buildings = [
-        Building(f"b{k}", box(e, n, e + 14, n + 11), float(rng.uniform(5, 15))) for k, (e, n) in enumerate(spot)
-    ]
-    site = scenes.site(buildings, ((0.0, 0.0, 30.0),))
+    site = scenes.site(town(rng, 1000, 1500), ((0.0, 0.0, 30.0),))
     result = replay(site, scenes.link(site), scenes.poses(rng.uniform([-200, -200, 20], [200, 200, 60], (20, 3))))
     assert (result.paths.depth == 2).sum() > 10
 

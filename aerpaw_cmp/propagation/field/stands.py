@@ -2,7 +2,9 @@
 
 A stand is a forest with a height: crowns from ``crown_base_m`` up to ``height_m`` over its area, trunks below. What a
 segment of a path loses there is that of three components whose powers add up (ITU-R P.833-10 section 3.2): through, by
-the length in the canopy; over the top, two knife edges where the ray enters and leaves; around either side.
+the length in the canopy; over the top, two knife edges where the ray enters and leaves; around either side. Near the
+top part of the Fresnel zone is in the canopy: what goes through is that of a ray lowered until the zone is below the
+top, and detours pass what it lacks, so that the level has no step where a ray leaves the canopy.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from .ridges import deygout_db
 
 TRUNKS = 0.3
 """Loss per metre between trunks over that in crowns: assumed."""
+CLEAR = 0.55
+"""First Fresnel radii by which a ray clears a knife edge without loss."""
 
 _UPRIGHT_M = 1e-6
 _SEGMENTS_AT_ONCE = 20_000
@@ -106,25 +110,27 @@ def _loss(
     if site.dem is not None:
         middle = start[row, :2] + share.mean(axis=1, keepdims=True) * (end - start)[row, :2]
         ground = np.nan_to_num(site.dem.ground_m(*middle.T))
-    up, rise = start[row, 2] - ground, (end - start)[row, 2]
-    base, length = stand.height_m * stand.crown_base_fraction, np.linalg.norm((end - start)[row], axis=1)
-    crown = _between(share, up, rise, base, stand.height_m) * length
-    depth = crown + TRUNKS * _between(share, up, rise, 0.0, base) * length
-    some, place = np.unique(row[depth > 0.0], return_inverse=True)
-    total_m = np.zeros(len(some))
-    np.add.at(total_m, place, depth[depth > 0.0])
-    through = model.loss_db(total_m)
-    if isinstance(model, Opaque) or not len(some):
-        return some, through
+    some, place = np.unique(row, return_inverse=True)
     enter, leave, top = np.full(len(some), np.inf), np.full(len(some), -np.inf), np.full(len(some), -np.inf)
-    np.minimum.at(enter, place, share[depth > 0.0, 0])
-    np.maximum.at(leave, place, share[depth > 0.0, 1])
-    np.maximum.at(top, place, stand.height_m + ground[depth > 0.0])
-    outside = (enter > 1e-9) & (leave < 1.0 - 1e-9)
-    total = 10.0 ** (-through / 10.0)
-    for way in _detours(stand, start[some], end[some], enter, leave, top):
-        total += np.where(outside, 10.0 ** (-deygout_db(*way, wavelength_m) / 10.0), 0.0)
-    return some, np.maximum(-10.0 * np.log10(total), 0.0)
+    np.minimum.at(enter, place, share[:, 0])
+    np.maximum.at(leave, place, share[:, 1])
+    np.maximum.at(top, place, stand.height_m + ground)
+    here, there, lower = start[some], end[some], np.zeros(len(some))
+    outside = ((enter > 1e-9) | (here[:, 2] > top)) & ((leave < 1.0 - 1e-9) | (there[:, 2] > top))
+    ways = list(_detours(stand, here, there, enter, leave, top))
+    if not isinstance(model, Opaque):
+        length, at, over = ways[0]
+        zone = CLEAR * np.sqrt(wavelength_m * length * at * (1.0 - at))
+        lower = np.where(outside, np.maximum((zone - over).min(axis=0), 0.0), 0.0)
+    up, rise = start[row, 2] - ground - lower[place], (end - start)[row, 2]
+    base, way = stand.height_m * stand.crown_base_fraction, np.linalg.norm((end - start)[row], axis=1)
+    depth = _between(share, up, rise, base, stand.height_m) + TRUNKS * _between(share, up, rise, 0.0, base)
+    through = model.loss_db(np.bincount(place, depth * way, len(some)).astype(np.float64))
+    if isinstance(model, Opaque):
+        return some, through
+    power = sum(10.0 ** (-deygout_db(*detour, wavelength_m) / 10.0) for detour in ways)
+    blocked = (1.0 - 10.0 ** (-through / 10.0)) * (1.0 - np.where(outside, np.minimum(power, 1.0), 0.0))
+    return some, -10.0 * np.log10(1.0 - blocked)
 
 
 def _between(share: FloatArray, up: FloatArray, rise: FloatArray, low: float, high: float) -> FloatArray:

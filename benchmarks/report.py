@@ -35,10 +35,11 @@ LIGHT = "import matplotlib.pyplot, pandas"
 def run(command: list[str], **environment: str) -> dict[str, float]:
     """Seconds (with its children) and peak memory [MiB] of one process, the largest of it and its children."""
     path = f"{ROOT}{os.pathsep}{ROOT / 'parsers'}"
+    inherited = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     with tempfile.TemporaryFile() as said:
         started = time.perf_counter()
         process = subprocess.Popen(
-            command, stdout=said, stderr=said, env={**os.environ, "PYTHONPATH": path, **environment}
+            command, stdout=said, stderr=said, env={**inherited, "PYTHONPATH": path, **environment}
         )
         _, status, used = os.wait4(process.pid, 0)  # RUSAGE_CHILDREN has the peak of all processes before it
         process.returncode = os.waitstatus_to_exitcode(status)

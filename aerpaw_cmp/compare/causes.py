@@ -289,7 +289,8 @@ def _best_sector(
     e: LevelEvidence, residual: FloatArray, sectors: Sequence[tuple[float, float]], phi: float
 ) -> tuple[float, float] | None:
     """Start and width [deg] of the sector whose loss takes off most; None where no sector has a loss."""
-    masks = np.array([(e.tower_azimuth_deg - first) % 360.0 < width for first, width in sectors])
+    turned = {first: (e.tower_azimuth_deg - first) % 360.0 for first in {first for first, _ in sectors}}
+    masks = np.array([turned[first] < width for first, width in sectors])
     shift, taken = _shift(residual, masks, phi)
     inside = masks.sum(axis=1)
     possible = (inside >= _LEAST_BINS) & (masks.shape[1] - inside >= _LEAST_BINS) & (shift < 0.0)

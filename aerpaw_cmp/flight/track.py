@@ -295,6 +295,7 @@ class Track:
         self._attitude = np.column_stack([column("roll_deg"), column("pitch_deg"), column("yaw_deg")])[rows]
         known = np.isfinite(self._attitude).all(axis=1) & np.any(self._attitude != 0.0, axis=1)
         self._known = known
+        self._asked = np.zeros(0, np.int64), self._pose_at(np.zeros(0, np.int64))
         interval = np.diff(self._time_s)
         self.account = TrackAccount(
             rows=len(stamp),
@@ -326,7 +327,9 @@ class Track:
         """
         instant = nanoseconds(times).ravel()
         if len(instant) <= AT_ONCE:
-            return self._pose_at(instant)
+            if not np.array_equal(instant, self._asked[0]):  # channels of a log share their instants
+                self._asked = instant, self._pose_at(instant)
+            return self._asked[1]
         parts = [self._pose_at(part) for part in np.array_split(instant, -(-len(instant) // AT_ONCE))]
         names = [field.name for field in dataclasses.fields(TrackPoses)]
         return TrackPoses(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

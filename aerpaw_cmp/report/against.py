@@ -12,7 +12,6 @@ from ..common.units import FloatArray
 from ..compare.entries import LevelSeries, level_scores
 from ..compare.forecast import ForecastScore
 from ..compare.verdicts import Verdict, stated_errors
-from .prediction_words import after_flight, rank_after_flight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +75,8 @@ class Against:
     @property
     def words(self) -> str:
         """Sentences on what the flight says of the prediction."""
+        from .prediction_words import after_flight, rank_after_flight  # few reports score a prediction
+
         said = [after_flight(self.scores, [item.stated for item in self.series])] if self.series else []
         return " ".join([*said, *(rank_after_flight(tower, score) for tower, score in self.ranks.items())])
 

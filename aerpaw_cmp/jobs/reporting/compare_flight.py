@@ -50,7 +50,6 @@ from ...flight.settings import RssSettings, RtSettings
 from ...flight.training import learned_here
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ...site.site import Site
-from ..learning.calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, levels_of, stated_spread
 from .likely_cause import cause_of
 
@@ -594,6 +593,8 @@ def _receiver_forecast(
     named = data.settings.rank.receiver
     if named is None:
         return None, None, ()
+    from ..learning.calibrate_rank import rank_samples, read_receiver  # few flights name one
+
     receivers = read_receiver(data.folder / named)
     if series.tower not in receivers:
         raise InputError(

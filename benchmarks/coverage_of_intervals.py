@@ -12,6 +12,7 @@ width over the truth (offset: over the shadowing). Every flight is given an inte
 """
 
 import argparse
+import itertools
 import json
 
 import numpy as np
@@ -121,12 +122,9 @@ def rank_coverage(flights: int, n: int, memory: float, replicates: int) -> dict[
         )
         swapped = compare_ranks(np.searchsorted(CUTS + 0.3, two) + 1.0, np.searchsorted(CUTS, one) + 1.0, replicates=20)
         ends = {
-            "agreement": fit.agreement_ci95,
-            "kappa": fit.kappa_ci95,
-            "total_variation": fit.total_variation_ci95,
-            "wasserstein": fit.wasserstein_ci95,
-            "bar_1": swapped.histogram_ci95[0],
-        }
+            "agreement": fit.agreement_ci95, "kappa": fit.kappa_ci95, "total_variation": fit.total_variation_ci95,
+            "wasserstein": fit.wasserstein_ci95, "bar_1": swapped.histogram_ci95[0],
+        }  # fmt: skip
         for name, (low, high) in ends.items():
             hits[name] += low <= truth[name] <= high
     return {name: count / flights for name, count in hits.items()}
@@ -139,12 +137,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     flights, replicates = arguments.flights, arguments.replicates
-    rows = [
-        rss_cell(flights, n, neighbours, noise)
-        for noise in (0.0, NOISE_DB)
-        for n in SIZES
-        for neighbours in CORRELATIONS
-    ]
+    cells = itertools.product((0.0, NOISE_DB), SIZES, CORRELATIONS)
+    rows = [rss_cell(flights, n, neighbours, noise) for noise, n, neighbours in cells]
     ranks = [
         {"samples": n, "memory_samples": memory, **rank_coverage(flights, n, memory, replicates)}
         for n, memory in ((1500, 5.0), (3000, 30.0))

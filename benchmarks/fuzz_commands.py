@@ -102,29 +102,19 @@ def drawn(draw: random.Random, root: Path) -> Call:
         return spelling(draw, root, folder)
 
     def ingest() -> list[str]:
-        words = [
-            "ingest",
-            *([str(root / "fifo")] if draw.random() < 0.02 else []),
-            *(path() for _ in range(draw.randint(1, 4))),
-            "--timezone",
-            "America/New_York",
-        ]
+        words = ["ingest", *([str(root / "fifo")] if draw.random() < 0.02 else [])]
+        words += [*(path() for _ in range(draw.randint(1, 4))), "--timezone", "America/New_York"]
         if draw.random() < 0.5:
             words += ["-o", draw.choice([path(), str(root / "out" / "f.h5"), "f.h5", str(root / "no" / "f.h5")])]
         if draw.random() < 0.2:
             words += ["--draft", draw.choice([path(), str(root / "out" / "flight.yaml")])]
         return words + draw.choice([[], [], ["--force"], ["--json"], ["-q"], ["--reader", "quectel_ri"]])
 
+    jobs = ["report", "simulate", "campaign", "calibrate", "map"]
     lines: list[Callable[[], list[str]]] = [
         ingest,
         lambda: draw.choice([[], ["--help"], ["--version"], ["formats"], ["formats", "--json"], ["reprot"], [path()]]),
-        lambda: [
-            draw.choice(["report", "simulate", "campaign", "calibrate", "map"]),
-            path(),
-            "--dry-run",
-            "-o",
-            path(),
-        ],
+        lambda: [draw.choice(jobs), path(), "--dry-run", "-o", path()],
         lambda: ["diff", path(), path()],
         lambda: ["explain", path(), "--time", draw.choice(["now", "2025-06-01T14:00:10Z", ""])],
         lambda: ["site", draw.choice(["import", "show", "export"]), path(), "-o", path()],

@@ -90,20 +90,12 @@ def write_drive_test(place: Path, lines: int) -> None:
             level = rng.integers(-115, -60, count).tolist()
             rows = zip(_wall(first, count, 500_000_000).tolist(), range(first, first + count), level, strict=True)
             file.writelines(
-                b"%s,-78.70%05d,35.73%05d,%d,11,%d,%d,%d,%d,9,%s\n"
-                % (
-                    time,
-                    n % 99989,
-                    n % 99991,
-                    n % 7,
-                    n // 50 % 8,
-                    rsrp,
-                    -9 - n % 5,
-                    n % 25,
+                b"%s,-78.70%05d,35.73%05d,%d,11,%d,%d,%d,%d,9,%s\n" % (
+                    time, n % 99989, n % 99991, n % 7, n // 50 % 8, rsrp, -9 - n % 5, n % 25,
                     b"%d" % (rsrp - 6) if n % 2 else b"",
                 )
                 for time, n, rsrp in rows
-            )
+            )  # fmt: skip
 
 
 SCALED: dict[str, tuple[Callable[[Path, int], None], str, ReadOptions]] = {

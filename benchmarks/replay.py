@@ -43,19 +43,14 @@ def digits(links: int) -> dict[str, object]:
     source = next(iter(site.towers.values())).position_m
     worst, wrong = 0.0, dict.fromkeys((10, 100, 1000), 0)
     eta = {name: mp.mpc(material(name).relative_permittivity(link.carrier_hz)) for name in set(result.faces.material)}
+
+    def face(f: int) -> tuple[Any, ...]:
+        name = result.faces.material[f]
+        offset = mp.mpf(float(result.faces.offset_m[f]))
+        return reference.vec(result.faces.normal[f]), offset, eta[name], material(name).thickness_m
+
     for pose in range(links):
-        paths = [
-            [
-                (
-                    reference.vec(result.faces.normal[f]),
-                    mp.mpf(float(result.faces.offset_m[f])),
-                    eta[result.faces.material[f]],
-                    material(result.faces.material[f]).thickness_m,
-                )
-                for f in row[row >= 0]
-            ]
-            for row in result.paths.faces[result.paths.pose == pose]
-        ]
+        paths = [[face(f) for f in row[row >= 0]] for row in result.paths.faces[result.paths.pose == pose]]
         turn = poses.rotation[pose] @ link.uav_array.mount
         h = reference.channel(
             [reference.vec(p) for p in source + tower.positions_m @ tower.mount.T],

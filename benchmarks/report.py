@@ -136,11 +136,8 @@ def main() -> None:
             "ratio_cpu": statistics.median(IMPORTED.ratios(r)["ratio"] for r in reports),
             "peak_mib": max(r["peak_mib"] for r in reports),
         },
-        "sample": sample,
-        "sample_later": sample_later,
-        "now": now,
-        "later": later,
-    }
+        "sample": sample, "sample_later": sample_later, "now": now, "later": later,
+    }  # fmt: skip
     if arguments.json:
         print(json.dumps(result, indent=1))
         return

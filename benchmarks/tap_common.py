@@ -66,13 +66,8 @@ def start_tap(port: Path, folder: Path, **settings: Any) -> subprocess.Popen[str
     """A tap in its own process; its summary comes as JSON on standard output."""
     values = {"port": str(port), "folder": str(folder), **settings}
     environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'parsers'}"}
-    return subprocess.Popen(
-        [sys.executable, "-c", CHILD, json.dumps(values)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    )
+    command = [sys.executable, "-c", CHILD, json.dumps(values)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 
 BROWSER = """
@@ -121,10 +116,8 @@ def damaged(chance: random.Random) -> bytes:
     if kind == 1:
         return bytes(request[: chance.randrange(len(request))])
     if kind == 2:
-        long = chance.choice(
-            [b"GET /" + b"a" * 70_000, b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * chance.choice([50, 2000])]
-        )
-        return long + b"\r\n\r\n"
+        many = b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * chance.choice([50, 2000])
+        return chance.choice([b"GET /" + b"a" * 70_000, many]) + b"\r\n\r\n"
     if kind == 3:
         parts = [b"/", b"..", b"%2e%2e", b"%00", b"etc", b"passwd", b"?token=", b"&", b"[", b"\\", b"events", b"\xff"]
         return b"GET " + b"".join(chance.choice(parts) for _ in range(10)) + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
@@ -161,12 +154,8 @@ def resident_kib(pid: int) -> int:
 
 def conditions() -> dict[str, object]:
     """What the numbers depend on."""
-    return {
-        "python": platform.python_version(),
-        "kernel": platform.release(),
-        "cores": os.cpu_count(),
-        "load": [round(x, 2) for x in os.getloadavg()],
-    }
+    load = [round(x, 2) for x in os.getloadavg()]
+    return {"python": platform.python_version(), "kernel": platform.release(), "cores": os.cpu_count(), "load": load}
 
 
 def show(result: dict[str, object], as_json: bool) -> None:

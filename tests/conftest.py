@@ -158,7 +158,7 @@ def blank_pictures() -> Iterator[None]:
     from aerpaw_cmp.report import canvas
 
     def save_as(fig: Any, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
-        return blank(tuple(fig.get_size_inches()), tuple(formats), kind)
+        return dict(blank(tuple(fig.get_size_inches()), tuple(formats), kind))  # the caller may take from it
 
     @cache
     def blank(size: tuple[float, float], formats: tuple[str, ...], kind: str) -> dict[str, bytes]:

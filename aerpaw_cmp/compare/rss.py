@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..common.jsonable import named
 from ..common.units import BoolArray, FloatArray, IntArray, db_from_power, power_from_db
 from .offset import SPAN_DB, STEP_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, trimmed_offset
 from .statistics import (
@@ -149,14 +150,11 @@ def compare_rss(
     offsets, curve = offset_curve(m, s, step_db=step_db, span_db=span_db)
     simple = {name: _levels(levels) for name, levels in (baselines or {}).items()}
     return RssComparison(
-        offset_db=fit.offset_db,
-        rmse_db=fit.rmse_db,
-        n=fit.n,
+        **named(fit, "offset_db rmse_db n at_edge"),
         n_out_of_coverage=int((known & ~use).sum()),
         n_measured_out=int((known & ~np.isfinite(measured)).sum()),
         n_simulated_out=int((known & ~np.isfinite(simulated)).sum()),
         n_no_pose=int((~known).sum()),
-        at_edge=fit.at_edge,
         correlation=correlation(m, s),
         intervals=error_intervals(m, s),
         identifiable_db=identifiable_range(offsets, curve),

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from ..common.errors import UsageError
+from ..common.jsonable import named
 from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
@@ -422,13 +423,9 @@ def replay_poses(
         _check_moving(engine, towers)
     search = Search(
         engine,
-        max_depth=rt.max_depth,
-        samples=rt.advanced.samples,
+        **named(rt, "max_depth diffraction refraction"),
+        **named(rt.advanced, "samples ridges device"),
         crowns=reflecting_crowns(site.trees, rt),
-        diffraction=rt.diffraction,
-        ridges=rt.advanced.ridges,
-        refraction=rt.refraction,
-        device=rt.advanced.device,
     )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
     alone = engine == "image" and search.crowns is None and site.dem is None

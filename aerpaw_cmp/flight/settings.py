@@ -24,6 +24,7 @@ from pydantic import (
 )
 
 from ..common.errors import InputError, UsageError
+from ..common.jsonable import named
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, noise_floor_dbm, wavelength_m
 from ..common.yamlfile import load_yaml
 from ..logs.readers import ReadOptions
@@ -227,11 +228,9 @@ class LinkSettings(Settings):
         wavelength = wavelength_m(self.carrier_hz)
         arrays = {name: self.towers.get(name, self.tower).build(wavelength, folder) for name in tower_names}
         return Link(
-            carrier_hz=self.carrier_hz,
+            **named(self, "carrier_hz transmit_power_dbm uav_transmits"),
             tower_arrays=arrays,
             uav_array=self.uav.build(wavelength, folder),
-            transmit_power_dbm=self.transmit_power_dbm,
-            uav_transmits=self.uav_transmits,
             noise_floor_dbm=self.floor_dbm,
         )
 
@@ -286,16 +285,7 @@ class LogSettings(Settings):
         """The reader options, with the flight's zone as default."""
         return ReadOptions(
             timezone=self.timezone or timezone,
-            clock=self.clock,
-            time_origin=self.time_origin,
-            ri_base=self.ri_base,
-            columns=self.columns,
-            kind=self.kind,
-            node=self.node,
-            channel=self.channel,
-            frequency_hz=self.frequency_hz,
-            unit=self.unit,
-            floor_db=self.floor_db,
+            **named(self, "clock time_origin ri_base columns kind node channel frequency_hz unit floor_db"),
         )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ..common.jsonable import named
 from ..common.units import AnyArray
 from .readers import ReadOptions
 from .records import COLUMNS, Attribute, Kind
@@ -62,13 +63,7 @@ def frame(
 
 def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Attribute]:
     """Attributes from the options, then those of the reader; what is unknown is left out."""
-    found: dict[str, Attribute | None] = {
-        "node": options.node,
-        "channel": options.channel,
-        "frequency_hz": options.frequency_hz,
-        "timezone": options.timezone,
-        **extra,
-    }
+    found: dict[str, Attribute | None] = {**named(options, "node channel frequency_hz timezone"), **extra}
     return {name: value for name, value in found.items() if value is not None}
 
 

@@ -180,10 +180,8 @@ def waypoints_of(data: FlightData) -> tuple[record.Waypoint, ...]:
         index = start + int(near[0])
         out.append(
             record.Waypoint(
-                label=point.label,
+                **named(point, "label east_m north_m"),
                 time=track.time[index],
-                east_m=point.east_m,
-                north_m=point.north_m,
                 up_m=point.height_m,
             )
         )

@@ -23,6 +23,7 @@ from shapely.geometry.base import BaseGeometry
 
 from ..common.errors import InputError, UsageError
 from ..common.geodesy import SiteFrame
+from ..common.jsonable import named
 from ..common.units import FloatArray
 from ..common.yamlfile import dump_yaml
 from .mapfiles import read_map_file
@@ -596,9 +597,7 @@ def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
         "forests": [
             {
                 **outline_dict(f.name, f.area),
-                "trees_per_hectare": f.trees_per_hectare,
-                "minimum_spacing_m": f.minimum_spacing_m,
-                "source": f.source,
+                **named(f, "trees_per_hectare minimum_spacing_m source"),
             }
             for f in imports.forests
         ],

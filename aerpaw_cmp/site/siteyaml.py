@@ -21,6 +21,7 @@ from shapely.geometry import Point, Polygon
 
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
+from ..common.jsonable import named
 from ..common.units import FloatArray
 from ..common.yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines, nearest
 from .dem import Dem, read_dem
@@ -410,12 +411,8 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     notes += _buried(towers, buildings) + _overlaps(buildings)
     forests = tuple(
         Forest(
-            name=item.name,
+            **named(item, "name trees_per_hectare minimum_spacing_m source height_m"),
             area=outline,
-            trees_per_hectare=item.trees_per_hectare,
-            minimum_spacing_m=item.minimum_spacing_m,
-            source=item.source,
-            height_m=item.height_m,
             crown_base_fraction=model.trees.crown_base_fraction,
         )
         for item, outline in _outlines(model.forests, "forests", frame)
@@ -423,16 +420,14 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     with _at("trees"):
         trees = _on_ground(_trees(model.trees, forests, buildings, towers, frame, notes), dem)
     return Site(
-        name=model.name,
+        **named(model, "name ground_material illustrative"),
         frame=frame,
         towers=towers,
         buildings=buildings,
         forests=forests,
         trees=trees,
         geofences=tuple(Geofence(item.name, area) for item, area in _outlines(model.geofences, "geofences", frame)),
-        ground_material=model.ground_material,
         area_m=area,
-        illustrative=model.illustrative,
         notes=tuple(notes),
         datum=datum,
         dem=dem,
@@ -450,10 +445,7 @@ def _scene(model: SiteModel, folder: Path) -> tuple[TriangleScene | None, list[s
     what = model.scene
     scene = placed_scene(
         folder / what.path,
-        materials=what.materials,
-        sha256=what.sha256,
-        offset_m=what.offset_m,
-        turn_deg=what.turn_deg,
+        **named(what, "materials sha256 offset_m turn_deg"),
         ground_plane=model.ground_material if what.ground_plane else None,
     )
     return scene, list(scene.notes)
@@ -586,13 +578,11 @@ def _tower(
         )
     return Tower(
         name=name,
-        latitude_deg=chosen.latitude_deg,
-        longitude_deg=chosen.longitude_deg,
+        **named(chosen, "latitude_deg longitude_deg source"),
         east_m=float(east),
         north_m=float(north),
         antenna_height_m=height,
         ground_m=ground,
-        source=chosen.source,
     )
 
 
@@ -619,12 +609,9 @@ def _building(model: BuildingModel, footprint: Polygon, dem: Dem | None) -> Buil
     if dem is not None:  # a floor is level: the ground under the middle
         base += float(np.nan_to_num(dem.ground_m(footprint.centroid.x, footprint.centroid.y)))
     return Building(
-        name=model.name,
+        **named(model, "name height_m material source"),
         footprint=footprint,
-        height_m=model.height_m,
         base_m=base,
-        material=model.material,
-        source=model.source,
     )
 
 

@@ -283,9 +283,7 @@ def of_campaign(data: CampaignData) -> Export | None:
             time = start + _nanoseconds(track.time_s)
             lines.append(Line(flight=track.flight, time=time, east_m=east, north_m=north, up_m=up))
     return Export(
-        name=data.name,
-        title=data.title,
-        site=data.site,
+        **named(data, "name title site"),
         sets=(*points_table("rss", rss, data.site.frame), *points_table("rank", rank, data.site.frame)),
         lines=tuple(lines),
         clock=_clock(item["time"] for item in (*rss, *rank)),

@@ -187,7 +187,7 @@ def render(spec: FigureSpec, formats: Sequence[str] = ("svg", "png"), kind: str 
     """Draw a figure and forget it; its pictures stay."""
     with style(kind):
         files = save_as(spec.draw(), (*formats, INLINE) if "png" in formats else formats, kind)
-    return Picture(spec, files, files.pop(INLINE, b""))
+    return Picture(spec, {name: files[name] for name in formats}, files.get(INLINE, b""))
 
 
 def write_figures(

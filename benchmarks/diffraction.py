@@ -3,12 +3,14 @@
 1. 5 towers x ``--poses`` poses x 12 buildings, 4 x 4 elements, depth 2: replays without and with edges in turn, on one
    thread, ``--pairs`` times; the ratio is that of what diffraction adds to what the reflections take;
 2. with ``--town``: munich with 200 receivers, depth 2, single diffraction (Sionna RT must be installed: its scene);
-3. with ``--flights``: flight files with the site's buildings, without and with edges: RMSE of levels, kappa of ranks;
+3. with ``--flights``: flight files with the site's buildings (each of tests/field where none is named), without and
+   with edges: RMSE of levels, kappa and agreement of ranks at K = 10, and whether diffraction pays, by the interval of
+   the paired difference (95 %);
 4. with ``--sionna``: Sionna RT's ``edge_diffraction`` behind a metal screen less the exact half-plane (the values that
    the tests hold), by the polarisation of the elements and the angle of shadow.
 
 Run: python benchmarks/diffraction.py [--poses 10000] [--pairs 3] [--town] [--sionna] [--json]
-     python benchmarks/diffraction.py --flights FILE... --logs-root DIR [--json]
+     python benchmarks/diffraction.py --flights [FILE...] --logs-root DIR
 """
 
 import argparse
@@ -22,6 +24,7 @@ import numpy as np
 from scenes import ends, shipped  # type: ignore[import-not-found]
 
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.jobs.notebook import open_flight
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
@@ -29,6 +32,11 @@ from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import Replay, replay
 from aerpaw_cmp.site.mitsuba import read_scene
 from aerpaw_cmp.site.site import Site, Tower
+
+VERDICTS = {"better": "it pays", "worse": "it costs"} | dict.fromkeys(
+    ("not significant", "no interval"), "it does not pay"
+)
+FIELD = Path(__file__).parents[1] / "tests" / "field"
 
 
 def timed(case: tuple[Site, Link, Poses], diffraction: str) -> tuple[Replay, float]:
@@ -71,22 +79,36 @@ def town(receivers: int = 200) -> dict[str, float]:
     return row | {"edge_paths": len(found.edge_paths or ()), "street_receivers": int(street.sum())}
 
 
-def flight(path: str, logs_root: str | None) -> list[dict[str, object]]:
-    """RMSE [dB] of each channel, and kappa of each tower's rank at K = 10, without and with edges."""
-    numbers: dict[tuple[str, str], list[float]] = {}
+def flight(path: str, logs_root: str | None) -> list[str]:
+    """A sentence for each channel and each tower's rank: its error without and with edges, and the difference."""
+    results = []
     for mode in ("none", "edges"):
         changed = {"site.without_buildings": False, "rt.diffraction": mode, "rt.audit_links": 0}
-        scores = open_flight(path, logs_root=logs_root, overrides=changed).compare()
-        for one in scores.result.rss:
-            numbers.setdefault((f"{one.tower} {one.channel}", "RMSE dB"), []).append(one.score.rmse_db)
-        if scores.result.rank:
-            table = scores.rank_to_frame()
-            for row in table[table.k == 10].itertuples():
-                numbers.setdefault((row.tower, "kappa"), []).append(row.kappa)
-    return [
-        {"flight": path, "series": series, "number": name, "without": round(two[0], 4), "with": round(two[1], 4)}
-        for (series, name), two in numbers.items()
-    ]
+        results.append(open_flight(path, logs_root=logs_root, overrides=changed).compare())
+    without, edges = (scores.result for scores in results)
+    lines = []
+    for plain, bent in zip(without.rss, edges.rss, strict=True):
+        two = [np.where(s.posed, s.measured_db - s.simulated_dbm, np.nan) for s in (bent, plain)]
+        pair = paired_difference(*two)
+        low, high = pair.difference_ci95_db
+        lines.append(
+            f"{Path(path).stem} {plain.tower} {plain.channel}: RMSE {plain.score.rmse_db:.2f} dB,"
+            f" with edges {bent.score.rmse_db:.2f}, difference {pair.difference_db:+.2f} ({low:.2f} to {high:.2f}):"
+            f" {VERDICTS[pair.verdict]}"
+        )
+    for first, second in zip(without.rank, edges.rank, strict=True):
+        both = np.isfinite(first.measured) & (first.rank[10] > 0) & (second.rank[10] > 0)
+        pair = paired_difference(
+            *(np.where(both, ranks.rank[10] != ranks.measured, np.nan) for ranks in (second, first)), free_offset=False
+        )
+        tables = (scores.rank_to_frame().set_index(["tower", "k"]) for scores in results)
+        kappa = [float(table.kappa[first.tower, 10.0]) for table in tables]
+        low, high = pair.mean_square_ci95_db2
+        lines.append(
+            f"{Path(path).stem} {first.tower} rank: kappa {kappa[0]:.3f}, with edges {kappa[1]:.3f}, disagreement"
+            f" {pair.mean_square_difference_db2:+.4f} ({low:.4f} to {high:.4f}): {VERDICTS[pair.verdict]}"
+        )
+    return lines
 
 
 def screen() -> dict[str, float]:
@@ -134,15 +156,17 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--town", action="store_true")
     parser.add_argument("--sionna", action="store_true")
-    parser.add_argument("--flights", nargs="*", default=[])
+    parser.add_argument("--flights", nargs="*")
     parser.add_argument("--logs-root")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     result: dict[str, object] = {"load": os.getloadavg()[0]}
-    if options.flights:
-        rows = [row for path in options.flights for row in flight(path, options.logs_root)]
-        result |= {f"{row['flight']} {row['series']}": row for row in rows}
-    elif options.sionna:
+    if options.flights is not None:
+        every = (path for path in sorted(FIELD.rglob("*.yaml")) if "\nflight:" in "\n" + path.read_text())
+        for path in options.flights or map(str, every):
+            print(*flight(path, options.logs_root), sep="\n", flush=True)
+        return
+    if options.sionna:
         result["screen"] = screen()
     else:
         result["boxes"] = boxes(options.poses, options.pairs)

@@ -1,11 +1,19 @@
-"""Benchmarks are run rarely: that each still comes to its end is asked by ``make bench-check``, which must know all."""
+"""Benchmarks are run rarely: ``make bench-check`` must know all; short parts of those that look for faults run here."""
 
+import json
 import runpy
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+from benchmarks import kriging
+
+ROOT = Path(__file__).parents[1]
+BENCHMARKS = ROOT / "benchmarks"
+LINUX = sys.platform.startswith("linux")
 
 
 @pytest.fixture(scope="module")
@@ -34,3 +42,65 @@ def test_what_needs_the_field_data_is_left_out_without(
     monkeypatch.delenv("AERPAW_CMP_FIELD_DATA", raising=False)
     assert every["check"](["learned_map"]) == 0
     assert "left out: AERPAW_CMP_FIELD_DATA is not set" in capsys.readouterr().out
+
+
+def said_by(name: str, *options: str) -> str:
+    """What a benchmark says that finds no fault."""
+    command = [sys.executable, str(BENCHMARKS / f"{name}.py"), *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_both_sides_of_kriging_agree(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pykrige")
+    report = kriging.main(["--quick", "--json"])
+    assert json.loads(capsys.readouterr().out) == report
+    assert report["leave_one_out"]["largest_difference"] < 1e-9
+    assert report["leave_one_out"]["systems"] == 100 * 27
+    assert report["moving_window"]["largest_difference_C"] < 1e-9
+
+
+@pytest.mark.skipif(not LINUX or not shutil.which("cc"), reason="needs Linux and a C compiler")
+def test_outputs_are_whole_after_kills_and_errors() -> None:
+    found = json.loads(said_by("output_faults", "--kills", "10", "--seed", "3", "--jobs", "site import"))
+    assert found["n"] == 0
+    assert found["total"]["killed"] >= 8
+    assert found["total"]["full"] == found["total"]["broken"] == found["jobs"]["site import"]["calls"] > 5
+    assert found["planted_fault"]["violations"] > 0
+
+
+@pytest.mark.skipif(not LINUX, reason="forks, and /dev/full")
+def test_random_command_lines_end_in_a_message_and_a_code() -> None:
+    said = said_by("fuzz_commands", "--calls", "60", "--seed", "31")  # the long run is of 10 000
+    assert said.startswith("60 command lines, 0 violations")
+
+
+@pytest.mark.skipif(not LINUX, reason="forks, and /dev/full")
+def test_a_fault_planted_under_random_command_lines_is_seen() -> None:
+    planted = (
+        "import sys, runpy, aerpaw_cmp.logs.ingest as place\n"
+        "def fails(*_): raise ValueError('planted')\n"
+        "place.account_rows = fails\n"
+        f"sys.argv = ['x', '--calls', '40', '--seed', '31']\n"
+        f"runpy.run_path({str(BENCHMARKS / 'fuzz_commands.py')!r}, run_name='__main__')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", planted], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "ValueError: planted" in done.stdout
+
+
+@pytest.mark.parametrize("name", ["planted_faults", "outside_faults"])
+def test_no_planted_fault_is_stale(name: str) -> None:
+    """Faults are planted by text, which must still be in the code."""
+    said_by(name, "--stale")
+
+
+def test_the_tests_named_for_a_fault_from_outside_are_there() -> None:
+    faults = runpy.run_path(str(BENCHMARKS / "outside_faults.py"))["FAULTS"]
+    assert len(faults) == 32
+    assert sum(not fault.unseen for fault in faults) >= 21
+    for fault in faults:
+        for named in fault.tests.split():
+            file, _, test = named.partition("::")
+            assert f"def {test}" in (ROOT / file).read_text(encoding="utf-8"), named

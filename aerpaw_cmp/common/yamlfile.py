@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NoReturn, TypeVar
 
 import pydantic
 import yaml
@@ -192,20 +192,6 @@ class _Document:
         return self.lines.get(known)
 
 
-@dataclass(slots=True)
-class _Open:
-    """A list or mapping under construction."""
-
-    value: Any
-    location: Location
-    line: int
-    anchor: str | None
-    nodes_before: int
-    key: Any = None
-    has_key: bool = False
-    merges: list[tuple[Any, int]] = field(default_factory=list)
-
-
 _KEYS = "keys such as {}"
 
 
@@ -233,42 +219,28 @@ def _tab_indents(text: str, mark: Any) -> bool:
 
 
 class _Builder:
-    """Values from parser events, without recursion, so that no input can overflow the stack."""
+    """Values from parser events; :data:`MAX_DEPTH` bounds the recursion, so that no input can overflow the stack."""
 
     def __init__(self, path: str | Path | None) -> None:
         self.path = path
         self.document = _Document()
-        self.stack: list[_Open] = []
         self.anchors: dict[str, tuple[Any, int]] = {}
         self.nodes = 0
-        self.documents = 0
 
     def build(self, events: Iterator[Any]) -> _Document:
+        self.events = events
+        documents = 0
         for event in events:
-            if isinstance(event, yaml.ScalarEvent):
-                self._count(1, event)
-                value = self._scalar(event)
-                if event.anchor:
-                    self.anchors[event.anchor] = (value, 1)
-                self._place(value, event)
-            elif isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
-                self._open(event)
-            elif isinstance(event, yaml.MappingEndEvent | yaml.SequenceEndEvent):
-                self._close(event)
-            elif isinstance(event, yaml.AliasEvent):
-                anchor = str(event.anchor)
-                if anchor not in self.anchors:
-                    self._fail(event, f"the alias '*{anchor}' names no anchor above it, or contains itself")
-                value, nodes = self.anchors[anchor]
-                self._count(nodes, event)
-                self._place(value, event)
-            elif isinstance(event, yaml.DocumentStartEvent):
-                self.documents += 1
-                if self.documents > 1:
+            if isinstance(event, yaml.DocumentStartEvent):
+                documents += 1
+                if documents > 1:
                     self._fail(event, "a second document begins here ('---'); expected one document")
+                root = next(events)
+                self.document.lines[()] = root.start_mark.line + 1
+                self.document.value = self._value(root, ())
         return self.document
 
-    def _fail(self, event: Any, found: str) -> None:
+    def _fail(self, event: Any, found: str) -> NoReturn:
         raise UsageError(found, path=self.path, line=event.start_mark.line + 1)
 
     def _count(self, nodes: int, event: Any) -> None:
@@ -276,67 +248,66 @@ class _Builder:
         if self.nodes > MAX_NODES:
             self._fail(event, f"the file unfolds to more than {MAX_NODES} values (aliases of aliases?)")
 
-    def _location(self) -> Location:
-        if not self.stack:
-            return ()
-        top = self.stack[-1]
-        return (*top.location, top.key if isinstance(top.value, dict) else len(top.value))
-
-    def _open(self, event: Any) -> None:
+    def _value(self, event: Any, location: Location) -> Any:
+        """What begins with an event; the anchor of a list or mapping is known from its end on."""
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in self.anchors:
+                self._fail(event, f"the alias '*{event.anchor}' names no anchor above it, or contains itself")
+            value, nodes = self.anchors[event.anchor]
+            self._count(nodes, event)
+            return value
+        before = self.nodes
         self._count(1, event)
-        if len(self.stack) >= MAX_DEPTH:
+        value = self._scalar(event) if isinstance(event, yaml.ScalarEvent) else self._collection(event, location)
+        if event.anchor:
+            self.anchors[event.anchor] = (value, self.nodes - before)
+        return value
+
+    def _collection(self, event: Any, location: Location) -> list[Any] | dict[str, Any]:
+        if len(location) >= MAX_DEPTH:
             self._fail(event, f"nested deeper than {MAX_DEPTH} levels")
         is_map = isinstance(event, yaml.MappingStartEvent)
         if event.tag not in (None, "!", _TAG + ("map" if is_map else "seq")):
             self._fail(event, f"the tag '{event.tag}' is not allowed here")
-        top = self.stack[-1] if self.stack else None
-        if top is not None and isinstance(top.value, dict) and not top.has_key:
-            self._fail(event, "a list or mapping stands where a key should be")
-        line = event.start_mark.line + 1
-        self.stack.append(_Open({} if is_map else [], self._location(), line, event.anchor, self.nodes - 1))
+        if is_map:
+            return self._mapping(location)
+        items: list[Any] = []
+        while not isinstance(item := next(self.events), yaml.SequenceEndEvent):
+            place = (*location, len(items))
+            self.document.lines[place] = item.start_mark.line + 1
+            items.append(self._value(item, place))
+        return items
 
-    def _close(self, event: Any) -> None:
-        done = self.stack.pop()
-        for merged, line in done.merges:
+    def _mapping(self, location: Location) -> dict[str, Any]:
+        content: dict[str, Any] = {}
+        merges: list[tuple[Any, int]] = []
+        while not isinstance(event := next(self.events), yaml.MappingEndEvent):
+            key = self._key(event)
+            place = (*location, key)
+            if key in content:
+                first = self.document.lines.get(place)
+                self._fail(event, f"the key '{key}' stands twice (first on line {first})")
+            line = self.document.lines[place] = event.start_mark.line + 1
+            value = self._value(next(self.events), place)
+            if key == "<<":
+                merges.append((value, line))
+            else:
+                content[key] = value
+        for merged, line in merges:
             for part in merged if isinstance(merged, list) else [merged]:
                 if not isinstance(part, dict):
                     raise UsageError("'<<' merges something that is not a mapping", path=self.path, line=line)
-                for key, value in part.items():
-                    done.value.setdefault(key, value)
-        if done.anchor:
-            self.anchors[done.anchor] = (done.value, self.nodes - done.nodes_before)
-        self._place(done.value, event, done.line)
+                content |= {key: value for key, value in part.items() if key not in content}
+        return content
 
-    def _place(self, value: Any, event: Any, line: int | None = None) -> None:
-        line = event.start_mark.line + 1 if line is None else line
-        if not self.stack:
-            self.document.value = value
-            self.document.lines.setdefault((), line)
-            return
-        top = self.stack[-1]
-        if isinstance(top.value, list):
-            self.document.lines[self._location()] = line
-            top.value.append(value)
-        elif top.has_key:
-            top.has_key = False
-            if top.key == "<<":
-                top.merges.append((value, line))
-            else:
-                top.value[top.key] = value
-        else:
-            self._key(top, value, event, line)
-
-    def _key(self, top: _Open, key: Any, event: Any, line: int) -> None:
+    def _key(self, event: Any) -> str:
+        """A key is a name: 'on', 1 or 1.5 stays what was written, for pydantic wants words."""
+        if isinstance(event, yaml.CollectionStartEvent):
+            self._fail(event, "a list or mapping stands where a key should be")
+        key = self._value(event, ())
         if key is None or isinstance(key, list | dict):
             self._fail(event, "a key is empty or not a word")
-        # keys are names: 'on', 1 or 1.5 as keys stay what was written (pydantic wants words)
-        key = event.value if isinstance(event, yaml.ScalarEvent) else str(key)
-        place = (*top.location, key)
-        if key in top.value:
-            first = self.document.lines.get(place)
-            self._fail(event, f"the key '{key}' stands twice (first on line {first})")
-        top.key, top.has_key = key, True
-        self.document.lines[place] = line
+        return str(event.value if isinstance(event, yaml.ScalarEvent) else key)
 
     def _scalar(self, event: Any) -> Any:
         text: str = event.value

@@ -12,13 +12,16 @@ from .. import __version__
 PACKAGES = ("numpy", "scipy", "pandas", "pyproj", "shapely", "sionna-rt", "mitsuba", "drjit")
 
 
+NOT_INSTALLED = "not installed"
+
+
 @cache
 def version(package: str) -> str:
     """Version of an installed package, "not installed" where it is not; its metadata is read once."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
-        return "not installed"
+        return NOT_INSTALLED
 
 
 def utc_now() -> str:

@@ -54,9 +54,9 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 
 
 class StrictModel(pydantic.BaseModel):
-    """A settings model that refuses unknown keys and cannot be changed after loading."""
+    """Base of all settings: nothing unknown, every number one, no change after loading."""
 
-    model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(extra="forbid", frozen=True)
+    model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def nearest(name: object, choices: Iterable[str]) -> str | None:
@@ -249,7 +249,7 @@ class _Builder:
             self._fail(event, f"the file unfolds to more than {MAX_NODES} values (aliases of aliases?)")
 
     def _value(self, event: Any, location: Location) -> Any:
-        """What begins with an event; the anchor of a list or mapping is known from its end on."""
+        """Scalar, list or mapping that begins with an event; the anchor of a list or mapping is known from its end on."""
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in self.anchors:
                 self._fail(event, f"the alias '*{event.anchor}' names no anchor above it, or contains itself")

@@ -9,7 +9,6 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from ..common.errors import UsageError
 from ..common.jsonable import named
 from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
@@ -419,8 +418,6 @@ def replay_poses(
     engine = engine or rt.engine
     towers = "+".join(link.tower_arrays)
     name = f"{engine} {towers}" if towers_m is None else f"replay {towers}, which moves"
-    if towers_m is not None:
-        _check_moving(engine, towers)
     search = Search(
         engine,
         **named(rt, "max_depth diffraction refraction"),
@@ -449,22 +446,6 @@ def _tell(progress: Progress, name: str, estimate: Estimate) -> None:
     """Say what a search will take, where it is more than a moment."""
     if estimate.seconds > 1.0:
         progress(f"path search {name}: {estimate}")
-
-
-def _check_moving(engine: Engine, name: str) -> None:
-    """Refuse what a tower that moves cannot be replayed with.
-
-    Raises
-    ------
-    UsageError
-        Engine sionna.
-    """
-    if engine != "image":
-        raise UsageError(
-            f"towers.{name} moves and the engine is {engine!r}",
-            expected="rt.engine: image (or --engine image)",
-            cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
-        )
 
 
 def fields_from(

@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     ModelWrapValidatorHandler,
     PrivateAttr,
@@ -26,7 +24,7 @@ from pydantic import (
 from ..common.errors import InputError, UsageError
 from ..common.jsonable import named
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, noise_floor_dbm, wavelength_m
-from ..common.yamlfile import load_yaml
+from ..common.yamlfile import StrictModel, load_yaml
 from ..logs.readers import ReadOptions
 from ..logs.records import Kind
 from ..propagation.arrays import (
@@ -48,13 +46,7 @@ if TYPE_CHECKING:
 Positive = Annotated[float, Field(gt=0)]
 
 
-class Settings(BaseModel):
-    """Base of all settings: frozen, nothing unknown, every number one."""
-
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class GroupedSettings(Settings):
+class GroupedSettings(StrictModel):
     """Settings whose numerical knobs stand below ``advanced``.
 
     Files of 0.3 and before have the knobs beside it, and keys that are gone: both are read, and :func:`load_flight`
@@ -116,7 +108,7 @@ class AntennaSettings(GroupedSettings):
         return self
 
 
-class ArraySettings(Settings):
+class ArraySettings(StrictModel):
     """Elements of one device.
 
     ``layout``: ``single``; ``linear`` (``elements`` at half a wavelength, along the device's left axis);
@@ -194,7 +186,7 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
     return Isotropic()
 
 
-class LinkSettings(Settings):
+class LinkSettings(StrictModel):
     """One radio link: carrier, power, and the arrays at both ends."""
 
     carrier_hz: Positive
@@ -249,7 +241,7 @@ def _rank_link() -> LinkSettings:
     )
 
 
-class LinksSettings(Settings):
+class LinksSettings(StrictModel):
     """The RSS link (single elements, 3.3 GHz) and the rank link (4 x 4, 3.4 GHz) of the paper as defaults."""
 
     rss: LinkSettings = Field(default_factory=_rss_link)
@@ -258,7 +250,7 @@ class LinksSettings(Settings):
     rank: LinkSettings = Field(default_factory=_rank_link)
 
 
-class LogSettings(Settings):
+class LogSettings(StrictModel):
     """One log file and what it cannot say about itself."""
 
     path: str
@@ -289,7 +281,7 @@ class LogSettings(Settings):
         )
 
 
-class Waypoint(Settings):
+class Waypoint(StrictModel):
     """A planned point: ``height_m`` above the ground at the origin; the UAV waits there ``hold_s`` seconds."""
 
     label: str = ""
@@ -299,7 +291,7 @@ class Waypoint(Settings):
     hold_s: Annotated[float, Field(ge=0)] = 0.0
 
 
-class PlanSettings(Settings):
+class PlanSettings(StrictModel):
     """Ground truth that ``aerpaw-cmp simulate`` plants into the logs it writes; all of it goes into truth.json."""
 
     start: datetime
@@ -331,7 +323,7 @@ class PlanSettings(Settings):
     """Share of reports with RI 0 (no CSI)."""
 
 
-class FlightSettings(Settings):
+class FlightSettings(StrictModel):
     """Name and kind of the flight."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
@@ -341,7 +333,7 @@ class FlightSettings(Settings):
     plan: PlanSettings | None = None
 
 
-class SiteChoice(Settings):
+class SiteChoice(StrictModel):
     """A site and what this flight changes of it."""
 
     file: str = "lake_wheeler"
@@ -352,7 +344,7 @@ class SiteChoice(Settings):
     without_buildings: bool = False
 
 
-class GroundNode(Settings):
+class GroundNode(StrictModel):
     """A node of this flight that the site does not list, such as a rover or a second UAV: a place, or its track."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
@@ -380,7 +372,7 @@ class GroundNode(Settings):
         return self
 
 
-class AdvancedRt(Settings):
+class AdvancedRt(StrictModel):
     """Knobs of a replay that few flights need."""
 
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=100_000_000)] = "auto"
@@ -440,7 +432,7 @@ MAXIMUM_OFFSETS = 1_000_000
 """The offset grid of a report may not be longer: 100 dB in steps of 0.0001 dB."""
 
 
-class AdvancedRss(Settings):
+class AdvancedRss(StrictModel):
     """Knobs of the level's comparison that few flights need."""
 
     step_db: Positive = 0.1
@@ -490,7 +482,7 @@ class RssSettings(GroupedSettings):
         return value
 
 
-class AdvancedRank(Settings):
+class AdvancedRank(StrictModel):
     """Knobs of the rank's comparison that few flights need."""
 
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
@@ -527,7 +519,7 @@ class ReportSettings(GroupedSettings):
     """Formats of the samples besides rss.csv and rank.csv."""
 
 
-class FlightFile(Settings):
+class FlightFile(StrictModel):
     """The whole flight.yaml."""
 
     flight: FlightSettings
@@ -577,7 +569,7 @@ class FlightFile(Settings):
         return value
 
 
-class LearnedSettings(Settings):
+class LearnedSettings(StrictModel):
     """calibrated.yaml: the part of a flight.yaml that a calibration knows."""
 
     trained_on: list[str] = []

@@ -360,11 +360,7 @@ class FlightSimulator:
         links = self.settings.link
         link = links.channels.get(log.channel, links.rss).build([log.node], self.folder)
         rt = self.settings.rt
-        search = Search(
-            rt.engine,
-            max_depth=rt.max_depth,
-            samples=rt.advanced.samples,
-        )
+        search = Search(rt.engine, max_depth=rt.max_depth, samples=rt.advanced.samples)
         result = replay(self.site, link, self._poses(time_s), search)
         offset = plan.offsets_db.get(log.node, {}).get(log.channel, 0.0)
         summed = result.rss_power_dbm if self.settings.rss.field == "power" else result.rss_dbm

@@ -15,6 +15,7 @@ from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any, Literal
 
+from ..common import versions
 from ..common.errors import AerpawCmpError
 from . import llvm
 
@@ -87,13 +88,6 @@ def python_check(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
     return Check("Python", "ok", found)
 
 
-def _version(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
-
-
 def package_checks() -> Iterator[Check]:
     """Sionna RT, Mitsuba and Dr.Jit are installed, in the versions that Sionna RT pins."""
     pins: dict[str, str] = {}
@@ -104,10 +98,9 @@ def package_checks() -> Iterator[Check]:
     except metadata.PackageNotFoundError:
         pass
     for title, name in (("Sionna RT", "sionna-rt"), ("Mitsuba", "mitsuba"), ("Dr.Jit", "drjit")):
-        version = _version(name)
-        pin = pins.get(name)
-        if version is None:
-            yield Check(title, "fail", "not installed", "make setup")
+        version, pin = versions.version(name), pins.get(name)
+        if version == versions.NOT_INSTALLED:
+            yield Check(title, "fail", version, "make setup")
         elif pin and version != pin:
             yield Check(title, "fail", f"{version}, but Sionna RT needs {pin}", f"pip install '{name}=={pin}'")
         else:

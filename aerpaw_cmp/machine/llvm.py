@@ -21,10 +21,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
-from importlib import metadata
 from pathlib import Path
 
 from ..common.errors import CheckError
+from ..common.versions import version
 
 MINIMUM_MAJOR = 17
 """14 is refused by Dr.Jit; 15 and 16 abort on AVX-512. 19 and 22 were tried on such a machine."""
@@ -319,12 +319,7 @@ def _verdict_file(library: Library) -> Path:
     except OSError:
         processor = platform.processor()
     stat = library.path.stat()
-    versions = []
-    for name in ("sionna-rt", "mitsuba", "drjit"):
-        try:
-            versions.append(metadata.version(name))
-        except metadata.PackageNotFoundError:
-            versions.append("none")
+    versions = [version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
     # the nodes of a cluster share home folders: hence the processor in the key
     key = repr((str(library.path), stat.st_size, stat.st_mtime_ns, versions, processor, sys.prefix))
     return cache_folder() / "llvm" / sha256(key.encode()).hexdigest()[:24]

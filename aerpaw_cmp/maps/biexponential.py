@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -181,15 +182,7 @@ class _Projection:
 
     def single(self) -> float:
         """Logarithm of the rate of the best single exponential."""
-        from scipy.optimize import minimize_scalar
-
-        def cost(log_rate: float) -> float:
-            return self._single_cost(log_rate)
-
-        axis = np.linspace(*self.log_rates, 200)
-        best = int(np.argmin([cost(a) for a in axis]))
-        bracket = (axis[max(best - 1, 0)], axis[min(best + 1, len(axis) - 1)])
-        return float(minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": 1e-13}).x)
+        return least_on_axis(self._single_cost, self.log_rates, 1e-13)
 
     def _single_amplitude(self, log_rate: float) -> float:
         basis = np.exp(-np.exp(log_rate) * self.d) * self.root_weight
@@ -260,3 +253,13 @@ def _candidate_amplitudes(basis: FloatArray, target: FloatArray) -> FloatArray:
 def _clipped(right: FloatArray, square: FloatArray) -> FloatArray:
     """Minimum over [0, 1] of square * x^2 - 2 * right * x."""
     return np.asarray(np.clip(right / np.maximum(square, TINY), 0.0, 1.0))
+
+
+def least_on_axis(cost: Callable[[float], float], ends: tuple[float, float], tolerance: float) -> float:
+    """Place of the least cost between two ends: the best of 200, then refined between its neighbours."""
+    from scipy.optimize import minimize_scalar
+
+    axis = np.linspace(*ends, 200)
+    best = int(np.argmin([cost(a) for a in axis]))
+    bracket = (axis[max(best - 1, 0)], axis[min(best + 1, len(axis) - 1)])
+    return float(minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": tolerance}).x)

@@ -168,11 +168,16 @@ def grouped(model: Predictor, points_m: ArrayLike, values: ArrayLike, group: Int
     Score
     """
     data = np.asarray(values, dtype=np.float64)
-    estimate = np.full_like(data, np.nan)
+    return score(data, _group_estimate(model, points_m, data, group))
+
+
+def _group_estimate(model: Predictor, points_m: ArrayLike, values: FloatArray, group: IntArray) -> FloatArray:
+    """Estimate of each value from the groups that it is not in."""
+    estimate = np.full_like(values, np.nan)
     for number in np.unique(group):
         test = group == number
-        estimate[test] = held_out_estimate(model, points_m, data, test)[0][test]
-    return score(data, estimate)
+        estimate[test] = held_out_estimate(model, points_m, values, test)[0][test]
+    return estimate
 
 
 def altitude_held_out(model: Predictor, points_m: ArrayLike, altitudes_m: ArrayLike, values: ArrayLike) -> Score:
@@ -201,12 +206,8 @@ def altitude_held_out(model: Predictor, points_m: ArrayLike, altitudes_m: ArrayL
     space = np.column_stack([np.tile(points[:, :2], (len(heights), 1)), np.repeat(heights, len(points))])
     stacked = data.transpose(1, 0, 2).reshape(len(space), -1)
     level = np.repeat(np.arange(len(heights)), len(points))
-    estimate = np.full_like(stacked, np.nan)
-    for held in range(len(heights)):
-        test = level == held
-        estimate[test] = held_out_estimate(model, space, stacked, test)[0][test]
-    shape = (len(heights), len(points), -1)
-    return score(data, estimate.reshape(shape).transpose(1, 0, 2))
+    estimate = _group_estimate(model, space, stacked, level)
+    return score(data, estimate.reshape(len(heights), len(points), -1).transpose(1, 0, 2))
 
 
 def along_trajectory(model: Predictor, grid: Grid, values: ArrayLike, trajectory_m: ArrayLike) -> Score:

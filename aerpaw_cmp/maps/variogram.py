@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray
-from .biexponential import PAPER_BIEXPONENTIAL, BiExponential, fit_biexponential
+from .biexponential import PAPER_BIEXPONENTIAL, BiExponential, fit_biexponential, least_on_axis
 
 __all__ = [
     "PAPER_BIEXPONENTIAL",
@@ -38,7 +38,6 @@ __all__ = [
     "field_correlation",
     "fit_biexponential",
     "fit_vertical_scale",
-    "semivariance",
     "vector_correlation",
     "vertical_correlation",
 ]
@@ -121,8 +120,9 @@ def vector_correlation(
     if missing == "drop" or present[kept].all():
         unit = data[kept] - data[kept].mean(axis=1, keepdims=True)
         unit /= np.sqrt((unit**2).sum(axis=1, keepdims=True))
-        product = _PairProduct(unit)
-        bins = _bin_pairs(points[kept], product, width_m, maximum_m)
+        bins = _bin_pairs(
+            points[kept], lambda rows, columns: np.clip(unit[rows] @ unit[columns].T, -1.0, 1.0), width_m, maximum_m
+        )
     else:
         bins = _bin_pairs(points[kept], _PairwisePearson(data[kept], MINIMUM_COMMON), width_m, maximum_m)
     return BinnedCorrelation(*bins, int(kept.sum()), int(constant.sum()), int(lacking.sum()))
@@ -159,37 +159,8 @@ def field_correlation(
     filled = np.where(present, data, 0.0)
     centred = np.where(present, data - filled.sum(axis=0) / np.maximum(count, 1), 0.0)
     scaled = centred / np.sqrt((centred**2).sum(axis=0) / np.maximum(count, 1))
-    bins = _bin_pairs(points, _MeanProduct(scaled, present), width_m, maximum_m)
+    bins = _bin_pairs(points, _mean_product(scaled, present), width_m, maximum_m)
     return BinnedCorrelation(*bins, int(present.any(axis=1).sum()), int(constant.sum()), int(lacking.sum()))
-
-
-def semivariance(
-    points_m: ArrayLike, values: ArrayLike, *, width_m: float = PAPER_WIDTH_M, maximum_m: float = PAPER_MAXIMUM_M
-) -> BinnedCorrelation:
-    """Matheron's semivariance of one field (n,): half the mean squared difference, in ``correlation``'s place.
-
-    Parameters
-    ----------
-    points_m : array_like, (n, 2) or (n, 3)
-        Distances are horizontal.
-    values : array_like, (n,)
-        NaN takes no part.
-    width_m, maximum_m : float
-        Width of the bins of distance, and the largest distance.
-
-    Returns
-    -------
-    BinnedCorrelation
-        With gamma [squared unit of the values] in place of the correlation.
-
-    Notes
-    -----
-    ``gamma(h) = mean((z_i - z_j)^2) / 2`` over the pairs of a bin (Matheron 1963, doi:10.2113/gsecongeo.58.8.1246).
-    """
-    points, data = _points_and_vectors(points_m, values)
-    kept = np.isfinite(data).all(axis=1)
-    bins = _bin_pairs(points[kept], _HalfSquaredDifference(data[kept]), width_m, maximum_m)
-    return BinnedCorrelation(*bins, int(kept.sum()), 0, int((~kept).sum()))
 
 
 def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorrelation:
@@ -253,8 +224,6 @@ def fit_vertical_scale(
     float
         For ``OrdinaryKriging(vertical_scale=...)``.
     """
-    from scipy.optimize import minimize_scalar
-
     usable = np.isfinite(vertical.correlation) & (vertical.mean_distance_m > 0)
     if not usable.any():
         raise UsageError("no two altitudes to compare", expected="maps of at least two altitudes that vary")
@@ -263,10 +232,7 @@ def fit_vertical_scale(
     def cost(log_scale: float) -> float:
         return float(((np.asarray(correlation(np.exp(log_scale) * height)) - phi) ** 2).sum())
 
-    axis = np.linspace(np.log(bounds[0]), np.log(bounds[1]), 200)
-    best = int(np.argmin([cost(a) for a in axis]))
-    bracket = (axis[max(best - 1, 0)], axis[min(best + 1, len(axis) - 1)])
-    return float(np.exp(minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": 1e-9}).x))
+    return float(np.exp(least_on_axis(cost, (np.log(bounds[0]), np.log(bounds[1])), 1e-9)))
 
 
 # --- pairs ----------------------------------------------------------------------------------------------------------
@@ -333,16 +299,6 @@ class Variogram:
         return np.asarray(sill * (1.0 - self.model_(distance_m)))
 
 
-class _PairProduct:
-    """Product of unit vectors."""
-
-    def __init__(self, unit: FloatArray) -> None:
-        self.unit = unit
-
-    def __call__(self, rows: IntArray, columns: IntArray) -> FloatArray:
-        return np.asarray(np.clip(self.unit[rows] @ self.unit[columns].T, -1.0, 1.0))
-
-
 class _PairwisePearson:
     """Pearson correlation over the components that both vectors have, by matrix products of masked vectors."""
 
@@ -371,30 +327,18 @@ class _PairwisePearson:
         return np.where(good, np.clip(covary / scale, -1.0, 1.0), np.nan)
 
 
-class _MeanProduct:
+def _mean_product(scaled: FloatArray, present: BoolArray) -> Block:
     """Mean product of standardised fields that both positions have."""
+    known, complete = present.astype(np.float64), bool(present.all())
 
-    def __init__(self, scaled: FloatArray, present: BoolArray) -> None:
-        self.scaled = scaled
-        self.present = present.astype(np.float64)
-        self.complete = bool(present.all())
-
-    def __call__(self, rows: IntArray, columns: IntArray) -> FloatArray:
-        product = self.scaled[rows] @ self.scaled[columns].T
-        if self.complete and self.scaled.shape[1]:
-            return np.asarray(product / self.scaled.shape[1])
-        common = self.present[rows] @ self.present[columns].T
+    def of(rows: IntArray, columns: IntArray) -> FloatArray:
+        product = scaled[rows] @ scaled[columns].T
+        if complete and scaled.shape[1]:
+            return np.asarray(product / scaled.shape[1])
+        common = known[rows] @ known[columns].T
         return np.where(common > 0, product / np.maximum(common, 1.0), np.nan)
 
-
-class _HalfSquaredDifference:
-    """(z_i - z_j)^2 / 2."""
-
-    def __init__(self, data: FloatArray) -> None:
-        self.data = data
-
-    def __call__(self, rows: IntArray, columns: IntArray) -> FloatArray:
-        return np.asarray(((self.data[rows, None, :] - self.data[None, columns, :]) ** 2).mean(axis=2) / 2)
+    return of
 
 
 class _Sums:

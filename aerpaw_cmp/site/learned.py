@@ -11,13 +11,13 @@ import gzip
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from ..common.errors import InputError, UsageError
 from ..common.files import LARGEST_TABLE, read_bounded, write_whole
-from ..common.yamlfile import dump_yaml, load_yaml
+from ..common.yamlfile import StrictModel, dump_yaml, load_yaml
 
 INDEX = "learned.yaml"
 FORMAT: Literal["aerpaw-cmp learned 2"] = "aerpaw-cmp learned 2"
@@ -27,11 +27,7 @@ BAND = 0.02
 """Share by which a carrier may differ from the one that an antenna was learned at."""
 
 
-class _Record(BaseModel):
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Source(_Record):
+class Source(StrictModel):
     """Source of the flights, as calibration.yaml says."""
 
     title: str = ""
@@ -40,7 +36,7 @@ class Source(_Record):
     airframe: str = "not stated"
 
 
-class Errors(_Record):
+class Errors(StrictModel):
     """On flights left out, means over series: RMSE [dB] after one offset, and the share inside 90 % intervals."""
 
     series: int
@@ -51,7 +47,7 @@ class Errors(_Record):
     sector_rmse_db: float | None = None
 
 
-class LearnedLock(_Record):
+class LearnedLock(StrictModel):
     """Lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) of the predicted path gain [dB].
 
     The scores are means over flights left out: Brier and log score (nat) beside those of the constant ``share``, and
@@ -71,7 +67,7 @@ class LearnedLock(_Record):
     free_space_floor_rmse_db: float
 
 
-class LearnedLevel(_Record):
+class LearnedLevel(StrictModel):
     """Level of a log minus free space of a transmit power and the gains as written [dB]; ``sd_db``: of a new flight."""
 
     offset_db: float
@@ -80,7 +76,7 @@ class LearnedLevel(_Record):
     unit: str
 
 
-class LearnedSeries(_Record):
+class LearnedSeries(StrictModel):
     """Antennas of one tower and channel, and what the log of that channel looks like."""
 
     tower: str
@@ -96,7 +92,7 @@ class LearnedSeries(_Record):
     """None of receivers that lose their lock, and of memories before 0.5."""
 
 
-class LearnedReceiver(_Record):
+class LearnedReceiver(StrictModel):
     """A rank receiver of one tower: error on flights left out as kappa and log score beside the constant forecast."""
 
     tower: str
@@ -108,7 +104,7 @@ class LearnedReceiver(_Record):
     constant_log_score: float | None = None
 
 
-class Entry(_Record):
+class Entry(StrictModel):
     """One calibration."""
 
     command: str
@@ -140,7 +136,7 @@ class Entry(_Record):
         return text + (f"; expect kappa {sum(kappas) / len(kappas):.2f} on another flight" if kappas else "")
 
 
-class Learned(_Record):
+class Learned(StrictModel):
     """All that a site remembers, by name."""
 
     format: Literal["aerpaw-cmp learned 1", "aerpaw-cmp learned 2"] = FORMAT
@@ -237,7 +233,7 @@ def read_table(path: Path, expected: str) -> bytes:
     return unpacked
 
 
-class Named(_Record):
+class Named(StrictModel):
     """An entry by name, such as ``lake_wheeler/dataset12_uav``, and its part: ``uav``, ``TOWER.CHANNEL`` or all."""
 
     entry: Entry

@@ -50,9 +50,10 @@ def read_pattern_file(path: str | Path, *, polarised: bool = True, carrier_hz: f
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
     name = path.stem
     if _PLANET.search(text):
-        return _from_cuts(*_planet(text, path), name, path, _megahertz(_FREQUENCY.search(text)))
+        carrier = _FREQUENCY.search(text)
+        return _from_cuts(_planet(text, path), name, path, float(carrier[1]) * 1e6 if carrier else None)
     if _NSMA.search(text):
-        return _from_cuts(*_nsma(text, path), name, path, None)
+        return _from_cuts(_nsma(text, path), name, path, None)
     if _PHI_CUT.search(text):
         return _great_circle(text, name, path, carrier_hz)
     if _GAIN_TABLE.search(text):
@@ -64,11 +65,7 @@ def read_pattern_file(path: str | Path, *, polarised: bool = True, carrier_hz: f
     return read_pattern_text(path, polarised=polarised)
 
 
-def _megahertz(found: re.Match[str] | None) -> float | None:
-    return float(found[1]) * 1e6 if found else None
-
-
-def _planet(text: str, path: Path) -> tuple[FloatArray, FloatArray]:
+def _planet(text: str, path: Path) -> dict[str, FloatArray]:
     """Gain [dBi] of MSI Planet's cuts at each degree: clockwise from the front; from the front downwards."""
     gain = _GAIN.search(text)
     if gain is None:
@@ -78,10 +75,10 @@ def _planet(text: str, path: Path) -> tuple[FloatArray, FloatArray]:
     for found in _PLANET.finditer(text):
         rows = _pairs(text[found.end() :].split("\n"), int(found[2]), path)
         cuts[found[1].upper()] = peak - _each_degree(rows, found[1], path)
-    return _both(cuts, ("HORIZONTAL", "VERTICAL"), path)
+    return cuts
 
 
-def _nsma(text: str, path: Path) -> tuple[FloatArray, FloatArray]:
+def _nsma(text: str, path: Path) -> dict[str, FloatArray]:
     """Gain [dBi] of NSMA's (TIA-804-B) first azimuth and elevation cut, as :func:`_planet` has them."""
     fields = {key.upper(): value for key, value in re.findall(r"(?m)^\s*([A-Za-z]{4,7}):\s*,\s*([^\n,]*)", text)}
     relative = "DBR" in fields.get("GUNITS", "DBI/DBR").upper().partition("/")[2]
@@ -102,7 +99,7 @@ def _nsma(text: str, path: Path) -> tuple[FloatArray, FloatArray]:
         if kind == "VERTICAL":
             rows = rows * [-1.0, 1.0]  # elevation is positive upwards there
         cuts[kind] = _each_degree(rows, found[1], path) + (peak if relative else 0.0)
-    return _both(cuts, ("HORIZONTAL", "VERTICAL"), path)
+    return cuts
 
 
 def _pairs(lines: list[str], count: int, path: Path) -> FloatArray:
@@ -132,17 +129,12 @@ def _each_degree(rows: FloatArray, cut: str, path: Path) -> FloatArray:
     return np.asarray(np.interp(np.arange(360.0), angle[order], value[order], period=360.0))
 
 
-def _both(cuts: dict[str, FloatArray], wanted: tuple[str, str], path: Path) -> tuple[FloatArray, FloatArray]:
-    lacking = [name for name in wanted if name not in cuts]
-    if lacking:
-        raise InputError(f"no cut {lacking[0]}", expected="a horizontal and a vertical cut", path=path)
-    return cuts[wanted[0]], cuts[wanted[1]]
-
-
-def _from_cuts(
-    horizontal: FloatArray, vertical: FloatArray, name: str, path: Path, frequency_hz: float | None
-) -> MeasuredPattern:
+def _from_cuts(cuts: dict[str, FloatArray], name: str, path: Path, frequency_hz: float | None) -> MeasuredPattern:
     """A sphere of two cuts [dBi at each degree]; see the module text."""
+    for cut in ("HORIZONTAL", "VERTICAL"):
+        if cut not in cuts:
+            raise InputError(f"no cut {cut}", expected="a horizontal and a vertical cut", path=path)
+    horizontal, vertical = cuts["HORIZONTAL"], cuts["VERTICAL"]
     theta, phi = _grid()
     below = np.degrees(theta) - 90.0
     around = np.degrees(phi)

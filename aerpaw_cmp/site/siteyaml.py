@@ -12,11 +12,11 @@ from dataclasses import replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import shapely
-from pydantic import AfterValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 from shapely.geometry import Point, Polygon
 
 from ..common.errors import UsageError
@@ -89,13 +89,7 @@ def _problem(shape: Polygon) -> str | None:
     return None
 
 
-class SiteBase(StrictModel):
-    """Settings of a site: every number is one."""
-
-    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class HeightModel(SiteBase):
+class HeightModel(StrictModel):
     """A height with its reference."""
 
     height_m: float
@@ -112,7 +106,7 @@ class AbsoluteHeightModel(HeightModel):
     reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL]
 
 
-class OriginModel(SiteBase):
+class OriginModel(StrictModel):
     """Point where east = north = up = 0."""
 
     latitude_deg: Latitude
@@ -121,7 +115,7 @@ class OriginModel(SiteBase):
     takeoff_ground_m: float = 0.0
 
 
-class PositionModel(SiteBase):
+class PositionModel(StrictModel):
     """One published position of a tower."""
 
     latitude_deg: Latitude
@@ -130,7 +124,7 @@ class PositionModel(SiteBase):
     source: str = ""
 
 
-class TowerModel(SiteBase):
+class TowerModel(StrictModel):
     """A tower, with one position or several published ones."""
 
     latitude_deg: Latitude | None = None
@@ -154,7 +148,7 @@ class TowerModel(SiteBase):
         return self
 
 
-class PolygonModel(SiteBase):
+class PolygonModel(StrictModel):
     """A named outline."""
 
     name: str
@@ -208,7 +202,7 @@ class ForestModel(PolygonModel):
 OutlineT = TypeVar("OutlineT", bound=PolygonModel)
 
 
-class DistributionModel(SiteBase):
+class DistributionModel(StrictModel):
     """A size drawn from a normal distribution between limits."""
 
     mean: Positive
@@ -226,7 +220,7 @@ Size = Annotated[  # told apart beforehand: a wrong number is one message, not o
 ]
 
 
-class SingleTreeModel(SiteBase):
+class SingleTreeModel(StrictModel):
     """A tree with sizes of its own; what is absent is drawn like that of all trees."""
 
     at_m: tuple[float, float] | None = None
@@ -242,7 +236,7 @@ class SingleTreeModel(SiteBase):
         return self
 
 
-class TreesModel(SiteBase):
+class TreesModel(StrictModel):
     """Sizes of all trees, the seed of the placement, and single trees."""
 
     seed: Annotated[int, Field(ge=0)] = 0
@@ -264,7 +258,7 @@ class TreesModel(SiteBase):
         )
 
 
-class DemModel(SiteBase):
+class DemModel(StrictModel):
     """An elevation model; relative paths start at the folder of site.yaml."""
 
     path: str
@@ -272,7 +266,7 @@ class DemModel(SiteBase):
     reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL] = HeightReference.ORTHOMETRIC
 
 
-class SceneModel(SiteBase):
+class SceneModel(StrictModel):
     """A scene of triangles; a relative path starts at the folder of site.yaml."""
 
     path: str
@@ -284,7 +278,7 @@ class SceneModel(SiteBase):
     ground_plane: bool = False
 
 
-class SiteModel(SiteBase):
+class SiteModel(StrictModel):
     """The whole of site.yaml."""
 
     name: str

@@ -267,8 +267,7 @@ def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float) -> str
     degrees = np.radians(np.arange(360.0))
     level = pattern.gain_dbi(np.full(360, np.pi / 2), -degrees)
     below = np.pi / 2 + degrees  # zenith angle on the great circle through the boresight
-    over = pattern.gain_dbi(np.where(below % (2 * np.pi) > np.pi, 2 * np.pi - below % (2 * np.pi), below % (2 * np.pi)),
-                            np.where(below % (2 * np.pi) > np.pi, np.pi, 0.0))  # fmt: skip
+    over = pattern.gain_dbi(below, np.zeros(360))
     peak = max(float(level.max()), float(over.max()))
     lines = [f"NAME {name}", f"FREQUENCY {carrier_hz / 1e6:g}", f"GAIN {peak:.2f} dBi", "HORIZONTAL 360"]
     lines += [f"{i} {peak - v:.2f}" for i, v in enumerate(level)]

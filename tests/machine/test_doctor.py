@@ -81,7 +81,7 @@ def test_a_library_variable_that_names_nothing(monkeypatch: pytest.MonkeyPatch) 
 
 def test_versions_that_do_not_belong_together(monkeypatch: pytest.MonkeyPatch) -> None:
     installed = {"sionna-rt": "2.2.0", "mitsuba": "3.8.0"}
-    monkeypatch.setattr(doctor, "_version", installed.get)
+    monkeypatch.setattr(doctor.versions, "version", lambda name: installed.get(name, "not installed"))
     monkeypatch.setattr(doctor.metadata, "requires", lambda _: ["mitsuba==3.9.1", "drjit==1.5.0", "numpy>=1.26"])
     found = {check.name: check for check in doctor.package_checks()}
     assert found["Sionna RT"].status == "ok"

@@ -12,7 +12,6 @@ from aerpaw_cmp.maps.variogram import (
     PAPER_BIEXPONENTIAL,
     field_correlation,
     fit_biexponential,
-    semivariance,
     vector_correlation,
     vertical_correlation,
 )
@@ -141,28 +140,6 @@ def test_field_correlation_leaves_missing_values_out():
     z = (fields - np.nanmean(fields, axis=0)) / np.nanstd(fields, axis=0)
     assert found.correlation[1] == pytest.approx((z[0, 0] * z[1, 0] + z[1, 0] * z[2, 0]) / 2)
     assert found.correlation[2] == pytest.approx((z[0] * z[2]).mean())
-
-
-def test_semivariance_equals_scikit_gstat():
-    skgstat = pytest.importorskip("skgstat")
-    points, values = RNG.uniform(0, 400, (150, 2)), RNG.normal(size=150)
-    found = semivariance(points, values, width_m=30.0, maximum_m=200.0)
-    edges = 30.0 * (np.arange(len(found.pairs)) + 0.5)
-    peer = skgstat.Variogram(
-        points, values, bin_func=lambda *_: (edges, None), maxlag=float(edges[-1]), fit_method=None
-    )
-    # their first bin is (0, 15], ours also holds the pairs of a position with itself, each 0
-    np.testing.assert_allclose(found.correlation[1:-1], peer.experimental[1:-1], rtol=1e-12)
-
-
-def test_semivariance_and_correlation_agree_for_a_standardised_field():
-    """gamma(h) + C(h) = mean of (z_i^2 + z_j^2) / 2: exact when all pairs of a bin are taken."""
-    points = np.column_stack([np.arange(50) * 30.0, np.zeros(50)])
-    z = RNG.normal(size=50)
-    z = (z - z.mean()) / z.std()
-    gamma, phi = semivariance(points, z, maximum_m=60.0), field_correlation(points, z, maximum_m=60.0)
-    expected = np.mean([(z[:-1] ** 2).mean(), (z[1:] ** 2).mean()])
-    assert gamma.correlation[1] + phi.correlation[1] == pytest.approx(expected, rel=1e-12)
 
 
 def test_vertical_correlation_closed_form():

@@ -23,12 +23,12 @@ from ...common.errors import InputError, UsageError
 from ...common.files import read_input
 from ...common.jsonable import fields_of, json_safe
 from ...common.units import BoolArray, FloatArray, IntArray
-from ...common.yamlfile import load_yaml
+from ...common.yamlfile import StrictModel, load_yaml
 from ...compare.entries import LevelSeries, intervals, level_scores
 from ...compare.forecast import constant_forecast, score_forecast
 from ...compare.learning.calibration import Observed
 from ...flight.data import FlightData, load_data
-from ...flight.settings import FlightFile, Settings
+from ...flight.settings import FlightFile
 from ..learning.calibrate import observe
 from ..learning.calibrate_rank import RankSamples, rank_samples
 
@@ -45,7 +45,7 @@ BASELINES = ("free_space", "log_distance")
 Split = Literal["flights", "sectors", "blocks", "stretches"]
 
 
-class FileEntry(Settings):
+class FileEntry(StrictModel):
     """A published file, known by its bytes after unpacking."""
 
     repository: str
@@ -65,7 +65,7 @@ class FileEntry(Settings):
         return f"https://raw.githubusercontent.com/{self.repository}/HEAD/{quote(self.path)}"
 
 
-class Task(Settings):
+class Task(StrictModel):
     """Definition of a task: what is predicted from what."""
 
     title: str
@@ -100,7 +100,7 @@ class Task(Settings):
         return f"Known: {known}. {said}"
 
 
-class Manifest(Settings):
+class Manifest(StrictModel):
     """Files, flights and tasks of one version of the benchmark."""
 
     version: int

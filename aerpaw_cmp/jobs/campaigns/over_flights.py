@@ -11,14 +11,15 @@ import numpy as np
 
 from ...common.jsonable import named
 from ...common.units import FloatArray, finite_mean
+from ...common.yamlfile import StrictModel
 from ...compare.offset import Pooling, pooled_moments
 from ...compare.passes import Pass, PassPair, PassTable, Visit
 from ...compare.rank import repeat_rank
-from ...flight.settings import Positive, Settings
+from ...flight.settings import Positive
 from ...report.campaign_data import FlownRank, PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
 
 
-class RepeatSettings(Settings):
+class RepeatSettings(StrictModel):
     """Settings for when two samples count as taken at the same place, and how residuals are gathered by place."""
 
     radius_m: Positive = 3.0

@@ -16,7 +16,7 @@ from ...common.errors import InputError, UsageError
 from ...common.provenance import union
 from ...common.stages import Stages
 from ...common.units import FloatArray
-from ...common.yamlfile import load_yaml
+from ...common.yamlfile import StrictModel, load_yaml
 from ...compare import direction_gain
 from ...compare.learning import calibration
 from ...compare.learning.calibration import Learned, Observed, Recipe, Score
@@ -25,7 +25,7 @@ from ...compare.learning.learning_curve import CurvePoint, learning_curve
 from ...compare.mount import GainOf
 from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ...flight.lock import LOCK_FLOOR_DB
-from ...flight.settings import AntennaSettings, Settings, load_flight, load_pattern
+from ...flight.settings import AntennaSettings, load_flight, load_pattern
 from ...flight.training import counted_once, flight_logs
 from ...propagation.arrays import rotation_from_yaw_pitch_roll
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
@@ -38,7 +38,7 @@ ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
 """Heights of roughness that are tried [m]; infinite is no ground ray."""
 
 
-class PatternsSettings(Settings):
+class PatternsSettings(StrictModel):
     """Measured patterns that the learned gain stands on; none: isotropic."""
 
     uav: AntennaSettings | None = None
@@ -47,7 +47,7 @@ class PatternsSettings(Settings):
     """By ``tower.channel``, where they differ."""
 
 
-class FitSettings(Settings):
+class FitSettings(StrictModel):
     """Selection of what is learned."""
 
     gain: Literal["both", "uav", "tower", "none"] = "both"
@@ -60,7 +60,7 @@ class FitSettings(Settings):
     bin_s: Annotated[float, Field(gt=0, le=60)] = 4.0
 
 
-class CalibrationFile(Settings):
+class CalibrationFile(StrictModel):
     """The whole calibration.yaml."""
 
     calibration: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\\-]*$")]

@@ -21,12 +21,12 @@ from ...common.errors import InputError, UsageError
 from ...common.jsonable import json_safe
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, IntArray
+from ...common.yamlfile import StrictModel
 from ...compare import receiver
 from ...compare.forecast import ForecastScore, constant_forecast, score_forecast
 from ...compare.rss import seconds
 from ...flight.data import FlightData, RankSeries, rank_positions
 from ...flight.replay import attitude_rotation
-from ...flight.settings import Settings
 from ...flight.training import logs_of
 from ...propagation.arrays import Link, Poses
 from ...propagation.drivers.geometries import Geometry, every_geometry, singular_values_of
@@ -45,7 +45,7 @@ SLANTS_DEG: tuple[tuple[float, ...], ...] = (
 """Ways to slant the four ports of a modem: two diagonals, two upright and two lying, all alike."""
 
 
-class RankFitSettings(Settings):
+class RankFitSettings(StrictModel):
     """``rank`` of calibration.yaml: which geometries are tried."""
 
     yaw_step_deg: Annotated[float, Field(ge=5, le=90)] = 30.0

@@ -141,14 +141,10 @@ def singular_values_of(
             last = mount
         at_uav, at_tower = slant_basis(g.uav_slant_deg), slant_basis(g.tower_slant_deg).T
         los, ground = at_uav @ direct @ at_tower, g.ground * (at_uav @ bounced @ at_tower)
-        yield _coherent(los + ground) if g.sum == "coherent" else _power_sum(los, ground)
+        yield np.linalg.svd(los + ground, compute_uv=False) if g.sum == "coherent" else _of_power_sum(los, ground)
 
 
-def _coherent(h: ComplexArray) -> FloatArray:
-    return np.asarray(np.linalg.svd(h, compute_uv=False))
-
-
-def _power_sum(los: ComplexArray, ground: ComplexArray) -> FloatArray:
+def _of_power_sum(los: ComplexArray, ground: ComplexArray) -> FloatArray:
     covariance = los @ _hermitian(los) + ground @ _hermitian(ground)
     # the eigenvalues of a Hermitian matrix come ascending; rounding leaves the zero ones slightly negative
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., ::-1], 0.0)))

@@ -121,10 +121,14 @@ def replay_moving(
     -----
     Exact: each pose is traced from its own place. Paths and fields are those of a fixed tower there.
     """
-    (name,) = _one_tower(link)
+    if len(link.tower_arrays) != 1:
+        raise UsageError(
+            f"{len(link.tower_arrays)} towers in a link whose tower moves", expected="one tower: links of their own"
+        )
+    (name,) = link.tower_arrays
     if search.engine != "image":
         raise UsageError(
-            f"tower {name!r} moves and the engine is {search.engine!r}",
+            f"towers.{name} moves and the engine is {search.engine!r}",
             expected="rt.engine: image (or --engine image)",
             cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
         )
@@ -147,14 +151,6 @@ def _whole(link: Link, poses: Poses, sources_m: FloatArray) -> Whole:
     pairs = len(poses) * len(link.uav_array) * sum(map(len, link.tower_arrays.values()))
     points = np.concatenate([poses.position_m, sources_m])
     return Whole.of(points, 0, pairs * WORK_PER_POSE)  # each place has few faces in reach: mirror images
-
-
-def _one_tower(link: Link) -> tuple[str, ...]:
-    if len(link.tower_arrays) != 1:
-        raise UsageError(
-            f"{len(link.tower_arrays)} towers in a link whose tower moves", expected="one tower: links of their own"
-        )
-    return tuple(link.tower_arrays)
 
 
 def _scene_of(

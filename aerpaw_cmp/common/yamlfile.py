@@ -249,7 +249,7 @@ class _Builder:
             self._fail(event, f"the file unfolds to more than {MAX_NODES} values (aliases of aliases?)")
 
     def _value(self, event: Any, location: Location) -> Any:
-        """Scalar, list or mapping that begins with an event; the anchor of a list or mapping is known from its end on."""
+        """Scalar, list or mapping that begins with an event; an anchor is known from its end on."""
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in self.anchors:
                 self._fail(event, f"the alias '*{event.anchor}' names no anchor above it, or contains itself")

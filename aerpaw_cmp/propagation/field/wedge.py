@@ -43,9 +43,9 @@ _POWERS = _fitted()
 
 
 def _fitted_sector(terms: int = 26, shares: int = 11) -> FloatArray:
-    """Coefficients (shares, terms, 2) of the integral of :func:`sector` times ``(along + MIDDLE)^2``.
+    """Coefficients (terms, shares, 2) of the integral of :func:`sector` times ``(along + MIDDLE)^2``.
 
-    Powers of ``2 (off / along)^2 - 1`` and of ``(along - MIDDLE) / (along + MIDDLE)``; largest relative error 1.2e-8.
+    Powers of ``(along - MIDDLE) / (along + MIDDLE)`` and of ``2 (off / along)^2 - 1``; largest relative error 1.2e-8.
     """
     nodes, low = (np.cos(np.pi * (np.arange(many) + 0.5) / many)[:, None] for many in (terms, shares))
     root = MIDDLE * (1.0 + nodes) / (1.0 - nodes)
@@ -58,7 +58,7 @@ def _fitted_sector(terms: int = 26, shares: int = 11) -> FloatArray:
     fit = chebyshev.chebfit(low[:, 0], value * (root[:, 0] + MIDDLE) ** 2, shares - 1)
     fit = chebyshev.chebfit(nodes[:, 0], fit.T, terms - 1).T
     powers = np.apply_along_axis(chebyshev.cheb2poly, 0, np.apply_along_axis(chebyshev.cheb2poly, 1, fit))
-    return np.ascontiguousarray(np.stack([powers.real, powers.imag], axis=2))  # or numba cannot cache its code
+    return np.ascontiguousarray(np.stack([powers.real.T, powers.imag.T], axis=2))  # or numba cannot cache its code
 
 
 _SECTORS = _fitted_sector()
@@ -99,11 +99,11 @@ def sector(along: Number, off: Number, passed: Any) -> Any:
     square = 2.0 * share * share - 1.0
     re = im = 0.0 * variable
     for k in range(len(_SECTORS) - 1, -1, -1):
-        a = b = 0.0 * variable
+        a = b = 0.0 * square  # short sums inside: a processor takes some at once
         for i in range(_SECTORS.shape[1] - 1, -1, -1):
-            a = a * variable + _SECTORS[k, i, 0]
-            b = b * variable + _SECTORS[k, i, 1]
-        re, im = re * square + a, im * square + b
+            a = a * square + _SECTORS[k, i, 0]
+            b = b * square + _SECTORS[k, i, 1]
+        re, im = re * variable + a, im * variable + b
     value = 0.5 * share * scale * scale * (re + 1j * im)
     other_re, other_im = transition(size)
     # both sectors of a right angle are the product of two transition functions

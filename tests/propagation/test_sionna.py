@@ -241,20 +241,6 @@ def test_versions_name_the_device(sionna):
     assert versions["variant"].startswith(("llvm", "cuda"))
 
 
-def test_mitsubas_renderers_are_registered_when_one_is_imported(sionna):
-    import subprocess
-    import sys
-
-    code = (
-        "import importlib, sys; from aerpaw_cmp.propagation.search import sionna; sionna.load_variant()\n"
-        "assert not [name for name in sys.modules if 'prb' in name]\n"
-        "import mitsuba as mi; importlib.import_module('mitsuba.python.ad.integrators.prb')\n"
-        "print(type(mi.load_dict({'type': 'prb'})).__module__)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.split() == ["mitsuba.python.ad.integrators.prb"], done.stderr
-
-
 def test_sionnas_viewer_is_loaded_when_it_is_asked_for(sionna):
     import subprocess
     import sys

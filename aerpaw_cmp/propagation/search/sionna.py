@@ -21,7 +21,6 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -100,7 +99,6 @@ def load_variant(prefer: str | None = None) -> str:
             prepare_llvm()  # before Dr.Jit looks for one by itself
         except CheckError as error:
             without_llvm = error  # a GPU may do without
-    first = "mitsuba" not in sys.modules
     import mitsuba as mi
 
     current = mi.variant()
@@ -112,8 +110,7 @@ def load_variant(prefer: str | None = None) -> str:
         if kind == "llvm" and without_llvm:
             raise without_llvm
         if dr.has_backend(dr.JitBackend.CUDA if kind == "cuda" else dr.JitBackend.LLVM):
-            with _no_renderers(first):
-                mi.set_variant(f"{kind}_ad_mono_polarized")
+            mi.set_variant(f"{kind}_ad_mono_polarized")
             return str(mi.variant())
     raise UsageError(
         f"Dr.Jit finds no {' and no '.join(kinds)} device", cause="'aerpaw-cmp doctor' says what is missing"
@@ -139,22 +136,6 @@ def _leave_for_later() -> None:
     for name, kind in _LATER.items():
         later = sys.modules[f"sionna.rt.{name}"] = ModuleType(f"sionna.rt.{name}")
         vars(later)[kind] = partial(_made, later, kind)
-
-
-_RENDERERS = ("prb_basic", "prb", "prbvolpath", "direct_projective", "prb_projective", "volprim_rf_basic")
-"""Mitsuba's differentiable renderers of images: compiling their source takes 0.1 s, and no search renders."""
-
-
-@contextmanager
-def _no_renderers(first: bool) -> Iterator[None]:
-    """Let Mitsuba load without them, if it is loaded here first; importing one of them registers it as ever."""
-    names = [f"mitsuba.python.ad.integrators.{name}" for name in _RENDERERS if first]
-    sys.modules.update({name: ModuleType(name) for name in names})
-    try:
-        yield
-    finally:
-        for name in names:
-            sys.modules.pop(name, None)
 
 
 def _made(later: ModuleType, kind: str, *given: Any, **named: Any) -> Any:

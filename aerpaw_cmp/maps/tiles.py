@@ -80,12 +80,11 @@ class Tiling:
 
 def over_grid(like: MapResult, grid: Grid, values: Mapping[str, Any]) -> MapResult:
     """A map over another grid, with its values of :data:`PLANES`, serving towers and their borders."""
-    west, east, south, north = grid.area_m
     return replace(
         like,
         grid=grid,
         serving=serving_tower(grid.points_m, like.towers_m),
-        borders=voronoi_borders(like.towers_m, (west, east, south, north)),
+        borders=voronoi_borders(like.towers_m, grid.area_m),
         **values,
     )
 

@@ -11,19 +11,12 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ..common.outputs import explained_os_errors
-from .materials import (
-    CONSTANT,
-    CROWN,
-    CROWN_ATTENUATION_DB_PER_M,
-    CROWN_PERMITTIVITY,
-    lossy_conductivity_s_per_m,
-    material,
-)
+from .materials import CONSTANT, CROWN, face_material, material
 from .meshes import Mesh, site_meshes
 from .site import Site
 
-HALF_SPACE_THICKNESS_M = 1.0
-"""Thickness given to ground in the export: a slab from which no echo of its second face returns."""
+HALF_SPACE_THICKNESS_M, CROWN_THICKNESS_M = 1.0, 2.5
+"""Thickness given to ground in the export, a slab from which no echo of its second face returns; and to crowns."""
 
 
 def export_scene(site: Site, folder: str | Path, *, trees: bool = True) -> list[Path]:
@@ -47,7 +40,7 @@ def export_scene(site: Site, folder: str | Path, *, trees: bool = True) -> list[
     folder = Path(folder)
     parts = _parts(site, trees)
     lines = ['<scene version="2.1.0">', f"<!-- {_comment(site)} -->"]
-    lines += [_bsdf(name, CROWN_ATTENUATION_DB_PER_M) for name in dict.fromkeys(name for _, name, _ in parts)]
+    lines += [_bsdf(name) for name in dict.fromkeys(name for _, name, _ in parts)]
     written = [folder / "scene.xml"]
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
@@ -104,25 +97,21 @@ def _bsdf_id(name: str) -> str:
     return f"mat-{_plain(name)}" if name == CROWN or name.startswith(CONSTANT) else f"mat-itu_{_plain(name)}"
 
 
-def _bsdf(name: str, gamma_db_per_m: float) -> str:
+def _bsdf(name: str) -> str:
+    what = face_material(name)
+    thickness = {"thickness": HALF_SPACE_THICKNESS_M if what.thickness_m is None else what.thickness_m}
     if name == CROWN:
-        sigma = lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, gamma_db_per_m)
-        values = {"relative_permittivity": CROWN_PERMITTIVITY, "conductivity": sigma, "thickness": 2.5}
-        return f'<bsdf type="radio-material" id="{_bsdf_id(name)}">' + _floats(values) + "</bsdf>"
-    what = material(name)
-    thickness = what.thickness_m
-    if name.startswith(CONSTANT):
-        eta = what.relative_permittivity(1e9)
+        thickness = {"thickness": CROWN_THICKNESS_M}
+    if name == CROWN or name.startswith(CONSTANT):
         values = {
-            "relative_permittivity": eta.real,
+            "relative_permittivity": what.relative_permittivity(1e9).real,
             "conductivity": what.conductivity_s_per_m(1e9),
-            "thickness": HALF_SPACE_THICKNESS_M if thickness is None else thickness,
         }
-        return f'<bsdf type="radio-material" id="{_bsdf_id(name)}">' + _floats(values) + "</bsdf>"
+        return f'<bsdf type="radio-material" id="{_bsdf_id(name)}">' + _floats(values | thickness) + "</bsdf>"
     if name == "vacuum":
         return f'<bsdf type="absorber-radio-material" id="{_bsdf_id(name)}"/>'
     inner = f'<string name="type" value="{name.partition(" with ")[0]}"/>'
-    inner += _floats({"thickness": HALF_SPACE_THICKNESS_M if thickness is None else thickness})
+    inner += _floats(thickness)
     return f'<bsdf type="itu-radio-material" id="{_bsdf_id(name)}">{inner}</bsdf>'
 
 

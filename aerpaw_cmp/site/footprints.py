@@ -253,14 +253,7 @@ def _fill(
         _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions), actions
     ):
         result.buildings.append(
-            Building(
-                name=name,
-                footprint=area,
-                height_m=round(shape.height_m, 2),
-                base_m=0.0,
-                material=shape.material,
-                source=shape.source,
-            )
+            Building(name, area, round(shape.height_m, 2), material=shape.material, source=shape.source)
         )
     for name, shape, area in _parts(_first_keeps(_without_duplicates(shapes["forest"], actions), actions), actions):
         result.forests.append(Forest(name, area, trees_per_hectare, minimum_spacing_m, shape.source))
@@ -591,14 +584,10 @@ def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
     """Outlines and trees of maps in place of those of the base."""
     content |= {
         "buildings": [
-            {**outline_dict(b.name, b.footprint), "height_m": b.height_m, "material": b.material, "source": b.source}
-            for b in imports.buildings
+            outline_dict(b.name, b.footprint) | named(b, "height_m material source") for b in imports.buildings
         ],
         "forests": [
-            {
-                **outline_dict(f.name, f.area),
-                **named(f, "trees_per_hectare minimum_spacing_m source"),
-            }
+            outline_dict(f.name, f.area) | named(f, "trees_per_hectare minimum_spacing_m source")
             for f in imports.forests
         ],
         "geofences": [outline_dict(g.name, g.area) for g in imports.geofences],

@@ -17,69 +17,50 @@ from ..common.units import SPEED_OF_LIGHT_MPS, VACUUM_PERMITTIVITY_F_PER_M
 Band = tuple[float, float, float, float, float, float]
 """Lowest and highest frequency [GHz], a, b, c, d."""
 
-# P.2040-4 table 3. Where bands overlap the first that contains the frequency holds.
-_TABLE: dict[str, tuple[Band, ...]] = {
-    "vacuum": ((0.001, 100.0, 1.0, 0.0, 0.0, 0.0),),
-    "concrete": ((1.0, 100.0, 5.24, 0.0, 0.0462, 0.7822), (110.0, 330.0, 5.17, 0.0, 0.0145, 1.09)),
-    "brick": ((1.0, 40.0, 3.91, 0.0, 0.0238, 0.16), (110.0, 330.0, 4.15, 0.0, 0.0006, 1.5712)),
-    "plasterboard": (
+# Usual thickness of a wall or roof [m], None of a half-space (no second face echoes); P.2040-4 table 3. Where bands
+# overlap the first that contains the frequency holds.
+_TABLE: dict[str, tuple[float | None, tuple[Band, ...]]] = {
+    "vacuum": (None, ((0.001, 100.0, 1.0, 0.0, 0.0, 0.0),)),
+    "concrete": (0.3, ((1.0, 100.0, 5.24, 0.0, 0.0462, 0.7822), (110.0, 330.0, 5.17, 0.0, 0.0145, 1.09))),
+    "brick": (0.2, ((1.0, 40.0, 3.91, 0.0, 0.0238, 0.16), (110.0, 330.0, 4.15, 0.0, 0.0006, 1.5712))),
+    "plasterboard": (0.025, (
         (1.0, 100.0, 2.73, 0.0, 0.0085, 0.9395),
         (110.0, 330.0, 2.56, 0.0, 0.0001, 1.7799),
         (100.0, 400.0, 2.65, 0.0, 0.0002, 1.598),
-    ),
-    "wood": (
+    )),
+    "wood": (0.15, (
         (0.001, 100.0, 1.99, 0.0, 0.0047, 1.0718),
         (110.0, 330.0, 1.82, 0.0, 0.0040, 1.0761),
         (100.0, 400.0, 2.1183, 0.0, 0.0055, 1.1113),
-    ),
-    "glass": (
+    )),
+    "glass": (0.006, (
         (0.1, 100.0, 6.31, 0.0, 0.0036, 1.3394),
         (220.0, 450.0, 5.79, 0.0, 0.0004, 1.658),
         (100.0, 400.0, 6.5767, 0.0, 0.0012, 1.4697),
-    ),
-    "ceiling_board": (
+    )),
+    "ceiling_board": (0.02, (
         (1.0, 100.0, 1.48, 0.0, 0.0011, 1.075),
         (220.0, 450.0, 1.52, 0.0, 0.0029, 1.029),
         (100.0, 400.0, 1.2567, 0.0, 0.00013, 1.454),
-    ),
-    "chipboard": ((1.0, 100.0, 2.58, 0.0, 0.0217, 0.78), (100.0, 200.0, 2.16, 0.0, 0.0023, 1.359)),
-    "plywood": (
+    )),
+    "chipboard": (0.02, ((1.0, 100.0, 2.58, 0.0, 0.0217, 0.78), (100.0, 200.0, 2.16, 0.0, 0.0023, 1.359))),
+    "plywood": (0.02, (
         (1.0, 40.0, 2.71, 0.0, 0.33, 0.0),
         (110.0, 330.0, 1.94, 0.0, 0.0067, 0.9982),
         (100.0, 400.0, 2.17, 0.0, 0.0063, 1.045),
-    ),
-    "marble": (
+    )),
+    "marble": (0.03, (
         (1.0, 60.0, 7.074, 0.0, 0.0055, 0.9262),
         (110.0, 330.0, 7.94, 0.0, 0.0001, 1.733),
         (100.0, 400.0, 8.62, 0.0, 0.0027, 1.15),
-    ),
-    "floorboard": ((50.0, 100.0, 3.66, 0.0, 0.0044, 1.3515), (100.0, 400.0, 3.1575, 0.0, 0.001675, 1.32775)),
-    "asphalt_concrete": ((1.0, 40.0, 4.83, 0.0, 0.0108, 1.3969),),
-    "metal": ((1.0, 100.0, 1.0, 0.0, 1e7, 0.0),),
-    "very_dry_ground": ((1.0, 10.0, 3.0, 0.0, 0.00015, 2.52),),
-    "medium_dry_ground": ((1.0, 10.0, 15.0, -0.1, 0.035, 1.63),),
-    "wet_ground": ((1.0, 10.0, 30.0, -0.4, 0.15, 1.30),),
-}
-
-# Usual thickness of a wall or roof [m]; None is a half-space (no second face echoes).
-_THICKNESS_M: dict[str, float | None] = {
-    "vacuum": None,
-    "concrete": 0.3,
-    "brick": 0.2,
-    "plasterboard": 0.025,
-    "wood": 0.15,
-    "glass": 0.006,
-    "ceiling_board": 0.02,
-    "chipboard": 0.02,
-    "plywood": 0.02,
-    "marble": 0.03,
-    "floorboard": 0.02,
-    "asphalt_concrete": None,
-    "metal": 0.005,
-    "very_dry_ground": None,
-    "medium_dry_ground": None,
-    "wet_ground": None,
-}
+    )),
+    "floorboard": (0.02, ((50.0, 100.0, 3.66, 0.0, 0.0044, 1.3515), (100.0, 400.0, 3.1575, 0.0, 0.001675, 1.32775))),
+    "asphalt_concrete": (None, ((1.0, 40.0, 4.83, 0.0, 0.0108, 1.3969),)),
+    "metal": (0.005, ((1.0, 100.0, 1.0, 0.0, 1e7, 0.0),)),
+    "very_dry_ground": (None, ((1.0, 10.0, 3.0, 0.0, 0.00015, 2.52),)),
+    "medium_dry_ground": (None, ((1.0, 10.0, 15.0, -0.1, 0.035, 1.63),)),
+    "wet_ground": (None, ((1.0, 10.0, 30.0, -0.4, 0.15, 1.30),)),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,19 +135,8 @@ def lossy_conductivity_s_per_m(permittivity: float, gamma_db_per_m: float) -> fl
     return 2 * math.sqrt(permittivity) * neper_per_m * VACUUM_PERMITTIVITY_F_PER_M * SPEED_OF_LIGHT_MPS
 
 
-VEGETATION = Material(
-    CROWN,
-    (
-        (
-            0.03,
-            100.0,
-            CROWN_PERMITTIVITY,
-            0.0,
-            lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, CROWN_ATTENUATION_DB_PER_M),
-            0.0,
-        ),
-    ),
-)
+_CROWN_S_PER_M = lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, CROWN_ATTENUATION_DB_PER_M)
+VEGETATION = Material(CROWN, ((0.03, 100.0, CROWN_PERMITTIVITY, 0.0, _CROWN_S_PER_M, 0.0),))
 """Crowns as a half-space, 30 MHz to 100 GHz (the scope of P.833)."""
 
 
@@ -216,7 +186,8 @@ def material(name: str) -> Material:
             expected="one of " + ", ".join(MATERIALS),
             cause=f"did you mean '{near[0]}'?" if near else None,
         )
-    return Material(key, _TABLE[key], _THICKNESS_M[key])
+    thickness, bands = _TABLE[key]
+    return Material(key, bands, thickness)
 
 
 def _stated(plain: str, said: str, name: str) -> Material:

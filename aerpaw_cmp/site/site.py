@@ -7,7 +7,7 @@ tower's own ground height says otherwise (one reflecting plane per tower).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from shapely.geometry import Polygon
@@ -115,16 +115,7 @@ class Trees:
     @classmethod
     def none(cls) -> Trees:
         """No tree."""
-        empty = np.zeros(0)
-        return cls(
-            east_m=empty,
-            north_m=empty,
-            ground_m=empty,
-            height_m=empty,
-            crown_diameter_m=empty,
-            crown_base_m=empty,
-            trunk_diameter_m=empty,
-        )
+        return cls(**{column.name: np.zeros(0) for column in fields(cls)})
 
 
 @dataclass(frozen=True, slots=True)

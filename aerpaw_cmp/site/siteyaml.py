@@ -602,11 +602,7 @@ def _building(model: BuildingModel, footprint: Polygon, dem: Dem | None) -> Buil
     base = model.base_m
     if dem is not None:  # a floor is level: the ground under the middle
         base += float(np.nan_to_num(dem.ground_m(footprint.centroid.x, footprint.centroid.y)))
-    return Building(
-        **named(model, "name height_m material source"),
-        footprint=footprint,
-        base_m=base,
-    )
+    return Building(**named(model, "name height_m material source"), footprint=footprint, base_m=base)
 
 
 def _trees(

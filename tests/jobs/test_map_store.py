@@ -17,6 +17,7 @@ from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.jobs.mapping import coverage_map as mapping
 from aerpaw_cmp.jobs.tasks.workers import Here, Processes
 from aerpaw_cmp.maps.grid import Grid
+from aerpaw_cmp.maps.job import RATIO_LIMIT_DB
 from aerpaw_cmp.maps.store import LEDGER
 from aerpaw_cmp.maps.tiles import PLANES
 from aerpaw_cmp.site.siteyaml import load_site
@@ -47,7 +48,7 @@ def assert_like(outcome, whole):
         for name in PLANES:
             expected = getattr(whole.maps[mode], name)
             if name in ("spread_db", "condition_db"):
-                expected = np.minimum(expected, mapping.RATIO_LIMIT_DB)
+                expected = np.minimum(expected, RATIO_LIMIT_DB)
             np.testing.assert_allclose(getattr(one, name), expected, atol=0.00501, err_msg=f"{mode} {name}")
 
 

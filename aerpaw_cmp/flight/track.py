@@ -328,7 +328,10 @@ class Track:
         instant = nanoseconds(times).ravel()
         if len(instant) <= AT_ONCE:
             if not np.array_equal(instant, self._asked[0]):  # channels of a log share their instants
-                self._asked = instant, self._pose_at(instant)
+                poses = self._pose_at(instant)
+                for field in dataclasses.fields(poses):
+                    getattr(poses, field.name).flags.writeable = False  # the next who asks gets the same
+                self._asked = instant, poses
             return self._asked[1]
         parts = [self._pose_at(part) for part in np.array_split(instant, -(-len(instant) // AT_ONCE))]
         names = [field.name for field in dataclasses.fields(TrackPoses)]

@@ -147,6 +147,16 @@ def test_a_shuffled_log_is_the_log_in_order(order):
     assert any("sorted by time" in text for text in two.account.warnings)
 
 
+def test_poses_asked_twice_are_those_of_the_instants():
+    track = Track(telemetry(np.arange(9.0), 3.0 * np.arange(9), 0, 10, roll_deg=1, pitch_deg=0, yaw_deg=0), FRAME)
+    instants = np.array(at([1, 2]), dtype="datetime64[ns]")
+    first = track.pose_at(instants)
+    instants += np.timedelta64(1, "s")  # the caller's own array, moved in place
+    np.testing.assert_allclose(track.pose_at(instants).position_m[:, 0], [6, 9], atol=1e-4)
+    with pytest.raises(ValueError, match="read-only"):
+        first.position_m[0] = 0.0
+
+
 def test_a_clock_set_back_in_flight_does_not_mix_its_parts():
     seconds = np.arange(0, 100.0)
     stepped = np.where(seconds >= 70, seconds - 30.5, seconds)

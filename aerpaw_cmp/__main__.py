@@ -157,7 +157,7 @@ def _run(arguments: list[str]) -> int:
 
     code = cli.main(arguments)
     if code == SIGNALLED + signal.SIGINT:
-        interrupts.look()  # typer makes this code, without a word, of what came while it read the command line
+        interrupts.raise_interrupt()  # typer gives this code for what came as it read the words
     return code
 
 

@@ -31,7 +31,7 @@ _came = False
 _last: int = signal.SIGINT
 
 
-def came() -> bool:
+def interrupted() -> bool:
     """Check whether an interrupt came since :func:`noted` began; False outside of it."""
     return _came
 
@@ -41,7 +41,7 @@ def last() -> signal.Signals:
     return signal.Signals(_last)
 
 
-def look() -> None:
+def raise_interrupt() -> None:
     """Raise the interrupt that was swallowed.
 
     Raises

@@ -34,7 +34,7 @@ from typing import BinaryIO
 
 from .errors import OutputError, UsageError, add_note, one_line
 from .files import plain_mode, sync
-from .interrupts import AT_END, came, held, look
+from .interrupts import AT_END, held, interrupted, raise_interrupt
 
 SUMS = "SHA256SUMS"
 """The list of a result folder; ``sha256sum -c SHA256SUMS`` checks it."""
@@ -207,7 +207,7 @@ class OutputFile:
                 os.fsync(stream.fileno())
             self._refuse()  # what came there meanwhile is not replaced either
             place.refuse_gone()
-            look()
+            raise_interrupt()
             with held():
                 place.part.rename(self.target)
                 place.leave()  # HDF5 opens no file that somebody locks
@@ -226,7 +226,7 @@ class OutputFile:
 
 def _say_kept(error: BaseException | None, named: Path) -> None:
     """Add to an interrupt what stands at the output's name."""
-    if isinstance(error, KeyboardInterrupt) or (error is not None and came()):
+    if isinstance(error, KeyboardInterrupt) or (error is not None and interrupted()):
         there = os.path.lexists(named)
         add_note(error, f"{one_line(str(named))} {'is as it was before' if there else 'was not written'}")
 
@@ -370,7 +370,7 @@ class OutputFolder:
         with explained_os_errors(self.named):
             yield place.part
             place.refuse_gone()
-            look()
+            raise_interrupt()
             with held():
                 self._commit(place)
                 self._written = True
@@ -457,7 +457,7 @@ def _remove_folders(made: list[Path]) -> None:
 # --- the place beside -----------------------------------------------------------------------------
 
 
-def beside(target: Path, suffix: str) -> Path:
+def hidden_name(target: Path, suffix: str) -> Path:
     """The hidden name of a place beside the target; short where the name is long (255 bytes are the limit)."""
     name = target.name
     if len(os.fsencode(name)) > 200:
@@ -470,7 +470,7 @@ class _Place:
 
     def __init__(self, target: Path, named: Path, *, folder: bool) -> None:
         self.target, self.named = target, named
-        self.part = beside(target, "part")
+        self.part = hidden_name(target, "part")
         self._further: list[int] = []
         self._left = False
         with explained_os_errors(named):
@@ -600,7 +600,7 @@ def _exchange(part: Path, target: Path) -> None:
     """Two folders swap their names in one step; where the system cannot, in two that :func:`_restore` mends."""
     if _renamed_both(part, target):
         return
-    old = beside(target, "old")
+    old = hidden_name(target, "old")
     target.rename(old)
     part.rename(target)
     old.rename(part)
@@ -608,7 +608,7 @@ def _exchange(part: Path, target: Path) -> None:
 
 def _restore(target: Path) -> None:
     """Mend what a run killed between the two steps left: the old set has its name again."""
-    old = beside(target, "old")
+    old = hidden_name(target, "old")
     if not old.is_dir():
         return
     if os.path.lexists(target):

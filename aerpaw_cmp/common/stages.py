@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Protocol
 
-from .interrupts import look
+from .interrupts import raise_interrupt
 
 
 class Progress(Protocol):
@@ -75,7 +75,7 @@ class Stages:
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
         """Time one stage; one that comes again is not announced again. A swallowed interrupt is raised first."""
-        look()
+        raise_interrupt()
         if name not in self.seconds:
             self.progress(name)
         start = time.perf_counter()

@@ -206,7 +206,7 @@ def _covariance(terms: Sequence[Term], one: Sequence[LinkSamples], other: Sequen
     return out
 
 
-def _whole(model: GainModel, rows: Sequence[LinkSamples]) -> FloatArray:
+def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> FloatArray:
     """Covariance (n, n) of the levels of all rows: gains, and each series' offset, nuisance and noise [dB^2]."""
     from scipy.spatial.distance import cdist
 
@@ -421,7 +421,7 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     from scipy.linalg import cho_solve
 
     model, rows = binned_series(series, model or GainModel())
-    lower = factor_of(_whole(model, rows))
+    lower = factor_of(_covariance_of_levels(model, rows))
     target = np.concatenate([s.residual_db - s.residual_db.mean() for s in rows])
     weights = cho_solve((lower, True), target, check_finite=False)
     misfit = float(target @ weights)
@@ -488,5 +488,5 @@ def column_forms(
 
     model, rows = binned_series(series, model)
     values = np.concatenate([columns(s, model.bin_s) for s in series if len(s.binned(model.bin_s))])
-    inside = solve_triangular(factor_of(_whole(model, rows)), values, lower=True)
+    inside = solve_triangular(factor_of(_covariance_of_levels(model, rows)), values, lower=True)
     return np.asarray(inside.T @ inside)

@@ -56,13 +56,13 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     here, way = _metres(mine[1], there[1]), _metres(there[1], there[1])
     length = time_s[-1] - time_s[0]
     shifts = np.arange(-time_s[0] - 0.5 * length, track_s[-1] - time_s[0] - 0.5 * length, 1.0)
-    misses = np.array([_miss(time_s + shift, here, track_s, way) for shift in shifts])
+    misses = np.array([_median_distance(time_s + shift, here, track_s, way) for shift in shifts])
     if not len(misses) or not np.isfinite(misses).any():
         return None
     best = int(np.nanargmin(misses))
     apart = np.abs(shifts - shifts[best]) > 60
     fine = shifts[best] + np.arange(-15, 16) / 10
-    finer = np.array([_miss(time_s + shift, here, track_s, way) for shift in fine])
+    finer = np.array([_median_distance(time_s + shift, here, track_s, way) for shift in fine])
     distance = float(np.nanmin(finer))
     second = float(np.nanmin(misses[apart])) if np.isfinite(misses[apart]).any() else np.inf
     # like with like: the other places were tried each second, and between two seconds an aircraft flies some metres
@@ -93,7 +93,7 @@ def _metres(points: FloatArray, about: FloatArray) -> FloatArray:
     return np.stack([east, north, np.nan_to_num(points[:, 2])], axis=1)
 
 
-def _miss(time_s: FloatArray, here: FloatArray, track_s: FloatArray, way: FloatArray) -> float:
+def _median_distance(time_s: FloatArray, here: FloatArray, track_s: FloatArray, way: FloatArray) -> float:
     """Median distance; NaN where less than half of the log lies within the track."""
     inside = (time_s >= track_s[0]) & (time_s <= track_s[-1])
     if 2 * inside.sum() < len(time_s):

@@ -230,7 +230,7 @@ def run_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOpt
         if given not in known:
             raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
     if asked.recommend is not None:
-        _beside(asked.recommend, flight, options.logs_root)
+        _require_same_folder(asked.recommend, flight, options.logs_root)
     settings, inputs, folder = _report_inputs(flight, asked, options)
     stages, learned = Stages(options.progress), None if asked.learned is None else Path(asked.learned)
     with ExitStack() as outputs:
@@ -289,7 +289,7 @@ def plan_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOp
     return report_plan(settings, flight.parent, options.logs_root, inputs=inputs, out=folder, figures=asked.figures)
 
 
-def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
+def _require_same_folder(recommend: Path, flight: Path, logs_root: Path | None) -> None:
     """Paths in a flight file are relative to its folder: a changed one must stand beside it."""
     if logs_root is None and os.path.realpath(recommend.parent) != os.path.realpath(flight.parent):
         raise UsageError(

@@ -198,18 +198,18 @@ def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
     length = np.diff(np.append(starts, count))
     minute, dated = _minutes(cells[starts, :16])
     valid = np.repeat(dated, length)
-    second, good = _whole(cells[:, 17:19])
+    second, good = _integers(cells[:, 17:19])
     valid &= good & (second < 60) & (cells[:, 16] == 58)
     wall = np.repeat(minute, length) + second * np.int64(1_000_000_000)
     if fraction:
-        part, good = _whole(cells[:, 20 : 20 + fraction])
+        part, good = _integers(cells[:, 20 : 20 + fraction])
         valid &= good & (cells[:, 19] == 46)
         wall += part * np.int64(10 ** (9 - fraction))
     wall[~valid] = 0
     return wall, valid
 
 
-def _whole(cells: AnyArray) -> tuple[IntArray, BoolArray]:
+def _integers(cells: AnyArray) -> tuple[IntArray, BoolArray]:
     """Digits, uint8 of shape (n, up to 9), as whole numbers; second, whether they are digits."""
     total, worst = np.zeros(len(cells), dtype=np.int64), np.zeros(len(cells), dtype=np.uint8)
     for column in cells.T:

@@ -97,7 +97,7 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
             for i, file in enumerate(files):
                 _write_file(shelf.create_group(f"{i:05d}"), file, sink)
     finally:
-        sink.look()  # what HDF5 says after a failure is its consequence
+        sink.raise_spared()  # what HDF5 says after a failure is its consequence
     size = stream.seek(0, os.SEEK_END)
     digest = _digest(stream, size)
     stream.seek(size)
@@ -114,7 +114,7 @@ class _Sink:
         self._stream = stream
         self._failure: BaseException | None = None
 
-    def look(self) -> None:
+    def raise_spared(self) -> None:
         """Raise what HDF5 was spared."""
         if self._failure is not None:
             raise self._failure
@@ -212,7 +212,7 @@ def _write_stream(group: Any, stream: Stream, sink: _Sink) -> None:
     )
     for i, column in enumerate(columns):
         _write_column(group, f"C{i:05d}", stream.frame[column["name"]], column["type"])
-        sink.look()
+        sink.raise_spared()
 
 
 def _type(column: pd.Series[Any]) -> str:

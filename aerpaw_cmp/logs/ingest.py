@@ -425,7 +425,7 @@ def _in_pieces(place: Path, reader: Reader, options: OptionsFor | None) -> Inges
     if reader.read_pieces is None or _raw(place, 2) in _UTF_16:
         return None
     digest = hashlib.sha256()
-    given = _options(place, options, _beside(place))
+    given = _options(place, options, _neighbour_reader(place))
     read_pieces = reader.read_pieces
     result = _checked(place, reader, given, lambda: read_pieces(chunks.file_pieces(place, digest), given))
     return IngestedFile(str(place), digest.hexdigest(), result)
@@ -436,7 +436,7 @@ def _options(path: Path, options: OptionsFor | None, beside: Callable[[str], byt
     return replace(given, file_name=path.name, beside=beside)
 
 
-def _beside(path: Path) -> Callable[[str], bytes | None]:
+def _neighbour_reader(path: Path) -> Callable[[str], bytes | None]:
     """Reads another file of a log's folder."""
 
     def read(name: str) -> bytes | None:
@@ -454,7 +454,7 @@ def _read(
     options: OptionsFor | None,
     beside: Callable[[str], bytes | None] | None = None,
 ) -> IngestedFile:
-    given = _options(path, options, beside or _beside(path))
+    given = _options(path, options, beside or _neighbour_reader(path))
     return IngestedFile(str(path), digest, _checked(path, reader, given, lambda: reader.read(data, given)))
 
 

@@ -179,7 +179,7 @@ class Rejects:
             for i in sorted(numbers)[:KEPT_REJECTED]:
                 self._kept.append(RejectedLine(int(i) + self.before + 1, reason, lines.text(int(i))))
 
-    def one(self, number: int, reason: str, text: str) -> None:
+    def add_line(self, number: int, reason: str, text: str) -> None:
         """A line by its number from 1."""
         self._count(reason, 1, number, number)
         if len(self._kept) < 8 * KEPT_REJECTED:

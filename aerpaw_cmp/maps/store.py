@@ -18,7 +18,7 @@ import numpy as np
 
 from ..common.errors import UsageError, one_line
 from ..common.geodesy import SiteFrame
-from ..common.outputs import beside, explained_os_errors, files_below, foreign_entries
+from ..common.outputs import explained_os_errors, files_below, foreign_entries, hidden_name
 from .grid import Grid
 from .job import MapResult
 from .netcdf import maps_dataset
@@ -116,7 +116,7 @@ class TileStore:
         self._frame, self._about = frame, about
         with explained_os_errors(self.path):
             if not self.path.exists():
-                part = beside(self.path, "part")
+                part = hidden_name(self.path, "part")
                 shutil.rmtree(part, ignore_errors=True)
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._make(part, maps_dataset(empty, frame, about))

@@ -162,14 +162,14 @@ class Reach:
             return replace(self.site, towers=towers)
         near = np.zeros(len(self.site.buildings), dtype=np.bool_)
         for tower in towers.values():
-            near |= self._beside(tower, box_m)
+            near |= self._buildings_in_reach(tower, box_m)
         buildings = tuple(self.site.buildings[number] for number in np.flatnonzero(near))
         return replace(self.site, towers=towers, buildings=buildings)
 
     def _reaches(self, tower: Tower, box_m: FloatArray) -> bool:
         return bool(np.linalg.norm(_apart(tower, box_m)) <= self._range_m)
 
-    def _beside(self, tower: Tower, box_m: FloatArray) -> BoolArray:
+    def _buildings_in_reach(self, tower: Tower, box_m: FloatArray) -> BoolArray:
         """Buildings (buildings,) that can mirror or shade what one tower sends into a box."""
         at, tile = tower.position_m[:2], _box(box_m[:, :2])
         lines = [shapely.linestrings(np.vstack([at, tile, self._mirrors_at])[None])]

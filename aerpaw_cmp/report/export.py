@@ -246,7 +246,7 @@ def _number_columns(one: RankResult) -> dict[str, FloatArray]:
     return {name: np.where(np.isfinite(values), values, np.nan) for name, values in columns.items()}
 
 
-def whole(tables: Iterator[_Table], columns: Iterable[str]) -> Any:
+def joined_tables(tables: Iterator[_Table], columns: Iterable[str]) -> Any:
     """Tables below each other, rounded; without any, the bare columns."""
     import pandas as pd
 
@@ -263,7 +263,7 @@ def _text(tables: Iterator[_Table], columns: Iterable[str]) -> Iterator[str]:
             yield rows.to_csv(index=False, header=head, lineterminator="\n")
             head = False
     if head:
-        yield whole(iter(()), columns).to_csv(index=False, lineterminator="\n")
+        yield joined_tables(iter(()), columns).to_csv(index=False, lineterminator="\n")
 
 
 def _rows(table: _Table, part: slice) -> Any:

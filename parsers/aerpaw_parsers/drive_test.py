@@ -186,12 +186,12 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
     cells, others, ranks = _places(sheet)
     track = _pose.from_sheet(rows, sheet, name="phone", source="table of a phone")
     levels = _cells.streams(rows, _readings(sheet, cells), source="drive test")
-    columns = [*ranks, *others, *_beside(sheet, cells)]
+    columns = [*ranks, *others, *_event_columns(sheet, cells)]
     streams = [(_rank if column in ranks else _other)(rows, sheet, column) for column in columns]
     return rows.result(_distinct([track, *levels, *streams]))
 
 
-def _beside(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
+def _event_columns(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
     """Columns beside a serving level with values in rows of their own, which become streams: Nemo's rows are events."""
     found = []
     for cell in cells:

@@ -204,7 +204,7 @@ def _powers(
     size = max(1, round(BURST_S * rate))
     texts: list[str] = []
     powers: list[FloatArray] = []
-    starts = [min(max(_whole(item.get("core:sample_start"), 0), 0), len(samples)) for item in captures]
+    starts = [min(max(_integer(item.get("core:sample_start"), 0), 0), len(samples)) for item in captures]
     for capture, start, end in zip(captures, starts, [*starts[1:], len(samples)], strict=True):
         stamp = next((capture[key] for key in ("core:datetime", "core:timestamp", "core:time") if key in capture), None)
         if stamp is None:
@@ -232,7 +232,7 @@ def _samples(common: dict[str, Any], options: ReadOptions) -> AnyArray | None:
     if data is None or kind.split("_")[0] not in _SAMPLES:
         return None
     stored = np.dtype((">" if kind.endswith("_be") else "<") + _SAMPLES[kind.split("_")[0]][0])
-    shape = (min(max(_whole(common.get("core:num_channels"), 1), 1), 64), 2 if kind.startswith("c") else 1)
+    shape = (min(max(_integer(common.get("core:num_channels"), 1), 1), 64), 2 if kind.startswith("c") else 1)
     frame_bytes = stored.itemsize * shape[0] * shape[1]
     return np.frombuffer(data[: len(data) // frame_bytes * frame_bytes], dtype=stored).reshape(-1, *shape)
 
@@ -243,7 +243,7 @@ def _full_scale_db(meta: dict[str, Any]) -> float:
     return float(20 * np.log10(_SAMPLES[kind][1]))
 
 
-def _whole(value: Any, default: int) -> int:
+def _integer(value: Any, default: int) -> int:
     number = _json.number(value)
     return int(number) if np.isfinite(number) and abs(number) < 2**53 else default
 

@@ -255,7 +255,7 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     repeats, used, bad = _expand(samples, marks)
     foot = "no value behind the offset (torn last line, or the end of od's input)"
     for i, reason in (*bad, *((i, foot) for i in marks.line[marks.offset >= 0].tolist())):
-        rejects.one(i + 1, reason, texts.get(i, ""))
+        rejects.add_line(i + 1, reason, texts.get(i, ""))
     accepted = len(samples.line) + len(used)
     warnings: list[str] = []
     stream = _stream(samples, repeats, before - 1 if unterminated else -1, options, warnings)

@@ -104,7 +104,7 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
             continue
         if name == "nr5g" or frame["rank"].notna().any():
             if name == "nr5g":
-                frame = _beside(frame, rsrp)
+                frame = _with_serving_cell(frame, rsrp)
             ri_base = str(header.get("ri_base", "one"))
             streams.append(
                 Stream("rank", name, frame, {**common, "ri_base": ri_base, "channel": options.channel or name})
@@ -278,7 +278,7 @@ def _rsrp_columns(exchanges: list[tuple[int, dict[str, Any]]]) -> Columns:
     return _columns(answers, {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"})
 
 
-def _beside(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.DataFrame:
+def _with_serving_cell(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.DataFrame:
     """RSRP and SINR of the last serving-cell answer as columns of the rank frame."""
     rsrp_dbm, sinr_db = np.full(len(rank), np.nan), np.full(len(rank), np.nan)
     if rsrp is not None:

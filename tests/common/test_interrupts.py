@@ -52,7 +52,7 @@ def test_a_swallowed_interrupt_ends_the_job_before_its_next_stage():
         job()
     assert reached == ["one"]
     with Stages()("a later job"):  # is not ended by it
-        assert not interrupts.came()
+        assert not interrupts.interrupted()
     assert sys.unraisablehook is before
 
 
@@ -125,7 +125,7 @@ def test_a_process_that_ignores_interrupts_goes_on_ignoring_them():
     with interrupts.noted(), interrupts.held():
         interrupt()
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    assert not interrupts.came()
+    assert not interrupts.interrupted()
 
 
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])

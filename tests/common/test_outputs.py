@@ -204,7 +204,7 @@ def test_a_file_system_mounted_in_a_result_folder_keeps_its_files(tmp_path: Path
         with pytest.raises(UsageError, match="figures, a mounted file system"):
             write_folder(target, {"a.html": "2"}, force=True)
         assert (point / "a.svg").read_text() == "1"
-        hidden = outputs.beside(target, "part")
+        hidden = outputs.hidden_name(target, "part")
         with pytest.raises(OSError, match="mounted"):
             outputs._clear(target)
         assert not hidden.exists()

@@ -315,7 +315,7 @@ def test_before_anything_is_learned_gains_are_as_strong_and_as_smooth_as_they_we
         LinkSamples("a", "LW1", channel, np.zeros(len(k)), place[k], body[k], mast[k], np.zeros(len(k)))
         for channel, k in (("A", np.array([0, 1])), ("B", np.array([2])))
     ]
-    found = direction_gain._whole(GainModel(), rows)
+    found = direction_gain._covariance_of_levels(GainModel(), rows)
     of_body, of_mast = (np.linalg.norm(d[:, None] - d, axis=2) for d in (body, mast))
     same = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1.0]])
     expected = 3.2**2 * np.exp(-of_body / 1.0) + same * (

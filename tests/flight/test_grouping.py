@@ -228,9 +228,11 @@ def test_the_miss_is_the_median_distance_whatever_the_heights_count_from() -> No
     time = np.arange(10.0)
     way = np.column_stack([10.0 * time, 0 * time, 5.0 * time])
     here = way + np.array([3.0, -4.0, 70.0])
-    assert time_origin._miss(time, here, time, way) == pytest.approx(5.0)
-    assert time_origin._miss(time - 5.0, here, time, way) == pytest.approx(np.hypot(53.0, 4.0))  # half lies inside
-    assert np.isnan(time_origin._miss(time - 5.5, here, time, way))
+    assert time_origin._median_distance(time, here, time, way) == pytest.approx(5.0)
+    assert time_origin._median_distance(time - 5.0, here, time, way) == pytest.approx(
+        np.hypot(53.0, 4.0)
+    )  # half lies inside
+    assert np.isnan(time_origin._median_distance(time - 5.5, here, time, way))
     frame = pd.DataFrame({"time": pd.to_datetime(np.arange(500.0), unit="s"), "latitude_deg": 35.0 + 1e-5 * np.arange(500.0),
                           "longitude_deg": -78.0, "altitude_m": np.nan})  # fmt: skip
     thin = time_origin._points(frame.sample(frac=1.0, random_state=1), 240)

@@ -109,7 +109,10 @@ def _nothing(*_):
 
 
 FAULTS = {
-    "a shorter tile": ("_beside", lambda right: lambda self, tower, box_m: right(self, tower, (box_m + box_m[:1]) / 2)),
+    "a shorter tile": (
+        "_buildings_in_reach",
+        lambda right: lambda self, tower, box_m: right(self, tower, (box_m + box_m[:1]) / 2),
+    ),
     "no way in": ("_way_in", lambda _: _nothing),
     "no way out": ("_way_out", lambda _: _nothing),
 }
@@ -157,12 +160,12 @@ def test_solids_beside_segments_are_all_that_may_cut_them():
     rng = np.random.default_rng(5)
     start = np.array([-350.0, -300.0, 9.0]) + rng.uniform(0, 40, (300, 3))
     end = np.array([200.0, 330.0, 2.0]) + rng.uniform(0, 60, (300, 3))
-    beside = hiding._beside(start, end)
+    beside = hiding._solids_near(start, end)
     met = hiding._boxes(start, end, np.arange(len(hiding.pieces))).any(axis=0)
     assert set(np.flatnonzero(met)) <= set(beside.tolist())
     assert len(beside) < 0.6 * len(hiding.pieces)
     start[0] = np.nan  # a segment without a place hides none of the others
-    assert hiding._beside(start, end).tolist() == beside.tolist()
+    assert hiding._solids_near(start, end).tolist() == beside.tolist()
 
 
 def _few():

@@ -11,11 +11,11 @@ from benchmarks.fabricated import with_numbers
 
 
 def rss_frame(series):
-    return export.whole(export.rss_tables(series), names.RSS_COLUMNS)
+    return export.joined_tables(export.rss_tables(series), names.RSS_COLUMNS)
 
 
 def rank_frame(series):
-    return export.whole(export.rank_tables(series), names.RANK_COLUMNS)
+    return export.joined_tables(export.rank_tables(series), names.RANK_COLUMNS)
 
 
 def test_metrics_hold_the_contract(report_data):

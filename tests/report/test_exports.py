@@ -59,7 +59,7 @@ def frames(data, tmp_path_factory):
     found = {}
     for kind, tables in (("rss", export.rss_tables(data.rss)), ("rank", export.rank_tables(data.rank))):
         path = tmp_path_factory.mktemp("csv") / f"{kind}.csv"
-        export.whole(tables, ()).to_csv(path, index=False)
+        export.joined_tables(tables, ()).to_csv(path, index=False)
         table = pd.read_csv(path)
         table["time"] = pd.to_datetime(table["time_utc"]).astype("datetime64[ns, UTC]")
         found[kind] = table

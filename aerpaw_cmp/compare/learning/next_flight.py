@@ -57,9 +57,11 @@ class Known:
         planned = [dataclasses.replace(s, flight=PLANNED, residual_db=np.zeros(len(s))) for s in route]
         rows = [*self.series, *planned]
         fit = fit_gain(rows, self.model) if rows else None
-        return {antenna: self._one(antenna, target, rows, fit) for antenna, target in targets.items()}
+        return {antenna: self._deviation_db(antenna, target, rows, fit) for antenna, target in targets.items()}
 
-    def _one(self, antenna: str, target: LinkSamples, rows: Sequence[LinkSamples], fit: GainFit | None) -> FloatArray:
+    def _deviation_db(
+        self, antenna: str, target: LinkSamples, rows: Sequence[LinkSamples], fit: GainFit | None
+    ) -> FloatArray:
         if fit is None or antenna not in fit.antennas:
             gain = np.full(len(target), math.sqrt(sum(t.sd_db**2 for t in self.model.terms)))
         else:

@@ -143,10 +143,10 @@ def flight_ladder(data: FlightData, replays: FlightReplay) -> FlightLadder | Non
     """Climb the ladder; None for a flight without RSS, or replayed by rays of another engine than the image method."""
     if not data.rss or data.settings.rt.engine != "image":
         return None
-    return _Climber(data, [_thin(data.rss, i, r, data.settings.rss) for i, r in enumerate(replays.rss)]).climb()
+    return _Climber(data, [_sampled(data.rss, i, r, data.settings.rss) for i, r in enumerate(replays.rss)]).climb()
 
 
-def _thin(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: RssSettings) -> _Series:
+def _sampled(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: RssSettings) -> _Series:
     levels = levels_of(rss[index], replayed, rules)
     wanted = np.flatnonzero(levels.posed & np.isfinite(levels.measured_db))
     step = max(1, -(-len(wanted) // MOST_SAMPLES))

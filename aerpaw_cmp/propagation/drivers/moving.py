@@ -137,7 +137,7 @@ def replay_moving(
     if not blocks:
         return replay(site, link, poses, search, field, run)
     if len(blocks) > 1:
-        run = replace(run, whole=_whole(link, poses, sources_m))
+        run = replace(run, whole=_shared_by_blocks(link, poses, sources_m))
 
     def of(block: _Block) -> Replay:
         here, several, some, links = _scene_of(site, link, name, poses, block)
@@ -146,7 +146,7 @@ def replay_moving(
     return in_turn([block.rows for block in blocks], map(of, blocks), progress)
 
 
-def _whole(link: Link, poses: Poses, sources_m: FloatArray) -> Whole:
+def _shared_by_blocks(link: Link, poses: Poses, sources_m: FloatArray) -> Whole:
     """Properties of all blocks that each must know: one tolerance, and whether compiled code is worth loading."""
     pairs = len(poses) * len(link.uav_array) * sum(map(len, link.tower_arrays.values()))
     points = np.concatenate([poses.position_m, sources_m])

@@ -169,7 +169,7 @@ def _join(w: FloatArray) -> None:
 
 
 @kernel
-def _whole(row: FloatArray) -> Any:
+def _edge_of_row(row: FloatArray) -> Any:
     """An edge as the laws take it."""
     return (
         vector(row), vector(row[3:]), vector(row[6:]), vector(row[9:]), vector(row[12:]), row[15], vector(row[16:]),
@@ -187,8 +187,8 @@ def _over_pairs(w: FloatArray, t: Tables, r: Rows, first: int, many: int) -> Non
             put(w, _TURN + 3 * LANES + p, (0.0, 0.0, 1.0))
             continue
         before, after, cosines, joined, turn = edges.over_two(
-            taken(w, _SOURCE + p), taken(w, _TARGET + p), _whole(t.edge[r.edge[path, 0]]),
-            _whole(t.edge[r.edge[path, 1]]),
+            taken(w, _SOURCE + p), taken(w, _TARGET + p), _edge_of_row(t.edge[r.edge[path, 0]]),
+            _edge_of_row(t.edge[r.edge[path, 1]]),
             vector(r.vertices[path, 1]), vector(r.vertices[path, 2]), (r.shared[path, 0], r.shared[path, 1]),
             t.wave_number,
         )  # fmt: skip

@@ -53,7 +53,7 @@ def merged(scene: TriangleScene, merge_m: float = MERGE_M) -> Surfaces:
         raise InputError("no triangle of the scene has an area", expected="surfaces in metres")
     corners, normal, offset, area = corners[good], normal[good], offset[good], area[good]
     shape = scene.shape[good]
-    face, leader = _grown(corners, normal, offset, area, shape, merge_m)
+    face, leader = _faces_of_triangles(corners, normal, offset, area, shape, merge_m)
     order = np.argsort(face, kind="stable")
     face, corners, shape = face[order], corners[order], shape[order]
     triangle_area = area[order]
@@ -131,7 +131,7 @@ def _axes(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     return along, np.cross(normal, along)
 
 
-def _grown(
+def _faces_of_triangles(
     corners: FloatArray, normal: FloatArray, offset: FloatArray, area: FloatArray, shape: IntArray, merge_m: float
 ) -> tuple[IntArray, IntArray]:
     """Face of each triangle, and the triangle whose plane each face has: its largest."""
@@ -150,12 +150,12 @@ def _grown(
     by_edge = np.argsort(edge, kind="stable")
     start = np.searchsorted(edge[by_edge], np.arange(int(edge.max()) + 2))
     neighbours = edge.reshape(-1, 3), by_edge // 3, start
-    face, leader = _grow(np.argsort(-area, kind="stable"), corners, normal, offset, neighbours, merge_m)
+    face, leader = _merge_neighbours(np.argsort(-area, kind="stable"), corners, normal, offset, neighbours, merge_m)
     return face, leader
 
 
 @kernel
-def _grow(order, corners, normal, offset, neighbours, merge_m):  # type: ignore[no-untyped-def]
+def _merge_neighbours(order, corners, normal, offset, neighbours, merge_m):  # type: ignore[no-untyped-def]
     face = np.full(len(corners), -1, np.int64)
     leader = np.empty(len(corners), np.int64)
     todo = np.empty(len(corners), np.int64)

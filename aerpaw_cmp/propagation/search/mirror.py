@@ -202,7 +202,7 @@ class _Growth:
         level = Sequences(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
         levels, left = [level], self.budget - 1
         for _ in range(self.max_depth):
-            level = self._grown(level, source, usable, left)
+            level = self._one_face_longer(level, source, usable, left)
             left -= len(level.faces)
             if not len(level.faces):
                 break
@@ -214,7 +214,7 @@ class _Growth:
         hull = (low + high)[None] / 2, np.diag(high - low)[None] / 2
         return [levels[0], *(self._reaching(level, lit, hull) for level in levels[1:])]
 
-    def _grown(self, level: Sequences, source: FloatArray, usable: BoolArray, left: int) -> Sequences:
+    def _one_face_longer(self, level: Sequences, source: FloatArray, usable: BoolArray, left: int) -> Sequences:
         """Sequences one face longer, at most ``left`` of them."""
         faces, box, depth = self.faces, self.bounds, level.faces.shape[1]
         grown: list[IntArray] = []

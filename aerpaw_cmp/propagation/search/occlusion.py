@@ -87,7 +87,7 @@ class Occlusion:
         return cut
 
     def _cut(self, start: FloatArray, end: FloatArray) -> BoolArray:
-        solids = self._beside(start, end)
+        solids = self._solids_near(start, end)
         near = self._boxes(start, end, solids)
         result = np.zeros(len(start), dtype=np.bool_)
         seams: list[tuple[IntArray, FloatArray, FloatArray, int, int]] = []
@@ -109,7 +109,7 @@ class Occlusion:
             self._seams(result, start, end, seams)
         return result
 
-    def _beside(self, start: FloatArray, end: FloatArray) -> IntArray:
+    def _solids_near(self, start: FloatArray, end: FloatArray) -> IntArray:
         """Solids whose boxes meet the box of all segments, and from above also that turned to their mean direction."""
         east, north = np.nansum((end - start)[:, :2], axis=0)
         axes = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [east, north, 0], [-north, east, 0]])

@@ -127,7 +127,7 @@ class _Candidates:
         source, target = links.sources_m[self.tower], links.targets_m[self.pose]
         slot = (self.sequence == self.plane[self.tower][:, None]).argmax(axis=1)
         where, place, normal, part = specular_points(
-            dem, *_beside(faces, self.sequence, slot, source.copy(), target.copy()), wavelength_m
+            dem, *_ends_seen_from(faces, self.sequence, slot, source.copy(), target.copy()), wavelength_m
         )
         offset = (normal * place).sum(axis=1)
         mine = self.plane[self.tower[where]]
@@ -164,7 +164,7 @@ class _Candidates:
         return paths.select(np.lexsort((paths.tower, paths.pose)))
 
 
-def _beside(
+def _ends_seen_from(
     faces: Faces, sequence: IntArray, slot: IntArray, source: FloatArray, target: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Both ends as the ground at ``slot`` sees them: mirrored at the faces between."""

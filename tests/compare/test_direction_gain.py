@@ -359,3 +359,37 @@ def test_bins_are_means_from_the_first_sample_on_and_directions_stay_of_length_o
             assert getattr(found, name)[k] == pytest.approx(mean / np.linalg.norm(mean))
     assert len(found) == 5
     assert len(one.part(np.isnan(level)).binned(4.0)) == 0
+
+
+def test_planted_interaction_is_learned():
+    wave = lambda s: 3.0 * np.sin(4.0 * s.at_uav[:, 0] + 3.0 * s.at_tower[:, 1])  # noqa: E731
+    train, test = (
+        [dataclasses.replace(s, residual_db=s.residual_db + wave(s)) for s in part] for part in (TRAIN, TEST)
+    )
+    model = dataclasses.replace(MODEL, terms=(*TERMS, PAIR))
+    fit, without = fit_gain(train, model), fit_gain(train, MODEL)
+    for s in test:
+        assert rmse(s.residual_db - fit.mean(s)) < 0.95 * rmse(s.residual_db - without.mean(s))
+
+
+def test_flight_kept_aside_is_predicted_and_a_turned_body_is_not():
+    fit = fit_gain(TRAIN, MODEL)
+    for test in TEST:
+        clean = test.residual_db - test.residual_db.mean()
+        turned = dataclasses.replace(test, at_uav=test.at_uav * [-1.0, -1.0, 1.0])
+        gain, sd = fit.predict(test)
+        assert rmse(clean - gain) < 0.75 * rmse(clean)
+        assert rmse(clean - gain) < rmse(clean - fit.predict(turned)[0])
+        assert np.isfinite(sd).all()
+        assert (sd > 0).all()
+
+
+def test_shadowing_of_one_flight_is_not_learned_as_antenna():
+    """Flights without any antenna gain: what is learned must stay small, and without the nuisance it does not."""
+    flat = {k: (lambda d: np.zeros(len(d))) for k in GAINS}
+    flights = [s for k in range(2) for s in planted(f"f{k}", 30 + k, flat)]
+    strong = [dataclasses.replace(s, residual_db=s.residual_db * 3) for s in flights]
+    model = dataclasses.replace(MODEL, own_sd_db=3.0, noise_sd_db=3.0)
+    with_own = fit_gain(strong, model).predict(strong[0])[0]
+    without = fit_gain(strong, dataclasses.replace(model, own_sd_db=1e-3)).predict(strong[0])[0]
+    assert rmse(with_own) < 0.7 * rmse(without)

@@ -648,3 +648,24 @@ def test_a_curve_without_a_pair_says_nothing():
     ).all()
     assert curve.best_k_interval == curve.best_k_total_variation_interval == NO_INTERVAL
     assert not curve.at_edge
+
+
+def test_best_k_by_histogram_lies_in_its_interval_and_fits_best():
+    rng = np.random.default_rng(17)
+    profile = np.sort(10 ** rng.uniform(-3.0, 0, (1500, 4)), axis=1)[:, ::-1]
+    profile /= profile[:, :1]
+    h = with_profile(profile)
+    curve = k_curve(channel_rank(h, 30.0).astype(float), singular_values(h), replicates=100)
+    low, high = curve.best_k_total_variation_interval
+    assert low <= curve.best_k_total_variation <= high
+    assert low <= 30.0 * 1.1
+    assert high >= 30.0 / 1.1
+    assert high / low < 2.0, "where the distance is small, not where it is large"
+
+
+def test_an_interval_of_k_on_a_fine_grid_is_one_step_wider():
+    k = 1.25 ** np.arange(12)
+    low, high = ranks._central(np.array([k[4], k[8]] * 50), k)
+    assert (low, high) == (k[3], k[9])
+    between = ranks._central(np.full(9, k[5] * 1.1), k)
+    assert between == (k[4], k[7])

@@ -234,3 +234,11 @@ def test_means_in_time_are_those_of_a_loop() -> None:
             near = np.abs(time - time[i] - shift) <= average / 2
             near = near if near.any() else np.arange(80) == np.abs(time - time[i] - shift).argmin()
             np.testing.assert_allclose(found[:, row], power[:, near].mean(axis=1))
+
+
+def test_a_batch_of_features_equals_one_after_the_other():
+    x, rank, _, groups = planted(300)
+    both = np.stack([x, x[:, ::-1] * 2.0])
+    together = out_of_group(both, rank, groups, 3.0)
+    for i in (0, 1):
+        np.testing.assert_allclose(together[i], out_of_group(both[i], rank, groups, 3.0), atol=1e-6)

@@ -359,3 +359,17 @@ def test_same_places_pairs_the_nearest_and_wraps_headings():
     turned = Visit(a, np.zeros(3), np.array([359.0, 0, 0])), Visit(b, np.zeros(3), np.array([90.0, 0, 1]))
     here, _ = same_places(*turned)
     assert here.tolist() == [0]
+
+
+def test_models_of_equal_error_are_called_different_at_most_as_often_as_stated():
+    rng = np.random.default_rng(13)
+    wrong, truth_held = 0, 0
+    for _ in range(150):
+        common = shadowing(rng, 1500, 8, 3.0)
+        one, two = (common + shadowing(rng, 1500, 8, 2.0) + level for level in (5.0, -3.0))
+        found = paired_difference(one, two)
+        wrong += found.verdict in ("better", "worse")
+        low, high = found.difference_ci95_db
+        truth_held += low <= 0 <= high
+    assert wrong <= 15  # 5 % of 150 is 7.5
+    assert truth_held + wrong == 150

@@ -372,3 +372,19 @@ def test_the_stated_curve_is_the_one_that_maps_are_held_against(made):
     assert len(stated) == 5
     for name, value in stated.items():
         assert getattr(PAPER_BIEXPONENTIAL, name.lower()) == value
+
+
+def test_paths_of_infinite_loss_are_no_paths(site):
+    behind = np.array([[180.0, 0.0, 3.0], [50.0, 0.0, 3.0]])  # behind the hedge; in front of it
+    poses = Poses(behind, np.broadcast_to(np.eye(3), (2, 3, 3)))
+    one = Link(CARRIER_HZ, {"A": single_element()}, single_element(), 40.0)
+
+    def loss(paths, source, target):
+        return foliage_loss_db(source[paths.tower], paths.vertices_m, target[paths.pose], site.trees, Opaque())
+
+    result = replay(site, one, poses, field=Field(loss=loss))
+    assert result.has_path[:, 0].tolist() == [False, True]
+    assert np.isnan(result.rss_dbm[0, 0])
+    assert np.isnan(result.rss_power_dbm[0, 0])
+    assert (result.h[0] == 0).all()
+    assert np.isfinite(result.rss_dbm[1, 0])

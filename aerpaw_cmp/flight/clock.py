@@ -6,7 +6,7 @@ times are corrected by subtracting it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, product
 from typing import NamedTuple
@@ -194,11 +194,13 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     lag, excludes nothing. A level that depends on no position must be less likely than that.
     """
     models = list(channels[0].along.predicted_db)
-    features = {place: along.features() for place, along in {c.along.place: c.along for c in channels}.items()}
+    groups = _at_one_time(channels)
+    places = {place: some[0].along for (place, *_), some in groups.items()}
+    features = {place: along.features() for place, along in places.items()}
     bins = {
         tuple(c.name for c in some): b
-        for some in _at_one_time(channels)
-        if (b := _Bins.of(some, features[some[0].along.place], window_s)) is not None
+        for (place, *_), some in groups.items()
+        if (b := _Bins.of(some, features[place], window_s)) is not None
     }
     if not bins:
         return _nothing(NO_OVERLAP, window_s)
@@ -226,13 +228,13 @@ NO_OVERLAP = "too few samples at which the telemetry gives a position for every 
 NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
 
 
-def _at_one_time(channels: Sequence[ClockChannel]) -> list[list[ClockChannel]]:
-    """Channels in groups that share all but the levels: where and when they were measured, and which are missing."""
-    groups: dict[tuple[object, ...], list[ClockChannel]] = {}
+def _at_one_time(channels: Sequence[ClockChannel]) -> dict[tuple[Hashable, ...], list[ClockChannel]]:
+    """Channels in groups that share all but the levels: place, instants, and which levels are missing."""
+    groups: dict[tuple[Hashable, ...], list[ClockChannel]] = {}
     for one in channels:
         known = [np.isfinite(v).tobytes() for v in (one.measured_db, *one.along.predicted_db.values())]
         groups.setdefault((one.along.place, np.asarray(one.time_s).tobytes(), *known), []).append(one)
-    return list(groups.values())
+    return groups
 
 
 def _finer(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.geodesy import SiteFrame
-from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray
+from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..propagation.arrays import rotation_from_aircraft
 
 if TYPE_CHECKING:
@@ -193,21 +193,23 @@ def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
     return keep, int(repeated.sum()), int((~ordered).sum())
 
 
-def _order(stamp: AnyArray, position: FloatArray) -> AnyArray | None:
-    """Row order by time where stamps tell the truth and the file is shuffled; None where rows stay as written.
+def _order(stamp: AnyArray, position: FloatArray) -> tuple[IntArray, int]:
+    """Row order by time where stamps tell the truth and the file is shuffled, else as written; steps back so mended.
 
     A clock that stepped leaves the rows in the order that was flown: sorting them would mix two parts of the flight,
     and the path would grow. A file that was sorted by another column, or put together of parts, has the longer path.
     """
-    if not len(stamp) or bool((np.diff(stamp) >= 0).all()):
-        return None
+    steps, written = int((np.diff(stamp) < 0).sum()), np.arange(len(stamp))
+    if not steps:
+        return written, 0
     order = np.argsort(stamp, kind="stable")
 
     def length_m(path: FloatArray) -> float:
         return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
-    written = length_m(position)  # of a file in reverse order the path is as long, but for rounding
-    return order if length_m(position[order]) <= written * (1 + 1e-9) else None
+    # of a file in reverse order the path is as long, but for rounding
+    shorter = length_m(position[order]) <= length_m(position) * (1 + 1e-9)
+    return (order, steps) if shorter else (written, 0)
 
 
 def _hour_steps(stamp: AnyArray) -> int:
@@ -277,13 +279,11 @@ class Track:
         rows = np.flatnonzero(placed)
         east, north = self.frame.to_local(latitude[rows], longitude[rows])
         position = np.column_stack([east, north, altitude[rows] + self.ground_m])
-        order = _order(stamp[rows], position)
-        moved = 0 if order is None else int((np.diff(stamp[rows]) < 0).sum())
-        if order is not None:
-            rows, position = rows[order], position[order]
-        in_order = stamp[rows]
-        forward, duplicates, backward = _forward_rows(in_order)
-        rows, position = rows[forward], position[forward]
+        order, steps_sorted = _order(stamp[rows], position)
+        hour_steps = _hour_steps(stamp[rows[order]] if steps_sorted else stamp[timed])
+        forward, duplicates, backward = _forward_rows(stamp[rows[order]])
+        used = order[forward]
+        rows, position = rows[used], position[used]
 
         self.start_ns = int(stamp[rows[0]]) if len(rows) else 0
         self.end_ns = int(stamp[rows[-1]]) if len(rows) else 0
@@ -306,8 +306,8 @@ class Track:
             unknown_attitude=int((~known).sum()),
             gaps=int((interval > self.maximum_gap_s).sum()),
             longest_gap_s=float(interval.max()) if len(interval) else 0.0,
-            hour_steps=_hour_steps(stamp[timed] if order is None else in_order),
-            steps_sorted=moved,
+            hour_steps=hour_steps,
+            steps_sorted=steps_sorted,
         )
 
     def __len__(self) -> int:

@@ -69,8 +69,8 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
             "points": len(part),
             "mean_level_db": part["level_db"].mean(),
             "mean_sd_db": part["sd_db"].mean(),
-            **{f"share_{flag}": float((part["flag"] == flag).mean()) for flag in FLAGS},
             "share_outside_flown": outside_share(part),
+            **{f"share_{flag}": float((part["flag"] == flag).mean()) for flag in FLAGS if flag != "outside_flown"},
             **({"mean_p_above": part["p_above"].mean()} if "p_above" in part else {}),
         }
         for name, part in data.series

@@ -99,9 +99,8 @@ def _bsdf_id(name: str) -> str:
 
 def _bsdf(name: str) -> str:
     what = face_material(name)
-    thickness = {"thickness": HALF_SPACE_THICKNESS_M if what.thickness_m is None else what.thickness_m}
-    if name == CROWN:
-        thickness = {"thickness": CROWN_THICKNESS_M}
+    of_half_space = CROWN_THICKNESS_M if name == CROWN else HALF_SPACE_THICKNESS_M
+    thickness = {"thickness": of_half_space if what.thickness_m is None else what.thickness_m}
     if name == CROWN or name.startswith(CONSTANT):
         values = {
             "relative_permittivity": what.relative_permittivity(1e9).real,

@@ -187,7 +187,7 @@ def _polygons(
     for _ in range(element.count):
         corners: list[int] = []
         for name, kind, length in element.properties:
-            count, place = _read_row(data, words, place, order + length, element, path) if length else (1, place)
+            count, place = _read_count(data, words, place, order + length, element, path) if length else (1, place)
             values, place = _several(data, words, place, order + kind, int(count), element, path)
             corners = values if name == which else corners
         if len(corners) >= 3:
@@ -217,7 +217,9 @@ def _even_polygons(element: _Element, data: bytes, place: int, order: str, which
     return rows["corners"].astype(np.int64).reshape(element.count, -1), place + what.itemsize * element.count
 
 
-def _read_row(data: bytes, words: list[bytes], place: int, kind: str, element: _Element, path: Path) -> tuple[int, int]:
+def _read_count(
+    data: bytes, words: list[bytes], place: int, kind: str, element: _Element, path: Path
+) -> tuple[int, int]:
     values, place = _several(data, words, place, kind, 1, element, path)
     return values[0], place
 
@@ -243,7 +245,7 @@ def _skip(element: _Element, data: bytes, words: list[bytes], place: int, order:
         return place + width * element.count
     for _ in range(element.count):
         for _, kind, length in element.properties:
-            count, place = _read_row(data, words, place, order + length, element, path) if length else (1, place)
+            count, place = _read_count(data, words, place, order + length, element, path) if length else (1, place)
             _, place = _several(data, words, place, order + kind, int(count), element, path)
     return place
 

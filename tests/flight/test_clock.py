@@ -230,7 +230,7 @@ def test_channels_of_one_place_and_time_have_the_likelihoods_of_each_alone():
     level = ALONG.predicted_db["free space"]
     other = along(**{"free space": level + 3.0 * np.sin(GRID / 9.0)})  # another antenna: another prediction
     channels = [channel(0.5, 3), channel(0.5, 4, name="two", known=other), channel(0.5, 5, name="three")]
-    (together,) = _at_one_time(channels)
+    (together,) = _at_one_time(channels).values()
     parts = [[_Parts(5.0, 0.3, 1.0)], [_Parts(2.0, 0.1, 0.5), _Parts(15.0, 0.9, 2.0)], [_Parts(40.0, 0.3, 0.05)]]
     lags, both = np.arange(-9.0, 9.1, 0.5), _Bins.of(together, ALONG.features(), 15.0)
     assert both is not None
@@ -239,7 +239,7 @@ def test_channels_of_one_place_and_time_have_the_likelihoods_of_each_alone():
         assert alone is not None
         np.testing.assert_allclose(alone.likelihood(lags, [its])[0], expected, rtol=1e-9)
     missing = dataclasses.replace(channels[2], measured_db=np.where(np.arange(920) == 7, np.nan, 1.0))
-    assert [len(some) for some in _at_one_time([*channels[:2], missing])] == [2, 1]
+    assert [len(some) for some in _at_one_time([*channels[:2], missing]).values()] == [2, 1]
 
 
 def test_a_jittering_attitude_makes_no_sharp_optimum():

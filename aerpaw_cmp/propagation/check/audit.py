@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ...common.units import IntArray, spread_out
+from ...common.units import IntArray
 from ...compare.field_difference import FieldAudit
 from ...site.site import Site
 from ..arrays import Link, Poses
@@ -16,6 +16,7 @@ from ..paths import joined
 from ..replay import Replay
 from ..replay import replay as run_replay
 from ..search.mirror import plane_keys, planes_of
+from ..search.samples import spread
 from .field_audit import (
     REFERENCE_LINKS,
     Expected,
@@ -180,7 +181,7 @@ def audit(
 def _spread(poses: Poses, count: int | None) -> IntArray:
     """Indices of poses with a position, evenly spread."""
     good = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
-    return good if count is None else np.asarray(good[spread_out(len(good), count)])
+    return good if count is None else spread(good, count)
 
 
 def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[float] = RANK_K) -> Difference:

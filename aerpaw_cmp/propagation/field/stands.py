@@ -117,8 +117,8 @@ def _loss(
     np.maximum.at(top, place, stand.height_m + ground)
     here, there, lower = start[some], end[some], np.zeros(len(some))
     outside = ((enter > 1e-9) | (here[:, 2] > top)) & ((leave < 1.0 - 1e-9) | (there[:, 2] > top))
-    ways = list(_detours(stand, here, there, enter, leave, top))
-    if not isinstance(model, Opaque):
+    ways = [] if isinstance(model, Opaque) else list(_detours(stand, here, there, enter, leave, top))
+    if ways:
         length, at, over = ways[0]
         zone = CLEAR * np.sqrt(wavelength_m * length * at * (1.0 - at))
         lower = np.where(outside, np.maximum((zone - over).min(axis=0), 0.0), 0.0)
@@ -126,7 +126,7 @@ def _loss(
     base, way = stand.height_m * stand.crown_base_fraction, np.linalg.norm((end - start)[row], axis=1)
     depth = _between(share, up, rise, base, stand.height_m) + TRUNKS * _between(share, up, rise, 0.0, base)
     through = model.loss_db(np.bincount(place, depth * way, len(some)).astype(np.float64))
-    if isinstance(model, Opaque):
+    if not ways:
         return some, through
     power = sum(10.0 ** (-deygout_db(*detour, wavelength_m) / 10.0) for detour in ways)
     blocked = (1.0 - 10.0 ** (-through / 10.0)) * (1.0 - np.where(outside, np.minimum(power, 1.0), 0.0))

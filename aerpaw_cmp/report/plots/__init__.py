@@ -1,1 +1,1 @@
-"""Figures of a flight's report, a module per kind."""
+"""Figures of a flight's report: of levels, of ranks, and the order of all."""

@@ -1,4 +1,4 @@
-"""The figures of a report, in order, with their captions."""
+"""Figures of a report, in order, with their captions; those of serving cells and of a prediction beside the flight."""
 
 from __future__ import annotations
 
@@ -12,9 +12,18 @@ import numpy as np
 from ...common.units import AnyArray
 from ...compare.result import RankResult, RssResult
 from ...compare.serving import ServingComparison
-from .. import canvas
 from ..against import Against, AgainstSeries
-from ..canvas import POINTS_PER_CLOUD, TOWER, FigureSpec, colour_bar, subplots
+from ..canvas import (
+    MEASURED,
+    POINTS_PER_CLOUD,
+    SIMULATED,
+    TOWER,
+    FigureSpec,
+    colour_bar,
+    legend_below,
+    subplots,
+    time_axis,
+)
 from ..data import ReportData, Track
 from ..names import safe_name
 from ..words import count, learned_on
@@ -263,18 +272,18 @@ def against_specs(against: Against) -> Iterator[FigureSpec]:
 
 
 def _over_time(s: AgainstSeries) -> Figure:
-    fig, ax = canvas.subplots((9.2, 3.4))
-    ax.fill_between(s.time_s, s.low_db, s.high_db, color=canvas.SIMULATED, alpha=0.22, linewidth=0, label="90 %")
-    ax.plot(s.time_s, s.measured_db, ".", markersize=2, color=canvas.MEASURED, label="measured", rasterized=True)
-    ax.plot(s.time_s, s.level_db, color=canvas.SIMULATED, linewidth=1.2, label="predicted")
-    canvas.time_axis(ax, np.datetime64(0, "ns") if s.start is None else s.start)
+    fig, ax = subplots((9.2, 3.4))
+    ax.fill_between(s.time_s, s.low_db, s.high_db, color=SIMULATED, alpha=0.22, linewidth=0, label="90 %")
+    ax.plot(s.time_s, s.measured_db, ".", markersize=2, color=MEASURED, label="measured", rasterized=True)
+    ax.plot(s.time_s, s.level_db, color=SIMULATED, linewidth=1.2, label="predicted")
+    time_axis(ax, np.datetime64(0, "ns") if s.start is None else s.start)
     ax.set_ylabel("level [dB]")
-    canvas.legend_below(ax, 3)
+    legend_below(ax, 3)
     return fig
 
 
 def _reliability(against: Against) -> Figure:
-    fig, (left, right) = canvas.subplots((9.2, 3.6), 1, 2)
+    fig, (left, right) = subplots((9.2, 3.6), 1, 2)
     left.plot([0, 100], [0, 100], color="0.6", linewidth=1)
     for s in against.series:
         left.plot(100 * SHARES, [100 * s.coverage(share) for share in SHARES], "o-", markersize=3, label=s.name)

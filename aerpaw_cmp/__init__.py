@@ -11,6 +11,7 @@ from typing import Any
 
 __version__ = "0.3.0"
 
+# Where each public name lives.
 _HOME = {
     "Array": "propagation.arrays",
     "BiExponential": "maps.biexponential",
@@ -31,7 +32,6 @@ _HOME = {
     "read": "logs.frames",
     "trace": "propagation.trace",
 }
-"""Where each public name lives."""
 
 __all__ = [
     "Array",

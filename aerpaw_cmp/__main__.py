@@ -24,25 +24,25 @@ import sys
 from .common import interrupts, terminal
 
 INTERNAL_ERROR = 70
+# Plus the number of the signal.
 SIGNALLED = 128
-"""Plus the number of the signal."""
 OUTPUT_FAULT = 3
 BROKEN_PIPE = 141
+# Set by a shell that asks what may follow on the line.
 _COMPLETE = "_AERPAW_CMP_COMPLETE"
+# Typer's word for: do not look for a shell above this process (there may be none), it stands on the command line.
 _SHELL_IS_NAMED = "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"
-"""Typer's word for: do not look for a shell above this process (there may be none), it stands on the command line."""
-"""Set by a shell that asks what may follow on the line."""
 ISSUES = "the project's issue tracker"
+# Threads of BLAS: the tool solves many small systems, on which several threads wait for each other (3.6 times the
+# processor time of the sample's report). What the user set stays.
 BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Threads of BLAS: the tool solves many small systems, on which several threads wait for each other (3.6 times the
-processor time of the sample's report). What the user set stays."""
 
+# Faults of a path itself, which pathlib's own questions such as ``is_dir`` raise.
 _UNUSABLE = (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENOTDIR, errno.EIO, errno.ESTALE)
-"""Faults of a path itself, which pathlib's own questions such as ``is_dir`` raise."""
 LONGEST_NAME = 120
 
+# Made before Python looks for cycles among them (700 by default): a report makes a million, of which most stay.
 NEW_OBJECTS = 10_000
-"""Made before Python looks for cycles among them (700 by default): a report makes a million, of which most stay."""
 
 
 def help_text() -> str:

@@ -28,6 +28,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 HISTORY = ROOT / "benchmarks" / "history.jsonl"
+# What is run, each in a process of its own; ``scaling`` an axis at a time.
 COMMANDS: dict[str, list[str]] = {
     "scaling": ["benchmarks/scaling.py", "--json", "--axes"],
     "peers": ["benchmarks/peers.py"],
@@ -38,11 +39,11 @@ COMMANDS: dict[str, list[str]] = {
     "country": ["benchmarks/country.py", "--receivers", "1e5,1e6", "--json"],
     "pages": ["benchmarks/pages.py", "--only", "long,campaign", "--repeats", "1", "--json"],
 }
-"""What is run, each in a process of its own; ``scaling`` an axis at a time."""
 
+# What runs before all of them and is not counted: it compiles the kernels that replays and maps keep on disk.
 WARM = ["-c", "from aerpaw_cmp.propagation.compiled import COMPILE_S, load\nfor name in COMPILE_S: load(name)"]
-"""What runs before all of them and is not counted: it compiles the kernels that replays and maps keep on disk."""
 
+# How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards.
 SMALLEST: dict[str, list[str]] = {
     "aligned_paths": ["--links", "20"],
     "all": ["--only", "kriging", "--no-history"],
@@ -81,7 +82,6 @@ SMALLEST: dict[str, list[str]] = {
     "tap_sigkill": ["--quick"],
     "tap_web_soak": ["--quick"],
 }
-"""How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards."""
 
 ON_FIELD_DATA = ("learned_map", "left_out_reports")
 

@@ -54,6 +54,7 @@ def region(folder: Path, seed: int = 1) -> Path:
     return path
 
 
+# Runs a command and leaves processor seconds and peaks [MiB] of itself and of its workers.
 MAP = """
 import json, resource, sys, time
 from aerpaw_cmp.__main__ import main
@@ -62,7 +63,6 @@ peak = {w: resource.getrusage(getattr(resource, w)) for w in ("RUSAGE_SELF", "RU
 json.dump({w: [u.ru_utime + u.ru_stime, u.ru_maxrss / 1024] for w, u in peak.items()}, open("usage.json", "w"))
 sys.exit(code)
 """
-"""Runs a command and leaves processor seconds and peaks [MiB] of itself and of its workers."""
 
 
 def mapped(site: Path, receivers: float, workers: int, cells: int) -> dict[str, float]:

@@ -31,8 +31,8 @@ SAMPLE = Path(__file__).resolve().parents[1] / "sample_logs"
 LOGS = ("UAV/2025-06-01_10_00_00_vehicleOut.txt", "UAV/modem_ri.csv", "LW1/USRP1_power_log.txt")
 LINES = 30
 CODES = {0, 1, 2, 3, 141}
+# On a busy machine a call may wait for half a minute.
 SECONDS = 120.0
-"""On a busy machine a call may wait for half a minute."""
 ODD = "ol d\n\udcff"
 INSIDE = ("logs", "set.zip", "empty", "link.txt", "nowhere", "round", "flight.yaml", "bad.yaml", "campaign.yaml", ODD,
           "missing.txt", "set.zip/modem_ri.csv", "set.zip/abs/modem_ri.csv", "set.zip/../modem_ri.csv",

@@ -53,16 +53,16 @@ from aerpaw_cmp.logs.records import ReadResult  # noqa: E402
 
 LIMIT_S = 2.0
 LIMIT_MIB = 300
+# A worker that spends so much of the processor on one input hangs in native code, where no alarm reaches it.
 WATCHDOG_S = 20.0
-"""A worker that spends so much of the processor on one input hangs in native code, where no alarm reaches it."""
+# One that finishes no input for so long sleeps for ever; long, so that a run may have the lowest priority.
 WATCHDOG_WALL_S = 600.0
-"""One that finishes no input for so long sleeps for ever; long, so that a run may have the lowest priority."""
 
 BLOCK = 1000
+# Every so many inputs meet the sniffers of all readers.
 SNIFF_EVERY = 32
-"""Every so many inputs meet the sniffers of all readers."""
+# Every so many inputs are several logs joined by hand.
 JOINED_EVERY = 8
-"""Every so many inputs are several logs joined by hand."""
 SEED_BYTES = 1500
 MEDIUM_BYTES = 4000
 

@@ -98,13 +98,13 @@ def write_drive_test(place: Path, lines: int) -> None:
             )  # fmt: skip
 
 
+# By reader.
 SCALED: dict[str, tuple[Callable[[Path, int], None], str, ReadOptions]] = {
     "sounder_log": (write_sounder, "x_power_log.txt", ReadOptions(timezone=ZONE)),
     "vehicle_out": (write_vehicle, "x_vehicleOut.txt", ReadOptions(timezone=ZONE)),
     "quectel_csv": (write_quectel, "x_kpi.csv", ReadOptions(timezone=ZONE)),
     "drive_test": (write_drive_test, "x_phone.csv", ReadOptions(timezone=ZONE)),
 }
-"""By reader."""
 TABLES: dict[str, tuple[int, int, list[int]]] = {
     # rows above, place of the time, places of further numbers
     "vehicle_out": (0, 11, [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 13]),

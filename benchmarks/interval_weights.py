@@ -29,8 +29,8 @@ def sequences(rng: np.random.Generator, count: int, n: int, neighbours: float, n
     return np.asarray(lfilter([1.0], [1.0, -neighbours], drive, axis=1) + noise * rng.normal(size=(count, n)))
 
 
+# Likelihood, probability that a draw lies below the truth, square of the width (each (count, memories)); weight.
 Cell = tuple[FloatArray, FloatArray, FloatArray, float]
-"""Likelihood, probability that a draw lies below the truth, square of the width (each (count, memories)); weight."""
 
 
 def cell(kind: str, x: FloatArray, y: FloatArray, noise: float, size: float, weight: float) -> Cell:

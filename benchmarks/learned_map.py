@@ -43,28 +43,28 @@ from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 DATASET12 = ("40m_fs10MHz", "40m_fs5MHz", "70m_fs20MHz")
 LTE = ("lte_plotdata2", "lte_plotdata4")
 AFAR = ("afar_300_loc_1", "afar_300_loc_2", "afar_309_loc_2", "afar_328_loc_1", "afar_328_loc_3", "afar_288_loc_1")
+# Its levels are no task of the benchmark: one flight of the folder has them with positions.
 NR = {
     "timezone": "America/New_York",
     "site": {"file": "lake_wheeler", "coordinates": "A", "without_buildings": True},
     "logs": [{"path": "nr_rsrp", "node": "LW1"}],
     "link": {"rss": {"carrier_hz": 3.4e9}},
 }
-"""Its levels are no task of the benchmark: one flight of the folder has them with positions."""
 BLOCK_LINE = ("learned {:.3f} dB, {:.3f} about the mean error of each series (90 % holds {:.0f} %); with the chosen "
               "field {:.3f}, {:.3f} ({:.0f} %), on in {:.0f} % of blocks")  # fmt: skip
 MEANS_S, TARGETS, GUARD_S = 3.0, 25, 20.0
+# Lengths over place [m] and strengths of the residual field on a receiver's logits; an infinite length is a shift.
 RANK_FIELDS = {
     "a shift": [(np.inf, 1.0)], "0.6 over 15 m": [(15.0, 0.6)], "0.6 over 40 m": [(40.0, 0.6)],
     "0.6 over 100 m": [(100.0, 0.6)], "1.0 over 100 m": [(100.0, 1.0)],
     "0.6 over 100 m and a shift": [(100.0, 0.6), (np.inf, 1.0)],
 }  # fmt: skip
-"""Lengths over place [m] and strengths of the residual field on a receiver's logits; an infinite length is a shift."""
+# Reports that are predicted from those before, in such parts and from this time on.
 AHEAD_S, FIRST_S = 30.0, 120.0
-"""Reports that are predicted from those before, in such parts and from this time on."""
+# Times as far as places.
 HEIGHT_COUNTS = 2.0
-"""Times as far as places."""
+# Errors and stated standard deviations (n,) [dB].
 Part = tuple[FloatArray, FloatArray]
-"""Errors and stated standard deviations (n,) [dB]."""
 
 
 def learned(

@@ -44,11 +44,11 @@ import pytest
 ROOT = Path(__file__).parents[1]
 EQUIVALENT = Path(__file__).with_name("mutation_equivalent.txt")
 ROOMS = ("propagation", "compare", "flight", "maps")
+# Modules of the room `jobs` that decide what is scored, and on what.
 RULES = (
     "learning/calibrate", "reporting/compare_flight", "reporting/levels", "reporting/audit_flight", "reporting/ladder",
     "reporting/flight_run", "campaigns/over_flights",
 )  # fmt: skip
-"""Modules of the room `jobs` that decide what is scored, and on what."""
 
 TESTS = (
     *(f"{base}/{room}" for base in ("tests", "aerpaw_cmp") for room in (*ROOMS, "jobs")),
@@ -79,6 +79,7 @@ _OVER_EDGES = (
     f"{_EDGES}compiled_search_and_field_are_those_of_numpy",
     f"{_EDGES}paths_of_every_kind_by_force[2-all]", "tests/propagation/test_roof.py",
 )  # fmt: skip
+# Of compiled code no line is seen running: these tests call it, and it is interpreted for each mutant.
 COMPILED = {
     "aerpaw_cmp/maps/triangle_kernels.py": (
         "tests/maps/test_kriging.py::test_many_targets_among_few_samples_equal_the_textbook[always-7]",
@@ -94,7 +95,6 @@ COMPILED = {
     "aerpaw_cmp/propagation/search/boxtree.py": _BEAMS,
     "aerpaw_cmp/propagation/search/merging.py": _BEAMS,
 }  # fmt: skip
-"""Of compiled code no line is seen running: these tests call it, and it is interpreted for each mutant."""
 
 PRELOADED = (
     "numpy", "scipy.linalg", "scipy.signal", "scipy.spatial", "scipy.optimize", "scipy.stats", "pandas", "pytest",
@@ -296,8 +296,8 @@ def in_child(work: Callable[[], str], limit_s: float) -> str:
 
 # --- which test reaches which line -----------------------------------------------------------------------------------
 
+# By test: ``seconds`` of processor time, ``lines`` by module.
 Reach = dict[str, dict[str, Any]]
-"""By test: ``seconds`` of processor time, ``lines`` by module."""
 
 
 class Recorder:
@@ -447,11 +447,11 @@ class Trials:
         return ""
 
 
+# Unclear: the test fails without the change too, where it runs alone; such mutants do not count.
 KINDS = ("killed", "survived", "equivalent", "unclear")
-"""Unclear: the test fails without the change too, where it runs alone; such mutants do not count."""
 
+# Tests that a change outside functions is tried on, the shortest case of each first.
 MOST_ANEW = 120
-"""Tests that a change outside functions is tried on, the shortest case of each first."""
 
 
 def near_tests(reach: Reach, path: str, lines: tuple[int, int] | None) -> list[str]:

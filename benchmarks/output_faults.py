@@ -128,8 +128,8 @@ def _buildings(count: int) -> dict[str, Any]:
     }
 
 
+# Of the run that goes on.
 _variant = ["a"]
-"""Of the run that goes on."""
 
 
 def compute_once(jobs: dict[str, Job], folder: Path) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 HISTORY = ROOT / "benchmarks" / "history.jsonl"
 FIGURE = "performance_scaling.png"
+# Title and what was done, by axis of benchmarks/scaling.py.
 AXES = {
     "poses": ("Poses", "replay of 5 towers, 4 x 4 elements, 12 buildings, depth 2"),
     "towers": ("Towers", "replay of 10 000 poses, 4 x 4 elements, 12 buildings, depth 2"),
@@ -26,7 +27,6 @@ AXES = {
     "flights": ("Flights", "campaign, one tower, two channels, two settings, 130 s each, one worker"),
     "workers": ("Workers", "the same campaign of the most flights"),
 }
-"""Title and what was done, by axis of benchmarks/scaling.py."""
 
 SEARCH_NOTE = (
     "Path search is that of the bench scene (61 faces, 1000 places, depth 2). Its ratios fell with the run of "

@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 TROUBLES = ("none", "clock", "heading", "tower", "pattern", "blocked", "floor", "gain step")
 TOWERS = {"LW1": (0.0, 0.0, 10.0), "LW2": (-450.0, 80.0, 10.0), "LW3": (370.0, -290.0, 10.0)}
 STEP_S = 0.1
+# A trouble that changes the level by less [dB] is redrawn: noise of 2-3 dB hides it, and it costs no decision.
 LEAST_DB = 1.5
-"""A trouble that changes the level by less [dB] is redrawn: noise of 2-3 dB hides it, and it costs no decision."""
 
 
 def route(generator: np.random.Generator) -> tuple[Array, Array, Array]:

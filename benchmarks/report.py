@@ -25,10 +25,10 @@ from pathlib import Path
 import yaml
 
 ROOT = Path(__file__).parents[1]
+# What every report with its audit has to load, as a program.
 IMPORTS = (
     "from aerpaw_cmp.machine.llvm import let_sionna_load as let; let(); import sionna.rt, matplotlib.pyplot, pandas"
 )
-"""What every report with its audit has to load, as a program."""
 LIGHT = "import matplotlib.pyplot, pandas"
 
 

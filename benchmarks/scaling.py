@@ -34,6 +34,7 @@ import yaml
 from aerpaw_cmp.propagation.options import Search
 
 ROOT = Path(__file__).resolve().parents[1]
+# Short and large sizes of each axis; ``report`` in hours.
 SIZES: dict[str, tuple[list[float], list[float]]] = {
     "poses": ([10_000, 30_000, 100_000], [10_000, 100_000, 1_000_000]),
     "towers": ([1, 3, 10], [1, 3, 10, 30, 100]),
@@ -43,7 +44,6 @@ SIZES: dict[str, tuple[list[float], list[float]]] = {
     "flights": ([2, 4, 8], [2, 8, 32]),
     "workers": ([1, 2], [1, 2]),
 }
-"""Short and large sizes of each axis; ``report`` in hours."""
 
 
 def spent() -> float:

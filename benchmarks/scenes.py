@@ -219,8 +219,8 @@ def sionna_row(task: dict[str, Any]) -> dict[str, Any]:
     return row | {"extra_confirmed": int(clear.sum()), "extra_refuted": int((~clear).sum())}
 
 
+# Float32 at a kilometre, and the merge tolerance at grazing incidence.
 SHORTENED_M = 0.02
-"""Float32 at a kilometre, and the merge tolerance at grazing incidence."""
 
 
 def free_in_sionna(surfaces: Any, paths: Any, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:

@@ -42,6 +42,7 @@ if _OF_ALL:
     Path(os.environ["AERPAW_CMP_CACHE"], "llvm").symlink_to(Path(_OF_ALL, "llvm"))
 
 
+# Files that take longest, by and large in that order.
 DEAREST = (
     "propagation/test_growth.py",  # compiles for half a minute where nothing is kept yet; the other worker needs it later
     "jobs/test_campaign.py",
@@ -60,7 +61,6 @@ DEAREST = (
     "report/test_browser_map.py",
     "machine/test_llvm.py",
 )
-"""Files that take longest, by and large in that order."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -88,8 +88,8 @@ COMMANDS = {
 }
 
 
+# Command lines that meet each kind of fault.
 KINDS = {kind: lines.split("; ") for kind, lines in COMMANDS.items()}
-"""Command lines that meet each kind of fault."""
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ import typer
 from aerpaw_cmp.cli.app import app
 
 ROOT = Path(__file__).parents[1]
+# Pattern: what to write in its place.
 BANNED = {
     r"\bWORSE\b": "worse, and only where an interval says so",
     r"shown to be": "significant, not significant",
@@ -26,7 +27,6 @@ BANNED = {
     r"[Oo]ffset of the (?:span|others)\b": "offset of the selection, of the training flights",
     r"\bno (?:remarks|progress and)\b": "results, warnings and failures only",
 }
-"""Pattern: what to write in its place."""
 
 
 def texts_of(path: Path) -> Iterator[tuple[int, str]]:

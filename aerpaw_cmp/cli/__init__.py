@@ -15,8 +15,8 @@ from . import benchmark, campaign, diff, explain, flight, live, logs, machine, p
 from .app import Interrupted, app
 from .shown import say
 
+# The modules whose commands there are: importing them registers these.
 GROUPS = (logs, flight, explain, campaign, benchmark, diff, predict, plan, live, site, machine)
-"""The modules whose commands there are: importing them registers these."""
 
 
 @cache

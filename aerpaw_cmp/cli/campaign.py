@@ -60,8 +60,8 @@ def campaign(
     return 1 if strict and outcome.failed_checks else 0
 
 
+# Tasks of a list on the terminal; --json has them all.
 _SHOWN = 20
-"""Tasks of a list on the terminal; --json has them all."""
 
 
 def _print_status(status: Any) -> None:

@@ -45,8 +45,8 @@ def diff(
     return 1 if strict and comparison.differences else 0
 
 
+# Changes of one kind that are printed.
 _SHOWN = 20
-"""Changes of one kind that are printed."""
 
 
 def _print_diff(comparison: Any) -> None:

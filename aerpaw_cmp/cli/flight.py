@@ -103,8 +103,8 @@ def _verdict(outcome: Any, strict: bool) -> int:
     return 1 if strict and outcome.failed_checks else 0
 
 
+# Warnings of a report that are also said here.
 _WARNINGS = 10
-"""Warnings of a report that are also said here."""
 
 
 def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:

@@ -80,12 +80,12 @@ def _bar() -> Any:
     return progress.Progress(*columns, console=Console(stderr=True))
 
 
+# What all commands of this process say on standard error.
 say = ProgressLines()
-"""What all commands of this process say on standard error."""
 
 
+# Version of what ``--json`` prints (docs/reference/json.md): it rises when a key is renamed or removed.
 SCHEMA = 1
-"""Version of what ``--json`` prints (docs/reference/json.md): it rises when a key is renamed or removed."""
 
 
 def print_json(value: dict[str, Any]) -> None:
@@ -114,8 +114,8 @@ def print_files(paths: Sequence[Path], as_json: bool = False) -> None:
         print(path)
 
 
+# Columns up to this width (numbers, times) are never broken.
 _FIXED = 20
-"""Columns up to this width (numbers, times) are never broken."""
 
 
 def table(columns: list[str], rows: list[list[str]], title: str | None = None, width: int | None = None) -> None:

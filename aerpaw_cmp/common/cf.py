@@ -12,9 +12,10 @@ from .geodesy import SiteFrame
 
 CONVENTIONS = "CF-1.11"
 
+# dBm and dB as UDUNITS has them: tenths of the decimal logarithm of a power over 1 mW, of a ratio.
 DBM, DB = "0.1 lg(re 1 mW)", "0.1 lg(re 1)"
-"""dBm and dB as UDUNITS has them: tenths of the decimal logarithm of a power over 1 mW, of a ratio."""
 
+# Attributes of the grid mapping of latitudes and longitudes.
 WGS84 = {
     "grid_mapping_name": "latitude_longitude",
     "geographic_crs_name": "WGS 84",
@@ -26,7 +27,6 @@ WGS84 = {
     "prime_meridian_name": "Greenwich",
     "long_name": "coordinate reference system",
 }
-"""Attributes of the grid mapping of latitudes and longitudes."""
 
 
 def site_crs(frame: SiteFrame) -> Any:

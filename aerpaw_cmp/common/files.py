@@ -13,8 +13,8 @@ from pathlib import Path
 
 from .errors import InputError, OutputError
 
+# Of small files that are read whole: antenna patterns, receivers, the numbers of a report [bytes].
 LARGEST_TABLE = 64 << 20
-"""Of small files that are read whole: antenna patterns, receivers, the numbers of a report [bytes]."""
 
 
 @contextlib.contextmanager

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     _Handler = Callable[[int, FrameType | None], Any] | int | signal.Handlers | None
 
+# What ends a command in order.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""What ends a command in order."""
 
+# Undone when :func:`noted` ends: hidden places whose owner an interrupt did not let finish its first step.
 AT_END: list[Callable[[], None]] = []
-"""Undone when :func:`noted` ends: hidden places whose owner an interrupt did not let finish its first step."""
 
 _came = False
 _last: int = signal.SIGINT

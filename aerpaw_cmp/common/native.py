@@ -23,11 +23,11 @@ import numpy as np
 from .errors import InputError, one_line
 from .units import AnyArray
 
+# Of all arrays of a file together.
 MOST_BYTES = 1 << 30
-"""Of all arrays of a file together."""
 MOST_RATIO = 200
+# A file may declare so many bytes, and ``MOST_RATIO`` times its own size: text compresses to a hundredth.
 FREE_BYTES = 1 << 26
-"""A file may declare so many bytes, and ``MOST_RATIO`` times its own size: text compresses to a hundredth."""
 MOST_ITEMS = 100_000
 MOST_MEMORY = 4 << 30
 SECONDS = 60
@@ -78,8 +78,8 @@ def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:
     return child.returncode, child.stdout, child.stderr
 
 
+# All that the child sees of the environment: no HDF5_PLUGIN_PATH, no GDAL_DRIVER_PATH; threads cost memory limits.
 _ENVIRON = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
-"""All that the child sees of the environment: no HDF5_PLUGIN_PATH, no GDAL_DRIVER_PATH; threads cost memory limits."""
 
 
 def _unpacked(content: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:

@@ -36,8 +36,8 @@ from .errors import OutputError, UsageError, add_note, one_line
 from .files import plain_mode, sync
 from .interrupts import AT_END, held, interrupted, raise_interrupt
 
+# The list of a result folder; ``sha256sum -c SHA256SUMS`` checks it.
 SUMS = "SHA256SUMS"
-"""The list of a result folder; ``sha256sum -c SHA256SUMS`` checks it."""
 _SUMS_HEAD = "# aerpaw-cmp:"
 _SEAL = "# aerpaw-cmp wrote this file; SHA-256 of the lines below: "
 _UNFINISHED = ".unfinished"

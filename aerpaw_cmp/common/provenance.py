@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
+# Of YAML and JSON files; in front of a colon in the comments of a table.
 KEY = "trained_on"
-"""Of YAML and JSON files; in front of a colon in the comments of a table."""
 
 _LIST = re.compile(KEY + r"""["']?[ \t]*:[\s\["',-]*((?:[0-9a-f]{64}[\s"',#-]*)+)""")
 _DIGEST = re.compile(r"[0-9a-f]{64}")

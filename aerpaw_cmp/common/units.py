@@ -16,18 +16,18 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 AnyArray = NDArray[Any]
 
+# Speed of light in vacuum (SI, exact).
 SPEED_OF_LIGHT_MPS = 299_792_458.0
-"""Speed of light in vacuum (SI, exact)."""
 
+# CODATA 2018.
 VACUUM_PERMITTIVITY_F_PER_M = 8.854_187_8128e-12
-"""CODATA 2018."""
 
+# Poses below this height above ground are raised to it (arXiv 2502.10324, section V).
 MINIMUM_HEIGHT_M = 0.5
-"""Poses below this height above ground are raised to it (arXiv 2502.10324, section V)."""
 
 
+# Thermal noise at 290 K [dBm in 1 Hz]: -173.98 (Boltzmann's constant: SI, exact).
 THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
-"""Thermal noise at 290 K [dBm in 1 Hz]: -173.98 (Boltzmann's constant: SI, exact)."""
 
 
 def noise_floor_dbm(bandwidth_hz: float, noise_figure_db: float = 0.0) -> float:

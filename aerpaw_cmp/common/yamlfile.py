@@ -25,14 +25,14 @@ import yaml
 from .errors import InputError, UsageError
 from .files import read_bounded
 
+# Larger files are refused unread; a site with 100 000 single trees has about 6 MB.
 MAX_BYTES = 32 * 1024 * 1024
-"""Larger files are refused unread; a site with 100 000 single trees has about 6 MB."""
 
+# Scalars, lists and mappings, aliases counted unfolded: an alias bomb stops here.
 MAX_NODES = 4_000_000
-"""Scalars, lists and mappings, aliases counted unfolded: an alias bomb stops here."""
 
+# Nesting of lists and mappings.
 MAX_DEPTH = 64
-"""Nesting of lists and mappings."""
 
 _TAG = "tag:yaml.org,2002:"
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # events only: nothing is constructed by PyYAML
@@ -354,9 +354,10 @@ def _explain(
     return UsageError(f"{len(findings)} problems\n  " + "\n  ".join(shown), path=path)
 
 
+# Parts of a location that say which member of a union was tried; no key of ours has such a name.
 _MEMBER = re.compile(r"literal\[.*\]|float|int|str|bool")
-"""Parts of a location that say which member of a union was tried; no key of ours has such a name."""
 
+# What is expected, by pydantic's name of the error.
 _KINDS = {
     "float_(type|parsing)": "a number",
     "int_(type|parsing|from_float)": "a whole number",
@@ -368,7 +369,6 @@ _KINDS = {
     "too_long": "at most {max_length} in the list",
     "string_pattern_mismatch": "text of the form {pattern}",
 }
-"""What is expected, by pydantic's name of the error."""
 
 
 def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | None]:

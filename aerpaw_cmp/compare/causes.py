@@ -31,15 +31,15 @@ import numpy as np
 
 from ..common.units import BoolArray, FloatArray
 
+# Samples are averaged over so long [s].
 BIN_S = 1.0
-"""Samples are averaged over so long [s]."""
 FEWEST_BINS = 60
+# Log likelihood that a trouble must gain beyond its cost.
 MARGIN = 4.0
-"""Log likelihood that a trouble must gain beyond its cost."""
+# A trouble that takes less than this share off the RMSE is not the cause of the error.
 LEAST_SHARE = 0.1
-"""A trouble that takes less than this share off the RMSE is not the cause of the error."""
+# Half of the 95 % point of chi-squared with one degree of freedom.
 _NEAR = 1.92
-"""Half of the 95 % point of chi-squared with one degree of freedom."""
 _Estimate = tuple[float, float, float]
 _NOTHING: _Estimate = (math.nan, math.nan, math.nan)
 _PHI = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.985, 0.995])
@@ -193,8 +193,8 @@ def _fitted(residual: FloatArray, columns: FloatArray | None = None) -> _Fit:
     return _Fit(best.log_likelihood, left)
 
 
+# Of six harmonics; with ``MARGIN`` chance reaches it in fewer than one of a thousand.
 _PATTERN_COST = 3.0
-"""Of six harmonics; with ``MARGIN`` chance reaches it in fewer than one of a thousand."""
 _Found = tuple[str, _Estimate, str, _Fit]
 
 

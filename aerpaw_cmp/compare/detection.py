@@ -12,13 +12,13 @@ from .forecast import brier_losses, constant_forecast, log_losses
 from .offset import STEP_DB, OffsetFit, offset_grid
 from .receiver import out_of_group
 
+# Held-out segments of a flight, equally long.
 SEGMENTS = 10
-"""Held-out segments of a flight, equally long."""
 
 _PENALTY = 1.0
 _SPAN_DB = 60.0
+# Samples of either kind that a score needs.
 _FEWEST = 50
-"""Samples of either kind that a score needs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -251,11 +251,11 @@ def _reliability(said: FloatArray, detected: BoolArray) -> tuple[tuple[float, fl
     return tuple((float(said[g].mean()), float(detected[g].mean()), int(g.sum())) for g in groups if g.any())
 
 
+# Between two values of AERPAW's sounder [s]: 4095 chips and the rest of its correlation.
 BASE_S = 0.032768
-"""Between two values of AERPAW's sounder [s]: 4095 chips and the rest of its correlation."""
 
+# Correlation that the sounder's own time base must add before it is taken.
 _BETTER = 0.1
-"""Correlation that the sounder's own time base must add before it is taken."""
 
 
 def aligned_quality(time_s: FloatArray, power_db: FloatArray, quality_db: FloatArray) -> tuple[FloatArray, float]:

@@ -25,15 +25,15 @@ from ..common.units import BoolArray, FloatArray, IntArray
 Frame = Literal["body", "mast", "pair", "world", "place"]
 Sharing = Literal["all", "antenna"]
 
+# Prior of each offset in standard deviations of the noise: free in effect, and still a proper covariance.
 OFFSET_SD = 100.0
-"""Prior of each offset in standard deviations of the noise: free in effect, and still a proper covariance."""
 
+# Means that a fit rests on (a matrix of 72 MB); of more flights they are over longer times.
 MOST_ROWS = 3000
-"""Means that a fit rests on (a matrix of 72 MB); of more flights they are over longer times."""
 
+# Of the tower's gains against the UAV's: the likelier one is taken. Nothing else is chosen on flights: a length of the
+# nuisance by likelihood and its strength by flights left out, of 0.5 to 4, left 0.06 dB more on dataset 12.
 TOWER_FACTORS = (1.0, 0.5)
-"""Of the tower's gains against the UAV's: the likelier one is taken. Nothing else is chosen on flights: a length of the
-nuisance by likelihood and its strength by flights left out, of 0.5 to 4, left 0.06 dB more on dataset 12."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -373,8 +373,8 @@ class GainFit:
         return across @ self._weights, np.sqrt(np.maximum(prior - (spread**2).sum(axis=0), 0.0))
 
 
+# Samples that are predicted at a time; bounds the memory.
 AT_ONCE = 2000
-"""Samples that are predicted at a time; bounds the memory."""
 
 
 def directed(antenna: str, direction: FloatArray) -> LinkSamples:

@@ -12,14 +12,14 @@ from ..common.units import FloatArray
 from .rss import local_mean_db
 from .statistics import bootstrap_means
 
+# Length of the blocks that are resampled [s].
 BLOCK_S = 20.0
-"""Length of the blocks that are resampled [s]."""
 
+# Averaging window of the second error [s].
 WINDOW_S = 4.0
-"""Averaging window of the second error [s]."""
 
+# Nominal share of the interval whose coverage is told.
 COVERAGE = 0.9
-"""Nominal share of the interval whose coverage is told."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

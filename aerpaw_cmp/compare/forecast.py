@@ -16,8 +16,8 @@ from ..common.units import FloatArray, IntArray
 from .rank import MAX_RANK, cohen_kappa, kappa_of_means, one_hot, total_variation, variation_of_means
 from .statistics import NO_INTERVAL, REPLICATES, Interval, autocorrelation, bootstrap_means, interval
 
+# What a rank counts in the log score that a forecast held impossible.
 LEAST_PROBABILITY = 1e-6
-"""What a rank counts in the log score that a forecast held impossible."""
 
 
 def log_losses(probability: FloatArray, rank: IntArray) -> FloatArray:

@@ -12,12 +12,12 @@ import numpy as np
 
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray
 
+# Rows or columns, whichever are fewer: the power sums below make a characteristic polynomial up to this order.
 LARGEST = 4
-"""Rows or columns, whichever are fewer: the power sums below make a characteristic polynomial up to this order."""
+# Matrices at once; they fit into a processor's cache.
 LANES = 4096
-"""Matrices at once; they fit into a processor's cache."""
+# Half width of the zone around the threshold, as a share of lambda_1 / K^2, in which singular values decide.
 _GUARD = 1e-3
-"""Half width of the zone around the threshold, as a share of lambda_1 / K^2, in which singular values decide."""
 _ITERATIONS = 8
 
 

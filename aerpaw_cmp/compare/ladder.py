@@ -17,11 +17,11 @@ import numpy as np
 from ..common.units import BoolArray, FloatArray, IntArray
 from .statistics import NO_INTERVAL, Interval, PairedDifference, paired_difference
 
+# Places or stretches that a flight is cut into.
 BLOCKS = 8
-"""Places or stretches that a flight is cut into."""
 
+# A model that has no level at more than a fifth of the samples cannot be compared with the others.
 LEAST_COVERED = 0.8
-"""A model that has no level at more than a fifth of the samples cannot be compared with the others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

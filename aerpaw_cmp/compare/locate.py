@@ -15,50 +15,49 @@ from numpy.typing import ArrayLike
 
 from ..common.units import BoolArray, FloatArray
 
+# Exponent of the distance before a level was seen, and its standard deviation.
 SLOPE, SLOPE_SD = 3.0, 1.0
-"""Exponent of the distance before a level was seen, and its standard deviation."""
 
+# Gain that two antennas and the ground add over the elevation.
 ELEVATION_SD_DB = 5.0
-"""Gain that two antennas and the ground add over the elevation."""
 
+# Shadowing, how long it is remembered, and scatter of medians over some seconds.
+#
+# With them the regions hold the surveyed rover on the six AFAR and sounder flights that docs/formats.md names.
 SHADOW_SD_DB, SHADOW_S, SCATTER_SD_DB = 8.0, 30.0, 4.0
-"""Shadowing, how long it is remembered, and scatter of medians over some seconds.
 
-With them the regions hold the surveyed rover on the six AFAR and sounder flights that docs/formats.md names.
-"""
-
+# Standard deviation per axis of what the model cannot see (a tilted antenna, a wall), of the same flights.
 SYSTEMATIC_M = 20.0
-"""Standard deviation per axis of what the model cannot see (a tilted antenna, a wall), of the same flights."""
 
+# Medians are taken over at least so many seconds, and there are at most so many.
 WINDOW_S, MOST_BINS = 4.0, 120
-"""Medians are taken over at least so many seconds, and there are at most so many."""
 
+# Heights of the antenna that are tried, and their prior: a rover, a tower.
 HEIGHTS_M = {1.5: 0.7, 10.0: 0.3}
-"""Heights of the antenna that are tried, and their prior: a rover, a tower."""
 
+# Bins of a level that a search needs.
 FEWEST = 20
-"""Bins of a level that a search needs."""
 
+# Places up to so far beyond the track are tried, at this spacing; likely ones again at half of it.
 _REACH_M, _SPACING_M = 400.0, 40.0
-"""Places up to so far beyond the track are tried, at this spacing; likely ones again at half of it."""
 
+# Places whose log evidence is lower by more take no part.
 _POSSIBLE = 8.0
-"""Places whose log evidence is lower by more take no part."""
 
+# With more of them the region is wider than the spacing.
 _MOST_REFINED = 300
-"""With more of them the region is wider than the spacing."""
 
+# Standard deviation of a level about which nothing is known.
 _FREE_DB = 100.0
-"""Standard deviation of a level about which nothing is known."""
 
+# Of the shadowing; what they leave counts as scatter.
 _TERMS = 28
-"""Of the shadowing; what they leave counts as scatter."""
 
+# Newton steps of the Laplace approximation, and the change [dB] at which they end; there is one maximum.
 _STEPS, _SETTLED_DB = 12, 0.01
-"""Newton steps of the Laplace approximation, and the change [dB] at which they end; there is one maximum."""
 
+# Places whose matrices are held at a time.
 _AT_ONCE = 64
-"""Places whose matrices are held at a time."""
 
 
 @dataclass(frozen=True, slots=True)

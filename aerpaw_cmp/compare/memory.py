@@ -20,26 +20,26 @@ import numpy as np
 
 from ..common.units import FloatArray, IntArray
 
+# Cosine terms that the memory is judged by; faster ones tell about the power alone.
 TERMS = 24
-"""Cosine terms that the memory is judged by; faster ones tell about the power alone."""
 
+# Samples below which nothing is said.
 FEWEST = 20
-"""Samples below which nothing is said."""
 
+# Length of the sequence over the length of its memory (exponential: exp(-rate) is what two ends share).
 RATES = np.geomspace(0.3, 500.0, 18)
-"""Length of the sequence over the length of its memory (exponential: exp(-rate) is what two ends share)."""
 
+# Share of white noise in the slowest fluctuations.
 WHITE_SHARES = (0.0, 2e-3, 3e-2)
-"""Share of white noise in the slowest fluctuations."""
 
 Kind = Literal["mean", "power", "ratio"]
 
+# Logarithms of the weights in tenths, by kind, white share and rate; from 300 sequences in each of 54 cells of
+# (samples, correlation of neighbours, white noise).
 _TENTHS = Path(__file__).with_name("memory_weights.json")
-"""Logarithms of the weights in tenths, by kind, white share and rate; from 300 sequences in each of 54 cells of
-(samples, correlation of neighbours, white noise)."""
 
+# Draws come in pairs of opposite sign, so that exchanging two models turns an interval about exactly.
 _PAIRS = 2048
-"""Draws come in pairs of opposite sign, so that exchanging two models turns an interval about exactly."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,18 +10,18 @@ import numpy as np
 from ..common.units import FloatArray
 from .direction_gain import LinkSamples
 
+# Between the azimuths that are tried.
 STEP_DEG = 10.0
-"""Between the azimuths that are tried."""
 
+# Standard deviation of a bin about the patterns: 4 dB of residual that stays alike over some six bins.
+#
+# Least squares: a covariance with learned gains, or with shadowing correlated over place, takes for itself the broad
+# shape over azimuth that tells a mount. On dataset 12 the azimuth at the UAV then jumps between flights (320 and 120
+# deg, in place of 270 and 270).
 MOUNT_NOISE_DB = 10.0
-"""Standard deviation of a bin about the patterns: 4 dB of residual that stays alike over some six bins.
 
-Least squares: a covariance with learned gains, or with shadowing correlated over place, takes for itself the broad
-shape over azimuth that tells a mount. On dataset 12 the azimuth at the UAV then jumps between flights (320 and 120 deg,
-in place of 270 and 270)."""
-
+# Samples are averaged over this time [s].
 BIN_S = 4.0
-"""Samples are averaged over this time [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +50,8 @@ class MountFit:
     identified: bool
 
 
+# ``gain_db(direction (n, 3) in the device frame) -> (n,)``.
 GainOf = Callable[[FloatArray], FloatArray]
-"""``gain_db(direction (n, 3) in the device frame) -> (n,)``."""
 
 
 def fit_mounts(

@@ -16,17 +16,17 @@ from numpy.typing import ArrayLike
 
 from ..common.units import FloatArray
 
+# Search span of arXiv 2502.10324, section V [dB].
 SPAN_DB = (-50.0, 50.0)
-"""Search span of arXiv 2502.10324, section V [dB]."""
 
+# Search step of arXiv 2502.10324, section V [dB].
 STEP_DB = 0.1
-"""Search step of arXiv 2502.10324, section V [dB]."""
 
+# A longer grid is a mistake in the step or the span, and would not fit in memory.
 MAXIMUM_OFFSETS = 10_000_000
-"""A longer grid is a mistake in the step or the span, and would not fit in memory."""
 
+# Distances that differ by less than this share of a step are ties (0.15 lies between 0.1 and 0.2).
 _TIE = 1e-9
-"""Distances that differ by less than this share of a step are ties (0.15 lies between 0.1 and 0.2)."""
 
 
 @dataclass(frozen=True, slots=True)

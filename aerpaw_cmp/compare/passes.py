@@ -18,11 +18,11 @@ import numpy as np
 from ..common.units import BoolArray, FloatArray, IntArray, wrap_degrees
 from .statistics import NO_INTERVAL, Interval, correlation, error_intervals, spread_interval
 
+# Samples of two passes nearer than this were taken at the same place.
 SAME_PLACE_M = 2.0
-"""Samples of two passes nearer than this were taken at the same place."""
 
+# Largest difference of the headings of such samples, where headings count.
 HEADING_WITHIN_DEG = 20.0
-"""Largest difference of the headings of such samples, where headings count."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,11 +27,11 @@ from .statistics import (
     share_interval,
 )
 
+# Ranks of the histograms: 1 to 4 (RI of the AERPAW modems).
 MAX_RANK = 4
-"""Ranks of the histograms: 1 to 4 (RI of the AERPAW modems)."""
 
+# Matrix entries per SVD batch: bounds memory.
 _CHUNK = 1 << 20
-"""Matrix entries per SVD batch: bounds memory."""
 
 
 def singular_values(h: ArrayLike) -> FloatArray:
@@ -390,8 +390,8 @@ class KCurve:
     at_edge: bool
 
 
+# Samples times K that are resampled at once: bounds memory on flights of hours, and changes no digit.
 _CELLS_AT_ONCE = 2_000_000
-"""Samples times K that are resampled at once: bounds memory on flights of hours, and changes no digit."""
 
 
 def k_curve(
@@ -483,8 +483,8 @@ def _central(values: FloatArray, k: FloatArray) -> Interval:
     return float(min(k[first], low)), float(max(k[last], high))
 
 
+# Of the condition number at which srsUE reports two layers.
 LIMIT_DB = 17.0
-"""Of the condition number at which srsUE reports two layers."""
 
 
 def condition_number_rank(sigma: ArrayLike) -> IntArray:

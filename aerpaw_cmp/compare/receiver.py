@@ -24,20 +24,20 @@ from .forecast import constant_forecast, log_losses
 from .rank import MAX_RANK, cohen_kappa, one_hot
 from .statistics import REPLICATES, autocorrelation, bootstrap_means, interval
 
+# Ratios of singular values below this are as good as zero to any receiver.
 FLOOR_DB = -40.0
-"""Ratios of singular values below this are as good as zero to any receiver."""
 
+# Ridge penalties to choose from, on coefficients of standardised features (log likelihood of the whole flight).
 PENALTIES = (1.0, 3.0, 10.0, 30.0, 100.0)
-"""Ridge penalties to choose from, on coefficients of standardised features (log likelihood of the whole flight)."""
 
+# Ridge penalty while geometries are chosen.
 CHOICE_PENALTY = 10.0
-"""Ridge penalty while geometries are chosen."""
 
+# Training samples below which nothing is fitted.
 FEWEST = 50
-"""Training samples below which nothing is fitted."""
 
+# Numbers in one batch of regressions: bounds memory to some 100 MiB.
 _HELD = 1 << 22
-"""Numbers in one batch of regressions: bounds memory to some 100 MiB."""
 
 
 def stream_features(sigma: ArrayLike) -> FloatArray:

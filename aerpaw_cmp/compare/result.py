@@ -28,18 +28,18 @@ from .serving import ServingComparison
 from .spread import StatedSpread
 from .statistics import Interval, PairedDifference
 
+# Models that a replay is held against, with their names in words; the last two know no physics.
 BASELINE_TITLE = {
     "free_space": "free space",
     "two_ray": "two-ray ground",
     "log_distance": "log-distance line",
     "constant": "constant level",
 }
-"""Models that a replay is held against, with their names in words; the last two know no physics."""
 
+# What was done with a clock: corrected by the estimate, asked to be and not, not asked to be; corrected as stated.
 APPLIED, NOT_APPLIED, ESTIMATED, GIVEN = (
     "estimated and applied", "asked for, not applied", "estimated, not applied", "given in flight.yaml"
 )  # fmt: skip
-"""What was done with a clock: corrected by the estimate, asked to be and not, not asked to be; corrected as stated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

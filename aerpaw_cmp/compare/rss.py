@@ -26,10 +26,10 @@ from .statistics import (
     error_intervals,
 )
 
+# Two channels of one receiver "part" where they differ by more than this [dB].
 PART_DB = 10.0
-"""Two channels of one receiver "part" where they differ by more than this [dB]."""
+# Over means of so long [s].
 PART_S = 1.0
-"""Over means of so long [s]."""
 
 
 def seconds(time: ArrayLike) -> FloatArray:
@@ -167,8 +167,8 @@ def compare_rss(
     )
 
 
+# Among the numbers that were fitted on the very samples they would be scored on.
 LEARNED_HERE = "antennas"
-"""Among the numbers that were fitted on the very samples they would be scored on."""
 
 
 def without_errors(score: RssComparison) -> RssComparison:
@@ -185,12 +185,12 @@ def without_errors(score: RssComparison) -> RssComparison:
     )
 
 
+# Levels farther than this many interquartile ranges outside the quartiles are outlying: of a normal distribution one
+# in 10^9, and a deep fade of a real flight is not.
 _FENCE = 4.0
-"""Levels farther than this many interquartile ranges outside the quartiles are outlying: of a normal distribution one
-in 10^9, and a deep fade of a real flight is not."""
 
+# Least interquartile range that counts: a UAV that hovers has next to none.
 _NARROWEST_DB = 5.0
-"""Least interquartile range that counts: a UAV that hovers has next to none."""
 
 
 def outliers(level_db: ArrayLike) -> BoolArray:

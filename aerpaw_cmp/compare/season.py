@@ -12,11 +12,11 @@ from ..common.units import FloatArray
 from .offset import SPAN_DB, STEP_DB, nearest_offset, offset_grid
 from .statistics import autocorrelation
 
+# Fewer flights than this give no interval of a mean over flights.
 FEWEST_FLIGHTS = 3
-"""Fewer flights than this give no interval of a mean over flights."""
 
+# From so many flights on, how alike neighbouring flights are is estimated and counted.
 MANY_FLIGHTS = 20
-"""From so many flights on, how alike neighbouring flights are is estimated and counted."""
 
 Verdict = Literal["first", "worse", "not significant", "no interval"]
 
@@ -150,8 +150,8 @@ class Trend:
     scatter: float
 
 
+# Slopes are per so many days.
 DAYS = 30.0
-"""Slopes are per so many days."""
 
 
 def trend(days: ArrayLike, values: ArrayLike) -> Trend:

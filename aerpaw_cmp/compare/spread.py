@@ -12,18 +12,18 @@ import numpy as np
 from ..common.units import FloatArray
 from .direction_gain import LinkSamples
 
+# Nominal shares of samples within an interval.
 SHARES = (0.5, 0.9, 0.95)
-"""Nominal shares of samples within an interval."""
 
+# Of the band that a report draws.
 BAND = 0.9
-"""Of the band that a report draws."""
 
+# Beyond it the expansion of :meth:`Spread.half_width_db` is no longer one of a bell.
 MOST_KURTOSIS = 2.0
-"""Beyond it the expansion of :meth:`Spread.half_width_db` is no longer one of a bell."""
 
 
+# Squared skewness of fading in dB for each unit of excess kurtosis: 1.30 / 2.40 of Rayleigh's.
 FADE_SKEWNESS2 = 0.54
-"""Squared skewness of fading in dB for each unit of excess kurtosis: 1.30 / 2.40 of Rayleigh's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,8 +87,8 @@ class Spread:
             return None
 
 
+# Of learned files that state the standard deviation of the gain alone.
 NO_SPREAD = Spread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=0.0, fading_kurtosis=0.0, bin_s=4.0)
-"""Of learned files that state the standard deviation of the gain alone."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,14 +17,14 @@ from .memory import FEWEST
 from .season import mean_of_flights
 from .statistics import NO_INTERVAL, Interval, PairedDifference, mean_interval, paired_verdict, spread_interval
 
+# Share of sound campaigns in which a cause is named, over all that are tried together.
 FALSE_ALARMS = 0.02
-"""Share of sound campaigns in which a cause is named, over all that are tried together."""
 
+# Flights below which none of a campaign is called unlike the others.
 FEWEST_TO_COMPARE = 5
-"""Flights below which none of a campaign is called unlike the others."""
 
+# An offset that differs by less [dB] costs no decision, whatever its interval.
 LEAST_DB = 2.0
-"""An offset that differs by less [dB] costs no decision, whatever its interval."""
 
 NONE = "none"
 
@@ -202,11 +202,11 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
 
 # --- prediction -----------------------------------------------------------------------------------------------------
 
+# 99 % over 95 % of a normal distribution: a bias is named beyond it, since a spread is tried beside it.
 _TWO_TRIED = 1.3
-"""99 % over 95 % of a normal distribution: a bias is named beyond it, since a spread is tried beside it."""
 
+# Errors that are less than this times larger or smaller than stated are as stated.
 LEAST_RATIO = 1.15
-"""Errors that are less than this times larger or smaller than stated are as stated."""
 
 
 def stated_errors(error_db: FloatArray, sd_db: FloatArray, common_db: FloatArray | float = 0.0) -> Verdict:
@@ -250,8 +250,8 @@ def stated_errors(error_db: FloatArray, sd_db: FloatArray, common_db: FloatArray
 
 # --- map ------------------------------------------------------------------------------------------------------------
 
+# A map with less than this share of its positions in coverage has gaps that a sentence explains.
 COVERED = 0.95
-"""A map with less than this share of its positions in coverage has gaps that a sentence explains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

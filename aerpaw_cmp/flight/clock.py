@@ -18,44 +18,44 @@ from ..common.jsonable import fields_of
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
 
+# Verdicts.
 OK, SHIFTED, CANNOT_TELL = "ok", "shifted", "cannot tell"
-"""Verdicts."""
 
+# Lags whose log likelihood is this much below the best one are excluded [nat].
 EVIDENCE_NAT = 4.0
-"""Lags whose log likelihood is this much below the best one are excluded [nat]."""
 
+# Lags up to this are no shift [s]: positions, models and time stamps of real flights are no better.
 SAME_S = 0.5
-"""Lags up to this are no shift [s]: positions, models and time stamps of real flights are no better."""
 
+# Clocks agree where every lag beyond this is excluded [s].
 AGREE_S = 1.0
-"""Clocks agree where every lag beyond this is excluded [s]."""
 
+# Autopilots and loggers stamp their rows no better [s]: the interval is wider by this on either side.
 STAMPS_S = 0.25
-"""Autopilots and loggers stamp their rows no better [s]: the interval is wider by this on either side."""
 
+# First and last spacing of the lags; no finer where so many are still possible.
 _STEP_S, _FINEST_S, _MOST_FINE = 0.5, 0.02, 40
-"""First and last spacing of the lags; no finer where so many are still possible."""
+# Means of the level per channel, one a second or longer.
 _BINS = 900
-"""Means of the level per channel, one a second or longer."""
 _FEWEST = 60
+# Instants at which the prediction is averaged over a mean.
 _PER_BIN = 8
-"""Instants at which the prediction is averaged over a mean."""
 
+# Lengths (chord of the unit sphere) over which the gain of tower and UAV changes: fine, broad, both at once.
 _CHORDS = ((0.2, 0.4, 0.8), (0.2, 0.45, 0.9))
-"""Lengths (chord of the unit sphere) over which the gain of tower and UAV changes: fine, broad, both at once."""
+# Most features of an end's gain, and the variance that may be left out of it.
 _FEATURES, _LEFT = 64, 0.01
-"""Most features of an end's gain, and the variance that may be left out of it."""
 
+# Standard deviation of offset and slope, in that of the residual: they are free.
 _FREE = 1e3
-"""Standard deviation of offset and slope, in that of the residual: they are free."""
 
 _MEMORY_S = (2.0, 5.0, 15.0, 40.0)
 _WHITE = (0.1, 0.3, 0.9)
+# Tried for :class:`_Parts`.
 _GAIN = (0.05, 0.5, 1.0, 2.0)
-"""Tried for :class:`_Parts`."""
 
+# Lags whose systems are held in memory.
 _AT_ONCE = 16
-"""Lags whose systems are held in memory."""
 
 
 class _Parts(NamedTuple):

@@ -21,14 +21,14 @@ _IN_NAME = re.compile(
 )
 _NEMO_START = re.compile(r"^Measurement start;(\d{4} \w{3} \d\d \d\d:\d\d)", re.MULTILINE)
 
+# A name with a date alone may be local or UTC, and of the start or the end.
 _OF_THE_DAY = timedelta(hours=36)
-"""A name with a date alone may be local or UTC, and of the start or the end."""
 
+# A program is started before its radio is.
 _OF_THE_MINUTE = timedelta(minutes=15)
-"""A program is started before its radio is."""
 
+# A track whose lowest height [m] is farther from 0 does not begin at its take-off.
 GROUND_M = 5.0
-"""A track whose lowest height [m] is farther from 0 does not begin at its take-off."""
 
 
 def questions(file: IngestedFile, kept: Sequence[Stream], timezone: str | None) -> list[str]:

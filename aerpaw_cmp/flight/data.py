@@ -135,8 +135,8 @@ def choose_site(choice: SiteChoice, folder: Path) -> Site:
     return site
 
 
+# A ground node whose positions stay within this of their median stands still: that is the noise of its GNSS.
 STANDS_STILL_M = 3.0
-"""A ground node whose positions stay within this of their median stands still: that is the noise of its GNSS."""
 
 
 def ground_nodes(
@@ -286,8 +286,8 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 
 
 SNR = "snr"
+# Streams or channels of kind rss that are no levels, as sounder and controller name them.
 RATIOS = ("quality", SNR)
-"""Streams or channels of kind rss that are no levels, as sounder and controller name them."""
 
 
 def is_ratio(stream: Stream, names: Sequence[str] = RATIOS) -> bool:
@@ -450,8 +450,8 @@ def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximu
     return track
 
 
+# A flight further than this from every tower [m] was not flown at this site.
 FAR_M = 30_000.0
-"""A flight further than this from every tower [m] was not flown at this site."""
 
 
 def _check_place(data: FlightData, telemetry: Sequence[tuple[str, Stream]]) -> None:
@@ -673,8 +673,8 @@ def _check_overlap(data: FlightData) -> None:
             _check_shared(data, what, series.time, data.nodes[series.tower], node=series.tower)
 
 
+# A log that ends before counts from a zero of its own.
 FIRST_YEAR = 2000
-"""A log that ends before counts from a zero of its own."""
 
 
 def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: str | None = None) -> None:

@@ -215,21 +215,21 @@ def drafts(
     return made
 
 
+# Samples below it are take-off, landing and waiting: at 2 m an airframe, its pilot and the grass decide the level.
 MINIMUM_HEIGHT_M = 5
-"""Samples below it are take-off, landing and waiting: at 2 m an airframe, its pilot and the grass decide the level."""
 
+# A flight that never got higher has no part that is better than its start.
 FLOWN_ABOVE_M = 15.0
-"""A flight that never got higher has no part that is better than its start."""
 
 
+# Links that the audit of a first report checks.
 QUICK_AUDIT = 24
-"""Links that the audit of a first report checks."""
 
 _QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers to publish"
 
 
+# A node that is placed this well is seen from a flight some hundred metres away within some tens of degrees.
 SURE_M = 100.0
-"""A node that is placed this well is seen from a flight some hundred metres away within some tens of degrees."""
 
 
 def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
@@ -294,8 +294,8 @@ def _replay_lines(entries: _Entries, known: Proposal) -> list[str]:
     ]
 
 
+# Of the searched offsets about those that free space expects.
 _MARGIN_DB = 20.0
-"""Of the searched offsets about those that free space expects."""
 
 
 def _span_of_offsets(offsets_db: Sequence[float]) -> dict[str, Any]:
@@ -707,8 +707,8 @@ def _meet(one: Span, other: Span) -> bool:
     return bool(one[0] <= other[1] and other[0] <= one[1])
 
 
+# Of a log's cells, those told most often are proposed; in a city a phone hears a hundred.
 MOST_CELLS = 6
-"""Of a log's cells, those told most often are proposed; in a city a phone hears a hundred."""
 
 
 def _cells(streams: Sequence[Stream]) -> list[int]:

@@ -12,10 +12,10 @@ from ..logs.ingest import IngestedFile
 from ..logs.records import Stream, has_wall_clock
 from .time_origin import Origin, origin_of
 
+# Logs that end and begin within this are of one flight: radios are started before the take-off.
 SLACK = np.timedelta64(5, "m")
-"""Logs that end and begin within this are of one flight: radios are started before the take-off."""
+# Tracks at one time, but some 5 km apart, are of two aircraft.
 APART_DEG = 0.05
-"""Tracks at one time, but some 5 km apart, are of two aircraft."""
 
 Span = tuple[np.datetime64, np.datetime64]
 

@@ -10,14 +10,14 @@ from ..common.units import FloatArray
 from ..compare.detection import aligned_quality
 from ..logs.records import Stream
 
+# Quality [dB] at perfect lock (the peak of 4095 chips), and below which the receiver has lost it.
 LOCK_QUALITY_DB, LOST_QUALITY_DB = 20.0 * float(np.log10(4095.0)), 60.0
-"""Quality [dB] at perfect lock (the peak of 4095 chips), and below which the receiver has lost it."""
 
+# Level [dB re full scale] below which the receiver loses its lock: what it then writes is noise.
 LOCK_FLOOR_DB = -15.0
-"""Level [dB re full scale] below which the receiver loses its lock: what it then writes is noise."""
 
+# A quality of another log stands for a level this near in time.
 _WITHIN_S = 0.1
-"""A quality of another log stands for a level this near in time."""
 
 
 def may_lose_lock(stream: Stream) -> bool:

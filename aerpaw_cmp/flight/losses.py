@@ -61,12 +61,12 @@ def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     return loss
 
 
+# A reflection this near to a ground plane of the site is one off the ground.
 ON_GROUND_M = 1e-6
-"""A reflection this near to a ground plane of the site is one off the ground."""
 
 
+# The same over an elevation model, whose specular points are found by iteration.
 NEAR_TERRAIN_M = 0.01
-"""The same over an elevation model, whose specular points are found by iteration."""
 
 
 def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:

@@ -19,23 +19,23 @@ from ..site.site import Site
 from .scored import unscored
 from .track import Track
 
+# Log odds from which on a tower of the site is taken; the surveyed flights give 2.8 to 4.7, others at most 1.0.
 TOWER_ODDS = 2.0
-"""Log odds from which on a tower of the site is taken; the surveyed flights give 2.8 to 4.7, others at most 1.0."""
 
+# Log evidence by which another tower must explain the levels better before a named one is doubted.
 CONTRADICTED = 8.0
-"""Log evidence by which another tower must explain the levels better before a named one is doubted."""
 
+# Places of a list whose log odds differ by less are both named.
 UNDECIDED = 3.0
-"""Places of a list whose log odds differ by less are both named."""
 
+# Of the link that a draft proposes.
 CARRIER_HZ, POWER_DBM = 3.3e9, 40.0
-"""Of the link that a draft proposes."""
 
+# Below it an airframe on the ground decides the level.
 LOW_M = 5.0
-"""Below it an airframe on the ground decides the level."""
 
+# A place of a list that is farther from the track is not of this flight.
 NEAR_M = 5000.0
-"""A place of a list that is farther from the track is not of this flight."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,21 +17,21 @@ from ..common.errors import UsageError
 from ..common.units import FloatArray, spread_out
 
 Nose = Literal["along", "fixed", "four headings"]
+# How the nose is held: along the track; turned by 90 degrees from leg to leg; to the north.
 NOSES: tuple[Nose, ...] = ("along", "four headings", "fixed")
-"""How the nose is held: along the track; turned by 90 degrees from leg to leg; to the north."""
 
+# From the border of the area.
 MARGIN_M = 3.0
-"""From the border of the area."""
 
+# Shorter legs are left out.
 LEAST_LEG_M = 40.0
-"""Shorter legs are left out."""
 
+# Least spacing of legs.
 CLOSEST_M = 15.0
-"""Least spacing of legs."""
 
 TURN_STEPS = 8
+# A slow turn holds each eighth of the compass for this long.
 TURN_HOLD_S = 8.0
-"""A slow turn holds each eighth of the compass for this long."""
 
 TURN_POINTS = 4
 

@@ -70,8 +70,8 @@ def remembered(site: str | Path) -> dict[str, Remembered]:
     return out
 
 
+# Tower, channel (``rank`` of rank) and reader of a series of the draft.
 SeriesKey = tuple[str, str, str]
-"""Tower, channel (``rank`` of rank) and reader of a series of the draft."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -212,8 +212,8 @@ def lock_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path)
     return locks[0] if locks else None
 
 
+# Readers of one receiver: merged flights of the sounder hold the readings of its own logs.
 SOUNDER = {"flight_mat", "sounder_log"}
-"""Readers of one receiver: merged flights of the sounder hold the readings of its own logs."""
 
 
 def _placed(one: learned.LearnedSeries, tower: str, nodes: Nodes) -> bool:

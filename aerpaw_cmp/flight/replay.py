@@ -216,14 +216,14 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
     return Clock(result=result, applied_s=np.full(samples, radio_minus_telemetry_s))
 
 
+# Instants that are replayed at once: bounds memory on flights of more than half an hour.
 BLOCK = 100_000
-"""Instants that are replayed at once: bounds memory on flights of more than half an hour."""
 
+# Sampling of the prediction that a clock is judged by [s]; longer flights take wider steps.
 CLOCK_STEP_S, CLOCK_INSTANTS = 0.05, 40_000
-"""Sampling of the prediction that a clock is judged by [s]; longer flights take wider steps."""
 
+# The same of a tower that moves: each place is traced for itself.
 MOVING_CLOCK_STEP_S = 0.25
-"""The same of a tower that moves: each place is traced for itself."""
 
 
 def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[ClockChannel]:

@@ -428,8 +428,8 @@ class RtSettings(GroupedSettings):
             )
 
 
+# The offset grid of a report may not be longer: 100 dB in steps of 0.0001 dB.
 MAXIMUM_OFFSETS = 1_000_000
-"""The offset grid of a report may not be longer: 100 dB in steps of 0.0001 dB."""
 
 
 class AdvancedRss(StrictModel):

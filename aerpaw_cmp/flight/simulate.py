@@ -33,12 +33,12 @@ from ..site.site import Site
 from .data import site_place
 from .settings import FlightFile, LogSettings, PlanSettings, files_of
 
+# What was planted.
 TRUTH = "truth.json"
-"""What was planted."""
+# The flight file, beside the logs that it names.
 FLIGHT = "flight.yaml"
-"""The flight file, beside the logs that it names."""
+# Below this the simulated level is no signal.
 LOWEST_DBM = -400.0
-"""Below this the simulated level is no signal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +67,8 @@ class Trajectory:
         return np.asarray((np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None])[leg])
 
 
+# Of one simulated log: 140 h at ten a second.
 MAXIMUM_SAMPLES = 5_000_000
-"""Of one simulated log: 140 h at ten a second."""
 
 
 def plan_trajectory(plan: PlanSettings) -> Trajectory:

@@ -10,10 +10,10 @@ import pandas as pd
 from ..common.units import AnyArray, FloatArray
 from ..logs.records import Stream, has_wall_clock
 
+# Two receivers on one aircraft tell places this near each other, in the median.
 AGREE_M = 12.0
-"""Two receivers on one aircraft tell places this near each other, in the median."""
+# The second-best origin, a minute away or farther, must be so many times worse.
 UNIQUE = 1.8
-"""The second-best origin, a minute away or farther, must be so many times worse."""
 _POINTS = 240
 _METRES = 111_320.0
 

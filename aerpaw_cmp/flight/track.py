@@ -21,22 +21,22 @@ from ..propagation.arrays import rotation_from_aircraft
 if TYPE_CHECKING:
     import pandas as pd
 
+# Telemetry gaps longer than this are not bridged [s]; vehicleOut rows come every 1.0 s.
 MAXIMUM_GAP_S = 3.0
-"""Telemetry gaps longer than this are not bridged [s]; vehicleOut rows come every 1.0 s."""
 
+# Below this ground speed the course says nothing about the heading [m/s].
 COURSE_SPEED_MPS = 1.0
-"""Below this ground speed the course says nothing about the heading [m/s]."""
 
+# Instants whose poses are computed at once: bounds memory on flights of more than half an hour.
 AT_ONCE = 100_000
-"""Instants whose poses are computed at once: bounds memory on flights of more than half an hour."""
 
+# Positions this long before and after give a velocity that is not logged [s].
 COURSE_SPAN_S = 2.0
-"""Positions this long before and after give a velocity that is not logged [s]."""
 
+# Why a pose is not valid; index 0 is a valid pose.
 REASONS = (
     "", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time", "no position of the tower"
 )  # fmt: skip
-"""Why a pose is not valid; index 0 is a valid pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,11 +167,11 @@ def nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
     return np.asarray(np.where(good, stamp, np.iinfo(np.int64).min))
 
 
+# What an instant that is not known becomes.
 NO_TIME = np.iinfo(np.int64).min
-"""What an instant that is not known becomes."""
 
+# Instants nearer than this are one: epoch seconds as floats carry 0.2 microseconds [s].
 _SAME_S = 1e-6
-"""Instants nearer than this are one: epoch seconds as floats carry 0.2 microseconds [s]."""
 
 
 def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:

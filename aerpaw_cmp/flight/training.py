@@ -45,11 +45,11 @@ def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, 
     return common(own, [data.settings.trained_on, *(p.trained_on for p in patterns)])
 
 
+# Readings of a run; marks that a learned file keeps of a log; marks that two logs share if one is of the other.
 RUN, MARKS, SHARED = 32, 32, 3
-"""Readings of a run; marks that a learned file keeps of a log; marks that two logs share if one is of the other."""
 
+# Runs that are hashed at a time: bounds the memory.
 AT_ONCE = 8192
-"""Runs that are hashed at a time: bounds the memory."""
 
 _WEIGHTS = np.array([pow(0x9E3779B97F4A7C15, j, 2**64) for j in range(1, RUN + 1)], dtype=np.uint64)
 

@@ -27,17 +27,17 @@ from ..propagation.replay import Replay, replay
 from ..propagation.scene import Scene
 from ..site.site import Building, Site, Tower
 
+# Reflections of the reference and of the Sionna rows.
 DEPTH = 2
-"""Reflections of the reference and of the Sionna rows."""
 
+# Poses per PathSolver call.
 BATCH = 50
-"""Poses per PathSolver call."""
 
+# The same with explicit arrays, which multiply sources and targets.
 EXPLICIT_BATCH = 10
-"""The same with explicit arrays, which multiply sources and targets."""
 
+# Lines of a real channel-sounder flight.
 LINES = 20_523
-"""Lines of a real channel-sounder flight."""
 
 T = TypeVar("T")
 

@@ -21,13 +21,13 @@ from ..compare import report_difference
 from ..report.diff.data import Entry, InputEntry, ReportDiff, ReportSide
 from ..report.names import RANK_COLUMNS, RSS_COLUMNS, links_of
 
+# Differences up to this count as none: the tables hold four decimals, offsets one.
 TOLERANCE_DB = 0.01
-"""Differences up to this count as none: the tables hold four decimals, offsets one."""
 
 _NEEDED = ("flight", "versions", "inputs", "settings", "rss", "rank")
 _SIMULATED = "simulated_rank_k"
+# What changes without meaning anything, or is compared on its own.
 _VOLATILE = ("generated", "stages", "versions", "inputs", "settings", "warnings", "speed", "title", "flight")
-"""What changes without meaning anything, or is compared on its own."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -373,8 +373,8 @@ def _values(table: Any, name: str) -> FloatArray:
     return np.asarray(table[name], dtype=np.float64)
 
 
+# Instants [s] of the common samples of a link, and both residuals.
 _Residuals = tuple[FloatArray, FloatArray, FloatArray]
-"""Instants [s] of the common samples of a link, and both residuals."""
 
 
 def _instants(table: Any) -> FloatArray:

@@ -29,8 +29,8 @@ from ..site.site import Site
 from .options import RunOptions
 from .reporting.compare_flight import compare_flight
 
+# Tower and channel of an RSS series; tower and ``"rank"`` of a rank series.
 Series = tuple[str, str]
-"""Tower and channel of an RSS series; tower and ``"rank"`` of a rank series."""
 
 
 RANK_NUMBERS = "agreement kappa total_variation wasserstein"

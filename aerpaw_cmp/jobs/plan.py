@@ -27,8 +27,8 @@ from ..site.siteyaml import load_site
 MEASURED = "CPU seconds of reading and replay, tried on a few poses now; a stage with a dash was not tried"
 
 TRIED_POSES = (32, 160)
+# Of the two replays that a time is extrapolated from.
 TRIED_TILES = 4
-"""Of the two replays that a time is extrapolated from."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,11 @@ from pathlib import Path
 from ..common.errors import UsageError
 from ..common.outputs import OutputFolder
 
+# Where a wheel holds the samples.
 PACKAGED = Path(__file__).parents[1] / "sample_logs"
-"""Where a wheel holds the samples."""
 
+# Where a checkout of the project holds them.
 CHECKOUT = Path(__file__).parents[2] / "sample_logs"
-"""Where a checkout of the project holds them."""
 
 
 def sample_folder() -> Path:

@@ -24,11 +24,11 @@ from .log import Record
 from .modem import RI_QUERY
 from .session import TapStatus
 
+# Rows that stay: two hours at 10 Hz, ten at 2 Hz.
 ROWS = 72_000
-"""Rows that stay: two hours at 10 Hz, ten at 2 Hz."""
 PENDING = 20_000
+# Rows in one message, so that a slow link refills step by step.
 CHUNK = 4_000
-"""Rows in one message, so that a slow link refills step by step."""
 ALARMS = 300
 LONGEST_TEXT = 300
 RATE_WINDOW_S = 10.0
@@ -41,8 +41,8 @@ POINTS_AHEAD = 40
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
 PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
+# Faults that a crafted record of a played log can raise: the record is left out.
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
-"""Faults that a crafted record of a played log can raise: the record is left out."""
 _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
 
 

@@ -18,8 +18,8 @@ from ..logs.readers import Reader, ReadOptions, identify
 from .predict import Predict, Prediction
 
 MAX_AGE_S = 2.0
+# Of a log that is long already, only its end is read.
 TAIL_BYTES = 65_536
-"""Of a log that is long already, only its end is read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +37,8 @@ class TelemetrySample:
 
 
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "fix")
+# Looks at the log over which its least delay is taken: a line may wait some time before it is written.
 DELAYS = 20
-"""Looks at the log over which its least delay is taken: a line may wait some time before it is written."""
 
 
 class TelemetryFollower:

@@ -57,8 +57,8 @@ class Decoded:
 
 _FIELD = re.compile(r'\s*("[^"]*"?|[^,]*)\s*(?:,|$)')
 
+# Quectel's "no value", and the same after a division by ten.
 INVALID = (-32768, -3276)
-"""Quectel's "no value", and the same after a division by ten."""
 
 
 def split_fields(payload: str) -> list[str | None]:
@@ -100,6 +100,7 @@ class Range:
     missing: tuple[int, ...] = INVALID
 
 
+# TS 38.214 table 5.1.3.1 (mcs), TS 38.133 10.1.6-10.1.16 (rsrp, rsrq, sinr), TS 38.104 5.4.2.1 (arfcn).
 RANGES: Mapping[str, Range] = {
     "mcs": Range(0, 31),
     "ri_raw": Range(0, 8),
@@ -121,7 +122,6 @@ RANGES: Mapping[str, Range] = {
     "uplink_bandwidth_code": Range(0, 16),
     "tx_power_tenth_dbm": Range(-600, 300),
 }
-"""TS 38.214 table 5.1.3.1 (mcs), TS 38.133 10.1.6-10.1.16 (rsrp, rsrq, sinr), TS 38.104 5.4.2.1 (arfcn)."""
 
 NR_BANDWIDTH_MHZ = (5, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 200, 400, 35, 45)
 LTE_BANDWIDTH_MHZ = (1.4, 3, 5, 10, 15, 20)
@@ -357,6 +357,7 @@ def decode_nothing(_lines: Sequence[str], _flags: list[str]) -> Values:
     return {}
 
 
+# All that the tap may ask, by name.
 QUERIES: Mapping[str, Query] = {
     query.name: query
     for query in (
@@ -384,11 +385,10 @@ QUERIES: Mapping[str, Query] = {
         ),
     )
 }
-"""All that the tap may ask, by name."""
 
 RI_QUERY = "nr5g_csi"
+# Polled at the slower rate, in this order.
 OTHER_QUERIES = ("servingcell", "qrsrp", "qsinr", "lte_csi", "qrsrq", "qnwinfo", "qcainfo")
-"""Polled at the slower rate, in this order."""
 
 _BY_TEXT = {query.text: query for query in QUERIES.values()}
 _CSI_WRITE = re.compile(r'AT\+QNWCFG="csi_ctrl",[01],[01]')

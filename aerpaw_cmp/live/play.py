@@ -12,8 +12,8 @@ from .feed import Feed
 from .log import BadLine, Record, read_log
 from .stop import Stop
 
+# Time between two records beyond this (the tap was off) is passed at once, in seconds of the log.
 LONGEST_PAUSE_S = 10.0
-"""Time between two records beyond this (the tap was off) is passed at once, in seconds of the log."""
 
 
 class Player:

@@ -26,8 +26,8 @@ from pathlib import Path
 from ..common.errors import AerpawCmpError, InputError, UsageError
 
 QUECTEL_VENDOR = "2c7c"
+# Of 2c7c:0800: 00 is DIAG, 01 NMEA, 02 and 03 take AT commands (ModemManager's 77-mm-quectel-port-types.rules).
 AT_INTERFACES = ("02", "03")
-"""Of 2c7c:0800: 00 is DIAG, 01 NMEA, 02 and 03 take AT commands (ModemManager's 77-mm-quectel-port-types.rules)."""
 
 _GONE = {errno.ENOENT, errno.ENXIO, errno.EIO, errno.ENODEV, errno.ENOTCONN, errno.ESHUTDOWN}
 

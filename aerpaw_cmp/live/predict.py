@@ -53,8 +53,8 @@ class Prediction:
     learn: Learn | None = None
 
 
+# ``predict(utc_ns)``; None: nothing is known of that time.
 Predict = Callable[[int], "Prediction | None"]
-"""``predict(utc_ns)``; None: nothing is known of that time."""
 
 
 class RunningInterval:

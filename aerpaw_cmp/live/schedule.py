@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
+# A slot that is late by at most so many periods is still polled, at once; older ones are missed and counted.
 CATCH_UP = 2
-"""A slot that is late by at most so many periods is still polled, at once; older ones are missed and counted."""
 
 
 class Schedule:

@@ -31,8 +31,8 @@ from .modem import QUERIES
 from .ports import make_raw
 from .stop import Stop
 
+# Lines up to and with the final result; None: say nothing.
 Reply = tuple[str, ...] | None
-"""Lines up to and with the final result; None: say nothing."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,10 +32,10 @@ from .writer import LogWriter
 
 __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
 
+# A jump of the wall clock against the monotonic one beyond this is recorded.
 CLOCK_STEP_NS = 50_000_000
-"""A jump of the wall clock against the monotonic one beyond this is recorded."""
+# Gets each record once the log has it, and each status, in the polling thread: it must neither wait nor raise.
 Watch = Callable[["Record | TapStatus"], None]
-"""Gets each record once the log has it, and each status, in the polling thread: it must neither wait nor raise."""
 
 RATE_WINDOW_S = 10.0
 NOISE_LINES_PER_S = 50

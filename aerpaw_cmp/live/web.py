@@ -33,8 +33,8 @@ from .ports import holders_of_sockets
 
 DEFAULT = "127.0.0.1:8765"
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
+# Bytes handed to a browser's socket at once: each piece has its own time limit, so a slow link is no dead one.
 PIECE = 16_384
-"""Bytes handed to a browser's socket at once: each piece has its own time limit, so a slow link is no dead one."""
 
 
 @dataclass(frozen=True, slots=True)

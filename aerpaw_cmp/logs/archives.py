@@ -18,20 +18,21 @@ from pathlib import Path
 
 from ..common.errors import InputError
 
+# A flight of half an hour with a burst every 0.1 s has 18 000.
 MOST_MEMBERS = 20_000
-"""A flight of half an hour with a burst every 0.1 s has 18 000."""
+# Of one member after decompression.
 MOST_BYTES = 2**31
-"""Of one member after decompression."""
+# Of all members together.
 MOST_IN_ALL = 2**35
-"""Of all members together."""
+# Of all members together to the archive, beyond ``_FREE_BYTES``: logs shrink to a fifth, the most even to a 50th.
 MOST_RATIO = 100
-"""Of all members together to the archive, beyond ``_FREE_BYTES``: logs shrink to a fifth, the most even to a 50th."""
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 _TAR = b"ustar"
 _MARGIN = 2**20
 _FREE_BYTES = 2**28
+# Deflate makes a file at most 1032 times smaller: what claims more lies.
 _RATIO = 1200
-"""Deflate makes a file at most 1032 times smaller: what claims more lies."""
+# What Python's libraries raise for damaged archives; a ValueError for a directory that begins before the file does.
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -44,7 +45,6 @@ _DAMAGE = (
     OverflowError,
     NotImplementedError,
 )
-"""What Python's libraries raise for damaged archives; a ValueError for a directory that begins before the file does."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,10 +20,10 @@ from .readers import ReadOptions
 
 AMBIGUOUS = "ambiguous_local_time"
 NONEXISTENT = "nonexistent_local_time"
+# Wall clock as AERPAW tools write it (bytes pattern, no group).
 TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
-"""Wall clock as AERPAW tools write it (bytes pattern, no group)."""
+# Optional offset behind :data:`TIME`.
 ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
-"""Optional offset behind :data:`TIME`."""
 
 _BUCKET_S = 900  # no zone in use changes its offset within a quarter of an hour of wall clock
 _MONTH_DAYS = np.array([0, 31, 29, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])

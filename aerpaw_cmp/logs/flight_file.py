@@ -220,8 +220,8 @@ def _type(column: pd.Series[Any]) -> str:
     return {"M": "time", "f": "float", "i": "integer", "u": "integer", "b": "boolean"}.get(kind, "text")
 
 
+# Rows that are converted and written at a time: copies of all rows of a large log would take more than its records.
 _AT_ONCE = 1 << 18
-"""Rows that are converted and written at a time: copies of all rows of a large log would take more than its records."""
 _CHUNK = 1 << 16
 
 

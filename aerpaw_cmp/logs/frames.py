@@ -19,8 +19,8 @@ from .flight_file import IngestedFile, write_flight
 from .ingest import Ingested, account_notes, ingest, summary
 from .readers import ReadOptions
 
+# A file, a folder, a pattern such as ``"logs/*.txt"``, or an open binary file; ``~`` is the home folder.
 Source: TypeAlias = str | os.PathLike[str] | BinaryIO
-"""A file, a folder, a pattern such as ``"logs/*.txt"``, or an open binary file; ``~`` is the home folder."""
 
 
 class Logs(dict[str, pd.DataFrame]):

@@ -23,11 +23,11 @@ from .records import ReadResult, has_wall_clock
 if TYPE_CHECKING:
     import pandas as pd
 
+# Largest content of a packed file that is unpacked in memory.
 MAX_BYTES = 2**32
-"""Largest content of a packed file that is unpacked in memory."""
 
+# Rejected lines of a file that a summary quotes.
 FIRST_REJECTED = 3
-"""Rejected lines of a file that a summary quotes."""
 
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -198,8 +198,8 @@ def _beginning(place: Path, count: int = DEEP_BYTES) -> bytes:
     return as_utf8(head if packed.form(head) is None else packed.head_of(place, count))
 
 
+# Logs of flight files that were read, by the flight file.
 Held = dict[Path, list[IngestedFile]]
-"""Logs of flight files that were read, by the flight file."""
 
 
 def read_log(
@@ -538,8 +538,8 @@ def _span(frame: pd.DataFrame) -> dict[str, Any]:
     return {"start": start.isoformat() + "Z", "end": end.isoformat() + "Z", "rate_hz": rate}
 
 
+# Columns of :func:`account_rows`.
 ACCOUNT = ("file", "reader", "streams (rows)", "lines", "accepted", "rejected", "blank", "rate Hz", "start UTC", "s")
-"""Columns of :func:`account_rows`."""
 
 
 def account_rows(account: Mapping[str, Any]) -> tuple[str, list[list[str]]]:

@@ -38,6 +38,7 @@ class Limit:
     flag: str
 
 
+# Quantities that mean the same in every stream. Levels (by unit) and times have their own rules below.
 LIMITS: tuple[Limit, ...] = (
     Limit(
         ("latitude_deg", "longitude_deg", "altitude_m"),
@@ -57,23 +58,22 @@ LIMITS: tuple[Limit, ...] = (
     Limit(("rsrp_dbm",), ((-200.0, 50.0),), "rsrp_out_of_range"),
     Limit(("sinr_db",), ((-100.0, 100.0),), "sinr_out_of_range"),
 )
-"""Quantities that mean the same in every stream. Levels (by unit) and times have their own rules below."""
 
+# Levels by unit: thermal noise of 1 Hz is -174 dBm, 50 dBm would burn the receiver; a ratio to the noise is wider.
 LEVEL_DB = {"dBm": (-200.0, 50.0), "dB": (-200.0, 200.0)}
-"""Levels by unit: thermal noise of 1 Hz is -174 dBm, 50 dBm would burn the receiver; a ratio to the noise is wider."""
 
+# Levels re full scale, gain taken off: real sounder logs reach 33 dB.
 LEVEL_OTHER_DB = (-200.0, 100.0)
-"""Levels re full scale, gain taken off: real sounder logs reach 33 dB."""
 
+# A few rows further than a day from all others have a damaged stamp: no log is silent for a day and goes on.
 APART_S = 86_400.0
-"""A few rows further than a day from all others have a damaged stamp: no log is silent for a day and goes on."""
 
 FEW_SHARE = 0.01
+# At most this share, or this many, are "a few".
 FEW_ROWS = 3
-"""At most this share, or this many, are "a few"."""
 
+# Flags of rows that no comparison scores (`flight/scored.py`). The other flags void the doubtful value itself.
 UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports", "no_number")
-"""Flags of rows that no comparison scores (`flight/scored.py`). The other flags void the doubtful value itself."""
 
 
 def check(result: ReadResult) -> ReadResult:

@@ -16,15 +16,15 @@ import numpy as np
 from ..common.units import AnyArray, BoolArray, IntArray
 from .records import KEPT_REJECTED, RejectedLine, RejectedReason
 
+# Characters of a rejected line that are kept.
 TEXT_LIMIT = 500
-"""Characters of a rejected line that are kept."""
 
+# Flag of a record in a last line without line end: its last field may be cut short.
 UNTERMINATED = "unterminated_line"
-"""Flag of a record in a last line without line end: its last field may be cut short."""
 
 
+# A decimal number of bounded length (bytes pattern, no group): what pandas' parser takes, see ``_table``.
 NUMBER = rb"[-+]?\d{1,400}(?:\.\d{0,400})?(?:[eE][-+]?\d{1,400})?"
-"""A decimal number of bounded length (bytes pattern, no group): what pandas' parser takes, see ``_table``."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ class Lines:
         return np.asarray(self.buffer[self.starts[numbers][:, None] + np.arange(width)])
 
 
+# Bytes that a look at each byte takes at a time: they stay in the processor's cache.
 SLICE = 1 << 17
-"""Bytes that a look at each byte takes at a time: they stay in the processor's cache."""
 
 
 def places(buffer: AnyArray, one: int, other: int | None = None) -> IntArray:

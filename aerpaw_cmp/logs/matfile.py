@@ -20,13 +20,13 @@ from ..common.errors import InputError
 from ..common.units import AnyArray
 
 MAGIC = b"MATLAB 5.0 MAT-file"
+# First bytes of a version 7.3 file: HDF5 behind a block of 512 bytes.
 MAGIC_73 = b"MATLAB 7.3 MAT-file"
-"""First bytes of a version 7.3 file: HDF5 behind a block of 512 bytes."""
+# Of one variable after decompression.
 MOST_BYTES = 1 << 30
-"""Of one variable after decompression."""
 MOST_RATIO = 100
+# All compressed variables together unpack to at most so many bytes and ``MOST_RATIO`` times the file's size.
 FREE_BYTES = 1 << 28
-"""All compressed variables together unpack to at most so many bytes and ``MOST_RATIO`` times the file's size."""
 
 _COMPRESSED, _MATRIX, _INT8, _INT32, _UINT32 = 15, 14, 1, 5, 6
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}

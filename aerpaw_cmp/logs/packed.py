@@ -15,10 +15,10 @@ from ..common.errors import InputError
 
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\x00": "xz"}
 _PIECE = 2 << 20
+# What unpacks to more than so many times its size is no log: text of the most regular of them takes a hundredth.
 _MOST_RATIO = 1100
-"""What unpacks to more than so many times its size is no log: text of the most regular of them takes a hundredth."""
+# Of the xz library; its strongest setting takes 65 MiB.
 _MOST_MEMORY = 1 << 28
-"""Of the xz library; its strongest setting takes 65 MiB."""
 
 
 def form(head: bytes) -> str | None:

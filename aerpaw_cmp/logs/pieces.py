@@ -15,8 +15,8 @@ from .records import ReadResult, RejectedLine, RejectedReason, Stream
 if TYPE_CHECKING:
     import pandas as pd
 
+# A file with more records than this in a stream is a log of its own.
 PIECE_RECORDS = 50
-"""A file with more records than this in a stream is a log of its own."""
 
 
 def join(files: Sequence[IngestedFile]) -> list[IngestedFile]:

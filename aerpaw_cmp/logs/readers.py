@@ -16,13 +16,13 @@ from ..common.errors import InputError, UsageError
 from .records import Kind, ReadResult
 
 ENTRY_POINT_GROUP = "aerpaw_cmp.readers"
+# Sniffers see this much of a file first.
 HEAD_BYTES = 65_536
-"""Sniffers see this much of a file first."""
+# And this much where no log reader knows those.
 DEEP_BYTES = 4 << 20
-"""And this much where no log reader knows those."""
 
+# Reads a log from pieces of whole lines: the same result whatever their size.
 ReadPieces = Callable[[Iterable[bytes], "ReadOptions"], ReadResult]
-"""Reads a log from pieces of whole lines: the same result whatever their size."""
 
 
 @dataclass(frozen=True, slots=True)

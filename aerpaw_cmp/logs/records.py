@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 Kind = Literal["telemetry", "rss", "rank", "kpi"]
 Attribute = str | float | int | bool
 
+# Columns that a frame of each kind must have, besides ``time``, ``line`` and ``flag``.
 COLUMNS: dict[str, tuple[str, ...]] = {
     "telemetry": (
         "latitude_deg",
@@ -57,7 +58,6 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "rank": ("rank", "ri_raw"),
     "kpi": ("value",),
 }
-"""Columns that a frame of each kind must have, besides ``time``, ``line`` and ``flag``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +112,8 @@ class RejectedReason:
     last: int
 
 
+# Rejected lines of a file that are kept verbatim: the first; all others are counted.
 KEPT_REJECTED = 1000
-"""Rejected lines of a file that are kept verbatim: the first; all others are counted."""
 
 
 def reasons_of(rejected: Iterable[RejectedLine]) -> tuple[RejectedReason, ...]:

@@ -30,8 +30,8 @@ from .readers import HEAD_BYTES, ReadOptions, claims
 if TYPE_CHECKING:
     import pandas as pd
 
+# Columns of a route: height above take-off, yaw clockwise from north, seconds since its first point (NaN: a plan).
 COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "yaw_deg", "time_s")
-"""Columns of a route: height above take-off, yaw clockwise from north, seconds since its first point (NaN: a plan)."""
 
 _SEA_LEVEL_FRAMES, _RELATIVE_FRAMES, _TERRAIN_FRAMES = (0, 5), (3, 6), (10, 11)
 _WAYPOINTS = (16, 17, 18, 19, 31, 82)

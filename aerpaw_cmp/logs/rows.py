@@ -327,8 +327,8 @@ def built(
 RELATIVE = "the times are relative and no time_origin is given: they count from 1970-01-01T00:00"
 _SCALE_NS = {"s": 1e9, "ms": 1e6, "us": 1e3}
 _MOST_S = 9.2e9
+# Relative times beyond about 285 years would leave the range of datetime64[ns].
 _FLIGHT_S = 9.0e9
-"""Relative times beyond about 285 years would leave the range of datetime64[ns]."""
 
 
 def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> tuple[bool, _time.Instants, BoolArray]:
@@ -507,8 +507,8 @@ def _identity(numbers: FloatArray, most: int) -> FloatArray:
     return np.where((numbers >= 0) & (numbers <= most) & (numbers == np.round(numbers)), numbers, np.nan)
 
 
+# RNTIs have sixteen bits; programs print up to six hex digits.
 _MOST_RNTI, _MOST_PCI = 0xFFFFFF, 1007
-"""RNTIs have sixteen bits; programs print up to six hex digits."""
 
 
 def _together(spans: list[IntArray]) -> bool:

@@ -17,10 +17,10 @@ from ..common.units import AnyArray
 if TYPE_CHECKING:
     import pandas as pd
 
+# 20 log10 of the smallest normal float32: what the sounder's logarithm gives without a signal.
 FLT_MIN_DB = -758.5956
-"""20 log10 of the smallest normal float32: what the sounder's logarithm gives without a signal."""
+# Default gain that the sounder takes off its levels.
 RX_GAIN_DB = 30.0
-"""Default gain that the sounder takes off its levels."""
 
 
 def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]:

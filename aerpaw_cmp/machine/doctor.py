@@ -21,11 +21,11 @@ from . import llvm
 
 Status = Literal["ok", "warn", "fail"]
 
+# A report of 10 000 poses and 5 towers stays below this.
 MEMORY_NEEDED_BYTES = 2 * 1024**3
-"""A report of 10 000 poses and 5 towers stays below this."""
 
+# Reports, flight files and the path cache of a day in the field.
 DISK_NEEDED_BYTES = 1024**3
-"""Reports, flight files and the path cache of a day in the field."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,19 +26,19 @@ from pathlib import Path
 from ..common.errors import CheckError
 from ..common.versions import version
 
+# 14 is refused by Dr.Jit; 15 and 16 abort on AVX-512. 19 and 22 were tried on such a machine.
 MINIMUM_MAJOR = 17
-"""14 is refused by Dr.Jit; 15 and 16 abort on AVX-512. 19 and 22 were tried on such a machine."""
 
+# What Dr.Jit reads; a path set by the user is tried, never replaced.
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
-"""What Dr.Jit reads; a path set by the user is tried, never replaced."""
 
+# Folders to look into instead of the system's, separated as in PATH.
 FOLDERS_VARIABLE = "AERPAW_CMP_LLVM_FOLDERS"
-"""Folders to look into instead of the system's, separated as in PATH."""
 
 TRIAL_TIMEOUT_S = 300.0
 
+# Dr.Jit's wheel links libatomic.so.1, which a minimal Debian does not have.
 APT_RUNTIME = "libatomic1"
-"""Dr.Jit's wheel links libatomic.so.1, which a minimal Debian does not have."""
 
 _FOLDERS = (
     "/usr/lib/*-linux-gnu",
@@ -88,12 +88,12 @@ llvm = list(dr.detail.llvm_version()) if "llvm" in sys.argv[1] else []
 print(json.dumps({"right": right, "found_m": found, "llvm": llvm}))
 """
 
+# The same for ``doctor`` and ``make setup``, which name a Sionna RT that cannot be loaded, too.
 SIONNA_LOADS = f"""{TRIAL_PROGRAM}
 import typing, typing_extensions
 typing.__dict__.setdefault("Self", typing_extensions.Self)
 import sionna.rt
 """
-"""The same for ``doctor`` and ``make setup``, which name a Sionna RT that cannot be loaded, too."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,12 +58,12 @@ class BiExponential:
         return 1.0 - self.c1 - self.c3
 
 
+# The paper's fit (section VII-C).
 PAPER_BIEXPONENTIAL = BiExponential(0.2932, -0.0508, 0.7057, -0.001, 0.0153)
-"""The paper's fit (section VII-C)."""
 
 
+# Trust-region searches of a fit.
 STARTS = 6
-"""Trust-region searches of a fit."""
 
 
 def fit_biexponential(

@@ -303,8 +303,8 @@ def interval_coverage(
     return IntervalCoverage(level, np.asarray(inside), float((z**2).mean()), int(good.sum()))
 
 
+# Random orders of a learning curve.
 REPEATS = 3
-"""Random orders of a learning curve."""
 
 
 def learning_curve(

@@ -15,13 +15,13 @@ from numpy.typing import ArrayLike
 from ..common.errors import UsageError
 from ..common.units import AnyArray, FloatArray, IntArray
 
+# Horizontal interval d_rx of the UAV positions.
 PAPER_SPACING_M = 30.0
-"""Horizontal interval d_rx of the UAV positions."""
 
 MAXIMUM_CELLS_A_SIDE = 10_000
 
+# How plots and tables name a position without any path.
 OUT_OF_COVERAGE = "Z"
-"""How plots and tables name a position without any path."""
 
 
 @dataclass(frozen=True, slots=True)

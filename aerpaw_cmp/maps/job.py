@@ -36,8 +36,8 @@ PAPER_RANK_ALTITUDES_M = (3.0, *(float(h) for h in range(30, 111, 10)))
 PAPER_KS = (10.0, 100.0, 1000.0)
 CHUNK = 2048
 HIGHEST_RANK = 4
+# Largest ratio of singular values that is drawn and exported: values below 1e-9 of the largest are rounding.
 RATIO_LIMIT_DB = 180.0
-"""Largest ratio of singular values that is drawn and exported: values below 1e-9 of the largest are rounding."""
 
 Antennas = Literal["siso", "mimo"]
 

@@ -14,10 +14,10 @@ import numpy as np
 from ..common.errors import one_line
 from ..common.units import FloatArray
 
+# Z grey, then ranks 1 to 4 from dark to light (viridis), then spare ones.
 CLASS_COLOURS = ("#9e9e9e", "#440154", "#31688e", "#35b779", "#fde725", "#e66101", "#b2182b")
-"""Z grey, then ranks 1 to 4 from dark to light (viridis), then spare ones."""
+# Fixed, so that the same content gives the same bytes.
 _DATE = (1980, 1, 1, 0, 0, 0)
-"""Fixed, so that the same content gives the same bytes."""
 
 
 def xml_text(text: str) -> str:

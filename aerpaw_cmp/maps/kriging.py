@@ -41,18 +41,18 @@ from ..common.units import BoolArray, FloatArray, IntArray
 from ..propagation.compiled import triangles_for
 from . import neighbours as choose
 
+# Correlation as a function of distance [m]; vectorised.
 Correlation = Callable[[FloatArray], FloatArray]
-"""Correlation as a function of distance [m]; vectorised."""
 
 CONDITION_LIMIT = 1e10
+# Targets whose neighbours' offsets agree to this share one set of weights.
 SHARE_M = 1e-9
-"""Targets whose neighbours' offsets agree to this share one set of weights."""
+# Below this bound of the condition number a Cholesky solution has 9 digits and more, and needs no second look.
 SOUND_CONDITION = 1e6
-"""Below this bound of the condition number a Cholesky solution has 9 digits and more, and needs no second look."""
+# Targets that may share weights; bounds the memory.
 CHUNK = 2048
-"""Targets that may share weights; bounds the memory."""
+# Systems factored at once: enough to hide the calls, few enough for a processor's cache.
 LANES, COMPILED_LANES = 512, 128
-"""Systems factored at once: enough to hide the calls, few enough for a processor's cache."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,14 +15,14 @@ import numpy as np
 
 from ..common.units import FloatArray, IntArray
 
+# Targets per query; bounds the memory.
 CHUNK = 4096
-"""Targets per query; bounds the memory."""
 
+# Targets per query of all samples within a radius; bounds the memory and does not change a random draw.
 AT_ONCE = 256
-"""Targets per query of all samples within a radius; bounds the memory and does not change a random draw."""
 
+# Distances closer than this are tied; a sample closer than this to a target is at its place.
 TIE_M = 1e-6
-"""Distances closer than this are tied; a sample closer than this to a target is at its place."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,8 @@ from .tiles import PLANES, Tiling, over_grid
 LEDGER = "tile_paths"
 NOT_COMPUTED = -1
 _JOB = "aerpaw_cmp_job"
+# Files of a store of Zarr 3, as names below its folder.
 _OURS = re.compile(r"zarr\.json|\w+/(zarr\.json|c(/\d+)*)")
-"""Files of a store of Zarr 3, as names below its folder."""
 _NAMES = dict(zip(PLANES, ("rss_siso", "rss_mimo", "rss_sd", "rank", "spread", "condition"), strict=True))
 
 

@@ -28,14 +28,14 @@ from ..site.site import Site, Tower
 from .grid import Grid, serving_tower, voronoi_borders
 from .job import MapResult
 
+# A building this close to a hull counts [m]: far above the rounding of any plane.
 NEAR_M = 0.01
-"""A building this close to a hull counts [m]: far above the rounding of any plane."""
 
+# How far several paths may lift a level over that of free space [dB]: ten as strong as the direct one, in phase.
 IN_PHASE_DB = 20.0
-"""How far several paths may lift a level over that of free space [dB]: ten as strong as the direct one, in phase."""
 
+# Fields of a :class:`~aerpaw_cmp.maps.job.MapResult` with a value per position.
 PLANES = ("rss_siso_dbm", "rss_mimo_dbm", "level_sd_db", "rank", "spread_db", "condition_db")
-"""Fields of a :class:`~aerpaw_cmp.maps.job.MapResult` with a value per position."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,14 +42,14 @@ __all__ = [
     "vertical_correlation",
 ]
 
+# Positions per block of the pair products; bounds the memory to BLOCK x positions.
 BLOCK = 256
-"""Positions per block of the pair products; bounds the memory to BLOCK x positions."""
 
 PAPER_WIDTH_M = 30.0
 PAPER_MAXIMUM_M = 500.0
 HEIGHT_BIN_M = 10.0
+# Fewest components that a pair of positions must share where some are missing.
 MINIMUM_COMMON = 3
-"""Fewest components that a pair of positions must share where some are missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,8 +237,8 @@ def fit_vertical_scale(
 
 # --- pairs ----------------------------------------------------------------------------------------------------------
 
+# Value of each pair of two sets of positions: (rows,), (columns,) -> (rows, columns); NaN where undefined.
 Block = Callable[[IntArray, IntArray], FloatArray]
-"""Value of each pair of two sets of positions: (rows,), (columns,) -> (rows, columns); NaN where undefined."""
 
 
 class Variogram:

@@ -157,8 +157,8 @@ def rotation_from_aircraft(roll_deg: FloatArray, pitch_deg: FloatArray, yaw_deg:
 
 
 # Ports of the measurement comparison in arXiv 2502.10324, section VII-D
+# Positions along the tower array: spacings 60 mm, 1.68 m, 60 mm.
 TOWER_PORTS_M = (0.0, 0.060, 1.740, 1.800)
-"""Positions along the tower array: spacings 60 mm, 1.68 m, 60 mm."""
 
 
 def _centred_line(along_m: FloatArray) -> FloatArray:

@@ -20,11 +20,11 @@ from .options import Search
 from .paths import PathSet
 from .scene import Scene
 
+# Raised whenever the entries or the search change.
 LAYOUT = 4
-"""Raised whenever the entries or the search change."""
 
+# Stands behind the entry, before the SHA-256 of all bytes in front of it.
 _SEAL = b"AERPAWCP"
-"""Stands behind the entry, before the SHA-256 of all bytes in front of it."""
 
 _COLUMNS = ("pose", "tower", "depth", "faces", "vertices_m")
 

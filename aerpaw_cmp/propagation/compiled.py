@@ -37,6 +37,7 @@ SWITCH = "AERPAW_CMP_COMPILED"
 FIELD, BEAMS = "propagation.field.kernels", "propagation.search.beams"
 EDGES, EDGE_FIELD = "propagation.search.edge_kernels", "propagation.field.edge_kernels"
 TRIANGLES = "maps.triangle_kernels"
+# Files of kernels, and those whose functions and constants they take in.
 SOURCES = (
     *(f"propagation/{name}.py" for name in (
         "field/dyads", "field/fresnel", "field/kernels", "field/wedge", "field/edges", "field/edge_kernels",
@@ -45,30 +46,29 @@ SOURCES = (
     )),
     "maps/triangle_kernels.py",
 )  # fmt: skip
-"""Files of kernels, and those whose functions and constants they take in."""
 
+# CPU seconds of the first compilation on a machine.
 COMPILE_S = {FIELD: 10.0, BEAMS: 25.0, EDGES: 20.0, EDGE_FIELD: 20.0, TRIANGLES: 1.6}
-"""CPU seconds of the first compilation on a machine."""
+# CPU seconds of NumPy from which numba's import and reading what was compiled before pay off.
 READ_S = 0.4
-"""CPU seconds of NumPy from which numba's import and reading what was compiled before pay off."""
+# A job that NumPy does in less stays there, whatever is loaded.
 LEAST_S = 0.25
-"""A job that NumPy does in less stays there, whatever is loaded."""
 
+# CPU seconds of NumPy per element pair of a link (``benchmarks/replay.py``).
 FIELD_S = 6e-7
-"""CPU seconds of NumPy per element pair of a link (``benchmarks/replay.py``)."""
+# CPU seconds of NumPy per link and face, sequences of two reflections.
 MIRRORS_S = 1.6e-7
-"""CPU seconds of NumPy per link and face, sequences of two reflections."""
 
 
+# CPU seconds of NumPy per candidate of a path over an edge.
 CANDIDATES_S = 1.2e-7
-"""CPU seconds of NumPy per candidate of a path over an edge."""
+# CPU seconds of NumPy per path over an edge.
 EDGE_FIELD_S = 7e-6
-"""CPU seconds of NumPy per path over an edge."""
+# CPU seconds of NumPy per system and cube of its size.
 TRIANGLE_S = 4e-10
-"""CPU seconds of NumPy per system and cube of its size."""
 
+# Estimated seconds of this process so far.
 _in_numpy_s = dict.fromkeys(COMPILE_S, 0.0)
-"""Estimated seconds of this process so far."""
 
 
 @dataclass(frozen=True, slots=True)

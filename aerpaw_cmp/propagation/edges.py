@@ -14,17 +14,17 @@ from ..common.units import AnyArray, FloatArray, IntArray
 from .paths import Faces, PathSet
 from .surfaces import Surfaces
 
+# An end nearer than this to an edge has no path over it: there is no far field.
 NEAREST_M = 0.01
-"""An end nearer than this to an edge has no path over it: there is no far field."""
 
+# Faces of triangles that meet at less than this make no edge: they are facets of a bowed surface.
 BEND_RAD = np.radians(2.0)
-"""Faces of triangles that meet at less than this make no edge: they are facets of a bowed surface."""
 
+# Corners of triangles nearer than this are one [m].
 WELD_M = 1e-4
-"""Corners of triangles nearer than this are one [m]."""
 
+# Exterior angles nearer than this to 180 degrees [rad] are a plane.
 SHARPEST = 1e-6
-"""Exterior angles nearer than this to 180 degrees [rad] are a plane."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,11 +22,11 @@ from .search import mirror
 from .search.effort import Estimate
 from .search.samples import Choice, enough_samples, spread
 
+# A search that will take longer is a warning where nobody asked to be told.
 LONG_SEARCH_S = 60.0
-"""A search that will take longer is a warning where nobody asked to be told."""
 
+# Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same.
 MANY_FACES = 400
-"""Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same."""
 
 
 def path_cache(search: Search, run: Run) -> PathCache | None:

@@ -20,11 +20,11 @@ from ..common.units import BoolArray, FloatArray, IntArray
 from ..site.site import Building, Site
 from .paths import Faces
 
+# Walls start this far below the lower of their base and the site ground.
 WALL_FOOT_M = 0.5
-"""Walls start this far below the lower of their base and the site ground."""
 
+# Sine of the angle between two edges below which they are one wall.
 COLLINEAR = 1e-9
-"""Sine of the angle between two edges below which they are one wall."""
 
 _UP = np.array([0.0, 0.0, 1.0])
 

@@ -20,8 +20,8 @@ from .search.samples import Samples
 Engine = Literal["image", "sionna"]
 Device = Literal["auto", "cpu", "cuda"]
 Diffraction = Literal["none", "edges", "all"]
+# ``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target.
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
-"""``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,8 +38,8 @@ class Links:
 
 
 _ARRAYS = ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
+# Columns of faces: arrays, and tuples.
 _WORDS = ("material", "label", "polygon")
-"""Columns of faces: arrays, and tuples."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,11 +27,11 @@ from .search.terrain import on_terrain
 from .search.walls import ThroughWalls, paths_through
 from .surfaces import Surfaces
 
+# Poses of which levels are made at once.
 LEVELS_AT_ONCE = 1024
-"""Poses of which levels are made at once."""
 
+# Arrays (poses, towers, ...) of a replay.
 PER_LINK = ("rss_dbm", "rss_power_dbm", "h", "has_path")
-"""Arrays (poses, towers, ...) of a replay."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)

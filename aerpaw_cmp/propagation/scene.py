@@ -128,8 +128,8 @@ def _merged(scene: TriangleScene, merge_m: float) -> Surfaces:
     return merged(scene, merge_m)
 
 
+# Poses further than this from every tower [m] are no poses of the site.
 REACH_M = 100_000.0
-"""Poses further than this from every tower [m] are no poses of the site."""
 
 
 @dataclass(frozen=True, slots=True)

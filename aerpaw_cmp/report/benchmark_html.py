@@ -30,6 +30,7 @@ RANK_COLUMNS = {
 }
 
 
+# Names of our entrants on the page.
 TITLES = {
     "free_space": "free space",
     "log_distance": "log-distance line",
@@ -45,7 +46,6 @@ TITLES = {
     "learned_residual": "learned antennas and residual field",
     "boosted_trees": "gradient-boosted trees",
 }
-"""Names of our entrants on the page."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -82,8 +82,8 @@ STYLES = ("screen", "paper")
 FORMATS = ("png", "svg", "pdf")
 INLINE = "png of few colours"
 
+# Width of two columns of an IEEE page.
 IEEE_WIDTH_IN = 7.16
-"""Width of two columns of an IEEE page."""
 
 
 @contextmanager
@@ -450,8 +450,8 @@ def draw_out_of_coverage(
             )  # fmt: skip
 
 
+# More spans than this are joined where no eye could part them.
 _SPANS = 2000
-"""More spans than this are joined where no eye could part them."""
 
 
 def _apart(spans: list[tuple[int, int]], seconds: FloatArray) -> list[tuple[int, int]]:

@@ -20,9 +20,10 @@ from ..logs.records import RejectedLine
 from ..site.site import Site
 from .against import Against
 
+# Ranks of a 4 x 4 channel, the bars of every histogram.
 RANKS = (1, 2, 3, 4)
-"""Ranks of a 4 x 4 channel, the bars of every histogram."""
 
+# Quantities that residuals are drawn against, and their axis labels.
 GEOMETRY = {
     "distance_m": "Distance tower to UAV [m]",
     "elevation_deg": "Elevation of the UAV seen from the tower [deg]",
@@ -33,7 +34,6 @@ GEOMETRY = {
     "uav_elevation_deg": "Elevation of the tower,\nUAV antenna frame [deg]",
     "foliage_depth_m": "Path length inside tree crowns [m]",
 }
-"""Quantities that residuals are drawn against, and their axis labels."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,8 +87,8 @@ class Source:
     line: IntArray
 
 
+# Kinds of drawn paths beside a number of reflections: over edges, and through walls.
 DIFFRACTED, PASSING = -1, -2
-"""Kinds of drawn paths beside a number of reflections: over edges, and through walls."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,8 +26,8 @@ from .packed import PackedArrays
 from .shapes import listed, outline, walls
 from .words import nearest_k, pretty
 
+# Samples of all series together that the page holds; beyond them each series is thinned, extremes kept.
 POINTS = 50_000
-"""Samples of all series together that the page holds; beyond them each series is thinned, extremes kept."""
 
 TREES = 1500
 TRACK_POINTS = 4000

@@ -21,8 +21,8 @@ from .made import about
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 from .words import audit_summary
 
+# 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable.
 DECIMALS = 4
-"""0.1 mm and 1e-4 dB: finer than any log, and the files stay readable."""
 
 
 def metrics(data: ReportData) -> dict[str, Any]:
@@ -174,11 +174,11 @@ def rank_csv(series: Sequence[RankResult]) -> Iterator[str]:
     return _text(rank_tables(series), RANK_COLUMNS)
 
 
+# Times (n,) of a panel, and its further columns: arrays (n,), or one value for all rows.
 _Table = tuple[Any, dict[str, Any]]
-"""Times (n,) of a panel, and its further columns: arrays (n,), or one value for all rows."""
 
+# Rows that are text at once.
 _ROWS = 50_000
-"""Rows that are text at once."""
 
 
 def rss_tables(series: Sequence[RssResult]) -> Iterator[_Table]:

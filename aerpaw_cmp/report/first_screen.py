@@ -16,8 +16,8 @@ from .data import ReportData
 
 NO_INTERVAL = "no interval can be given"
 
+# A channel whose RMSE is this much [dB] above the pooled one is named as where the prediction fails.
 LARGE_DB = 1.5
-"""A channel whose RMSE is this much [dB] above the pooled one is named as where the prediction fails."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,8 +189,8 @@ def _rank_sentence(panels: Sequence[RankResult]) -> str:
     return ""
 
 
+# A shorter stretch of error is a fade, not a fault of the model.
 LONG_S = 5.0
-"""A shorter stretch of error is a fade, not a fault of the model."""
 
 
 def _causes(panels: Sequence[RssResult]) -> str:

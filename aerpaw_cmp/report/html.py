@@ -30,12 +30,12 @@ from .export import further_numbers, json_text, write_file
 from .first_screen import headlines, verdict
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
+# Rejected lines shown per file; the flight file holds all.
 REJECTED_SHOWN = 20
-"""Rejected lines shown per file; the flight file holds all."""
 
+# ``script``: 'none', or the digest of the page's one script. Lets a browser refuse whatever would be loaded or run
+# besides, should a hostile log ever get past the escaping.
 CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {script}"
-"""``script``: 'none', or the digest of the page's one script. Lets a browser refuse whatever would be loaded or run
-besides, should a hostile log ever get past the escaping."""
 
 
 def number(value: float | None, decimals: int = 1, unit: str = "") -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..common.jsonable import number_key
 
+# Columns of rss.csv, followed by one ``<baseline>_dbm`` per baseline.
 RSS_COLUMNS: dict[str, str] = {
     "time_utc": "instant of the sample, ISO 8601, UTC; empty: the log has relative times and no origin was given",
     "time_s": "seconds after the first sample of this tower and channel",
@@ -26,8 +27,10 @@ RSS_COLUMNS: dict[str, str] = {
     "measured_out_of_coverage": "1: the log has no signal here",
     "simulated_out_of_coverage": "1: the ray tracing has no path here",
 }
-"""Columns of rss.csv, followed by one ``<baseline>_dbm`` per baseline."""
 
+# Columns of rank.csv, followed by one ``simulated_rank_k<K>`` per K (0: no path), then what a receiver decides by:
+# ``level_dbm`` and ``sigma<i>_over_sigma1_db``, 20 log10 of the ratio of singular values (empty: no path, or zero);
+# with ``rank.receiver`` also ``probability_rank<r>``.
 RANK_COLUMNS: dict[str, str] = {
     "time_utc": "instant of the report, ISO 8601, UTC; empty: the log has relative times and no origin was given",
     "time_s": "seconds after the first report of this tower",
@@ -37,13 +40,10 @@ RANK_COLUMNS: dict[str, str] = {
     "up_m": "metres above the ground at the origin",
     "measured_rank": "reported rank 1 to 4; empty: no CSI",
 }
-"""Columns of rank.csv, followed by one ``simulated_rank_k<K>`` per K (0: no path), then what a receiver decides by:
-``level_dbm`` and ``sigma<i>_over_sigma1_db``, 20 log10 of the ratio of singular values (empty: no path, or zero);
-with ``rank.receiver`` also ``probability_rank<r>``."""
 
 
+# K as a key of metrics.json and of rank.csv.
 k_key = number_key
-"""K as a key of metrics.json and of rank.csv."""
 
 
 def iso_time(time: Any) -> Any:

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..common.units import AnyArray, FloatArray
 
+# What stands for NaN in an array of each integer kind.
 NONE = {"u1": 255, "u2": 65_535, "i2": -32_768}
-"""What stands for NaN in an array of each integer kind."""
 
 LARGEST = 32_767
 

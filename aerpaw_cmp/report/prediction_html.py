@@ -90,8 +90,8 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
     )
 
 
+# Rows of prediction.csv that are rounded and written together: bounds the memory.
 ROWS_AT_ONCE = 100_000
-"""Rows of prediction.csv that are rounded and written together: bounds the memory."""
 
 
 def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], list[str]]:
@@ -173,8 +173,8 @@ def _map_spec(data: PredictionPage, name: str, part: pd.DataFrame, height: str =
     )  # fmt: skip
 
 
+# Points of a map that are drawn.
 MOST_DOTS = 50_000
-"""Points of a map that are drawn."""
 
 
 def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:

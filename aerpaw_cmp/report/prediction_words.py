@@ -28,9 +28,10 @@ FLAGS = {
     "no_position": "no position",
 }
 
+# Share of points outside the flown places that the first words name.
 MANY = 0.2
-"""Share of points outside the flown places that the first words name."""
 
+# The chosen model on what was left out, by the paired interval.
 AGAINST_FREE_SPACE = {
     "better": (
         "The model is significantly better than free space ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
@@ -43,8 +44,8 @@ AGAINST_FREE_SPACE = {
     "not significant": ("The difference from free space of {effect:+.1f} dB is not significant (95 %).", ""),
     "no interval": ("Too few samples for an interval of the difference.", ""),
 }
-"""The chosen model on what was left out, by the paired interval."""
 
+# The residual field, by the interval of the difference of the CRPS; ``off`` where it holds zero.
 FIELD = {
     "better": (
         "The residual field is on: it lowers the CRPS by {size:.2f} dB (95 %: {high:+.2f} to {low:+.2f} dB).",
@@ -53,9 +54,9 @@ FIELD = {
     "worse": ("The residual field is off: it raises the CRPS by {size:.2f} dB on held-out samples.", ""),
     "off": ("The residual field is off: the CRPS differs by {size:.2f} dB, not significantly.", ""),
 }
-"""The residual field, by the interval of the difference of the CRPS; ``off`` where it holds zero."""
 
 HELD_OUT = "90 % intervals hold {inside:.0f} % of the held-out samples."
+# Stated standard deviations on what was left out, by :func:`~aerpaw_cmp.compare.verdicts.stated_errors`.
 STATED: dict[str, tuple[str, str]] = {
     "none": (HELD_OUT, ""),
     "no interval": ("", ""),
@@ -74,8 +75,8 @@ STATED: dict[str, tuple[str, str]] = {
         "check the gain of the flights that were learned from",
     ),
 }
-"""Stated standard deviations on what was left out, by :func:`~aerpaw_cmp.compare.verdicts.stated_errors`."""
 
+# The same on the flight that followed.
 FLOWN: dict[str, tuple[str, str]] = {
     "none": ("Intervals are as stated.", "`aerpaw-cmp predict` with this flight for the next route"),
     "no interval": ("Too few samples to judge the intervals.", ""),
@@ -95,7 +96,6 @@ FLOWN: dict[str, tuple[str, str]] = {
         "check transmit power and receiver gain of this flight",
     ),
 }
-"""The same on the flight that followed."""
 
 
 def first_words(correction: Correction, outside: float, expected_db: float) -> str:
@@ -135,11 +135,11 @@ def first_words(correction: Correction, outside: float, expected_db: float) -> s
     return " ".join(text for text in texts if text)
 
 
+# A prediction from the memory of the site; ``learned`` by entry.
 NO_FLIGHT = (
     "No flight is named: antennas and levels are those that the site remembers. {learned}. The offset of a new flight "
     "has a standard deviation of up to {sd:.1f} dB."
 )
-"""A prediction from the memory of the site; ``learned`` by entry."""
 
 UNSEEN = (
     "{percent:.0f} % of the points lie in directions that the remembered flights hardly saw. Next: `aerpaw-cmp plan` "

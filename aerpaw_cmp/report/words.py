@@ -17,11 +17,11 @@ from ..compare.statistics import Interval
 from .data import ReportData
 from .phrases import filled
 
+# Name of the ladder's rung with the settings of the flight file.
 AS_SET = "as set in flight.yaml"
-"""Name of the ladder's rung with the settings of the flight file."""
 
+# Below this a panel is called too short for a verdict.
 FEW_SAMPLES = 30
-"""Below this a panel is called too short for a verdict."""
 
 
 def pretty(name: str) -> str:
@@ -97,6 +97,7 @@ class Judged:
     unit: str = "channels"
 
 
+# What may follow the two errors, and when: the first whose condition holds. No other sentence says better or worse.
 SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
     (lambda f: not f.name, "No baseline could be scored."),
     (lambda f: not f.judged, "Too few samples for an interval of the difference."),
@@ -110,14 +111,13 @@ SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
     (lambda f: f.channels == 2, "The difference is not significant on either channel (95 %)."),
     (lambda f: f.channels > 2, "The difference is not significant on any of {channels} {unit} (95 %)."),
 )  # fmt: skip
-"""What may follow the two errors, and when: the first whose condition holds. No other sentence says better or worse."""
 
+# Sentence on the ranking of settings, by what the intervals say of those behind the first.
 RANKING: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
     (lambda said: said == {"no interval"}, "Too few flights for an interval of the difference to another setting."),
     (lambda said: said == {"worse"}, "Every other setting is significantly worse (95 %)."),
     (bool, "Not significantly worse (95 %): {named}."),
 )
-"""Sentence on the ranking of settings, by what the intervals say of those behind the first."""
 
 
 def ranking_sentence(verdicts: Mapping[str, str], most: int) -> str:
@@ -157,6 +157,7 @@ def expected_sentence(panels: Sequence[RssResult]) -> str:
     return f"Expect {learned:.1f} dB on another flight (free space {free:.1f} dB)."
 
 
+# Causes of :mod:`aerpaw_cmp.compare.causes` in words, and what to do next.
 CAUSES: dict[str, tuple[str, str]] = {
     "clock": (
         "the radio clock is {size:.1f} s {side} the telemetry clock (95 %: {low:+.1f} to {high:+.1f} s)",
@@ -181,7 +182,6 @@ CAUSES: dict[str, tuple[str, str]] = {
         "check the gain of the receiver; compare the two parts apart",
     ),
 }
-"""Causes of :mod:`aerpaw_cmp.compare.causes` in words, and what to do next."""
 
 
 def cause_sentence(panel: RssResult) -> str:
@@ -279,6 +279,7 @@ def _missing_paths(data: ReportData) -> int:
     return 0 if audit is None else audit.missing_paths
 
 
+# What may be said against the numbers, and when.
 DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
     (lambda d: any(p.score.at_edge for p in d.rss), "an offset lies at the edge of its search"),
     (lambda d: any(not p.score.n and not p.training for p in d.rss), "a channel could not be scored"),
@@ -293,7 +294,6 @@ DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
         "illustrative buildings",
     ),
 )
-"""What may be said against the numbers, and when."""
 
 
 def trust(data: ReportData) -> str:
@@ -312,11 +312,11 @@ def _recommended(data: ReportData) -> str:
     return next((row.model for row in data.ladder if row.recommended), "")
 
 
+# What to do next where no likely cause says it.
 NEXT: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
     (lambda d: _recommended(d) not in ("", AS_SET), "Next: `report --recommend FILE` writes the recommended model."),
     (lambda d: bool(d.rss), "Next: `aerpaw-cmp calibrate` with two flights of this site."),
 )
-"""What to do next where no likely cause says it."""
 
 
 def next_step(data: ReportData) -> str:
@@ -324,8 +324,8 @@ def next_step(data: ReportData) -> str:
     return next((text for holds, text in NEXT if holds(data)), "")
 
 
+# Outlying samples that move an RMSE by more than this [dB] are named in the first words.
 MOVED_DB = 0.3
-"""Outlying samples that move an RMSE by more than this [dB] are named in the first words."""
 
 
 def moved_by_outliers(panel: RssResult) -> float:

@@ -16,8 +16,8 @@ from .exports.formats import FOLDER
 from .plots import flight as figures
 
 PAGE = "page"
+# What is drawn: nothing, what the page shows, or every figure in one format or in all.
 FIGURES = ("none", PAGE, "svg", "png", "pdf", "all")
-"""What is drawn: nothing, what the page shows, or every figure in one format or in all."""
 
 __all__ = ["FIGURES", "PAGE", "STYLES", "WrittenReport", "write_report"]
 

@@ -26,17 +26,17 @@ from ..common.files import LARGEST_TABLE, read_input
 from ..common.units import AnyArray, ComplexArray, FloatArray, amplitude_from_db, db_from_power, power_from_db
 from ..logs.matfile import read_arrays
 
+# Peak directivity of a half-wave dipole (2.15 dBi): 4 / Cin(2 pi).
 HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
-"""Peak directivity of a half-wave dipole (2.15 dBi): 4 / Cin(2 pi)."""
 
+# Mean gain over the sphere that a file may have: no antenna radiates more than it gets, 0.5 dB is calibration.
 MAXIMUM_EFFICIENCY = 1.12
-"""Mean gain over the sphere that a file may have: no antenna radiates more than it gets, 0.5 dB is calibration."""
 
+# A mean gain below -20 dB is a field in other units, or normalised; measured antennas lie near 0.5.
 MINIMUM_EFFICIENCY = 0.01
-"""A mean gain below -20 dB is a field in other units, or normalised; measured antennas lie near 0.5."""
 
+# No element has more gain; a file that says so holds something else.
 HIGHEST_DBI = 60.0
-"""No element has more gain; a file that says so holds something else."""
 
 
 def _zeros(theta_rad: ArrayLike, phi_rad: ArrayLike) -> ComplexArray:
@@ -205,8 +205,8 @@ def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[Co
 
 # ---------------------------------------------------------------- AERPAW text files
 
+# As they begin without spaces and points, which differ from file to file of one lab.
 _COLUMNS = ("phi", "theta", "etotal", "e(phi)amp", "e(theta)amp", "e(phi)phase", "e(theta)phase")
-"""As they begin without spaces and points, which differ from file to file of one lab."""
 
 
 @dataclass(slots=True)

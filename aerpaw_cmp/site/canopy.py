@@ -19,14 +19,14 @@ from .footprints import SingleTree, only_trees, outline_dict
 from .site import Forest
 from .siteyaml import SiteModel
 
+# Lower vegetation is none; nothing grows higher.
 LOWEST_M, HIGHEST_M = 3.0, 120.0
-"""Lower vegetation is none; nothing grows higher."""
 
+# Smaller areas are single trees; smaller still, nothing.
 SMALLEST_STAND_M2, SMALLEST_CROWN_M2 = 200.0, 2.0
-"""Smaller areas are single trees; smaller still, nothing."""
 
+# Distances from a wall between which a surface model shows the ground.
 RING_M = (2.0, 12.0)
-"""Distances from a wall between which a surface model shows the ground."""
 
 
 def with_canopy(model: SiteModel, path: Path) -> tuple[SiteModel, list[str]]:

@@ -21,8 +21,8 @@ from ..common.geodesy import SiteFrame, in_shape
 from ..common.units import BoolArray, FloatArray, IntArray
 
 EARTH_RADIUS_M = 6_371_000.0
+# Ground on Earth lies between; other values are gaps that the file does not declare, or other units.
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
-"""Ground on Earth lies between; other values are gaps that the file does not declare, or other units."""
 
 MAX_BYTES = 512 * 1024 * 1024
 _SAMPLES_AT_ONCE = 1_000_000

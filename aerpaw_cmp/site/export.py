@@ -15,8 +15,8 @@ from .materials import CONSTANT, CROWN, face_material, material
 from .meshes import Mesh, site_meshes
 from .site import Site
 
+# Thickness given to ground in the export, a slab from which no echo of its second face returns; and to crowns.
 HALF_SPACE_THICKNESS_M, CROWN_THICKNESS_M = 1.0, 2.5
-"""Thickness given to ground in the export, a slab from which no echo of its second face returns; and to crowns."""
 
 
 def export_scene(site: Site, folder: str | Path, *, trees: bool = True) -> list[Path]:

@@ -35,27 +35,27 @@ from .tags import Kind, is_part, kind_of, levels_of, main_tag, material_of, metr
 LEVEL_M = 3.0
 DEFAULT_HEIGHT_M = 6.0
 TALLEST_M = 300.0
+# Outlines farther from the origin are not of this site.
 FAR_M = 20_000.0
-"""Outlines farther from the origin are not of this site."""
 
+# Coordinates are rounded to this.
 GRID_M = 0.001
-"""Coordinates are rounded to this."""
 
+# Areas narrower than this everywhere are drawing errors; vertices closer to a straight line are dropped too.
 SLIVER_M = 0.3
-"""Areas narrower than this everywhere are drawing errors; vertices closer to a straight line are dropped too."""
 
 MINIMUM_AREA_M2 = 2.0
 SAME_HEIGHT_M = 0.25
 
+# Formats whose data are OpenStreetMap's.
 OSM_KINDS = ("OSM XML", "Overpass JSON")
-"""Formats whose data are OpenStreetMap's."""
 
+# Forests are cut off this far outside the area of the site: trees there shadow nothing.
 FOREST_MARGIN_M = 1000.0
-"""Forests are cut off this far outside the area of the site: trees there shadow nothing."""
 
 TALLEST_TREE_M = 120.0
+# Distance of the trees of a row without a tagged crown diameter: the default crowns touch.
 ROW_SPACING_M = 10.0
-"""Distance of the trees of a row without a tagged crown diameter: the default crowns touch."""
 
 MAXIMUM_ROW_TREES = 10_000
 

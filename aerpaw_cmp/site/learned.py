@@ -20,11 +20,11 @@ from ..common.files import LARGEST_TABLE, read_bounded, write_whole
 from ..common.yamlfile import StrictModel, dump_yaml, load_yaml
 
 INDEX = "learned.yaml"
+# Since 2 the comments of a tower's table may hold the gain towards both ends at once (:mod:`.pair_gain`).
 FORMAT: Literal["aerpaw-cmp learned 2"] = "aerpaw-cmp learned 2"
-"""Since 2 the comments of a tower's table may hold the gain towards both ends at once (:mod:`.pair_gain`)."""
 
+# Share by which a carrier may differ from the one that an antenna was learned at.
 BAND = 0.02
-"""Share by which a carrier may differ from the one that an antenna was learned at."""
 
 
 class Source(StrictModel):

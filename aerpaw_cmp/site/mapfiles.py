@@ -22,11 +22,11 @@ from .osmfiles import read_elements
 from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, left_out, lonlat
 from .xmlfiles import xml_root
 
+# A map of a whole county is smaller; a site needs a few kilometres.
 MAX_BYTES = 256 * 1024 * 1024
-"""A map of a whole county is smaller; a site needs a few kilometres."""
 
+# Tags of an XML map file, begin and end: each becomes an object in memory.
 MAX_TAGS = 1_500_000
-"""Tags of an XML map file, begin and end: each becomes an object in memory."""
 
 FORMATS = "GeoJSON, OSM XML, Overpass JSON, KML or KMZ"
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from ..common.errors import UsageError
 from ..common.units import SPEED_OF_LIGHT_MPS, VACUUM_PERMITTIVITY_F_PER_M
 
+# Lowest and highest frequency [GHz], a, b, c, d.
 Band = tuple[float, float, float, float, float, float]
-"""Lowest and highest frequency [GHz], a, b, c, d."""
 
 # Usual thickness of a wall or roof [m], None of a half-space (no second face echoes); P.2040-4 table 3. Where bands
 # overlap the first that contains the frequency holds.
@@ -118,15 +118,15 @@ class Material:
         return complex(a * (frequency_hz / 1e9) ** b, -loss)
 
 
+# Names that :func:`material` knows.
 MATERIALS: tuple[str, ...] = tuple(_TABLE)
-"""Names that :func:`material` knows."""
 
+# Name of the crowns' material; not of ITU-R P.2040, and nothing else is made of it.
 CROWN = "vegetation"
-"""Name of the crowns' material; not of ITU-R P.2040, and nothing else is made of it."""
 
 CROWN_PERMITTIVITY = 1.1
+# Leaves and air, averaged. P.833 gives losses only; the permittivity decides the reflection, the loss hardly does.
 CROWN_ATTENUATION_DB_PER_M = 0.5
-"""Leaves and air, averaged. P.833 gives losses only; the permittivity decides the reflection, the loss hardly does."""
 
 
 def lossy_conductivity_s_per_m(permittivity: float, gamma_db_per_m: float) -> float:
@@ -136,8 +136,8 @@ def lossy_conductivity_s_per_m(permittivity: float, gamma_db_per_m: float) -> fl
 
 
 _CROWN_S_PER_M = lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, CROWN_ATTENUATION_DB_PER_M)
+# Crowns as a half-space, 30 MHz to 100 GHz (the scope of P.833).
 VEGETATION = Material(CROWN, ((0.03, 100.0, CROWN_PERMITTIVITY, 0.0, _CROWN_S_PER_M, 0.0),))
-"""Crowns as a half-space, 30 MHz to 100 GHz (the scope of P.833)."""
 
 
 def face_material(name: str) -> Material:
@@ -211,8 +211,8 @@ def _stated(plain: str, said: str, name: str) -> Material:
     return Material(stated_name(band[2], band[4], thickness), (band,), None if thickness is None else thickness or 1e-9)
 
 
+# Begins the name of a material that is not of ITU-R P.2040; its numbers follow.
 CONSTANT = "constant"
-"""Begins the name of a material that is not of ITU-R P.2040; its numbers follow."""
 
 
 def stated_name(permittivity: float, conductivity_s_per_m: float, thickness_m: float | None) -> str:

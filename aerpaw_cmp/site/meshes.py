@@ -17,11 +17,11 @@ from ..common.units import FloatArray, IntArray
 from .materials import CROWN, material
 from .site import Building, Site, Trees
 
+# Walls reach this far below the base of a building.
 WALL_DEPTH_M = 0.5
-"""Walls reach this far below the base of a building."""
 
+# The ground reaches this far beyond the area: reflections must not fall off its edge.
 GROUND_MARGIN_M = 3000.0
-"""The ground reaches this far beyond the area: reflections must not fall off its edge."""
 
 CROWN_SIDES = 8
 TRUNK_SIDES = 6

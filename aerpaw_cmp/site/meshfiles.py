@@ -15,14 +15,14 @@ from ..common.errors import InputError
 from ..common.files import read_input
 from ..common.units import FloatArray, IntArray
 
+# Bytes within which a PLY header ends; a longer one is no header.
 LARGEST_HEADER = 65_536
-"""Bytes within which a PLY header ends; a longer one is no header."""
 
+# Bytes of one mesh file.
 LARGEST_FILE = 2**30
-"""Bytes of one mesh file."""
 
+# A polygon whose corners depart further [m] from the plane of its first three is not flat.
 FLAT_M = 1e-3
-"""A polygon whose corners depart further [m] from the plane of its first three is not flat."""
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",

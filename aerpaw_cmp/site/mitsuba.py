@@ -23,8 +23,8 @@ from .materials import material, stated_name
 from .meshfiles import RawMesh, read_mesh
 from .xmlfiles import xml_root
 
+# Of a slab without a stated thickness, as in Sionna RT.
 DEFAULT_THICKNESS_M = 0.1
-"""Of a slab without a stated thickness, as in Sionna RT."""
 
 LARGEST_XML = 256 * 2**20
 MOST_TRIANGLES = 20_000_000

@@ -14,11 +14,11 @@ from shapely.geometry import Polygon
 
 from ..common.errors import InputError
 
+# Latitude, longitude [deg].
 Position = tuple[float, float]
-"""Latitude, longitude [deg]."""
 
+# What reading one element may raise: the element is left out and listed, the others stay.
 BROKEN_ELEMENT = (InputError, TypeError, KeyError, AttributeError, IndexError, ValueError, OverflowError)
-"""What reading one element may raise: the element is left out and listed, the others stay."""
 
 
 @dataclass(slots=True)
@@ -71,8 +71,8 @@ class MapFile:
         self.notes += other.notes
 
 
+# A ring that crosses itself more often is no outline that could be repaired: the time to try grows without bound.
 MAX_CROSSINGS = 1000
-"""A ring that crosses itself more often is no outline that could be repaired: the time to try grows without bound."""
 
 
 def is_tangled(ring: Polygon) -> bool:

@@ -12,8 +12,8 @@ import numpy as np
 from ..common.gaussian import gaussian_kernel
 from ..common.units import FloatArray
 
+# Share of the variance by which rounded values may miss the function.
 NUGGET = 1e-3
-"""Share of the variance by which rounded values may miss the function."""
 
 _HEAD = re.compile(r"^# pair: length (\S+) sd_db (\S+)$", re.MULTILINE)
 _ROW = re.compile(r"^# pair: (\S+,\S+,\S+,\S+,\S+,\S+)$", re.MULTILINE)

@@ -17,14 +17,14 @@ from .materials import material
 from .mitsuba import TriangleScene, read_scene
 from .site import Building, Site
 
+# A ground plane that is added reaches this many times the size of the scene beyond it.
 PLANE_MARGIN = 10.0
-"""A ground plane that is added reaches this many times the size of the scene beyond it."""
 
+# A scene whose level surfaces cover less of its plan than this has no ground.
 GROUND_SHARE = 0.5
-"""A scene whose level surfaces cover less of its plan than this has no ground."""
 
+# Upward part of the normal above which a surface can be ground.
 LEVEL = 0.7
-"""Upward part of the normal above which a surface can be ground."""
 
 
 def placed_scene(
@@ -151,12 +151,12 @@ def ground_share(scene: TriangleScene) -> float:
 DRAWN_SIMPLER_M = 0.5
 DRAWN_M2 = 10.0
 DRAWN_TALLER_M = 1.0
+# Of the prisms that stand for a scene in pictures: how much simpler, from which area and height
+# on, and how many at most.
 DRAWN_MOST = 3000
-"""Of the prisms that stand for a scene in pictures: how much simpler, from which area and height
-on, and how many at most."""
 
+# A part of a shape that covers more of the plan than this is ground, however hilly.
 GROUND_PART = 0.25
-"""A part of a shape that covers more of the plan than this is ground, however hilly."""
 
 
 def drawn_buildings(site: Site) -> tuple[Building, ...]:

@@ -32,23 +32,23 @@ from .scenes import placed_scene
 from .site import Building, Forest, Geofence, Site, Tower, Trees
 from .trees import Distribution, TreeSizes, join_trees, place_trees, trees_at, wanted_trees
 
+# Sites that come with the package, by name.
 PACKAGED = ("lake_wheeler",)
-"""Sites that come with the package, by name."""
 
+# A tower farther from the origin and from the area is refused.
 FAR_TOWER_M = 10_000.0
-"""A tower farther from the origin and from the area is refused."""
 
+# An outline that reaches farther from the origin is refused.
 FAR_POLYGON_M = 100_000.0
-"""An outline that reaches farther from the origin is refused."""
 
+# Buildings that overlap by less, everywhere, are not told of.
 OVERLAP_M = 0.5
-"""Buildings that overlap by less, everywhere, are not told of."""
 
+# No tree is placed at random closer to a tower: masts stand clear.
 MAST_CLEARANCE_M = 8.0
-"""No tree is placed at random closer to a tower: masts stand clear."""
 
+# A higher building or mast is in feet or centimetres; no structure on Earth reaches it.
 TALLEST_M = 1000.0
-"""A higher building or mast is in feet or centimetres; no structure on Earth reaches it."""
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]

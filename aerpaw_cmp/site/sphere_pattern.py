@@ -199,8 +199,8 @@ def read_sphere_csv(path: str | Path) -> SpherePattern:
     )
 
 
+# Begins the comment that names a calibration and, after ``, from``, its flights.
 LEARNED = "# aerpaw-cmp calibrate: "
-"""Begins the comment that names a calibration and, after ``, from``, its flights."""
 
 
 def _flights_in(text: str) -> tuple[str, ...]:

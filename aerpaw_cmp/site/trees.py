@@ -21,8 +21,8 @@ from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
 from .site import Forest, Trees
 
+# Of one forest.
 MAXIMUM_TREES = 2_000_000
-"""Of one forest."""
 
 _STALLED_ROUNDS = 12  # batches of darts in a row that add less than a thousandth: the forest is full
 

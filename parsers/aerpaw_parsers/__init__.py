@@ -13,13 +13,13 @@ from aerpaw_cmp.logs.readers import Reader
 
 from ._origins import CLOCKS, HEIGHTS
 
+# Modules in the order in which ``aerpaw-cmp formats`` lists them.
 _FORMATS = (
     "vehicle_out", "sounder_log", "flight_mat", "quectel_csv", "quectel_ri", "nemo_csv", "nemo_kml", "drive_test",
     "gnettrack_kml", "pose_csv", "aadm_snr", "controller_log", "srsenb_log", "tap_jsonl", "gpx", "pawprints",
     "srsue_log", "vehicle_log", "quectel_console", "srsran_gnb", "oai_log", "amarisoft", "ardupilot_bin",
     "mavlink_tlog", "px4_ulog", "sigmf", "iq_burst", "own_csv", "generic_csv", "no_log",
 )  # fmt: skip
-"""Modules in the order in which ``aerpaw-cmp formats`` lists them."""
 
 
 def _readers() -> Iterator[Reader]:

@@ -16,10 +16,10 @@ from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
+# An attitude farther in time than this from a position is not that of the position.
 NEAR_S = 0.5
-"""An attitude farther in time than this from a position is not that of the position."""
+# GPS week 0 as UTC seconds of 1970, leap seconds since 2017 taken off.
 _GPS_EPOCH_S = 315_964_800 - 18
-"""GPS week 0 as UTC seconds of 1970, leap seconds since 2017 taken off."""
 
 
 @dataclass
@@ -41,8 +41,8 @@ class Series:
         return np.where(np.abs(self.time_s[best] - time_s) <= NEAR_S, self.columns[name][best], np.nan)
 
 
+# Autopilots count seconds since 1970 or since they were switched on; more is damage, and no room for it in ns.
 _MOST_S = 4e9
-"""Autopilots count seconds since 1970 or since they were switched on; more is damage, and no room for it in ns."""
 
 NONE = Series(np.zeros(0), np.zeros(0, dtype=np.int64))
 

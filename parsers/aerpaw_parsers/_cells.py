@@ -12,11 +12,11 @@ from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Stream
 
+# Radio accesses; the first where a log does not say.
 RATS = ("", "lte", "nr")
-"""Radio accesses; the first where a log does not say."""
 BESIDE = ("rsrq_db", "rssi_dbm", "sinr_db", "pathloss_db")
+# RSRP beyond these is a sentinel (2147483647, 0) or a mistake.
 RANGE_DBM = (-170.0, -1.0)
-"""RSRP beyond these is a sentinel (2147483647, 0) or a mistake."""
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ from aerpaw_cmp.common.units import FloatArray, IntArray
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.records import RejectedLine
 
+# What Android and modems write for 'unavailable'.
 SENTINELS = (2147483647, -2147483648, 9223372036854775807, 268435455, 65535)
-"""What Android and modems write for 'unavailable'."""
 
 
 _MOST_LINES = 5000
+# Bytes of objects over several lines that were looked at in vain [bytes]: a limit on time.
 _MOST_TRIED = 64 << 20
-"""Bytes of objects over several lines that were looked at in vain [bytes]: a limit on time."""
 
 
 @dataclass

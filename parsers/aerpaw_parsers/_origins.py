@@ -6,6 +6,7 @@ _TS = "program: ts on the node, local wall time"
 _GPS = "written: UTC of the GPS"
 _TAKEOFF = "program: DroneKit relative frame, above take-off"
 
+# ``written``, or ``program`` or ``assumed`` with what that is. A text with an offset, or an epoch, is written.
 CLOCKS = {
     "vehicle_out": "program: aerpawlib datetime.now(), local wall time",
     "vehicle_log": _TS,
@@ -39,7 +40,6 @@ CLOCKS = {
     "own_csv": "written: UTC",
     "generic_csv": "written",
 }
-"""``written``, or ``program`` or ``assumed`` with what that is. A text with an offset, or an epoch, is written."""
 
 HEIGHTS = {
     "vehicle_out": _TAKEOFF,

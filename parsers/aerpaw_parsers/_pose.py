@@ -45,8 +45,8 @@ _OF_RECEIVERS = (
     {"time utc usec"},
 )
 _OF_PHONES = {"networktech", "networkmode"}
+# PX4's receiver: positions in 1e-7 degrees, altitudes in mm, where they are whole numbers.
 _PX4_GPS = "time utc usec"
-"""PX4's receiver: positions in 1e-7 degrees, altitudes in mm, where they are whole numbers."""
 _REST_S, _REST_M, _REST_RISE_M = 5.0, 2.0, 0.3
 ANGLES = {
     "roll_deg": (r"(osd |gimbal )?roll( deg| degrees| rad)?",),
@@ -66,8 +66,8 @@ COUNTS = {
 }
 
 
+# No count is so large.
 _MOST = 1e9
-"""No count is so large."""
 
 
 def has_position(names: list[str]) -> bool:

@@ -63,18 +63,18 @@ def quantity(name: str) -> Quantity | None:
     return next((meaning for pattern, meaning in _COMPILED if pattern.search(text)), None)
 
 
+# Columns that it alone has.
 OF_GNETTRACK = ("networktech", "networkmode")
-"""Columns that it alone has."""
 _GNETTRACK = {
     r"level": "rsrp", r"qual": "rsrq", r"psc": "pci", r"nrxlev(\d)": r"rsrp neighbour \1",
     r"nqual(\d)": r"rsrq neighbour \1", r"ncell(\d)": r"pci neighbour \1", r"narfcn(\d)": r"arfcn neighbour \1",
     r"lterssi": "rssi",
 }  # fmt: skip
+# Columns of srsUE's metrics file, whose time counts milliseconds.
 SRSUE = {"time", "cc", "earfcn", "rsrp", "cfo"}
-"""Columns of srsUE's metrics file, whose time counts milliseconds."""
 _SRSUE = {r"pl": "path loss"}
+# By itself the word may be that of any list; beside a level of a cell it is the channel's.
 _BARE = {r"rank": "rank indicator"}
-"""By itself the word may be that of any list; beside a level of a cell it is the channel's."""
 _CELLMAPPER = {r"signal": "rsrp", r"psc or pci": "pci"}
 
 

@@ -24,11 +24,12 @@ from . import _stamps
 from ._quantities import SRSUE, plain
 
 SEPARATORS = (",", ";", "\t", "|")
+# Lines in front of a header, at most.
 TITLES = 60
-"""Lines in front of a header, at most."""
 _NUMBER = re.compile(r"[-+]?\d{0,20}(?:[.,]\d{0,20})?(?:[eE][-+]?\d{1,3})?")
 _UNIT = re.compile(r"[\[(]([^\[\]()]{1,12})[\])]\s*$")
 _A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5%\u00b0]{1,7}(/[a-z]{1,3})?")
+# Units of values as they are read, and what one of each unit that a header may have is in them.
 _READ_IN = {
     "m": {"ft": 0.3048, "feet": 0.3048, "m": 1.0, "meters": 1.0},
     "m/s": {"mph": 0.44704, "m/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kts": 0.514444, "knots": 0.514444},
@@ -39,7 +40,6 @@ _READ_IN = {
     "dB": {"db": 1.0},
     "dBm": {"dbm": 1.0},
 }  # fmt: skip
-"""Units of values as they are read, and what one of each unit that a header may have is in them."""
 _FACTORS = {written: (unit, one) for unit, many in _READ_IN.items() for written, one in many.items()}
 
 IsHeader = Callable[[list[str]], bool]
@@ -239,6 +239,7 @@ def _fitted(fields: list[str], names: list[str]) -> list[str]:
     return [*fields, ""] if len(fields) == len(names) - 1 and not names[-1] else fields
 
 
+# Names of the column of times, the surest first.
 TIME_NAMES = (
     r"time utc usec",
     r"(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| iso| unix)?",
@@ -248,11 +249,10 @@ TIME_NAMES = (
     r"(rel|relative|elapsed) ?time( ms| s)?",
     r"t",
 )
-"""Names of the column of times, the surest first."""
 
 
+# Columns of ulog2csv's tables, whose time counts microseconds since the autopilot was switched on.
 PX4 = {"timestamp", "timestamp sample"}
-"""Columns of ulog2csv's tables, whose time counts microseconds since the autopilot was switched on."""
 
 
 def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str] = ()) -> _rows.Rows | None:
@@ -300,8 +300,8 @@ def _has_decimal_commas(sheet: Sheet) -> bool:
 
 
 _MOST_APART_NS = 1_500_000_000
+# Half of what a time stamp holds.
 _MOST_NS = 2.0**62
-"""Half of what a time stamp holds."""
 
 
 def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:

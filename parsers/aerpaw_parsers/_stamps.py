@@ -25,11 +25,11 @@ _OF_DAY = re.compile(r"T?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?) ?([AaPp][Mm])?"
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,12})?(?:[eE][-+]?\d{1,3})?")
 _COMMON = re.compile((_time.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+# Dates with hyphens or none, and Nemo's year, month, day: its summary of ``24Feb09`` says ``2024 Feb 09``.
 _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
 )
-"""Dates with hyphens or none, and Nemo's year, month, day: its summary of ``24Feb09`` says ``2024 Feb 09``."""
 
 
 def date_in_name(name: str) -> str | None:

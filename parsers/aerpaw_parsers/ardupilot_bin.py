@@ -56,8 +56,8 @@ def _form(body: bytes) -> tuple[int, _Form]:
     return kind, _Form(length, texts[0], texts[1], texts[2].split(","))
 
 
+# Number and values of each message, by its name and the columns that it had: a log may describe a name anew.
 _Rows = dict[str, dict[tuple[str, ...], list[tuple[int, tuple[float, ...]]]]]
-"""Number and values of each message, by its name and the columns that it had: a log may describe a name anew."""
 
 
 def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:

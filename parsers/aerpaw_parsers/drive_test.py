@@ -29,15 +29,15 @@ _NEIGHBOUR = re.compile(
 )
 _NR = re.compile(r"\b(nr|5g|spcell|ss ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss")
 _LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
+# A secondary carrier: it serves beside the primary one.
 _SECONDARY = re.compile(r"\bsc(?:ell|c) ?(\d{0,2})\b")
-"""A secondary carrier: it serves beside the primary one."""
 _NUMBER = re.compile(r"(?:^| )n?(\d{1,2})(?: |$)")
 _BESIDE = {"RSRQ": "rsrq_db", "RSSI": "rssi_dbm", "SINR": "sinr_db", "path loss": "pathloss_db"}
 _TOWER_SNR = re.compile(r"snr (lw\d)")
 
 
+# Columns of tables with a cell a row: whether the cell serves.
 _REGISTERED = (r"(is )?(registered|serving|connected)( cell)?",)
-"""Columns of tables with a cell a row: whether the cell serves."""
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
 
 

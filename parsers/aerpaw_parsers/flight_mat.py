@@ -67,13 +67,13 @@ KPIS = {"RSRQ": ("RSRQ", "dB")}
 _TEXTS = ("timestamp_power_for_csv", "timestamp_for_csv")
 _EPOCHS = ("timestamp_power", "timestamp_meas")
 _UTC, _DECODED = "timestamp_meas", "succes"
+# Levels of files without a clock, and the seconds between rows of the flights that they were made of.
 _PROCESSED = {"RSRP_s": 0.1, "power_all": 0.03276}
-"""Levels of files without a clock, and the seconds between rows of the flights that they were made of."""
 _NAMES = {*TELEMETRY, *LEVELS, *KPIS, *_TEXTS, *_EPOCHS, "mSpeed"}
+# Names that only a flight has.
 _SURE = {*LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
-"""Names that only a flight has."""
+# Raw positions of the LTE flights, which stand in front of their levels; the interpolated ones are read.
 _GPS = re.compile(r"GPS[xyz]")
-"""Raw positions of the LTE flights, which stand in front of their levels; the interpolated ones are read."""
 _COMPRESSED, _MATRIX = 15, 14
 
 
@@ -163,8 +163,8 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
     )
 
 
+# Clock of files that have none.
 COUNTED = "row number"
-"""Clock of files that have none."""
 
 
 def _instants(

@@ -26,10 +26,10 @@ from . import _stamps
 from ._sheet import SEPARATORS
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
+# What may stand beside a rank, or beside a level: the positions of a table merged by hand are its track.
 _BESIDE: dict[str, tuple[str, ...]] = {"rank": EXTRA, "rss": (*COLUMNS["telemetry"][:-2], "sinr_db")}
-"""What may stand beside a rank, or beside a level: the positions of a table merged by hand are its track."""
+# Columns that a record of a kind is about.
 _VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": ("rss_db",), "rank": ("ri_raw",)}
-"""Columns that a record of a kind is about."""
 
 _TEXT = re.compile(_time.TIME + _time.ZONE)
 _PLAIN = re.compile(_lines.NUMBER)
@@ -103,8 +103,8 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
     return options.kind, {column: header.index(name) for column, name in options.columns.items()}
 
 
+# What stands for no value; -inf dB is no signal. Any other word, and +inf, is flagged.
 _NONE = (b"", b"nan", b"na", b"n/a", b"none", b"null", b"-", b"--", b"-inf", b"-infinity")
-"""What stands for no value; -inf dB is no signal. Any other word, and +inf, is flagged."""
 
 
 def _numbers(cells: list[str], comma: bool = False) -> FloatArray:

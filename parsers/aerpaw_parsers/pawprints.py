@@ -23,11 +23,11 @@ _MARKS = (b'"cells"', b'"nr_signal_strength"', b'"connected_pci"', b'"companion_
 
 _TEXT = re.compile(rb"^CELL_LOG_START,(\d{13}),.*?,?CELL_LOG_STOP[ \t]*\r?$", re.MULTILINE)
 _BLOCK = re.compile(rb"BS_INFO_START,([^\n]*?),?BS_INFO_STOP")
+# Places in a block by its technology; LTE with all quantities switched on in the app, as it is delivered.
 _OF_TEXT = {
     b"4G_LTE": {"fields": 19, "connected": 1, "rsrp": 6, "rsrq": 7, "rssi": 8, "sinr": 5, "arfcn": 11, "pci": 12},
     b"5G_NR_SA": {"fields": 19, "connected": 2, "rsrp": 7, "rsrq": 8, "sinr": 9, "arfcn": 13, "pci": 14},
 }
-"""Places in a block by its technology; LTE with all quantities switched on in the app, as it is delivered."""
 
 
 def sniff(head: bytes) -> bool:

@@ -68,17 +68,17 @@ _SA = re.compile(
     + rb",".join([_V] * 3) + rb"," + _C + rb"," + _C + _END,
     re.MULTILINE,
 )  # fmt: skip
+# Kinds of row, and the quantities of their groups; a dot stands for one that is not read.
 _FORMS = (
     (_CSI, "time lte_mcs lte_ri lte_cqi lte_pmi nr5g_mcs nr5g_ri nr5g_cqi nr5g_pmi"),
     (_LTE, "time lte_pci lte_arfcn lte_rsrp . . . nr_pci nr_rsrp nr_sinr . nr_arfcn"),
     (_SA, "time nr_pci nr_arfcn nr_rsrp . nr_sinr"),
 )
-"""Kinds of row, and the quantities of their groups; a dot stands for one that is not read."""
 _ANY = re.compile(rb"^" + _time.TIME + _time.ZONE + rb',"?\+(?:QNWCFG|QENG|QENDC)')
+# 3GPP TS 38.133 table 10.1.6.1-1: reported SS-RSRP lies between -156 and -31 dBm.
 _RSRP_RANGE = (-156.0, -31.0)
-"""3GPP TS 38.133 table 10.1.6.1-1: reported SS-RSRP lies between -156 and -31 dBm."""
+# 3GPP TS 38.133 table 10.1.16.1-1: reported SS-SINR lies between -23 and 40 dB.
 _SINR_RANGE = (-23.0, 40.0)
-"""3GPP TS 38.133 table 10.1.16.1-1: reported SS-SINR lies between -23 and 40 dB."""
 
 
 def sniff(head: bytes) -> bool:

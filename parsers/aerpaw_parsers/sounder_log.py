@@ -219,8 +219,8 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     return repeats, stars.line[chosen], bad
 
 
+# What AERPAW's start scripts and emulator call the three logs: ``2025-01-01_power_log.txt``, ``lw1_snr.txt``.
 _NAMED = re.compile(r"(?<![a-z])(power|quality|snr)(?![a-z])|(?:power|quality|snr)(?=_?log)")
-"""What AERPAW's start scripts and emulator call the three logs: ``2025-01-01_power_log.txt``, ``lw1_snr.txt``."""
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

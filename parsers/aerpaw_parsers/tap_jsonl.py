@@ -35,12 +35,12 @@ from aerpaw_cmp.logs.records import Attribute, Kind, ReadResult, RejectedLine, S
 
 SCHEMA = "aerpaw-cmp-tap/1"
 _CRC = b',"crc":"'
+# RSRP and SINR older than this do not stand beside a rank.
 COMPANION_S = 2.0
-"""RSRP and SINR older than this do not stand beside a rank."""
 
 Columns = dict[str, AnyArray]
+# Line of the log, its record, what was decoded of it, its flags.
 Answer = tuple[int, dict[str, Any], dict[str, Any], list[str]]
-"""Line of the log, its record, what was decoded of it, its flags."""
 
 
 def sniff(head: bytes) -> bool:

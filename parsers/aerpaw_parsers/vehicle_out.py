@@ -52,8 +52,8 @@ _FIELDS = _SEP.join(
 _END = rb"[ ,\t]{0,8}\r?$"
 _MORE = rb"(?:,[^,\n]{0,80})"
 _ROW = re.compile(_FIELDS + _END, re.MULTILINE)
+# A logger that writes further fields behind these: only where most first rows have them: glued rows look so too.
 _LONGER = re.compile(_FIELDS + _MORE + rb"{1,6}" + _END, re.MULTILINE)
-"""A logger that writes further fields behind these: only where most first rows have them: glued rows look so too."""
 _EITHER = re.compile(_FIELDS + _MORE + rb"{0,6}" + _END, re.MULTILINE)
 _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while there is no fix
 

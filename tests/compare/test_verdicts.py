@@ -127,6 +127,7 @@ def difference(trouble: str, draw: Generator) -> Verdict:
     return changed_verdict(pooled, any(value > 0.01 for value in moved), level.measured_max_db > 0.01, changed)
 
 
+# What draws a case, and its troubles, the sound one first.
 KINDS: dict[Callable[[str, Generator], Verdict], tuple[str, ...]] = {
     campaign: ("none", "outlying error", "outlying offset", "gain step"),
     calibration: ("not significant", "better", "worse"),
@@ -135,11 +136,10 @@ KINDS: dict[Callable[[str, Generator], Verdict], tuple[str, ...]] = {
     coverage: ("none", "trees", "blocked", "level", "threshold", "no path", "extrapolated"),
     difference: ("none", "setting", "input", "version", "measured", "unexplained"),
 }
-"""What draws a case, and its troubles, the sound one first."""
 
 
+# Words that accuse nobody; of equal models a 95 % interval gives them in 2.5 %, like each of the other words.
 PRAISE = ("better", "antenna")
-"""Words that accuse nobody; of equal models a 95 % interval gives them in 2.5 %, like each of the other words."""
 
 
 def shares(kind: Callable[[str, Generator], Verdict], cases: int, seed: int = 5) -> tuple[float, float, int]:

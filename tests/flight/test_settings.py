@@ -11,6 +11,7 @@ from aerpaw_cmp.flight.settings import ArraySettings, FlightFile
 POINT = {"east_m": 0, "north_m": 0, "height_m": 5}
 PLAN = {"start": "2025-06-01T10:00:00", "waypoints": [POINT, POINT]}
 TINY = 1e-9
+# Numbers above 0, by the part of a flight file that they stand in.
 POSITIVE = {
     "link.rss": "bandwidth_hz",
     "logs": "frequency_hz",
@@ -18,7 +19,6 @@ POSITIVE = {
     "towers.N": "antenna_height_m",
     "rt.advanced": "gamma_db_per_m maximum_loss_db maximum_gap_s",
 }
-"""Numbers above 0, by the part of a flight file that they stand in."""
 LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
     **{f"{part}.{key}": ([TINY], [0.0]) for part, keys in POSITIVE.items() for key in keys.split()},
     **dict.fromkeys(("flight.plan.fading_db", "rt.reflection_loss_db", "rss.window_s"), ([0.0], [-TINY])),

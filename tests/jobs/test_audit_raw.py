@@ -26,10 +26,10 @@ from aerpaw_cmp.site import antennas, site
 from aerpaw_cmp.site.sphere_pattern import sphere_csv, sphere_grid
 
 ORIGIN = (35.7275, -78.696)
+# Height of the take-off point above the ground of the origin.
 TAKEOFF_M = 2.5
-"""Height of the take-off point above the ground of the origin."""
+# The radios show later times than the telemetry.
 AHEAD_S = 0.8
-"""The radios show later times than the telemetry."""
 
 SITE = f"""
 name: raw

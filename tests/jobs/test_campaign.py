@@ -29,8 +29,8 @@ pytestmark = pytest.mark.usefixtures("few_pictures")
 YAW_DEG = 110.0
 OFFSETS_DB = {"first": 12.3, "second": 9.1}
 FADING_DB = 1.0
+# The start of the plan: 2025-06-01 10:00 in New York, 14:00 UTC.
 START_POSIX_S = 1_748_786_400
-"""The start of the plan: 2025-06-01 10:00 in New York, 14:00 UTC."""
 YAW = "link.rss.tower.yaw_deg"
 
 

@@ -3,8 +3,8 @@
 import math
 import struct
 
+# 2025-03-02 15:00:00.250 UTC.
 START_US = 1_740_927_600_250_000
-"""2025-03-02 15:00:00.250 UTC."""
 COUNT = 5
 
 

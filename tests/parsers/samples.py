@@ -542,18 +542,19 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
     "px4_ulog": {"flight": (autopilots.ulog(), 5, 0)},
     "generic_csv": {"mapped": (GENERIC, 2, 1)},
 }
+# Formats whose account counts rows, values or messages.
 BINARY = ("flight_mat", "iq_burst", "sigmf", "ardupilot_bin", "mavlink_tlog", "px4_ulog")
-"""Formats whose account counts rows, values or messages."""
 CASES = [(reader, name) for reader, samples in SAMPLES.items() for name in samples]
 
+# Readers and samples whose clock is UTC or relative.
 WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
     "nemo_csv", "nemo_kml", "tap_jsonl", "pawprints", "srsran_json", "amarisoft_json", "own_csv",
     "ardupilot_bin", "mavlink_tlog", "px4_ulog",
     ("vehicle_out", "utc_offset"), ("flight_mat", "lte"), ("flight_mat", "processed"), ("gpx", "track"),
     ("drive_test", "srsue_metrics"), ("pose_csv", "airdata"), ("srsran_gnb", "log"), ("oai_log", "frames"), ("oai_log", "ue"),
 )  # fmt: skip
-"""Readers and samples whose clock is UTC or relative."""
 
+# A sample of each kind of file that is no log (the MATLAB ones aside).
 NO_LOGS: dict[str, bytes] = {
     "antenna_pattern": b"2\r\nFrequency=3300(MHz)\r\n\r\nphi theta total\r\n0 0 -1.5\r\n",
     "power_references": b"Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz\nlw1,tx,ch0,0,0.0,-57.5\n",
@@ -580,4 +581,3 @@ NO_LOGS: dict[str, bytes] = {
     "flight_plan": b'{\n    "fileType": "Plan",\n    "geoFence": {},\n    "mission": {"items": []}\n}\n',
     "flight_yaml": b"flight:\n  name: f\nsite: lake_wheeler\nlogs:\n  - {path: a.txt}\n",
 }
-"""A sample of each kind of file that is no log (the MATLAB ones aside)."""

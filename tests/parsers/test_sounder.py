@@ -9,8 +9,8 @@ from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_parsers import sounder_log
 from tests.parsers.samples import OPTIONS
 
+# 10:00 in New York.
 BEGIN = np.datetime64("2025-03-02T15:00:00")
-"""10:00 in New York."""
 
 
 def line(second: int, rest: str) -> str:

@@ -785,13 +785,13 @@ INSTANTS = {
     "new year, in winter": datetime(2024, 12, 31, 18, 59, 59, tzinfo=NEW_YORK),
 }
 VALUES = [3, 1, 2, 4]
+# Where a value comes out, its sign, and what the row writes above it.
 COLUMNS = {
     "level": ("rss_db", 1, 0.5),
     "-level": ("rss_db", -1, 0.0),
     "altitude_m": ("altitude_m", 1, 0.5),
     "above the first": ("altitude_m", 1, -3.0),
 }
-"""Where a value comes out, its sign, and what the row writes above it."""
 
 
 def written(form: Form, begin: datetime) -> tuple[str, list[np.datetime64]]:

@@ -324,11 +324,11 @@ def test_law_of_reflection_and_reciprocity(scenes, seed):
 
 
 BOUNCE, NORMAL = mirror_geometry(20.0, 10.0, 5.0, 100.0)
+# Ends that see each other over side 5 of a crown at (100, 0): its normal points west and up.
 ENDS = tuple(
     BOUNCE + length * (NORMAL + side * np.array([-NORMAL[1], NORMAL[0], 0.0]))
     for length, side in ((40, 0.5), (50, -0.5))
 )
-"""Ends that see each other over side 5 of a crown at (100, 0): its normal points west and up."""
 
 
 def middle(a, b, share=0.5):

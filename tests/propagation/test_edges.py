@@ -92,8 +92,8 @@ def test_the_audit_sees_a_path_over_an_edge_that_is_not_there() -> None:
         assert found.doubtful == 0
 
 
+# Two edges that meet are crossed so near their corner that the iteration has not ended: nothing is judged there.
 NEAR_A_CORNER_M = 1.0
-"""Two edges that meet are crossed so near their corner that the iteration has not ended: nothing is judged there."""
 
 
 class ByForce:

@@ -21,8 +21,8 @@ from aerpaw_cmp.site.site import Forest, Site, Tower
 from aerpaw_cmp.site.siteyaml import load_site
 
 FRAME, WAVELENGTH = SiteFrame(35.7, -78.7), 0.09
+# Loss in proportion to depth, too weak for a detour to matter; and so much that detours alone are left.
 WEAK, WALL = P833(1e-3, 1e3), P833(1e9, 1e9)
-"""Loss in proportion to depth, too weak for a detour to matter; and so much that detours alone are left."""
 
 
 def wood(area: Polygon, height: float = 20.0, **more: Any) -> Site:

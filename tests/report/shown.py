@@ -23,13 +23,13 @@ from aerpaw_cmp.report.prediction_words import first_words
 from benchmarks import fabricated
 
 Fixture = Callable[[str], Any]
+# Words of the made-up records themselves.
 DATA = (
     "made for a test", "Towers of another source differ by up to 9 m.", "repeated lines were re-expanded from",
     "Tower heights are 10 m.", "A season that was never flown", "samples (expected at least", "settings flights",
     "fields instead of", "a null of the two-ray pattern", "everything else is synthetic", "of woodland covers",
     "A synthetic flight sample was replayed",
 )  # fmt: skip
-"""Words of the made-up records themselves."""
 
 
 def _written(write: Callable[[Any, Path], Any], data: Any, name: str) -> str:

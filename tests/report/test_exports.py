@@ -259,8 +259,8 @@ def zeros_for_missing(monkeypatch, data):
     return changed(points.of_report(data), lambda table: table.fillna(dict.fromkeys(values, 0.0)))
 
 
+# Its lines show no missing value either.
 WITHOUT_UNITS = ("kmz",)
-"""Its lines show no missing value either."""
 
 
 SHOWN = [(name, fault) for fault in (swap_places, shift_time, wrong_unit, zeros_for_missing) for name in formats.FORMATS

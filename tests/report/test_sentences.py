@@ -178,8 +178,8 @@ class Text(HTMLParser):
             self.blocks[-1] += data
 
 
+# Names without a capital.
 ENGINES = {"image", "sionna"}
-"""Names without a capital."""
 SKIPPED = ("script", "style", "td", "pre", "code", "svg")
 
 

@@ -14,8 +14,8 @@ from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.siteyaml import load_site
 
 FRAME = SiteFrame(35.7, -78.7)
+# Centres of cells of one metre.
 EAST, NORTH = np.meshgrid(np.arange(-99.5, 100.0), np.arange(-79.5, 80.0))
-"""Centres of cells of one metre."""
 
 
 def raster(height: np.ndarray) -> Dem:

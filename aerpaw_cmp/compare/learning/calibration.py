@@ -21,16 +21,16 @@ from ..rss import local_mean_db
 from ..spread import Spread, StatedSpread, fading_of, inside_shares
 
 SECTORS = 6
+# Directions this near a left-out sector are not learned from either.
 GUARD_DEG = 10.0
-"""Directions this near a left-out sector are not learned from either."""
 
 STRETCHES = 8
 GUARD_S = 20.0
 CRUISE_M = 5.0
 LEAST_SAMPLES = 50
 
+# Fields of :class:`Score` that a learned model is held against, with their titles.
 BASELINES = {f"{name}_rmse_db": BASELINE_TITLE[name] for name in ("free_space", "log_distance", "constant")}
-"""Fields of :class:`Score` that a learned model is held against, with their titles."""
 
 SPLITS = ("flight_left_out", "altitude_left_out", "heading_left_out", "sector_left_out", "route_left_out")
 
@@ -142,8 +142,8 @@ class Learned:
         return known if self.fit is None else known + _mean_along(self.fit, samples)
 
 
+# A UAV hardly turns within this time [s].
 FINE_S = 0.5
-"""A UAV hardly turns within this time [s]."""
 
 
 def _mean_along(fit: GainFit, samples: LinkSamples) -> FloatArray:
@@ -263,8 +263,8 @@ def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None)
     )
 
 
+# Of a line over log distance: times free space.
 STEEPEST = 3.0
-"""Of a line over log distance: times free space."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,8 +304,8 @@ def flights_of(observed: Sequence[Observed]) -> list[str]:
     return list(dict.fromkeys(o.samples.flight for o in observed))
 
 
+# Flights are left out one by one, or, where they are more, in this many groups: none is predicted by itself.
 MOST_GROUPS = 6
-"""Flights are left out one by one, or, where they are more, in this many groups: none is predicted by itself."""
 
 
 def groups_of(flights: Sequence[str]) -> list[list[str]]:
@@ -346,8 +346,8 @@ def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]
     return {antenna: float(np.nanmean(values)) for antenna, values in each.items() if np.isfinite(values).any()}
 
 
+# Samples of a series at which standard deviations are checked: each costs a thousand times what its mean does.
 SPREAD_SAMPLES = 400
-"""Samples of a series at which standard deviations are checked: each costs a thousand times what its mean does."""
 
 
 def _scored_with(o: Observed, learned: Learned, offset_db: float, *, spread: bool) -> Score | None:
@@ -366,8 +366,8 @@ def _scored_with(o: Observed, learned: Learned, offset_db: float, *, spread: boo
     return dataclasses.replace(fitted, rmse_shared_offset_db=math.hypot(fitted.rmse_db, fitted.offset_db - offset_db))
 
 
+# Of more flights, this many are scored part by part, evenly over their order.
 MOST_SCORED = 6
-"""Of more flights, this many are scored part by part, evenly over their order."""
 
 
 def spread_flights(flights: Sequence[str]) -> list[str]:
@@ -375,9 +375,9 @@ def spread_flights(flights: Sequence[str]) -> list[str]:
     return [flights[i] for i in spread_out(len(flights), MOST_SCORED)]
 
 
+# ``parts(scored, other)``: per part the samples (n,) of the scored series in it, and those (m,) of another series that
+# may be learned from.
 Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]
-"""``parts(scored, other)``: per part the samples (n,) of the scored series in it, and those (m,) of another series that
-may be learned from."""
 
 
 def parts_left_out(

@@ -22,28 +22,30 @@ from ..statistics import mean_interval
 from .calibration import MOST_GROUPS, groups_of
 from .field_gp import NEW_FLIGHT, PARTS, FieldFit, FieldModel, Part, Rows, fit_field
 
+# Level above free space (n,) and its standard deviation (n,) [dB] of samples whose residual is not used.
 Predictor = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
-"""Level above free space (n,) and its standard deviation (n,) [dB] of samples whose residual is not used."""
 
+# Learns from samples whose residual is measured minus free space.
 Base = Callable[[Sequence[LinkSamples]], Predictor]
-"""Learns from samples whose residual is measured minus free space."""
 
 HeldOut = tuple[FloatArray, FloatArray]
 
+# Residuals are means over this time [s].
 BIN_S = 4.0
-"""Residuals are means over this time [s]."""
 
+# Side of the blocks of a single flight that are left out.
 BLOCK_M = 300.0
-"""Side of the blocks of a single flight that are left out."""
 
+# Of more flights than :data:`~.calibration.MOST_GROUPS`, so many groups are left out in turn, and the strengths of a
+# residual field that are learned without the first serve for all: one flight among many hardly moves them.
 SCORED_GROUPS = 3
-"""Of more flights than :data:`~.calibration.MOST_GROUPS`, so many groups are left out in turn, and the strengths of a
-residual field that are learned without the first serve for all: one flight among many hardly moves them."""
 
 OFF = "no correction"
 
 _NUISANCE = ("drift_sd_db", "drift_s", "noise_sd_db")
 
+# Scales of the place part that are tried; drift and noise always come from the likelihood. Between few flights the
+# likelihood alone confuses place with direction and height: measured, free lengths lost 0.3 dB on flights left out.
 _STARTS: dict[str, FieldModel | None] = {
     OFF: FieldModel(place_sd_db=1e-3, turn=math.inf, drift_s=8.0),
     "field of 2 dB, 30 m": FieldModel(place_sd_db=2.0, length_m=30.0, height_m=20.0, turn=0.35, drift_s=8.0),
@@ -51,8 +53,6 @@ _STARTS: dict[str, FieldModel | None] = {
     "field of 1.5 dB, 50 m": FieldModel(place_sd_db=1.5, length_m=50.0, height_m=40.0, turn=math.inf, drift_s=8.0),
     "field by likelihood": None,
 }
-"""Scales of the place part that are tried; drift and noise always come from the likelihood. Between few flights the
-likelihood alone confuses place with direction and height: measured, free lengths lost 0.3 dB on flights left out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -272,8 +272,8 @@ def _score_fold(
             tallies[title].append((error, np.sqrt(sd**2 + gain_sd**2 + model.noise_sd_db**2)))
 
 
+# Titles of residual fields without free lengths, which remember places.
 STATED_FIELDS = tuple(title for title, start in _STARTS.items() if start is not None)
-"""Titles of residual fields without free lengths, which remember places."""
 
 
 def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Sequence[str] = ()) -> Correction:
@@ -364,8 +364,8 @@ def fixed_base(gain: Callable[[LinkSamples], FloatArray]) -> Base:
     return learn
 
 
+# Of more samples at a time, a model of directions is evaluated once per degree of direction.
 MOST_DIRECTIONS = 5_000
-"""Of more samples at a time, a model of directions is evaluated once per degree of direction."""
 
 
 def by_degree(predictor: Predictor) -> Predictor:

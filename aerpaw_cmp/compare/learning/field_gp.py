@@ -27,29 +27,29 @@ from ..direction_gain import LinkSamples, factor_of
 Part = Literal["mean", "place", "offset", "drift"]
 PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
 
+# Of the unknown mean: free in effect, and still a proper covariance.
 MEAN_SD_DB = 100.0
-"""Of the unknown mean: free in effect, and still a proper covariance."""
 
+# Rows of the exact solution: one matrix of 72 MB.
 EXACT_ROWS = 3000
-"""Rows of the exact solution: one matrix of 72 MB."""
 
+# Rows squared times targets: beyond it (some ten seconds) only the nearest rows of a target are used.
 EXACT_WORK = 2.0e11
-"""Rows squared times targets: beyond it (some ten seconds) only the nearest rows of a target are used."""
 
+# Rows of the approximation for a single target, and at most for targets that share them.
 NEAREST, MOST_NEAREST = 40, 160
-"""Rows of the approximation for a single target, and at most for targets that share them."""
 
+# Side of the cells in scaled space whose targets share their rows.
 TOGETHER = 0.25
-"""Side of the cells in scaled space whose targets share their rows."""
 
+# Rows of one channel from which scales are learned.
 FIT_ROWS = 700
-"""Rows of one channel from which scales are learned."""
 
+# Targets at a time; bounds the memory.
 AT_ONCE = 1024
-"""Targets at a time; bounds the memory."""
 
+# Code of a flight that no row has.
 NEW_FLIGHT = -1
-"""Code of a flight that no row has."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +78,7 @@ class FieldModel:
     noise_sd_db: float = 1.5
 
 
+# What may be learned, and between which values.
 BOUNDS: dict[str, tuple[float, float]] = {
     "place_sd_db": (0.05, 12.0),
     "length_m": (10.0, 300.0),
@@ -87,7 +88,6 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "drift_s": (3.0, 600.0),
     "noise_sd_db": (0.2, 12.0),
 }
-"""What may be learned, and between which values."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -336,8 +336,8 @@ class FieldFit:
         return mean_of[member], sd_of[member]
 
 
+# Targets of smaller cells have their own rows: many at a time are as cheap.
 FEWEST_TOGETHER = 8
-"""Targets of smaller cells have their own rows: many at a time are as cheap."""
 
 
 def _cells(places: FloatArray, step: int) -> Iterator[tuple[IntArray, bool]]:

@@ -11,11 +11,11 @@ import numpy as np
 
 from .calibration import Observed, Recipe, flights_of, learn, score
 
+# Of each number of flights; where there are more subsets, those of neighbouring flights are taken.
 MOST_FITS = 6
-"""Of each number of flights; where there are more subsets, those of neighbouring flights are taken."""
 
+# Numbers of flights that are tried.
 MOST_SIZES = 6
-"""Numbers of flights that are tried."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,8 +17,8 @@ from ...common.units import FloatArray
 from ..direction_gain import GainFit, GainModel, LinkSamples, fit_gain
 from .field_gp import NEW_FLIGHT, FieldFit, FieldModel, Part, Rows
 
+# Name of the flight to come.
 PLANNED = "planned"
-"""Name of the flight to come."""
 
 
 @dataclass(frozen=True, kw_only=True)

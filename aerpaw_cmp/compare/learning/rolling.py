@@ -19,11 +19,11 @@ from .field_gp import FieldModel, Rows, covariance
 BIN_S = 2.0
 KEEP = 150
 LEAST = 8
+# A trend is judged by what it says of levels so much later [s].
 AHEAD_S = 20.0
-"""A trend is judged by what it says of levels so much later [s]."""
 
+# Weight of an older error against that of the next bin.
 FORGET = 0.98
-"""Weight of an older error against that of the next bin."""
 
 LENGTHS_M = (30.0, 120.0)
 SPEED_MPS = 8.0

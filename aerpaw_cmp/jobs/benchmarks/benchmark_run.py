@@ -25,8 +25,8 @@ from ...common.stages import Progress, begin_peak, peak_mib, silent
 from ...common.versions import utc_now
 from . import benchmark, entrants
 
+# By task and entrant.
 Scores = dict[str, dict[str, dict[str, Any]]]
-"""By task and entrant."""
 
 
 @dataclass(frozen=True, slots=True)

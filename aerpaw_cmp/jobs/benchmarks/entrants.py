@@ -27,11 +27,11 @@ from ..learning.calibrate import learned_antennas
 from ..learning.calibrate_rank import RankFitSettings, Tried
 from .benchmark import KEY, RANKS, Bench, Question, keys, questions, utc_texts
 
+# Level above free space (n,) of samples [dB], up to a constant.
 GainOf = Callable[[Observed], FloatArray]
-"""Level above free space (n,) of samples [dB], up to a constant."""
 
+# Level and standard deviation (n,) [dB].
 Answer = tuple[FloatArray, FloatArray]
-"""Level and standard deviation (n,) [dB]."""
 
 Entrant = Callable[[Question, Bench], list[Answer]]
 
@@ -91,8 +91,8 @@ def _two_ray(o: Observed, data: FlightData, series: RssSeries) -> FloatArray:
     return np.asarray(level - o.free_space_db)
 
 
+# Loss (n,) [dB] at distances and heights (n,) [m] and a carrier [Hz].
 Loss = Callable[[FloatArray, FloatArray, float], FloatArray]
-"""Loss (n,) [dB] at distances and heights (n,) [m] and a carrier [Hz]."""
 
 
 def _standard(loss_db: Loss, o: Observed, data: FlightData, series: RssSeries) -> FloatArray:
@@ -206,8 +206,8 @@ LEVEL: dict[str, Entrant] = {
     "boosted_trees": _trees,
 }
 
+# Minutes per flight, and the paths of ``replay_drafted``.
 ONLY_ON_DEMAND = ("replay_sionna",)
-"""Minutes per flight, and the paths of ``replay_drafted``."""
 
 
 def _rank_constant(bench: Bench, train: Sequence[str], flight: str) -> list[FloatArray]:

@@ -25,8 +25,8 @@ from .campaign_plan import compute, kept_outcomes
 from .campaign_tasks import Task, counted_once, flight_data, outcome_store
 from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
 
+# Label of the only setting of a campaign that names none.
 AS_WRITTEN = "as written"
-"""Label of the only setting of a campaign that names none."""
 
 
 class CampaignFile(GroupedSettings):

@@ -34,8 +34,8 @@ from ...site.learned import LearnedLock, Source
 from .calibrate_lock import learned_locks, lock_words
 from .calibrate_rank import RankFitSettings
 
+# Heights of roughness that are tried [m]; infinite is no ground ray.
 ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
-"""Heights of roughness that are tried [m]; infinite is no ground ray."""
 
 
 class PatternsSettings(StrictModel):

@@ -32,9 +32,10 @@ from ...propagation.arrays import Link, Poses
 from ...propagation.drivers.geometries import Geometry, every_geometry, singular_values_of
 from ...site.learned import read_table
 
+# First key of a receiver file.
 FORMAT = "aerpaw-cmp receiver 1"
-"""First key of a receiver file."""
 
+# Ways to slant the four ports of a modem: two diagonals, two upright and two lying, all alike.
 SLANTS_DEG: tuple[tuple[float, ...], ...] = (
     (45.0, -45.0, 45.0, -45.0), (45.0, -45.0, -45.0, 45.0), (45.0, 45.0, -45.0, -45.0),
     (-45.0, 45.0, -45.0, 45.0), (-45.0, 45.0, 45.0, -45.0), (-45.0, -45.0, 45.0, 45.0),
@@ -42,7 +43,6 @@ SLANTS_DEG: tuple[tuple[float, ...], ...] = (
     (90.0, 0.0, 90.0, 0.0), (90.0, 0.0, 0.0, 90.0), (90.0, 90.0, 0.0, 0.0),
     (0.0, 0.0, 0.0, 0.0), (90.0, 90.0, 90.0, 90.0),
 )  # fmt: skip
-"""Ways to slant the four ports of a modem: two diagonals, two upright and two lying, all alike."""
 
 
 class RankFitSettings(StrictModel):

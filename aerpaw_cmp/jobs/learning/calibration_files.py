@@ -37,11 +37,11 @@ from ...site.sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sph
 from .calibrate import Calibration, CalibrationFile
 from .calibrate_rank import RankCalibration
 
+# First words of calibrated.yaml, by which an own earlier output is known.
 MARK = "# aerpaw-cmp calibrate"
-"""First words of calibrated.yaml, by which an own earlier output is known."""
 
+# Share of the variance over both directions that the stored directions leave, and their largest number.
 PAIR_SHARE, MOST_PAIRS = 0.01, 400
-"""Share of the variance over both directions that the stored directions leave, and their largest number."""
 
 
 def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
@@ -339,11 +339,11 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
     )
 
 
+# Of a series: their standard deviations stand for its mean.
 SD_SAMPLES = 200
-"""Of a series: their standard deviations stand for its mean."""
 
+# Between flights, before any was left out: counts as two flights.
 OFFSET_SD_DB = 1.5
-"""Between flights, before any was left out: counts as two flights."""
 
 
 def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:

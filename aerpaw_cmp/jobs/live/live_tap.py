@@ -18,8 +18,8 @@ from ...live.session import TapSettings, TapStatus, TapSummary
 from ...live.stop import Stop
 from ...live.tap import run_tap
 
+# Environment variable with the token of a page beyond the loopback: so that it outlives a restart of the tap.
 TOKEN = "AERPAW_CMP_WEB_TOKEN"
-"""Environment variable with the token of a page beyond the loopback: so that it outlives a restart of the tap."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,11 +32,11 @@ from ...report.live_page import LiveMap
 from ...site.site import Site
 
 MAP_HEIGHTS_M = (10.0, 30.0, 50.0, 70.0, 90.0, 110.0)
+# Cells on the longer side of the map behind the flight.
 MAP_CELLS = 70
-"""Cells on the longer side of the map behind the flight."""
 ROUTE_STEP_S = 2.0
+# Points of the rest of the route in one record.
 ROUTE_SHOWN = 40
-"""Points of the rest of the route in one record."""
 DEMO_OFFSET_DB = -38.0
 DEMO_FADING_DB = 2.5
 

@@ -60,22 +60,22 @@ from ..tasks.manifest import site_inputs
 from ..tasks.outcomes import code_digest
 from ..tasks.workers import Here, Lost, Workers
 
+# Modes of the trees, from no loss to total loss; the paper's is the last.
 FOLIAGE = ("none", "attenuating", "opaque")
-"""Modes of the trees, from no loss to total loss; the paper's is the last."""
 
 RATIOS = ("spread", "condition")
 
+# Those of the paper.
 INTERPOLATORS = ("Kriging", "makima", "spline")
-"""Those of the paper."""
 
+# Receivers, positions times heights, beyond which a map is written tile by tile.
 TILED_ABOVE = 1_000_000
-"""Receivers, positions times heights, beyond which a map is written tile by tile."""
 
+# Positions along a side of a tile: some 0.7 MB of values per tower, height and foliage mode.
 TILE_CELLS = 128
-"""Positions along a side of a tile: some 0.7 MB of values per tower, height and foliage mode."""
 
+# Of a map in tiles, as many positions are drawn and exported beside the store.
 SHOWN_POSITIONS = 20_000
-"""Of a map in tiles, as many positions are drawn and exported beside the store."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,8 +168,8 @@ class MapSettings:
         return self.radius_m * max(1.0, self.spacing_m / cells.PAPER_SPACING_M)
 
 
+# A coarse map in seconds: what ``--quick`` puts in place of the paper's settings.
 QUICK: dict[str, Any] = {"spacing_m": 120.0, "rss_altitudes_m": (30.0, 110.0), "rank_altitudes_m": (3.0, 30.0, 110.0)}
-"""A coarse map in seconds: what ``--quick`` puts in place of the paper's settings."""
 
 
 def map_settings(given: Mapping[str, Any], *, quick: bool = False) -> MapSettings:

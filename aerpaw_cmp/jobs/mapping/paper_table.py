@@ -19,8 +19,8 @@ from ...report.maps.data import PaperRow
 from ...report.names import k_key
 from .coverage_map import INTERPOLATORS, MapOutcome
 
+# Horizontal distance of "near the tower" in the rows about rank 2.
 NEAR_M = 150.0
-"""Horizontal distance of "near the tower" in the rows about rank 2."""
 
 WORDS = {"zero": "Z as rank 0", "missing": "Z left out"}
 

@@ -23,8 +23,8 @@ from .predict import RANKS
 
 NEAR_M = 30.0
 NEAR_UP_M = 15.0
+# A sample is scored by the nearest predicted point within these distances [m] whose nose differs by less [deg].
 TURNED_DEG = 45.0
-"""A sample is scored by the nearest predicted point within these distances [m] whose nose differs by less [deg]."""
 
 FEWEST = 20
 

@@ -32,21 +32,21 @@ from .predict import site_of
 from .sources import NamedFlight, files_of, named_flights, sources_of
 from .where import Asked, Targets, find_targets, level_samples
 
+# Target: all directions of the tower seen from the UAV, at all headings.
 SPHERE = "sphere"
-"""Target: all directions of the tower seen from the UAV, at all headings."""
 
 SPHERE_AWAY_M = 150.0
+# Per antenna, while candidates are ranked.
 MOST_TARGETS = 600
-"""Per antenna, while candidates are ranked."""
 
+# At points of a target whose heading is open.
 HEADINGS = 4
-"""At points of a target whose heading is open."""
 
+# A target that lies farther outside the geofence throughout, or a geofence outside the site, is refused.
 FARTHEST_M = 1000.0
-"""A target that lies farther outside the geofence throughout, or a geofence outside the site, is refused."""
 
+# Of the battery, for what a longer flight buys.
 SHARES = (0.25, 0.5, 0.75, 1.0, 1.5)
-"""Of the battery, for what a longer flight buys."""
 
 ALLOWED_OUTSIDE_M = 1.0
 
@@ -102,8 +102,8 @@ class Ranked:
         return {"name": self.route.name, "sd_db": self.sd_db, **length, "refused": self.refused}
 
 
+# Route, pattern (None of a file), and why it may not be flown.
 Candidate = tuple[Route, Pattern | None, str]
-"""Route, pattern (None of a file), and why it may not be flown."""
 
 
 def plan_flight(
@@ -385,8 +385,8 @@ def _over(sd_db: Mapping[str, FloatArray]) -> FloatArray:
     return np.asarray(np.sqrt(np.mean([sd**2 for sd in sd_db.values()], axis=0)))
 
 
+# Candidates of which the best one counts at each length: a pattern of fewer legs may lie better.
 CURVE_OF = 3
-"""Candidates of which the best one counts at each length: a pattern of fewer legs may lie better."""
 
 
 def _curve(

@@ -51,26 +51,26 @@ from .sources import (
 )
 from .where import Asked, Targets, find_targets, flight_of, is_settings
 
+# Directions of the nose that count alike where it is not known.
 HEADINGS = 8
-"""Directions of the nose that count alike where it is not known."""
 
+# Targets that are predicted together: bounds the memory.
 AT_ONCE = 50_000
-"""Targets that are predicted together: bounds the memory."""
 
 RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
 
 TILE_M = 100.0
 
+# Targets at which the channel matrices of a receiver are evaluated.
 MOST_RANKED = 50_000
-"""Targets at which the channel matrices of a receiver are evaluated."""
 
+# Distance that counts as much as a turn of 60 degrees, where a target stands for its neighbours.
 NOSE_M = 50.0
-"""Distance that counts as much as a turn of 60 degrees, where a target stands for its neighbours."""
 
 FLAG_CODES = {name: code for code, name in enumerate(["", *FLAGS])}
 
+# Receiver of each tower, the link that says its arrays, and the folder of their files.
 Receivers = Mapping[str, tuple[FittedReceiver, LinkSettings, Path]]
-"""Receiver of each tower, the link that says its arrays, and the folder of their files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -572,8 +572,8 @@ def run_predict(
     return JobOutcome(folder=folder, metrics=prediction_metrics(prediction.page), files=files)
 
 
+# Cells of a grid that is also written as pictures for Google Earth.
 MOST_CELLS = 50_000
-"""Cells of a grid that is also written as pictures for Google Earth."""
 
 
 def write_maps(prediction: Prediction, grid: Grid, folder: Path) -> tuple[list[Path], list[str]]:

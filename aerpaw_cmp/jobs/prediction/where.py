@@ -20,11 +20,11 @@ from ...maps.grid import Grid
 from ...propagation.arrays import rotation_from_aircraft
 from ...site.site import Site
 
+# Between points of a route that is given by its corners [m].
 STEP_M = 10.0
-"""Between points of a route that is given by its corners [m]."""
 
+# Of a route without times.
 SPEED_MPS = 8.0
-"""Of a route without times."""
 
 MOST_POINTS = 2_000_000
 

@@ -36,23 +36,23 @@ from ...propagation.search.sionna import free_memory
 from ...site.site import Site
 from .audit_raw import raw_checked
 
+# Logged attitudes that are turned into rotations a second time.
 ATTITUDE_ROWS = 200
-"""Logged attitudes that are turned into rotations a second time."""
 
+# Both are float64; telemetry instants are exact to a nanosecond.
 ATTITUDE_TOLERANCE_RAD = 1e-6
-"""Both are float64; telemetry instants are exact to a nanosecond."""
 
+# Of all series together, at least three each: some 0.1 s apiece.
 REFERENCE_LINKS_AT_MOST = 64
-"""Of all series together, at least three each: some 0.1 s apiece."""
 
 TIMES = "The time of the engine is its share for the audited links; that of the reference includes its start-up."
 
+# What no audit of the replay can see.
 NOT_COVERED = (
     "whether reflection off smooth half-spaces and flat walls is what the place does",
     "positions of footprints and trees; intervals",
     "geometry of paths off crowns; terrain that blocks",
 )
-"""What no audit of the replay can see."""
 
 
 def audit_replays(
@@ -167,8 +167,8 @@ def _of_series(
     )
 
 
+# At so many moments a tower that moves is audited as one that stands where it was then; each is a scene of its own.
 MOMENTS = 6
-"""At so many moments a tower that moves is audited as one that stands where it was then; each is a scene of its own."""
 
 
 def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected]]:

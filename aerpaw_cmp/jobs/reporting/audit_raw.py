@@ -31,21 +31,21 @@ from ...propagation.check.raw import LOWEST_M, Log, Matrix, Pose, RawPath, Readi
 from ...propagation.check.reference import Mirror, Reference
 from ...site.site import Tower
 
+# Of all RSS series together, at least three of each; and moments of the track between its rows.
 SAMPLES = 48
-"""Of all RSS series together, at least three of each; and moments of the track between its rows."""
 
+# Larger logs are not read twice: a report of some gigabytes stays quick.
 LARGEST_LOG = 1 << 25
-"""Larger logs are not read twice: a report of some gigabytes stays quick."""
 
+# From the site's origin; beyond it the plane of the second way parts from the geodesic.
 FURTHEST_M = 5_000.0
-"""From the site's origin; beyond it the plane of the second way parts from the geodesic."""
 
+# Largest differences by kind, with the unit. Coherent levels have more in fades, as much as 0.01 rad does there.
 TOLERANCES = {
     "time": (1e-3, "s"), "position": (0.005, "m"), "rotation": (1e-5, "rad"), "measured level": (1e-3, "dB"),
     "simulated level": (0.01, "dB"), "compared level": (1e-6, "dB"), "offset": (1e-6, "dB"), "RMSE": (1e-6, "dB"),
     "tower": (0.005, "m"), "rank": (0.5, ""), "clock": (1e-6, "s"),
 }  # fmt: skip
-"""Largest differences by kind, with the unit. Coherent levels have more in fades, as much as 0.01 rad does there."""
 
 
 @dataclass(slots=True)
@@ -436,8 +436,8 @@ class _Series:
         return float(self.series.measured_db[row]) - 10 * math.log10(value) if value > 0 else math.nan
 
 
+# Clocks nearer to the telemetry's have no sign to see; samples; the opposite must be better by a tenth to fail.
 LEAST_AHEAD_S, CLOCK_SAMPLES, WRONG_SIGN = 0.2, 60, 0.9
-"""Clocks nearer to the telemetry's have no sign to see; samples; the opposite must be better by a tenth to fail."""
 
 
 def _value(reading: Reading, series: RssSeries, log: LogSettings) -> float | None:

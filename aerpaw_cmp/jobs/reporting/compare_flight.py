@@ -53,19 +53,19 @@ from ...site.site import Site
 from .levels import Levels, at_samples, levels_of, stated_spread
 from .likely_cause import cause_of
 
+# Both sides are averaged over these windows to see how much of the error is fading.
 AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
-"""Both sides are averaged over these windows to see how much of the error is fading."""
 
 AVERAGING_WAVELENGTHS = 40
+# And over stretches of path, each of which counts once, however long the UAV hovered there.
 AVERAGING_LENGTH_M = 20.0
-"""And over stretches of path, each of which counts once, however long the UAV hovered there."""
 
+# Two passes of one place, first and second half of a flight, come this near.
 PASSES_WITHIN_M = 3.0
-"""Two passes of one place, first and second half of a flight, come this near."""
 
 
+# A shorter stretch of large error is a fade.
 SHORTEST_S = 5.0
-"""A shorter stretch of large error is a fade."""
 
 
 def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
@@ -82,8 +82,8 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     )
 
 
+# A prediction of another cell at most this long before or after stands for the moment: phones report once a second.
 SERVING_WITHIN_S = 1.5
-"""A prediction of another cell at most this long before or after stands for the moment: phones report once a second."""
 
 
 def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> ServingComparison | None:

@@ -38,26 +38,26 @@ from ...site.site import Site
 from ...site.sphere_pattern import SpherePattern
 from .levels import Levels, levels_of
 
+# Loss of the weakened ground reflection: a smooth half-space reflects more than any field.
 WEAK_GROUND_DB = 10.0
-"""Loss of the weakened ground reflection: a smooth half-space reflects more than any field."""
 
+# Per series; of longer ones every second, third, ... sample is taken.
 MOST_SAMPLES = 4000
-"""Per series; of longer ones every second, third, ... sample is taken."""
 
 AS_SET = "as set in flight.yaml"
 FREE_SPACE = BASELINE_TITLE["free_space"]
+# Lines that replay nothing: what a model must beat to be worth its name.
 LINES = BASELINE_TITLE["constant"], BASELINE_TITLE["log_distance"]
-"""Lines that replay nothing: what a model must beat to be worth its name."""
 
+# Behind the name of a rung that would be scored where it was fitted.
 LEARNED_HERE = " (its antennas were learned on this flight, too: not scored)"
-"""Behind the name of a rung that would be scored where it was fitted."""
 
 Antennas = Literal["isotropic", "measured", "learned"]
 Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
 Trees = Literal["none", "p833", "weissberger", "opaque"]
 
+# What the ladder calls the sums and losses of the ground reflection.
 GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "rough": "rough", "power sum": "incoherent"}
-"""What the ladder calls the sums and losses of the ground reflection."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

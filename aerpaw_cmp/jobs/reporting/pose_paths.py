@@ -12,11 +12,11 @@ from ...flight.replay import FlightReplay, Replayed
 from ...propagation.paths import PathSet
 from ...report.data import DIFFRACTED, PASSING, PosePaths
 
+# Poses per tower whose paths are drawn.
 POSES = 300
-"""Poses per tower whose paths are drawn."""
 
+# Paths over edges, and through walls, that are drawn of a pose.
 SHORTEST = 8
-"""Paths over edges, and through walls, that are drawn of a pose."""
 
 
 def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> tuple[PosePaths, ...]:

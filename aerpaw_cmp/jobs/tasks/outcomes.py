@@ -25,15 +25,15 @@ from ...common.units import AnyArray
 from ...flight.settings import FlightFile
 from .manifest import digest_of, other_inputs
 
+# Raised whenever the form of an entry changes.
 LAYOUT = 5
-"""Raised whenever the form of an entry changes."""
 
 _SEAL = b"aerpaw-cmp outcome"
 
 _TORN = (OSError, EOFError, RecursionError, zipfile.BadZipFile)
 
+# Entry points of readers: those of other packages count with their version.
 READERS = "aerpaw_cmp.readers"
-"""Entry points of readers: those of other packages count with their version."""
 
 
 class OutcomeStore:
@@ -123,8 +123,8 @@ class OutcomeStore:
         return (self.folder / f"{key}.npz").is_file()
 
 
+# Key of the name of an array, in its place in the JSON.
 _ARRAY = "array of the entry"
-"""Key of the name of an array, in its place in the JSON."""
 
 
 def _plain(value: Any, arrays: _Arrays) -> Any:
@@ -166,8 +166,8 @@ def _text(manifest: Mapping[str, Any]) -> bytes:
     return (json.dumps(dict(manifest), indent=1, default=str) + "\n").encode()
 
 
+# Settings that a campaign's outcome does not depend on: names, the plan of a simulation, pages, the audit, caches.
 _WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links": True, "advanced": {"cache"}}}
-"""Settings that a campaign's outcome does not depend on: names, the plan of a simulation, pages, the audit, caches."""
 
 
 def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> list[dict[str, str]]:

@@ -31,24 +31,24 @@ from ...common.errors import InputError, UsageError
 from ...common.stages import Progress, silent
 from .outcomes import code_digest
 
+# What is done with an item; it can be pickled.
 Task = Callable[[Any], Any]
-"""What is done with an item; it can be pickled."""
 
+# Gets the number of an item and the result of its task, or :class:`Lost`.
 Done = Callable[[int, Any], None]
-"""Gets the number of an item and the result of its task, or :class:`Lost`."""
 
+# A task in work when a worker is lost is tried again; after so many tries once more, alone.
 TRIES = 2
-"""A task in work when a worker is lost is tried again; after so many tries once more, alone."""
 
+# How long a scheduler may take to answer.
 CONNECT_S = 10.0
-"""How long a scheduler may take to answer."""
 
+# A scheduler that has had no worker for so long is spoken of, again and again.
 NO_WORKER_S = 30.0
-"""A scheduler that has had no worker for so long is spoken of, again and again."""
 
 
+# How often workers are counted.
 LOOK_S = 2.0
-"""How often workers are counted."""
 
 
 @dataclass(frozen=True, slots=True)

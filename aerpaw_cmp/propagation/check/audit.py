@@ -27,11 +27,11 @@ from .field_audit import (
     spread_over_paths,
 )
 
+# Rays of the solve that gives Sionna's own coefficients: which paths there are is asked before, with all of them.
 FIELD_SAMPLES = 100_000
-"""Rays of the solve that gives Sionna's own coefficients: which paths there are is asked before, with all of them."""
 
+# Singular-value ratios of the paper.
 RANK_K = (10.0, 100.0, 1000.0)
-"""Singular-value ratios of the paper."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,8 +231,8 @@ def extra_rows(replay: Replay, reference: Replay, chosen: IntArray) -> IntArray:
     return np.array([row for key, row in ours.items() if key not in theirs], dtype=np.int64)
 
 
+# Rows of paths by place of the pose among the chosen ones, tower and planes.
 _Keys = dict[tuple[int, ...], int]
-"""Rows of paths by place of the pose among the chosen ones, tower and planes."""
 
 
 def _keys_of_both(replay: Replay, reference: Replay, chosen: IntArray) -> tuple[_Keys, _Keys]:

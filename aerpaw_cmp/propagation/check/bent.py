@@ -19,8 +19,8 @@ from scipy.special import fresnel as fresnel_integrals
 from ...common.units import ComplexArray, FloatArray
 from .reference import C_MPS, MARGIN_M, Matrix, Reference, Vector, element_wave, fresnel, permittivity, product
 
+# Share of an edge's length beside its ends where nothing is judged.
 NEAR_EDGE = 1e-6
-"""Share of an edge's length beside its ends where nothing is judged."""
 
 
 @dataclass(frozen=True, slots=True)

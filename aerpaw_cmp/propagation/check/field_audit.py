@@ -32,32 +32,32 @@ from ..search.terrain import TERRAIN
 from .bent import bent_matrix
 from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
 
+# Of one path in one pair of slants. Float32 coordinates move an angle of incidence by 1e-5; near Brewster's angle and
+# at the edge of a pattern's cut-off the coefficient turns that into some hundredths of a decibel.
 POWER_TOLERANCE_DB = 0.05
-"""Of one path in one pair of slants. Float32 coordinates move an angle of incidence by 1e-5; near Brewster's angle and
-at the edge of a pattern's cut-off the coefficient turns that into some hundredths of a decibel."""
 
+# Float32 moves a reflection point off its plane by 1e-4 m at most within ``PHASE_RANGE_M``: 7e-3 rad at 3.4 GHz.
 PHASE_TOLERANCE_RAD = 0.01
-"""Float32 moves a reflection point off its plane by 1e-4 m at most within ``PHASE_RANGE_M``: 7e-3 rad at 3.4 GHz."""
 
 PHASE_RANGE_M = 300.0
 
+# Entries this far below the largest of a path's four are compared with the largest: float32 has no digits for them.
 WEAK_DB = 20.0
-"""Entries this far below the largest of a path's four are compared with the largest: float32 has no digits for them."""
 
+# Of H against the second implementation, relative to the root of the links' mean path power; both are float64.
 EXACT_TOLERANCE = 1e-6
-"""Of H against the second implementation, relative to the root of the links' mean path power; both are float64."""
 
+# As that, where paths over edges are in H: their second transition function is a series cut off at 1e-5.
 EDGE_TOLERANCE = 3e-5
-"""As that, where paths over edges are in H: their second transition function is a series cut off at 1e-5."""
 
+# A path that a move of an edge by this much makes or breaks may differ in float32.
 SIONNA_MARGIN_M = 2e-3
-"""A path that a move of an edge by this much makes or breaks may differ in float32."""
 
+# Links per replay for the second implementation.
 REFERENCE_LINKS = 8
-"""Links per replay for the second implementation."""
 
+# Patterns of this package that Sionna has too.
 SIONNA_PATTERNS = {"iso": "iso", "hw_dipole": "hw_dipole", "tr38901": "tr38901"}
-"""Patterns of this package that Sionna has too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -496,11 +496,11 @@ def per_pair(
     return audit + _explicit(site, link, few, search.max_depth)
 
 
+# Sionna's explicit arrays are asked at the nearest poses within this range: beyond, their float32 phases are noise.
 EXPLICIT_POSES, EXPLICIT_RANGE_M = 10, 150.0
-"""Sionna's explicit arrays are asked at the nearest poses within this range: beyond, their float32 phases are noise."""
 
+# Of the largest entry of H, on the better half of the links; found: 4e-4.
 EXPLICIT_TOLERANCE = 0.01
-"""Of the largest entry of H, on the better half of the links; found: 4e-4."""
 
 EXPLICIT_SAMPLES = 50_000
 

@@ -10,8 +10,8 @@ import numpy as np
 from ...common.units import FloatArray, IntArray
 from ..surfaces import Surfaces
 
+# A surface closer to an antenna than this hides nothing.
 NEAR_END_M = 1e-3
-"""A surface closer to an antenna than this hides nothing."""
 
 
 def why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray) -> str:

@@ -28,8 +28,8 @@ Matrix = tuple[Vector, Vector, Vector]
 Grid = NDArray[np.float64]
 
 EQUATOR_M, FLATTENING = 6_378_137.0, 1 / 298.257_223_563
+# Poses below this height above the take-off ground are raised to it (arXiv 2502.10324).
 LOWEST_M = 0.5
-"""Poses below this height above the take-off ground are raised to it (arXiv 2502.10324)."""
 
 _STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,6})?(?:[+-]\d\d:?\d\d|Z)?")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)

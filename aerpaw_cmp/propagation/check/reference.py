@@ -25,14 +25,14 @@ from ...site.site import Site, Tower, Trees
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 Wave = tuple[complex, complex, complex]
+# ``(theta_rad, phi_rad) -> (E_theta, E_phi)`` in the device frame.
 Pattern = Callable[[float, float], tuple[complex, complex]]
-"""``(theta_rad, phi_rad) -> (E_theta, E_phi)`` in the device frame."""
 
 C_MPS = 299_792_458.0
 EPS0 = 8.8541878128e-12
 
+# Paths that a change of the geometry by this much makes or breaks are not judged.
 MARGIN_M = 1e-6
-"""Paths that a change of the geometry by this much makes or breaks are not judged."""
 
 # ITU-R P.2040-4 table 3: lowest and highest GHz, a, b, c, d; and the thickness of a wall of it [m], None a half-space
 P2040: dict[str, tuple[float, float, float, float, float, float, float | None]] = {
@@ -164,8 +164,8 @@ def tr38901(theta: float, phi: float) -> tuple[complex, complex]:
     return complex(10 ** ((8 - down) / 20)), 0j
 
 
+# By their names in flight.yaml.
 PATTERNS: dict[str, Pattern] = {"iso": isotropic, "dipole": half_wave_dipole, "tr38901": tr38901}
-"""By their names in flight.yaml."""
 
 
 def permittivity(name: str, carrier_hz: float) -> tuple[complex, float | None] | None:

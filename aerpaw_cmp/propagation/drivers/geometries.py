@@ -26,8 +26,8 @@ from ..arrays import Array, Link, Poses, rotation_from_yaw_pitch_roll
 from ..field.sum import channel_matrices
 from ..paths import Faces, PathSet
 
+# How the ground ray is added to the direct one.
 Ground = Literal["coherent", "power_sum"]
-"""How the ground ray is added to the direct one."""
 
 GROUND_MATERIAL = "itu_medium_dry_ground"
 

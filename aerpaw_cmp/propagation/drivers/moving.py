@@ -22,14 +22,14 @@ from ..paths import PathSet
 from ..replay import PER_LINK, Replay, replay
 from .parts import in_turn
 
+# Places of a node in one block: H of a block has this many times the links that count.
 PLACES_AT_ONCE = 64
-"""Places of a node in one block: H of a block has this many times the links that count."""
 
+# Links (poses times places) of a block: some 4 MB of H with 4 x 4 elements.
 LINKS_AT_ONCE = 16_384
-"""Links (poses times places) of a block: some 4 MB of H with 4 x 4 elements."""
 
+# Element pairs that NumPy evaluates in the time of one pose with a source of its own.
 WORK_PER_POSE = 200
-"""Element pairs that NumPy evaluates in the time of one pose with a source of its own."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
+# A float, or an array of any shape.
 Number = Any
-"""A float, or an array of any shape."""
 Vector = tuple[Number, Number, Number]
+# Axes of a device, as rows.
 Rotation = tuple[Vector, Vector, Vector]
-"""Axes of a device, as rows."""
 
 _ROUND = 6755399441055744.0  # 1.5 * 2**52: adding and taking it off rounds to an integer, ties to even
 

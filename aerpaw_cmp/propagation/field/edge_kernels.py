@@ -27,8 +27,8 @@ _JOINED, _TURN, _PARTS, _ELEMENT, _MIDDLE, _LOST, _POWER, _ALL = (
     row * LANES for row in (115, 123, 129, 145, 154, 160, 161, 162)
 )
 _EXTERIOR, _MATERIAL_0, _MATERIAL_N = (row * LANES for row in (15, 16, 19))
+# Rows of an element: its field along beta and phi, its place along the edge and its distance from it.
 EACH = 6 * LANES
-"""Rows of an element: its field along beta and phi, its place along the edge and its distance from it."""
 
 for _one in (
     dyads.arctangent, wedge.transition, wedge.pole, wedge.edge_term, wedge.obliquity, wedge.matrix, wedge.coupled,

@@ -411,8 +411,8 @@ def over_one(source: Vector, target: Vector, edge: Any, wave_number: float) -> A
     )  # fmt: skip
 
 
+# ``turn`` of :func:`over_two` for a path over one edge, whose legs lie in one plane as they are.
 STRAIGHT = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-"""``turn`` of :func:`over_two` for a path over one edge, whose legs lie in one plane as they are."""
 
 
 def over_two(

@@ -20,11 +20,11 @@ from ...common.errors import UsageError
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...site.site import Trees
 
+# Form of a crown between its base and the tree's top; the paper's is the cone.
 Shape = Literal["cone", "ellipsoid", "cylinder"]
-"""Form of a crown between its base and the tree's top; the paper's is the cone."""
 
+# ITU-R P.833: near 1 GHz trees in leaf attenuate about 20 % more (dB/m) than leafless ones.
 LEAFLESS_FACTOR = 1 / 1.2
-"""ITU-R P.833: near 1 GHz trees in leaf attenuate about 20 % more (dB/m) than leafless ones."""
 
 _PIECE_M = 8.0  # paths are looked up in pieces of this length
 _CELL_M = 4.0

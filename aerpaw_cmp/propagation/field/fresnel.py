@@ -213,8 +213,8 @@ def reflection_coefficients(
     return np.asarray(te_re + 1j * te_im), np.asarray(tm_re + 1j * tm_im)
 
 
+# Before the material's name: a path passes the face; its thickness is negative.
 THROUGH = "through "
-"""Before the material's name: a path passes the face; its thickness is negative."""
 
 
 @dataclass(frozen=True, slots=True)

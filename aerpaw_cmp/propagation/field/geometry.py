@@ -63,8 +63,8 @@ def _columns(array: Array, element: IntArray) -> tuple[FloatArray, FloatArray]:
     return np.ascontiguousarray(array.positions_m[element].T), np.stack([np.cos(slant), np.sin(slant)])
 
 
+# Pattern fields of tower and UAV; None for 1 along theta in all directions.
 Ends = tuple[FloatArray | None, FloatArray | None]
-"""Pattern fields of tower and UAV; None for 1 along theta in all directions."""
 
 
 def geometry(

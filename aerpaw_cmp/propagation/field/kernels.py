@@ -17,8 +17,8 @@ from ..numba_options import kernel, law
 from . import dyads, fresnel
 from .geometry import Elements, Ends, Geometry
 
+# Element pairs of a path evaluated at once; a power of two, so that rows of the workspace cannot overlap.
 LANES = 64
-"""Element pairs of a path evaluated at once; a power of two, so that rows of the workspace cannot overlap."""
 
 # rows of the workspace: direction and length, wave, field of the UAV's element, coefficients
 _X, _Y, _Z, _LENGTH = (row * LANES for row in range(4))

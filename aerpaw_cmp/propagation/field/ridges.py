@@ -15,8 +15,8 @@ from ...site.dem import Dem, above_line
 
 Ridges = Literal["deygout", "bullington"]
 
+# Ground that rises less over its chord is a plane.
 _PLANE_M = 1e-6
-"""Ground that rises less over its chord is a plane."""
 
 
 def ridge_loss_db(

@@ -19,10 +19,10 @@ from ...site.site import Forest, Site
 from .foliage import FoliageModel, NoFoliage, Opaque
 from .ridges import deygout_db
 
+# Loss per metre between trunks over that in crowns: assumed.
 TRUNKS = 0.3
-"""Loss per metre between trunks over that in crowns: assumed."""
+# First Fresnel radii by which a ray clears a knife edge without loss.
 CLEAR = 0.55
-"""First Fresnel radii by which a ray clears a knife edge without loss."""
 
 _UPRIGHT_M = 1e-6
 _SEGMENTS_AT_ONCE = 20_000

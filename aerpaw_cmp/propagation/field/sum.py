@@ -28,11 +28,11 @@ from . import dyads
 from .fresnel import FaceMaterials, coefficients
 from .geometry import Elements, Ends, Geometry, directions, geometry, parts_of, pattern_fields, plain, rows_of
 
+# Element pairs that NumPy evaluates at once: their columns stay in the cache of a core.
 PAIRS_PER_CHUNK = 8_000
-"""Element pairs that NumPy evaluates at once: their columns stay in the cache of a core."""
 
+# Paths between whose ends threads change: some milliseconds of work.
 PATHS_PER_PART = 4096
-"""Paths between whose ends threads change: some milliseconds of work."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,8 @@ from ...common.units import FloatArray
 from .dyads import Number, larger, select, sine_cosine, smaller
 from .fresnel import coefficients, half_space, reflection, returned
 
+# Argument of the transition function that the variable of its polynomial has at 0.
 MIDDLE = 2.0
-"""Argument of the transition function that the variable of its polynomial has at 0."""
 
 
 def _fitted(terms: int = 24) -> FloatArray:

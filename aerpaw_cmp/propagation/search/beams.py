@@ -28,23 +28,23 @@ from .effort import Estimate, Progress, SearchRun
 from .merging import WINDOW
 from .mirror import merge, searched_links
 
+# Closer to a plane than this [m] is on it.
 SIDE_M = 1e-6
-"""Closer to a plane than this [m] is on it."""
 
+# A surface closer to an antenna than this [m] does not hide it: it is mounted there.
 END_M = 1e-3
-"""A surface closer to an antenna than this [m] does not hide it: it is mounted there."""
 
+# Outlines are this much larger in the cuts than they are [m], so that no cut loses a path to rounding.
 SLACK_M = 1e-5
-"""Outlines are this much larger in the cuts than they are [m], so that no cut loses a path to rounding."""
 
+# How far outside its triangles a reflection point may lie [m]: the seams inside a face.
 EDGE_M = 1e-6
-"""How far outside its triangles a reflection point may lie [m]: the seams inside a face."""
 
+# Share of a triangle's height by which a segment must meet it to cut it beyond doubt.
 SOLID_MARGIN = 1e-6
-"""Share of a triangle's height by which a segment must meet it to cut it beyond doubt."""
 
+# First faces that an estimate draws from, the fewest that it tries, and the standard error at which it stops.
 POOL, FEWEST_TRIED, CERTAIN = 1024, 24, 0.12
-"""First faces that an estimate draws from, the fewest that it tries, and the standard error at which it stops."""
 
 
 class _Mirrors(NamedTuple):
@@ -197,8 +197,8 @@ def _mirrors(surfaces: Surfaces, usable: BoolArray | None = None, *, front_only:
     )
 
 
+# Receivers (n,), faces (n, depth), reflection points (n, depth, 3); -1 and any point where a path has fewer.
 _Level = tuple[IntArray, IntArray, FloatArray]
-"""Receivers (n,), faces (n, depth), reflection points (n, depth, 3); -1 and any point where a path has fewer."""
 
 
 class _Search:
@@ -298,8 +298,8 @@ def _chunks(first: IntArray, threads: int) -> Iterator[tuple[list[IntArray], int
         at += each * 4 * threads
 
 
+# Paths over parallel planes whose reflection points are all closer than this [m] are one path.
 COINCIDENT_M = 5e-3
-"""Paths over parallel planes whose reflection points are all closer than this [m] are one path."""
 
 
 def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:

@@ -14,8 +14,8 @@ from ...common.units import FloatArray, IntArray
 from ..numba_options import kernel, law, part
 from ..surfaces import BoxTree
 
+# Nodes that wait while a tree is walked: twice its depth for 4e9 items.
 DEEPEST = 64
-"""Nodes that wait while a tree is walked: twice its depth for 4e9 items."""
 
 
 def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:

@@ -31,23 +31,23 @@ from ..paths import Faces, Links, PathSet, joined
 from .mirror import CELLS_PER_CHUNK, RELATIVE_TOLERANCE, merge, searched_links
 from .occlusion import Occlusion
 
+# Sides, then the bottom.
 FACES_PER_CROWN = CROWN_SIDES + 1
-"""Sides, then the bottom."""
 
+# Margin of the beams, which only thin out: far above their rounding; the reflection point decides.
 SLACK_M = 1e-3
-"""Margin of the beams, which only thin out: far above their rounding; the reflection point decides."""
 
+# Poses are looked up in layers of about this height: beams light little of each.
 LAYER_M, MOST_LAYERS = 10.0, 12
-"""Poses are looked up in layers of about this height: beams light little of each."""
 
+# Beams whose rectangle is larger than this share of the poses', both ways, are tried against every pose at once.
 WIDE_SHARE = 0.2
-"""Beams whose rectangle is larger than this share of the poses', both ways, are tried against every pose at once."""
 
+# Sources whose beams are kept; 10 MB each for 10 000 trees.
 KEPT_BEAMS = 12
-"""Sources whose beams are kept; 10 MB each for 10 000 trees."""
 
+# Each of them holds less than a fifth of the poses both ways.
 RECTANGLES_AT_ONCE = 2_000
-"""Each of them holds less than a fifth of the poses both ways."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,14 +17,14 @@ from ..numba_options import kernel, part
 from .beams import in_face, segment_cut
 from .boxtree import DEEPEST, box_missed, overlapping
 
+# Radius round a point of an edge within which the air from face to face must be empty [m].
 PROBE_M = 0.01
-"""Radius round a point of an edge within which the air from face to face must be empty [m]."""
 
+# Most convex pieces of a leaf of the tree, whose boxes are compared at once.
 LEAF = 16
-"""Most convex pieces of a leaf of the tree, whose boxes are compared at once."""
 
+# Fewest paths for which there is room at first.
 ROWS = 16384
-"""Fewest paths for which there is room at first."""
 
 
 class Solids(NamedTuple):

@@ -26,17 +26,17 @@ from ..surfaces import Surfaces
 from .mirror import scene_tolerance_m
 from .occlusion import Occlusion
 
+# How far beside an edge point the air on both of its faces is looked for.
 PROBE_M = 1e-3
-"""How far beside an edge point the air on both of its faces is looked for."""
 
+# Place of boxes that no segment meets.
 FAR_M = 1e7
-"""Place of boxes that no segment meets."""
 
+# Pairs of edge and pose that are looked at together.
 LINKS_AT_ONCE = 200_000
-"""Pairs of edge and pose that are looked at together."""
 
+# Poses whose compiled search one thread takes at once.
 POSES_PER_PART = 256
-"""Poses whose compiled search one thread takes at once."""
 
 
 def find_edge_paths(

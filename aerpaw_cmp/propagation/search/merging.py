@@ -16,17 +16,17 @@ from ..paths import Faces
 from ..surfaces import Surfaces
 from .boxtree import box_tree, overlapping
 
+# Triangles whose corners lie within this of one plane [m] are one face. The files hold float32: 0.1 mm at 1 km.
 MERGE_M = 1e-3
-"""Triangles whose corners lie within this of one plane [m] are one face. The files hold float32: 0.1 mm at 1 km."""
 
+# Corners of one shape closer than this are one corner [m].
 WELD_M = 1e-4
-"""Corners of one shape closer than this are one corner [m]."""
 
+# Most corners of the convex outline by which a face is searched; one with more is searched by a rectangle.
 WINDOW = 8
-"""Most corners of the convex outline by which a face is searched; one with more is searched by a rectangle."""
 
+# Triangles of less area have no plane; they are dropped.
 SMALLEST_M2 = 1e-10
-"""Triangles of less area have no plane; they are dropped."""
 
 
 def merged(scene: TriangleScene, merge_m: float = MERGE_M) -> Surfaces:

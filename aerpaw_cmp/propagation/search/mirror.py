@@ -26,23 +26,23 @@ from ..paths import Faces, Links, PathSet
 from .effort import Progress
 from .occlusion import Occlusion
 
+# Of the largest coordinate: some thousand times the rounding error of a plane equation.
 RELATIVE_TOLERANCE = 1e-12
-"""Of the largest coordinate: some thousand times the rounding error of a plane equation."""
 
+# A link shorter than this has no path: there is no far field, and no direction when it is zero.
 MINIMUM_LENGTH_M = 0.01
-"""A link shorter than this has no path: there is no far field, and no direction when it is zero."""
 
+# Face sequences per tower beyond which the ``image`` engine gives up.
 SEQUENCE_BUDGET = 200_000
-"""Face sequences per tower beyond which the ``image`` engine gives up."""
 
+# Bounds the memory of every dense step (8 MB per array).
 CELLS_PER_CHUNK = 1_000_000
-"""Bounds the memory of every dense step (8 MB per array)."""
 
+# Targets whose heights over all faces are held.
 TARGETS_AT_ONCE = 1024
-"""Targets whose heights over all faces are held."""
 
+# Margin of :class:`Mirrors` [m]: far above the tolerance of any search that it thins out.
 REACH_SLACK_M = 1e-3
-"""Margin of :class:`Mirrors` [m]: far above the tolerance of any search that it thins out."""
 
 
 def find_paths(

@@ -18,14 +18,14 @@ from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..faces import corners
 from ..paths import Faces
 
+# Segment-solid pairs looked at at once.
 CELLS_PER_CHUNK = 1_000_000
-"""Segment-solid pairs looked at at once."""
 
+# Radius, in tolerances, within which a point of a seam must be surrounded by buildings; shorter seams hide nothing.
 NEIGHBOURHOOD = 1e4
-"""Radius, in tolerances, within which a point of a seam must be surrounded by buildings; shorter seams hide nothing."""
 
+# Share of its area by which a convex footprint may fall short of its hull.
 ROUNDING = 1e-13
-"""Share of its area by which a convex footprint may fall short of its hull."""
 
 _ROUND = np.pi / 8 * (np.arange(16) + 0.37)  # no direction of a map is favoured
 _AROUND = np.column_stack([np.cos(_ROUND), np.sin(_ROUND), np.zeros(16)])

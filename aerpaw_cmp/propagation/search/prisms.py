@@ -20,11 +20,11 @@ from .merging import WINDOW
 from .mirror import images_of, merge, planes_of, scene_tolerance_m, trace_back
 from .occlusion import Occlusion
 
+# The ground is searched to this many times the largest coordinate: no reflection point lies further out.
 REACH = 10.0
-"""The ground is searched to this many times the largest coordinate: no reflection point lies further out."""
 
+# Boxes of faces are this much larger [m].
 OVERLAP_M = 1e-3
-"""Boxes of faces are this much larger [m]."""
 
 
 def find_paths(

@@ -20,13 +20,13 @@ from .mirror import plane_keys, planes_of
 
 Samples = int | Literal["auto"]
 
+# Rays per tower of the first pilot.
 FIRST = 10_000
-"""Rays per tower of the first pilot."""
 
 FACTOR = 4
 
+# Rays per tower at which pilots end in any case.
 MOST = 2_560_000
-"""Rays per tower at which pilots end in any case."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,27 +52,27 @@ from .mirror import (
 
 SPECULAR_TABLE_SLOTS = 2**24
 FEWEST_SLOTS = 2**20
+# Candidates per tower and batch that there is room for at first: their number is known afterwards.
 MAXIMUM_PATHS = 2**16
-"""Candidates per tower and batch that there is room for at first: their number is known afterwards."""
 
+# Room beyond which a batch is refused (some 100 bytes each).
 MOST_CANDIDATES = 2**25
-"""Room beyond which a batch is refused (some 100 bytes each)."""
 
+# Share of the table that candidates may fill: two hashes are asked, so about twice this share is lost.
 FULLEST_TABLE = 1 / 32
-"""Share of the table that candidates may fill: two hashes are asked, so about twice this share is lost."""
 
+# Slots of the table, over all towers of a call (two tables of 4 bytes each).
 MOST_SLOTS = 2**28
-"""Slots of the table, over all towers of a call (two tables of 4 bytes each)."""
 
 LARGEST_BATCH = 100
+# Sionna knows slabs only; in this one no second echo returns. Its coefficients are not used for H.
 HALF_SPACE_THICKNESS_M = 10.0
-"""Sionna knows slabs only; in this one no second echo returns. Its coefficients are not used for H."""
+# A float32 reflection point may lie this far outside its face.
 EDGE_TOLERANCE_M = 1e-3
-"""A float32 reflection point may lie this far outside its face."""
 
+# Scenes in use. Dr.Jit compiles virtual calls for every material that is alive, those of dead scenes included, and may
+# then define a function twice and abort the process: no scene may stay when the next is made.
 _ALIVE: WeakSet[Any] = WeakSet()
-"""Scenes in use. Dr.Jit compiles virtual calls for every material that is alive, those of dead scenes included, and may
-then define a function twice and abort the process: no scene may stay when the next is made."""
 
 
 def load_variant(prefer: str | None = None) -> str:
@@ -117,13 +117,13 @@ def load_variant(prefer: str | None = None) -> str:
     )
 
 
+# Modules of Sionna RT with a class that no search makes.
 _LATER = {
     "preview": "Previewer",
     "rcs.scattering_model_viewer": "ScatteringModelViewer",
     "radio_map_solvers.radio_map_solver": "RadioMapSolver",
     "path_solvers.sb_deterministic": "SBDeterministicCandidateGenerator",
 }
-"""Modules of Sionna RT with a class that no search makes."""
 
 
 def _leave_for_later() -> None:
@@ -270,8 +270,8 @@ def _points(values: FloatArray) -> Any:
     return mi.Point3f(*(mi.Float(column) for column in values.T.astype(np.float32).tolist()))
 
 
+# An array of one element.
 _CENTRE = np.zeros((1, 3))
-"""An array of one element."""
 
 
 @dataclass(frozen=True, slots=True)

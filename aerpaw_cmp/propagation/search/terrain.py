@@ -21,11 +21,11 @@ from ..paths import Faces, Links, PathSet, joined
 from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, images_of, trace_back
 from .occlusion import Occlusion
 
+# ``solid`` of the tangent planes of the terrain; that of a tower's level ground is -1.
 TERRAIN = -2
-"""``solid`` of the tangent planes of the terrain; that of a tower's level ground is -1."""
 
+# A mirror over less of its Fresnel zone is left out.
 SMALLEST_PART = 0.1
-"""A mirror over less of its Fresnel zone is left out."""
 
 _STEPS = 8
 _STILL_M = 1e-6

@@ -18,11 +18,11 @@ from ..field.fresnel import THROUGH
 from ..paths import Faces, Links, PathSet, joined
 from . import mirror
 
+# A path through more is left out.
 MOST_WALLS = 8
-"""A path through more is left out."""
 
+# A leg that ends this near to a plane does not cross it.
 NEAR_M = 1e-6
-"""A leg that ends this near to a plane does not cross it."""
 
 LEGS_AT_ONCE = 4_000
 

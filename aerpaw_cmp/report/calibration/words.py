@@ -12,6 +12,7 @@ from ..phrases import said_of
 
 ONE_FLIGHT = "Nothing is scored: one flight alone. Next: add a second flight."
 
+# Learned antennas against the best baseline, by :func:`~aerpaw_cmp.compare.verdicts.by_flight`.
 HELPS: dict[str, tuple[str, str]] = {
     "better": (
         "The learned antennas are significantly better ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
@@ -30,8 +31,8 @@ HELPS: dict[str, tuple[str, str]] = {
         "add a third flight",
     ),
 }
-"""Learned antennas against the best baseline, by :func:`~aerpaw_cmp.compare.verdicts.by_flight`."""
 
+# Body frame against frames that do not turn, by :func:`~aerpaw_cmp.compare.verdicts.antenna_or_place`.
 FRAMES: dict[str, tuple[str, str]] = {
     "antenna": (
         "What was learned turns with the UAV, as an antenna does: {where} the error is {size:.1f} dB larger "
@@ -49,7 +50,6 @@ FRAMES: dict[str, tuple[str, str]] = {
     ),
     "no interval": ("Antenna and place are not separable with two flights.", ""),
 }
-"""Body frame against frames that do not turn, by :func:`~aerpaw_cmp.compare.verdicts.antenna_or_place`."""
 
 WRONG_FRAMES = {
     "world frame at the UAV": "in a frame fixed to the ground",

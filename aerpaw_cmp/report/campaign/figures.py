@@ -37,22 +37,22 @@ if TYPE_CHECKING:
 
 DISTANCE_BINS = 30
 
+# Samples that a bin needs: no line is drawn over what was not flown.
 FEWEST_PER_BIN = 8
-"""Samples that a bin needs: no line is drawn over what was not flown."""
 
 MAPS_PER_ROW = 3
 
+# Flights, links and settings together that a figure with a line for each still shows; the season's figures stand for
+# more.
 MOST_BARS = 200
-"""Flights, links and settings together that a figure with a line for each still shows; the season's figures stand for
-more."""
 
 MOST_SETTINGS = 40
 
+# Flights that are told apart by colour, or have a map each.
 MOST_FLIGHTS = 12
-"""Flights that are told apart by colour, or have a map each."""
 
+# No figure is higher than this [inch], however many flights there are.
 TALLEST = 40.0
-"""No figure is higher than this [inch], however many flights there are."""
 
 
 def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
@@ -249,8 +249,8 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
     return fig
 
 
+# Setting, its error and the 95 % interval.
 Scored: TypeAlias = "tuple[str, float, Interval | None]"
-"""Setting, its error and the 95 % interval."""
 
 
 def _by_setting(names: Sequence[str], groups: Mapping[str, Sequence[Scored]]) -> tuple[Figure, Axes, list[FloatArray]]:

@@ -26,20 +26,20 @@ from ..words import pretty
 from . import figures as campaign_figures
 from . import words
 
+# Warnings that stand on the page at all.
 MANY = 200
-"""Warnings that stand on the page at all."""
 
+# Flights of a table that has a column or a heading for each.
 FEW_FLIGHTS = 20
-"""Flights of a table that has a column or a heading for each."""
 
+# Rows of a table on the page; the files beside it hold all.
 ROWS_SHOWN = 300
-"""Rows of a table on the page; the files beside it hold all."""
 
+# From so many rows on campaign.json is written without indentation.
 COMPACT_ROWS = 2000
-"""From so many rows on campaign.json is written without indentation."""
 
+# Fields of a row that are samples, not numbers of a table.
 ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
-"""Fields of a row that are samples, not numbers of a table."""
 
 
 def _entries(items: Iterable[Any], without: Sequence[str]) -> list[dict[str, Any]]:
@@ -202,11 +202,11 @@ def write_campaign(
 
 # --- pairs of flights at the same places -----------------------------------------------------------------------------
 
+# Pairs of each kind that campaign.json lists; of more, those with the most places.
 LISTED_PAIRS = 1000
-"""Pairs of each kind that campaign.json lists; of more, those with the most places."""
 
+# The file with all of them, less its ending.
 PAIR_TABLE = "pairs"
-"""The file with all of them, less its ending."""
 
 
 Pair = TypeVar("Pair", Repeat, RankPairing)

@@ -14,9 +14,10 @@ from ..names import k_key
 from ..phrases import said_of
 from ..words import first_sentence, pooled_db, pretty, ranking_sentence
 
+# Warnings of flights that stand one by one.
 FEW = 8
-"""Warnings of flights that stand one by one."""
 
+# Sentence and next step by :func:`~aerpaw_cmp.compare.verdicts.campaign_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "outlying error": (
         "Flight {where} stands out: its RMSE is {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) that of the others.",
@@ -35,13 +36,12 @@ CAUSES: dict[str, tuple[str, str]] = {
         "open the report of {flight}",
     ),
 }
-"""Sentence and next step by :func:`~aerpaw_cmp.compare.verdicts.campaign_verdict`."""
 
+# Settings that a sentence names.
 FEW_SETTINGS = 4
-"""Settings that a sentence names."""
 
+# Below this share of samples with a pair, a repeatability floor is that of a few places.
 FEW_PAIRS = 0.25
-"""Below this share of samples with a pair, a repeatability floor is that of a few places."""
 
 
 def rss_flights(data: CampaignData) -> list[str]:

@@ -34,28 +34,29 @@ def write_diff(diff: ReportDiff, folder: Path) -> list[Path]:
     return [write_file(folder / "diff.html", diff_page(diff)), write_file(folder / "diff.json", numbers)]
 
 
+# Differences of agreement and kappa below this are rounding.
 LEAST_RANK = 1e-6
-"""Differences of agreement and kappa below this are rounding."""
 
+# Sentence on two reports, by the verdict of the paired interval. No other sentence of a diff says better or worse.
 DIFFERENCE = {
     "better": "The second is significantly better: {difference:+.2f} dB {interval} (95 %).",
     "worse": "The second is significantly worse: {difference:+.2f} dB {interval} (95 %).",
     "not significant": "The difference of {difference:+.2f} dB {interval} is not significant (95 %).",
     "no interval": "The difference is {difference:+.2f} dB; too few independent samples for an interval.",
 }
-"""Sentence on two reports, by the verdict of the paired interval. No other sentence of a diff says better or worse."""
 
+# Next step by the word of the paired interval.
 KEEP = {
     "better": "go on as in the second report",
     "worse": "go on as in the first report",
     "not significant": "go on with either; this flight does not decide",
     "no interval": "compare on a longer flight",
 }
-"""Next step by the word of the paired interval."""
 
+# Settings, inputs or versions that a sentence names.
 NAMED = 3
-"""Settings, inputs or versions that a sentence names."""
 
+# Cause and next step, by :func:`~aerpaw_cmp.compare.verdicts.changed_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "none": ("{listed} {verb}.", ""),
     "measured": (
@@ -71,7 +72,6 @@ CAUSES: dict[str, tuple[str, str]] = {
         "run both reports again; numbers that still differ are a fault of the program",
     ),
 }
-"""Cause and next step, by :func:`~aerpaw_cmp.compare.verdicts.changed_verdict`."""
 
 
 def verdict(diff: ReportDiff) -> str:

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from .points import Export
 
 FORMATS = ("geojson", "kmz", "netcdf")
+# By format: the modules that it needs besides the default installation.
 _NEEDS = {"netcdf": ("netCDF4", "xarray")}
-"""By format: the modules that it needs besides the default installation."""
 
 ALL = "all"
 FOLDER = "exports"

@@ -12,11 +12,11 @@ import numpy as np
 from ..names import iso_time
 from .points import LABELS, UP, Export, Points
 
+# WGS84, longitude first: what RFC 7946 prescribes; named for programs that ask.
 CRS84 = "urn:ogc:def:crs:OGC:1.3:CRS84"
-"""WGS84, longitude first: what RFC 7946 prescribes; named for programs that ask."""
 
+# Samples that are text at once.
 ROWS = 20_000
-"""Samples that are text at once."""
 
 
 def write_geojson(export: Export, folder: Path) -> list[Path]:

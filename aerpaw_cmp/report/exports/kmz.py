@@ -22,8 +22,8 @@ from ..canvas import keep_extremes
 from ..names import iso_time
 from .points import Column, Export, latitude_longitude
 
+# Points of all coloured lines together: more, and Google Earth gets slow.
 POINTS = 24_000
-"""Points of all coloured lines together: more, and Google Earth gets slow."""
 TRACK_POINTS = 5_000
 
 _LEVELS = {"calibrated_db": "Level measured", "simulated_dbm": "Level replayed", "residual_db": "Residual"}
@@ -153,10 +153,10 @@ def _legend(scale: Scale) -> bytes:
 
 # --- colours ---------------------------------------------------------------------------------------------------------
 
+# Colours of a scale of numbers.
 LEVELS = 10
-"""Colours of a scale of numbers."""
+# Grey: no value.
 OUT = CLASS_COLOURS[0]
-"""Grey: no value."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,8 +10,8 @@ import numpy as np
 from ...common.cf import WGS84, dataset, file_attributes, netcdf_bytes
 from .points import LABELS, PLACES, Column, Export, Points
 
+# Stands for a missing code in NetCDF; attribute ``_FillValue``.
 NO_CODE = -1
-"""Stands for a missing code in NetCDF; attribute ``_FillValue``."""
 
 
 _TITLES = {"rss": "Received level, measured and replayed", "rank": "Channel rank, reported and replayed"}

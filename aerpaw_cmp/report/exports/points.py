@@ -24,11 +24,11 @@ from ..data import ReportData, Track
 from ..export import DECIMALS, rank_tables, rss_tables
 from ..names import RANK_COLUMNS, RSS_COLUMNS, k_key
 
+# 1 mm.
 DEGREE_DECIMALS = 8
-"""1 mm."""
 
+# Meanings of 0 to 4 in a simulated rank.
 RANK_FLAGS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
-"""Meanings of 0 to 4 in a simulated rank."""
 YES_NO = ("no", "yes")
 
 _UNITS = (

@@ -16,8 +16,8 @@ from ...site.site import Site
 from ..made import Made
 from ..names import k_key
 
+# Name of the map in which the nearest tower serves.
 JOINT = "joint"
-"""Name of the map in which the nearest tower serves."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

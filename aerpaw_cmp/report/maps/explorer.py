@@ -22,8 +22,8 @@ from ..shapes import listed
 from .data import JOINT, MapLayer, MapsData, RankMap, RssMap, at_height
 from .figures import grouped
 
+# Base64 that the layers may take; beyond it layers of single towers are left out, then cells.
 MOST_BYTES = 4_000_000
-"""Base64 that the layers may take; beyond it layers of single towers are left out, then cells."""
 
 LATTICE = 9
 DEGREE = 4

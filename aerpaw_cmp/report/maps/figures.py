@@ -25,8 +25,8 @@ LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3
 MARKERS = "os^Dv<>P"
 COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
 MISSING: dict[str, Any] = {"facecolor": "#F2F2F2", "edgecolor": "#888888", "hatch": "//////", "linewidth": 0.0}
+# Maps side by side, at most.
 COLUMNS = 6
-"""Maps side by side, at most."""
 
 
 def curve_style(number: int, *, marked: bool = False) -> dict[str, Any]:

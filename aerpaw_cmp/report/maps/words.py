@@ -14,6 +14,7 @@ from .data import JOINT, MapsData, RssMap
 
 LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
 
+# Sentence and next step by :func:`~aerpaw_cmp.compare.verdicts.coverage_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
     "trees": (LEAST + "; trees take most of the rest.", "fly higher, or map `--foliage attenuating` beside it"),
@@ -32,7 +33,6 @@ CAUSES: dict[str, tuple[str, str]] = {
         "`aerpaw-cmp plan` names the flight that helps most",
     ),
 }
-"""Sentence and next step by :func:`~aerpaw_cmp.compare.verdicts.coverage_verdict`."""
 
 
 def first_words(data: MapsData) -> str:

@@ -186,8 +186,8 @@ def _rank_specs(data: ReportData, panel: RankResult) -> Iterator[FigureSpec]:
 
 # --- serving cells ---------------------------------------------------------------------------------------------------
 
+# Cells with a row of their own; the others stand together.
 MOST_CELLS = 16
-"""Cells with a row of their own; the others stand together."""
 
 OTHER, NONE = "others", "no path"
 
@@ -248,8 +248,8 @@ def serving_spec(serving: ServingComparison) -> FigureSpec:
     )
 
 
+# Of the reliability plot.
 SHARES = np.arange(0.1, 1.0, 0.1)
-"""Of the reliability plot."""
 
 
 def against_specs(against: Against) -> Iterator[FigureSpec]:

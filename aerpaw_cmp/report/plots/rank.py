@@ -160,8 +160,8 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
     return fig
 
 
+# Means of the forecast along the flight: as many as a page can show.
 _FORECAST_COLUMNS = 600
-"""Means of the forecast along the flight: as many as a page can show."""
 
 
 def rank_forecast(data: ReportData, panel: RankResult) -> Figure:

@@ -77,8 +77,8 @@ class Against:
         """Sentences on what the flight says of the prediction."""
         from .prediction_words import after_flight, rank_after_flight  # few reports score a prediction
 
-        said = [after_flight(self.scores, [item.stated for item in self.series])] if self.series else []
-        return " ".join([*said, *(rank_after_flight(tower, score) for tower, score in self.ranks.items())])
+        sentences = [after_flight(self.scores, [item.stated for item in self.series])] if self.series else []
+        return " ".join([*sentences, *(rank_after_flight(tower, score) for tower, score in self.ranks.items())])
 
     def metrics(self) -> dict[str, Any]:
         """``against`` of metrics.json."""

@@ -118,10 +118,10 @@ def _words(order: Sequence[str], scores: Mapping[str, Mapping[str, Any]], key: s
         return f"Lowest log score: {name}, {best[key]:.2f} nat; the constant has {best['constant_log_score']:.2f}."
     beaten: list[str] = []
     equal: list[str] = []
-    for other in ("free_space", "log_distance"):
-        low, high = best.get(f"difference_to_{other}_ci95_db", (math.nan, math.nan))
-        if order[0] != other and math.isfinite(low):
-            (beaten if high < 0 else equal).append(TITLES[other])
+    for baseline in ("free_space", "log_distance"):
+        low, high = best.get(f"difference_to_{baseline}_ci95_db", (math.nan, math.nan))
+        if order[0] != baseline and math.isfinite(low):
+            (beaten if high < 0 else equal).append(TITLES[baseline])
     words = [f"Lowest RMSE: {name}, {best[key]:.2f} dB."]
     if beaten:
         words.append(f"It is lower than that of {' and '.join(beaten)} (paired, 95 %).")

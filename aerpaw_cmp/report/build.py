@@ -51,8 +51,8 @@ def report_data(
         *(text for item in result.rank for text in rank_warnings(item)),
     ]
     sources = {
-        one.name: record.Source(files=tuple(log.path for log in settings.logs), file=series.log, line=series.line)
-        for one, series in zip(result.rss, data.rss, strict=True)
+        panel.name: record.Source(files=tuple(log.path for log in settings.logs), file=series.log, line=series.line)
+        for panel, series in zip(result.rss, data.rss, strict=True)
         if len(series.line) == len(series.time)
     }
     return record.ReportData(
@@ -79,9 +79,9 @@ def report_data(
 
 def clock_warnings(clocks: Mapping[str, ClockResult]) -> tuple[str, ...]:
     """Clocks that were corrected, should be, or cannot be judged; a correction that was not made comes first."""
-    asked = sorted(clocks, key=lambda receiver: clocks[receiver].applied != NOT_APPLIED)
-    found = {receiver: clock_warning(clocks[receiver]) for receiver in asked}
-    return tuple(f"{receiver}: {text}" for receiver, text in found.items() if text)
+    receivers = sorted(clocks, key=lambda receiver: clocks[receiver].applied != NOT_APPLIED)
+    sentences = {receiver: clock_warning(clocks[receiver]) for receiver in receivers}
+    return tuple(f"{receiver}: {text}" for receiver, text in sentences.items() if text)
 
 
 def clock_warning(clock: ClockResult) -> str:
@@ -152,10 +152,10 @@ def track_of(data: FlightData) -> record.Track | None:
         time = np.arange(data.track.start_ns, data.track.end_ns + 1, step_ns).astype("datetime64[ns]")
         position = data.track.pose_at(time).position_m
     else:
-        own = next((s for s in data.rank if s.position_m is not None), None)
-        if own is None or own.position_m is None:
+        placed = next((s for s in data.rank if s.position_m is not None), None)
+        if placed is None or placed.position_m is None:
             return None
-        time, position = own.time, own.position_m
+        time, position = placed.time, placed.position_m
     return record.Track(time=time, east_m=position[:, 0], north_m=position[:, 1], up_m=position[:, 2])
 
 

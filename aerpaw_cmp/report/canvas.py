@@ -222,7 +222,7 @@ def write_figures(
         progress("figures", len(drawn) / len(specs))
         picture = render(spec, formats, kind)
         drawn.append(picture)
-        written += [write_file(folder / f"{spec.name}.{form}", one) for form, one in picture.formats.items()]
+        written += [write_file(folder / f"{spec.name}.{form}", content) for form, content in picture.formats.items()]
     if specs:
         progress("figures", 1.0)
     return drawn, written
@@ -322,13 +322,13 @@ def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
         return np.arange(n)
     per = -(-n // max(1, limit // (2 * len(values))))
     starts = np.arange(0, n, per)
-    kept = [np.array([0, n - 1])]
+    rows = [np.array([0, n - 1])]
     for array in values:
         table = np.pad(np.asarray(array, dtype=np.float64), (0, -n % per), constant_values=np.nan).reshape(-1, per)
         missing = np.isnan(table)
-        kept += [starts + np.where(missing, np.inf, table).argmin(axis=1)]
-        kept += [starts + np.where(missing, -np.inf, table).argmax(axis=1)]
-    return np.unique(np.minimum(np.concatenate(kept), n - 1))
+        rows += [starts + np.where(missing, np.inf, table).argmin(axis=1)]
+        rows += [starts + np.where(missing, -np.inf, table).argmax(axis=1)]
+    return np.unique(np.minimum(np.concatenate(rows), n - 1))
 
 
 def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
@@ -407,10 +407,10 @@ def lonely(level: FloatArray) -> BoolArray:
     [True, False, False, False, False]
     """
     good = np.isfinite(level)
-    beside = np.zeros(len(good), dtype=bool)
-    beside[1:] |= good[:-1]
-    beside[:-1] |= good[1:]
-    return np.asarray(good & ~beside)
+    neighboured = np.zeros(len(good), dtype=bool)
+    neighboured[1:] |= good[:-1]
+    neighboured[:-1] |= good[1:]
+    return np.asarray(good & ~neighboured)
 
 
 def draw_out_of_coverage(
@@ -441,11 +441,11 @@ def draw_out_of_coverage(
         hatch=hatch, linewidth=0.0, label=label, zorder=0.5 if height == 1.0 else 4.0,
     )  # fmt: skip
     bars.set_rasterized(len(spans) > 300)
-    whole = max(float(seconds[-1] - seconds[0]), step)
-    for left, width in spans:
-        if width > 0.015 * whole and height == 1.0:
+    duration = max(float(seconds[-1] - seconds[0]), step)
+    for begin, width in spans:
+        if width > 0.015 * duration and height == 1.0:
             ax.text(
-                left + width / 2, 0.93, "Z", transform=ax.get_xaxis_transform(), ha="center", va="center", zorder=6,
+                begin + width / 2, 0.93, "Z", transform=ax.get_xaxis_transform(), ha="center", va="center", zorder=6,
                 fontweight="bold", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
             )  # fmt: skip
 

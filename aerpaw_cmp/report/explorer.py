@@ -69,10 +69,12 @@ def as_json(content: Mapping[str, Any]) -> str:
 
 def _place(panel: RssResult | RankResult, pick: IntArray, arrays: PackedArrays) -> dict[str, int]:
     """Places of the UAV, and those of a tower that moves."""
-    found = {axis: arrays.add(places[pick]) for axis, places in zip(AXES, panel.position_m.T, strict=True)}
-    if panel.tower_m is not None:
-        found |= {f"tower_{axis}": arrays.add(places[pick]) for axis, places in zip(AXES, panel.tower_m.T, strict=True)}
-    return found
+    ends = [("", panel.position_m), *([] if panel.tower_m is None else [("tower_", panel.tower_m)])]
+    return {
+        f"{whose}{axis}": arrays.add(places[pick])
+        for whose, position_m in ends
+        for axis, places in zip(AXES, position_m.T, strict=True)
+    }
 
 
 AXES = ("east", "north", "up")
@@ -84,14 +86,14 @@ def _rss(
     pick = keep_extremes([panel.measured_db, panel.residual_db], limit) if len(panel.time) else np.arange(0)
     models = [{"name": "ray tracing", **_fit(panel.score), "level": arrays.add(panel.simulated_dbm[pick]),
                "learned_here": panel.training}]  # fmt: skip
-    for name, one in panel.baselines.items():
-        models.append({"name": pretty(name), **_fit(one), "level": arrays.add(one.level_dbm[pick])})
+    for name, baseline in panel.baselines.items():
+        models.append({"name": pretty(name), **_fit(baseline), "level": arrays.add(baseline.level_dbm[pick])})
     geometry = [
         {"name": GEOMETRY[key].replace("\n", " "), "values": arrays.add(values[pick])}
         for key, values in panel.geometry.items()
         if key in GEOMETRY
     ]
-    said = {
+    channel = {
         **named(panel, "name tower unit"),
         "of": len(panel.time),
         "time": arrays.add(seconds_since(panel.time, start)[pick], "f8"),
@@ -101,12 +103,12 @@ def _rss(
         "geometry": geometry,
     }
     if source is not None:
-        said |= {
+        channel |= {
             "files": list(source.files),
             "file": arrays.add(source.file[pick]),
             "line": arrays.add(source.line[pick], "f8"),
         }
-    return said
+    return channel
 
 
 def _fit(model: RssComparison | ModelLevel) -> dict[str, float | None]:
@@ -172,8 +174,8 @@ def scene(site: Site, most_trees: int = TREES) -> dict[str, Any]:
 
 def plan_of(site: Site) -> dict[str, Any]:
     """:func:`scene` for a plan: no trees (foliage is in the levels), roofs alone of buildings."""
-    whole = scene(site)
-    return {**whole, "trees": [], "buildings": [faces[-1:] for faces in whole["buildings"]]}
+    solid = scene(site)
+    return {**solid, "trees": [], "buildings": [faces[-1:] for faces in solid["buildings"]]}
 
 
 def _number(value: float) -> float | None:

@@ -59,8 +59,8 @@ def metrics(data: ReportData) -> dict[str, Any]:
     return safe
 
 
-def _rss_metrics(one: RssResult) -> dict[str, Any]:
-    score = one.score
+def _rss_metrics(series: RssResult) -> dict[str, Any]:
+    score = series.score
     return {
         **named(score, "offset_db rmse_db n n_out_of_coverage"),
         "at_search_edge": score.at_edge,
@@ -69,12 +69,12 @@ def _rss_metrics(one: RssResult) -> dict[str, Any]:
         "correlation_ci95": score.intervals.correlation,
         "n_effective": score.intervals.autocorrelation.n_effective,
         "lag_s": score.lag_s,
-        "lag_verdict": one.clock_verdict,
-        "unit": one.unit,
+        "lag_verdict": series.clock_verdict,
+        "unit": series.unit,
         "fitted": score.fitted_on_scored,
-        "baselines": {name: named(model, "offset_db rmse_db") for name, model in one.baselines.items()},
-        **fields_of(one.further),
-        "residual_by": one.residual_by,
+        "baselines": {name: named(model, "offset_db rmse_db") for name, model in series.baselines.items()},
+        **fields_of(series.further),
+        "residual_by": series.residual_by,
     }
 
 
@@ -95,8 +95,8 @@ def _histogram(share: FloatArray, intervals: Sequence[Interval]) -> dict[str, An
     }
 
 
-def _rank_metrics(one: RankResult) -> dict[str, Any]:
-    score = one.score
+def _rank_metrics(series: RankResult) -> dict[str, Any]:
+    score = series.score
     simulated = {
         k_key(k): {
             **_histogram(fit.histogram, fit.histogram_ci95),
@@ -110,32 +110,32 @@ def _rank_metrics(one: RankResult) -> dict[str, Any]:
     return {
         "measured": {
             **_histogram(score.histogram, score.histogram_ci95),
-            "n": int(np.isfinite(one.measured).sum()),
-            "n_no_csi": int((~np.isfinite(one.measured)).sum()),
+            "n": int(np.isfinite(series.measured).sum()),
+            "n_no_csi": int((~np.isfinite(series.measured)).sum()),
         },
         "simulated": simulated,
         "best_k": score.best_k,
         "best_k_ci95": score.curve.best_k_interval,
-        **further_numbers(one),
+        **further_numbers(series),
     }
 
 
-def further_numbers(one: RssResult | RankResult) -> dict[str, Any]:
+def further_numbers(series: RssResult | RankResult) -> dict[str, Any]:
     """Numbers of a series that stand in a table of their own on the page, as JSON has them."""
     numbers: dict[str, Any] = {}
-    if isinstance(one, RankResult):
-        curve = one.score.curve
+    if isinstance(series, RankResult):
+        curve = series.score.curve
         numbers = {
-            **named(one.score, "n n_effective n_no_csi"),
+            **named(series.score, "n n_effective n_no_csi"),
             "best_k_total_variation": curve.best_k_total_variation,
             "best_k_total_variation_ci95": curve.best_k_total_variation_interval,
-            "stale": named(one.score.staleness, "verdict n_reports hold_s"),
+            "stale": named(series.score.staleness, "verdict n_reports hold_s"),
             "rules": {
                 name: fields_of(fit) | _histogram(fit.histogram, fit.histogram_ci95)
-                for name, fit in one.score.rules.items()
+                for name, fit in series.score.rules.items()
             },
         }
-    safe: dict[str, Any] = json_safe(numbers | fields_of(one.further))
+    safe: dict[str, Any] = json_safe(numbers | fields_of(series.further))
     return safe
 
 
@@ -155,9 +155,9 @@ def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
     }
 
 
-def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
+def merge(into: dict[str, Any], numbers: Mapping[str, Any]) -> None:
     """Put ``other`` into ``into``, key by key; what is only in ``into`` stays."""
-    for key, value in other.items():
+    for key, value in numbers.items():
         if isinstance(value, Mapping) and isinstance(into.get(key), dict):
             merge(into[key], value)
         else:
@@ -182,30 +182,31 @@ _ROWS = 50_000
 
 
 def rss_tables(series: Sequence[RssResult]) -> Iterator[_Table]:
-    """Times and further columns of rss.csv by tower and channel, not yet rounded; one that a series lacks is NaN."""
+    """Times and further columns of rss.csv by tower and channel, not yet rounded; what a series lacks is NaN."""
     models = list(dict.fromkeys(name for item in series for name in item.baselines))
     more = [_rss_columns(item) for item in series]
-    for one, own in zip(series, more, strict=True):
-        nowhere = np.full(len(one.time), np.nan)
+    names = dict.fromkeys(name for columns in more for name in columns)
+    for panel, optional in zip(series, more, strict=True):
+        nowhere = np.full(len(panel.time), np.nan)
         yield (
-            one.time,
+            panel.time,
             {
-                **named(one, "tower channel unit"),
-                **_places(one.position_m),
-                **named(one, "measured_db calibrated_db simulated_dbm residual_db"),
-                "measured_out_of_coverage": one.measured_out_of_coverage.astype(int),
-                "simulated_out_of_coverage": one.simulated_out_of_coverage.astype(int),
-                **{f"{m}_dbm": one.baselines[m].level_dbm if m in one.baselines else nowhere for m in models},
-                **{name: own.get(name, nowhere) for name in dict.fromkeys(name for other in more for name in other)},
+                **named(panel, "tower channel unit"),
+                **_places(panel.position_m),
+                **named(panel, "measured_db calibrated_db simulated_dbm residual_db"),
+                "measured_out_of_coverage": panel.measured_out_of_coverage.astype(int),
+                "simulated_out_of_coverage": panel.simulated_out_of_coverage.astype(int),
+                **{f"{m}_dbm": panel.baselines[m].level_dbm if m in panel.baselines else nowhere for m in models},
+                **{name: optional.get(name, nowhere) for name in names},
             },
         )
 
 
-def _rss_columns(one: RssResult) -> dict[str, FloatArray]:
+def _rss_columns(series: RssResult) -> dict[str, FloatArray]:
     """Columns that not every series has: stated intervals, the place of a moving tower."""
     return {
-        **({} if one.stated is None else one.stated.columns(one.simulated_dbm)),
-        **({} if one.tower_m is None else _places(one.tower_m, "tower_")),
+        **({} if series.stated is None else series.stated.columns(series.simulated_dbm)),
+        **({} if series.tower_m is None else _places(series.tower_m, "tower_")),
     }  # fmt: skip
 
 
@@ -215,34 +216,35 @@ def _places(position_m: FloatArray, whose: str = "") -> dict[str, FloatArray]:
 
 
 def rank_tables(series: Sequence[RankResult]) -> Iterator[_Table]:
-    """Times and further columns of rank.csv by tower, not yet rounded; one that a series lacks is empty."""
+    """Times and further columns of rank.csv by tower, not yet rounded; what a series lacks is empty."""
     import pandas as pd
 
     def integers(values: Any) -> Any:
         return pd.Series(values, dtype="float64").astype("Int64").array  # NaN becomes an empty cell, 2.0 becomes 2
 
     ks = sorted({k for item in series for k in item.rank})
-    numbers = [_number_columns(item) for item in series]
-    for one, own in zip(series, numbers, strict=True):
-        nowhere = np.full(len(one.time), np.nan)
+    more = [_number_columns(item) for item in series]
+    names = dict.fromkeys(name for columns in more for name in columns)
+    for panel, optional in zip(series, more, strict=True):
+        nowhere = np.full(len(panel.time), np.nan)
         yield (
-            one.time,
+            panel.time,
             {
-                "tower": one.tower,
-                **_places(one.position_m),
-                "measured_rank": integers(one.measured),
-                **{f"simulated_rank_k{k_key(k)}": integers(one.rank.get(k, nowhere)) for k in ks},
-                **{name: own.get(name, nowhere) for name in dict.fromkeys(name for other in numbers for name in other)},
+                "tower": panel.tower,
+                **_places(panel.position_m),
+                "measured_rank": integers(panel.measured),
+                **{f"simulated_rank_k{k_key(k)}": integers(panel.rank.get(k, nowhere)) for k in ks},
+                **{name: optional.get(name, nowhere) for name in names},
             },
         )
 
 
-def _number_columns(one: RankResult) -> dict[str, FloatArray]:
+def _number_columns(series: RankResult) -> dict[str, FloatArray]:
     """Numbers a receiver decides by; no path, a ratio of nothing and a vanishing singular value are empty cells."""
-    columns = {"level_dbm": one.level_dbm, **({} if one.tower_m is None else _places(one.tower_m, "tower_"))}
-    columns |= {f"sigma{i}_over_sigma1_db": ratio for i, ratio in enumerate(one.singular_ratio_db.T, start=2)}
-    if one.probability is not None:
-        columns |= {f"probability_rank{rank}": share for rank, share in enumerate(one.probability.T, start=1)}
+    columns = {"level_dbm": series.level_dbm, **({} if series.tower_m is None else _places(series.tower_m, "tower_"))}
+    columns |= {f"sigma{i}_over_sigma1_db": ratio for i, ratio in enumerate(series.singular_ratio_db.T, start=2)}
+    if series.probability is not None:
+        columns |= {f"probability_rank{rank}": share for rank, share in enumerate(series.probability.T, start=1)}
     return {name: np.where(np.isfinite(values), values, np.nan) for name, values in columns.items()}
 
 

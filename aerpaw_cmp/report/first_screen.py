@@ -22,19 +22,19 @@ LARGE_DB = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Headline:
-    """One number of the first screen: what it is, its value with unit, its interval or range, what stands beside it."""
+    """One number of the first screen: what it is, its value with unit, its interval or range, its reference."""
 
     label: str
     value: str
     interval: str
-    beside: str
+    reference: str
 
 
 def verdict(data: ReportData) -> tuple[str, ...]:
     """Two sentences: how good against which baseline; where it fails, and whether to trust it."""
     scored = _scored(data.rss)
-    found = judged(scored)
-    first = words.first_sentence(found) if found is not None else _rank_sentence(data.rank)
+    comparison = judged(scored)
+    first = words.first_sentence(comparison) if comparison is not None else _rank_sentence(data.rank)
     if learned := _training(data):
         learned = " ".join(part for part in (learned, words.expected_sentence(data.rss)) if part)
         return learned, " ".join(part for part in (_baseline_sentence(data.rss), first, words.trust(data)) if part)
@@ -127,16 +127,16 @@ def judge(
     total, count_of = words.pooled_db(*map(list, zip(*scored, strict=True))), len(scored)
     every = []
     for name, error in baselines_db.items():
-        said = [own[name] for own in verdicts if own.get(name, "no interval") != "no interval"]
-        every.append(words.Judged(ray_db=total, channels=count_of, name=name, other_db=error, judged=len(said),
-                            better=said.count("better"), worse=said.count("worse"), unit=unit))  # fmt: skip
+        decided = [row[name] for row in verdicts if row.get(name, "no interval") != "no interval"]
+        every.append(words.Judged(ray_db=total, channels=count_of, name=name, other_db=error, judged=len(decided),
+                            better=decided.count("better"), worse=decided.count("worse"), unit=unit))  # fmt: skip
     return most_telling(every) if every else words.Judged(ray_db=total, channels=count_of, unit=unit)
 
 
 def most_telling(every: Sequence[words.Judged]) -> words.Judged:
     """The comparison to be said first: the best baseline that ray tracing loses to, else the best one."""
     lost = [entry for entry in every if entry.worse > entry.better]
-    return min(lost or every, key=lambda one: one.other_db)
+    return min(lost or every, key=lambda comparison: comparison.other_db)
 
 
 def _forecast_of(panel: RankResult) -> ForecastScore | None:
@@ -165,7 +165,7 @@ def _forecast_card(panel: RankResult, score: ForecastScore) -> Headline:
         label=f"Rank forecast at {panel.tower}",
         value=f"kappa {score.kappa:.2f}",
         interval=_interval(score.kappa_ci95, ".2f"),
-        beside=_log_score(score),
+        reference=_log_score(score),
     )
 
 
@@ -176,11 +176,11 @@ def _rank_sentence(panels: Sequence[RankResult]) -> str:
         k = words.nearest_k(panel)
         if k is not None:
             at, commonest = panel.score.simulated[k], panel.further.commonest
-            beside = (
+            guess = (
                 f"; always guessing {commonest.rank} agrees in {100 * commonest.agreement:.0f} %"
                 if commonest.rank else ""
             )  # fmt: skip
-            agree = f" Per position they agree in {100 * at.agreement:.0f} % of samples{beside}."
+            agree = f" Per position they agree in {100 * at.agreement:.0f} % of samples{guess}."
             return (
                 f"Rank at {panel.tower} (K = {k:.10g}, best of {len(panel.score.simulated)} thresholds): predicted and "
                 f"reported shares differ by {points(at.total_variation)} in all."
@@ -195,7 +195,7 @@ LONG_S = 5.0
 
 def _causes(panels: Sequence[RssResult]) -> str:
     """The cause that explains most of a channel's error; nothing where no channel shows one."""
-    gains = [(one.gain, i) for i, panel in enumerate(panels) if (one := panel.further.likely_cause) is not None]
+    gains = [(cause.gain, i) for i, panel in enumerate(panels) if (cause := panel.further.likely_cause) is not None]
     return words.cause_sentence(panels[max(gains)[1]]) if gains else ""
 
 
@@ -236,13 +236,13 @@ def headlines(data: ReportData) -> list[Headline]:
 def _audit(audit: AuditResult) -> Headline:
     """Failed checks of the audit; paths that the other engine did not sample are no fault of ours."""
     fields = audit.fields
-    beside = f"{words.count(audit.links)} links against {audit.reference}"
+    extent = f"{words.count(audit.links)} links against {audit.reference}"
     if fields is None:
         value = f"{words.count(audit.missing_paths)} paths missing"
     else:
         value = f"{words.count(len(fields.failures))} failed"
-        beside += f"; {words.count(fields.raw_poses)} poses, {words.count(fields.raw_levels)} levels from raw bytes"
-    return Headline(label="Audit", value=value, interval=words.audit_paths(audit), beside=beside)
+        extent += f"; {words.count(fields.raw_poses)} poses, {words.count(fields.raw_levels)} levels from raw bytes"
+    return Headline(label="Audit", value=value, interval=words.audit_paths(audit), reference=extent)
 
 
 def _error(panels: Sequence[RssResult]) -> Headline:
@@ -251,7 +251,7 @@ def _error(panels: Sequence[RssResult]) -> Headline:
         label="RMSE of the level" if len(panels) == 1 else f"RMSE of the level, {len(panels)} channels",
         value=f"{total:.1f} dB",
         interval=_ends(panels),
-        beside="no baseline" if best is None else f"{words.pretty(best[0])}: {best[1]:.1f} dB",
+        reference="no baseline" if best is None else f"{words.pretty(best[0])}: {best[1]:.1f} dB",
     )
 
 
@@ -269,28 +269,28 @@ def _ends(panels: Sequence[RssResult]) -> str:
 
 
 def _difference(panels: Sequence[RssResult]) -> list[Headline]:
-    found = judged(panels)  # as the sentence above the cards
-    name = "" if found is None else found.name
+    comparison = judged(panels)  # as the sentence above the cards
+    name = "" if comparison is None else comparison.name
     paired = _paired(panels, name)
     if not paired:
         return []
-    said = [entry.verdict for entry in paired]
-    undecided = len(said) - said.count("better") - said.count("worse")
+    verdicts = [entry.verdict for entry in paired]
+    undecided = len(verdicts) - verdicts.count("better") - verdicts.count("worse")
     if len(paired) == 1:
         return [
             Headline(
                 label=f"Against {words.pretty(name)}, same samples",
                 value=f"{paired[0].difference_db:+.1f} dB".replace("-", "−"),
                 interval=_interval(paired[0].difference_ci95_db, "+.1f", " dB"),
-                beside="negative: smaller error of ray tracing",
+                reference="negative: smaller error of ray tracing",
             )
         ]
     return [
         Headline(
             label=f"Better than {words.pretty(name)}",
-            value=f"{said.count('better')} of {len(said)}",
-            interval=f"worse: {said.count('worse')}, not significant: {undecided}",
-            beside="channels, by paired 95 % intervals",
+            value=f"{verdicts.count('better')} of {len(verdicts)}",
+            interval=f"worse: {verdicts.count('worse')}, not significant: {undecided}",
+            reference="channels, by paired 95 % intervals",
         )
     ]
 
@@ -305,7 +305,7 @@ def _rank(panel: RankResult, k: float) -> Headline:
         value=points(at.total_variation),
         interval="between predicted and reported shares"
         + (f" (95 %: {100 * low:.0f} to {100 * high:.0f})" if known else ""),
-        beside=f"{agree}; always saying {commonest.rank}: {100 * commonest.agreement:.0f} %"
+        reference=f"{agree}; always saying {commonest.rank}: {100 * commonest.agreement:.0f} %"
         if commonest.rank
         else agree,
     )

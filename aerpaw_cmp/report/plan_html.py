@@ -88,9 +88,9 @@ def _draw_map(data: PlanPage) -> Figure:
     fig, axes = canvas.subplots((9.2, 4.8), 1, 2, sharex=True, sharey=True)
     _, first, member = np.unique(data.place_m[:, :2].round(1), axis=0, return_index=True, return_inverse=True)
     count = np.bincount(member.ravel())
-    both = [np.sqrt(np.bincount(member.ravel(), v**2) / count) for v in (data.before_db, data.after_db)]
-    low, high = float(min(v.min() for v in both)), float(max(v.max() for v in both))
-    for ax, values, title in zip(axes, both, ("now", "after the flight"), strict=True):
+    spreads = [np.sqrt(np.bincount(member.ravel(), v**2) / count) for v in (data.before_db, data.after_db)]
+    low, high = float(min(v.min() for v in spreads)), float(max(v.max() for v in spreads))
+    for ax, values, title in zip(axes, spreads, ("now", "after the flight"), strict=True):
         for ring in (data.outline_m, *data.holes_m):
             ax.plot(ring[:, 0], ring[:, 1], color="0.75", linewidth=0.8)
         place = data.place_m[first]
@@ -102,8 +102,8 @@ def _draw_map(data: PlanPage) -> Figure:
         canvas.plan_axes(ax)
         ax.set_title(title)
         ax.label_outer()
-    seen = np.concatenate([data.place_m[:, :2], data.outline_m, data.track_m[:, :2]])
-    canvas.frame_around(axes[0], *seen.T, shape=canvas.plan_shape(*seen.T))
+    extent = np.concatenate([data.place_m[:, :2], data.outline_m, data.track_m[:, :2]])
+    canvas.frame_around(axes[0], *extent.T, shape=canvas.plan_shape(*extent.T))
     axes[1].plot(data.track_m[:, 0], data.track_m[:, 1], color=canvas.MEASURED, linewidth=1.0)
     return fig
 

@@ -115,10 +115,10 @@ def first_words(correction: Correction, outside: float, expected_db: float) -> s
     """
     key, free = (correction.base, correction.title), ("free space", OFF)
     over = "flights left out, each about its own mean" if len(correction.flights) > 1 else "300 m blocks left out"
-    beside = f"; free space {correction.rmse_db[free]:.1f} dB" if free in correction.rmse_db else ""
+    baseline = f"; free space {correction.rmse_db[free]:.1f} dB" if free in correction.rmse_db else ""
     texts = [
         f"Expect an RMSE of {expected_db:.1f} dB over 4 s means at these points on a new flight.",
-        f"On {over}: {correction.rmse_db[key]:.1f} dB{beside}.",
+        f"On {over}: {correction.rmse_db[key]:.1f} dB{baseline}.",
     ]
     if free in correction.rmse_db and key != free:
         texts.append(said_of(against_free_space(correction), AGAINST_FREE_SPACE))
@@ -178,8 +178,10 @@ def inside_share(error: FloatArray, sd: FloatArray) -> float:
 
 def against_free_space(correction: Correction) -> Verdict:
     """The chosen model and free space on the same samples that were left out."""
-    error, other = (correction.held_out[key][0] for key in ((correction.base, correction.title), ("free space", OFF)))
-    pair = paired_difference(error, other, free_offset=False)
+    error, free_space = (
+        correction.held_out[key][0] for key in ((correction.base, correction.title), ("free space", OFF))
+    )
+    pair = paired_difference(error, free_space, free_offset=False)
     return Verdict(cause=pair.verdict, effect=pair.difference_db, interval=pair.difference_ci95_db)
 
 
@@ -209,11 +211,11 @@ def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Ver
     """
     rows = list(scores.values())
     mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
-    told = max(stated, key=lambda one: list(FLOWN).index(one.cause))
+    worst = max(stated, key=lambda verdict: list(FLOWN).index(verdict.cause))
     return (
         f"Predicted before this flight: RMSE {mean['rmse_db']:.1f} dB as predicted ({mean['rmse_4s_db']:.1f} dB over "
         f"4 s), {mean['own_offset_rmse_db']:.1f} dB after the flight's own offset. The 90 % intervals hold "
-        f"{100 * mean['coverage_90']:.0f} % of the samples. {said_of(told, FLOWN)}"
+        f"{100 * mean['coverage_90']:.0f} % of the samples. {said_of(worst, FLOWN)}"
     )
 
 

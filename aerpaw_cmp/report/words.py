@@ -122,7 +122,7 @@ RANKING: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
 
 def ranking_sentence(verdicts: Mapping[str, str], most: int) -> str:
     """Sentence on what the intervals say of the settings behind the first, by name; at most ``most`` are named."""
-    alike = [name for name, said in verdicts.items() if said != "worse"]
+    alike = [name for name, word in verdicts.items() if word != "worse"]
     named = ", ".join(alike[:most]) + (f" and {len(alike) - most} more" if len(alike) > most else "")
     return next(text for holds, text in RANKING if holds(set(verdicts.values()))).format(named=named)
 
@@ -139,10 +139,10 @@ def first_sentence(facts: Judged) -> str:
     >>> first_sentence(Judged(ray_db=6.72, channels=2, name="free_space", other_db=6.0, judged=2))
     'Ray tracing: RMSE 6.7 dB; free space: 6.0 dB. The difference is not significant on either channel (95 %).'
     """
-    beside = f"; {pretty(facts.name)}: {facts.other_db:.1f} dB" if facts.name else ""
+    baseline = f"; {pretty(facts.name)}: {facts.other_db:.1f} dB" if facts.name else ""
     text = next(text for holds, text in SIGNIFICANCE if holds(facts))
-    said = text.format(better=facts.better, worse=facts.worse, channels=facts.channels, unit=facts.unit)
-    return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{beside}. {said}"
+    significance = text.format(better=facts.better, worse=facts.worse, channels=facts.channels, unit=facts.unit)
+    return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{baseline}. {significance}"
 
 
 def expected_sentence(panels: Sequence[RssResult]) -> str:
@@ -367,9 +367,9 @@ def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
     chosen = best.model
     mine = {row.model: [r for r in rows if r.model == row.model] for row in rows}
     error = {model: pooled_db([r.rmse_heldout_db for r in of], [r.n for r in of]) for model, of in mine.items()}
-    beside = [f"{name} {error[name]:.1f} dB" for name in (AS_SET, *BASELINE_TITLE.values()) if name in error]
+    compared = [f"{name} {error[name]:.1f} dB" for name in (AS_SET, *BASELINE_TITLE.values()) if name in error]
     least = min(error, key=lambda name: error[name])
-    text = f"Cross-validated RMSE: {', '.join(beside)}."
+    text = f"Cross-validated RMSE: {', '.join(compared)}."
     if least in (BASELINE_TITLE["log_distance"], BASELINE_TITLE["constant"]):
         text += f" The {least}, which replays nothing, has the smallest error of all models."
     how = "the simplest replay within one standard error of the best replay"
@@ -447,7 +447,7 @@ def lock_lost(panel: RssResult) -> DetectionScore | None:
 
 def lock_sentence(panels: Sequence[RssResult]) -> str:
     """Both parts of the score of a receiver that lost its lock; nothing where none did."""
-    said = []
+    sentences = []
     for panel in panels:
         score, known = lock_lost(panel), panel.further.elsewhere or {}
         if score is None:
@@ -458,13 +458,13 @@ def lock_sentence(panels: Sequence[RssResult]) -> str:
                 f" Expect {known['floor_rmse_db']:.1f} dB on another flight (free space "
                 f"{known['free_space_floor_rmse_db']:.1f} dB)."
             )
-        said.append(
+        sentences.append(
             f"{panel.name} lost its lock in {100 - 100 * score.n_detected / score.n:.0f} % of the samples. With lower "
             f"levels counted as {floor} {panel.unit}: RMSE {score.rmse_db:.1f} dB; free space: "
             f"{score.free_space_rmse_db:.1f} dB.{expected} P(locked), {learned_on(score)}: Brier score "
             f"{score.brier:.2f}; a constant: {score.constant_brier:.2f}."
         )
-    return " ".join(said)
+    return " ".join(sentences)
 
 
 def _snr_words(panel: RssResult) -> str:
@@ -486,7 +486,7 @@ def rank_verdict(panel: RankResult) -> str:
     best, logs = panel.score.simulated[k], panel.further.trained_on
     learned = f" {training_sentence([panel.tower], 'the receiver', logs)}" if logs else ""
     agree = f" and agrees pose by pose in {100 * best.agreement:.0f} %" if math.isfinite(best.agreement) else ""
-    kappa = f" (kappa {best.kappa:.2f}; 0 is chance{_beside_kappa(panel)})" if math.isfinite(best.kappa) else ""
+    kappa = f" (kappa {best.kappa:.2f}; 0 is chance{_kappa_references(panel)})" if math.isfinite(best.kappa) else ""
     return (
         f"{panel.tower} rank: of the K shown, K = {k:.10g} comes nearest to the reported distribution "
         f"(total variation {best.total_variation:.2f}){agree}{kappa}.{learned}"
@@ -501,16 +501,16 @@ def nearest_k(panel: RankResult) -> float | None:
     return min(distance, key=lambda k: distance[k], default=None)
 
 
-def _beside_kappa(panel: RankResult) -> str:
+def _kappa_references(panel: RankResult) -> str:
     """Agreement that needs no model, and the one that the modem's agreement with itself allows, in words."""
-    said = ""
+    words = ""
     commonest = panel.further.commonest
     if commonest.rank:
-        said += f"; always saying {commonest.rank} would agree in {100 * commonest.agreement:.0f} %"
+        words += f"; always saying {commonest.rank} would agree in {100 * commonest.agreement:.0f} %"
     repeat = panel.further.repeat.get("same_heading") or panel.further.repeat.get("any_heading")
     if repeat is not None and repeat.n and math.isfinite(repeat.kappa):
-        said += f"; the modem repeats itself at the same places to kappa {repeat.kappa:.2f}"
-    return said
+        words += f"; the modem repeats itself at the same places to kappa {repeat.kappa:.2f}"
+    return words
 
 
 def warnings(data: ReportData) -> list[str]:

@@ -81,8 +81,8 @@ def write_report(
         with stages("exports"):
             written += write_exports(of_report(data), folder, exports, stages.progress)
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
-    beside = (folder, folder / FOLDER)
-    files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in beside)]
+    offered = (folder, folder / FOLDER)
+    files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in offered)]
     with stages("report"):
         shown = [picture for picture in pictures if {"png", "svg"} & set(picture.formats)]
         page = write_file(folder / "report.html", html.page(data, shown, files))

@@ -165,7 +165,7 @@ def test_a_single_sample_is_no_result(report_data):
 def test_at_most_four_numbers_each_with_something_beside_it(report_data):
     found = headlines(report_data)
     assert 2 <= len(found) <= 4
-    assert all(one.value and one.beside for one in found)
+    assert all(one.value and one.reference for one in found)
 
 
 def test_doubts_are_said(report_data):

@@ -67,7 +67,7 @@ def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
                 gain_dbi=whole,
                 sd_db=sd.reshape(shape),
                 level_db=float((raw - whole).flat[0]),
-                seen=fit.seen(frame, antenna),
+                flown=fit.seen(frame, antenna),
             )
     return out
 

@@ -22,7 +22,7 @@ class AntennaMap:
     gain_dbi, sd_db : (t, p)
     level_db : float
         What was taken from the learned gain for a mean of 0 dBi.
-    seen : (m, 3)
+    flown : (m, 3)
         Unit vectors of the directions that flights looked in.
     """
 
@@ -32,7 +32,7 @@ class AntennaMap:
     gain_dbi: FloatArray
     sd_db: FloatArray
     level_db: float
-    seen: FloatArray
+    flown: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -36,7 +36,7 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
         **named(data, "flights trained_on scores controls mounts strengths ground words warnings"),
         learning_curve={"points": data.curve, "one_more_rmse_db": data.one_more_rmse_db},
         antennas=[
-            {"name": a.name, "share_of_sphere_seen": share_seen(a), "n_bins": len(a.seen)} for a in data.antennas
+            {"name": a.name, "share_of_sphere_seen": share_seen(a), "n_bins": len(a.flown)} for a in data.antennas
         ],
         rank=data.rank or {},
         **about(data),
@@ -48,7 +48,7 @@ def share_seen(antenna: AntennaMap, within_deg: float = 10.0) -> float:
     t, p = np.radians(antenna.theta_deg)[:, None], np.radians(antenna.azimuth_deg)[None, :]
     grid = np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
     near = np.zeros(grid.shape[:2], bool)
-    for part in np.array_split(antenna.seen, max(1, len(antenna.seen) // 500)):
+    for part in np.array_split(antenna.flown, max(1, len(antenna.flown) // 500)):
         near |= (grid @ part.T > np.cos(np.radians(within_deg))).any(axis=-1)
     weight = np.sin(t) * np.ones_like(near)
     return float((near * weight).sum() / weight.sum())
@@ -74,8 +74,8 @@ def draw_antenna(antenna: AntennaMap) -> Figure:
         fig.colorbar(mesh, ax=ax, label=label, pad=0.01)
         ax.set_ylabel("elevation [deg]")
         ax.set_yticks([-90, -45, 0, 45, 90])
-    at = np.degrees(np.arctan2(antenna.seen[:, 1], antenna.seen[:, 0])) % 360.0
-    up = np.degrees(np.arcsin(np.clip(antenna.seen[:, 2], -1, 1)))
+    at = np.degrees(np.arctan2(antenna.flown[:, 1], antenna.flown[:, 0])) % 360.0
+    up = np.degrees(np.arcsin(np.clip(antenna.flown[:, 2], -1, 1)))
     for ax, colour in zip(axes, ("black", "white"), strict=True):
         ax.plot(at, up, ".", markersize=1.5, color=colour, alpha=0.6, label="flown")
     axes[1].set_xlabel("azimuth, counter-clockwise from forward or east [deg]")
@@ -93,8 +93,8 @@ def draw_scores(data: CalibrationData) -> Figure:
     rows = [(name, value) for name, value in rows if np.isfinite(value)]
     fig, ax = canvas.subplots((9.2, 0.4 * len(rows) + 1.0))
     names, values = [r[0] for r in rows][::-1], [r[1] for r in rows][::-1]
-    beside = [n in BASELINES.values() or "control" in n for n in names]
-    colours = [canvas.OUT_OF_COVERAGE if pale else canvas.SIMULATED for pale in beside]
+    pale = [n in BASELINES.values() or "control" in n for n in names]
+    colours = [canvas.OUT_OF_COVERAGE if reference else canvas.SIMULATED for reference in pale]
     ax.barh(names, values, color=colours)
     for y, value in enumerate(values):
         ax.text(value, y, f" {value:.2f}", va="center", fontsize=8)

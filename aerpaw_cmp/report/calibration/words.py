@@ -99,7 +99,7 @@ def sentences(
     if not left_out:
         return (ONE_FLIGHT,)
     verdict, turned = helps(left_out), frame(controls)
-    worst = max(left_out, key=lambda one: one.rmse_db)
+    worst = max(left_out, key=lambda score: score.rmse_db)
     ends = sorted(map(abs, turned.interval))
     helped, _, step = said_of(verdict, HELPS).partition(" Next: ")
     first = (
@@ -116,11 +116,11 @@ def sentences(
 def _further(scores: Mapping[str, Sequence[Score]], ground_m: tuple[float, float] | None) -> Iterator[str]:
     left_out, sectors = scores["flight_left_out"], scores["sector_left_out"]
     if sectors:
-        base, left = mean_rmse(sectors, "free_space_rmse_db"), mean_rmse(sectors)
-        yield f"Directions that no training flight has seen: RMSE {left:.1f} dB; free space: {base:.1f} dB."
+        base, error = mean_rmse(sectors, "free_space_rmse_db"), mean_rmse(sectors)
+        yield f"Directions that no training flight has seen: RMSE {error:.1f} dB; free space: {base:.1f} dB."
         gain = mean_rmse(left_out, "free_space_rmse_db") - mean_rmse(left_out)
         if gain > 0:
-            share = min(max((base - left) / gain, 0.0), 1.0)
+            share = min(max((base - error) / gain, 0.0), 1.0)
             yield f"{100 * share:.0f} % of the gain over free space carries over to these directions."
     if not scores["heading_left_out"]:
         yield "No heading could be left out: the flights share one."

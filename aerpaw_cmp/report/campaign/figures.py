@@ -129,8 +129,8 @@ def season_errors(data: CampaignData) -> Figure:
     ax.set_yticks(range(len(ranking)), [entry.setting for entry in ranking])
     ax.invert_yaxis()
     ax.grid(visible=False, axis="y")
-    held = "Held-out error" if data.season.held_out else "Error with the flight's own offset"
-    ax.set_xlabel(f"{held} of a flight, mean over towers and channels [dB]")
+    kind = "Held-out error" if data.season.held_out else "Error with the flight's own offset"
+    ax.set_xlabel(f"{kind} of a flight, mean over towers and channels [dB]")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return fig
 
@@ -238,8 +238,8 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
         ax.set_visible(False)
     for ax, row, cell_mean in zip(axes.ravel(), rows, means, strict=False):
         if cell_mean:
-            own = np.array([mean for mean, _ in cell_mean.values()])
-            mesh = _cells(ax, data, np.array(list(cell_mean)), own, reach, [row.tower])
+            residual = np.array([mean for mean, _ in cell_mean.values()])
+            mesh = _cells(ax, data, np.array(list(cell_mean)), residual, reach, [row.tower])
         ax.set_title(f"{row.flight} ({count(row.n)} samples)")
         ax.label_outer()
     _frame(axes[0][0], data, cells, [rows[0].tower], shape)

@@ -102,7 +102,7 @@ CSV_COLUMNS = [
 ]  # fmt: skip
 
 
-def repeatability_beside(data: CampaignData) -> list[tuple[Any, float, float]]:
+def errors_of_pairs(data: CampaignData) -> list[tuple[Any, float, float]]:
     """Each pair of flights with the RMSE of both under the reference setting."""
     rmse = {row.key: row.rmse_db for row in data.reference_rows}
     return [
@@ -132,11 +132,11 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         data=data,
         sections=by_section(pictures),
         mean_rmse=words.mean_rmse(data),
-        beside=repeatability_beside(data),
+        pair_errors=errors_of_pairs(data),
         halves=halves(data),
         headline=words.headline(data),
         verdict=words.verdict(data),
-        beside_baselines=words.beside_baselines,
+        against_baselines=words.against_baselines,
         warnings=words.warnings(data),
         baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
         rss_flights=words.rss_flights(data),

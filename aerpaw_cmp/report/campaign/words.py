@@ -157,12 +157,12 @@ def verdict(data: CampaignData) -> list[str]:
     known = {name: [row.baselines.get(name, np.nan) for row in rows] for row in rows for name in row.baselines}
     errors = {name: pooled_db(each, [row.n for row in rows]) for name, each in known.items() if np.isfinite(each).all()}
     out = [first_sentence(judge(scored, errors, [row.verdicts for row in rows], "flights x channels"))]
-    held = [row.held_out_rmse_db for row in rows if np.isfinite(row.held_out_rmse_db)]
-    own = float(np.mean([row.rmse_db for row in rows]))
-    if held:
+    held_out = [row.held_out_rmse_db for row in rows if np.isfinite(row.held_out_rmse_db)]
+    mean_own = float(np.mean([row.rmse_db for row in rows]))
+    if held_out:
         out.append(
-            f"Mean RMSE: {own:.1f} dB with each flight's own offset, {np.mean(held):.1f} dB with the offset of the "
-            f"other flights. Expect {np.mean(held):.1f} dB on a new flight."
+            f"Mean RMSE: {mean_own:.1f} dB with each flight's own offset, {np.mean(held_out):.1f} dB with the offset "
+            f"of the other flights. Expect {np.mean(held_out):.1f} dB on a new flight."
         )
     flight, error, link = _by_error(rows, "rmse_db")[0]
     return [*out, said_of(cause(data), CAUSES, flight=flight, error=error, link=link)]
@@ -180,10 +180,10 @@ def cause(data: CampaignData) -> Verdict:
     return campaign_verdict({name: float(np.mean(of)) for name, of in errors.items()}, offsets, order)
 
 
-def beside_baselines(row: RssRow) -> str:
+def against_baselines(row: RssRow) -> str:
     """Baselines that the ray tracing is significantly better and worse than, in one cell."""
     parts = [
-        f"{word} than " + ", ".join(pretty(name) for name, said in row.verdicts.items() if said == word)
+        f"{word} than " + ", ".join(pretty(name) for name, decision in row.verdicts.items() if decision == word)
         for word in ("worse", "better")
         if word in row.verdicts.values()
     ]

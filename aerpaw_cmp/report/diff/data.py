@@ -101,18 +101,18 @@ def _differences(diff: ReportDiff) -> Iterator[str]:
         yield f"{len(diff.numbers)} reported numbers, the first {diff.numbers[0].key}"
 
 
-def _level_clauses(one: LevelDifference, tolerance_db: float) -> Iterator[str]:
-    for what, value in (("measured", one.measured_max_db), ("replayed", one.simulated_max_db)):
+def _level_clauses(level: LevelDifference, tolerance_db: float) -> Iterator[str]:
+    for what, value in (("measured", level.measured_max_db), ("replayed", level.simulated_max_db)):
         if value > tolerance_db:
             yield f"{what} level by up to {value:.3g} dB"
-    if abs(one.offset_db.difference) > tolerance_db:
-        yield f"offset by {one.offset_db.difference:+.3g} dB"
-    if abs(one.rmse.difference_db) > tolerance_db:
-        yield f"RMSE by {one.rmse.difference_db:+.3g} dB"
-    if one.samples.only_first or one.samples.only_second:
-        yield _alone(one.samples)
-    elif one.scored.first != one.scored.second or one.scored.common != one.scored.first:
-        yield f"{one.scored.first} scored samples against {one.scored.second}"
+    if abs(level.offset_db.difference) > tolerance_db:
+        yield f"offset by {level.offset_db.difference:+.3g} dB"
+    if abs(level.rmse.difference_db) > tolerance_db:
+        yield f"RMSE by {level.rmse.difference_db:+.3g} dB"
+    if level.samples.only_first or level.samples.only_second:
+        yield _alone(level.samples)
+    elif level.scored.first != level.scored.second or level.scored.common != level.scored.first:
+        yield f"{level.scored.first} scored samples against {level.scored.second}"
 
 
 def _alone(samples: Overlap) -> str:
@@ -121,10 +121,10 @@ def _alone(samples: Overlap) -> str:
     return ", ".join(f"{n} samples only in the {name}" for n, name in sides if n)
 
 
-def _rank_clauses(one: RankDifference) -> Iterator[str]:
-    if one.n_changed:
-        yield f"{one.n_changed} of {one.samples.common} simulated ranks"
-    if one.n_reported_changed:
-        yield f"{one.n_reported_changed} of {one.samples.common} reported ranks"
-    if one.samples.only_first or one.samples.only_second:
-        yield _alone(one.samples)
+def _rank_clauses(rank: RankDifference) -> Iterator[str]:
+    if rank.n_changed:
+        yield f"{rank.n_changed} of {rank.samples.common} simulated ranks"
+    if rank.n_reported_changed:
+        yield f"{rank.n_reported_changed} of {rank.samples.common} reported ranks"
+    if rank.samples.only_first or rank.samples.only_second:
+        yield _alone(rank.samples)

@@ -79,8 +79,8 @@ def verdict(diff: ReportDiff) -> str:
     common = sum(level.samples.common for level in diff.levels)
     ranked = max((rank.samples.common for rank in diff.ranks), default=0)
     if not diff.differences:
-        seen = [f"{count(common)} RSS samples"] * bool(common) + [f"{count(ranked)} rank samples"] * bool(ranked)
-        on = f" on {' and '.join(seen)}" if seen else ""
+        samples = [f"{count(common)} RSS samples"] * bool(common) + [f"{count(ranked)} rank samples"] * bool(ranked)
+        on = f" on {' and '.join(samples)}" if samples else ""
         return f"No difference: the numbers agree within {diff.tolerance_db:g} dB{on}.{_cause(diff)}"
     parts = [text for text in (_level_verdict(diff), _rank_verdict(diff)) if text]
     return " ".join(parts or ["The reported numbers differ."]) + _cause(diff)
@@ -91,15 +91,17 @@ def _cause(diff: ReportDiff) -> str:
     kinds = {"setting": diff.settings, "input": diff.inputs, "version": diff.versions}
     changed = {name: len(items) for name, items in kinds.items()}
     moved = max((level.measured_max_db for level in diff.levels if math.isfinite(level.measured_max_db)), default=0.0)
-    found = changed_verdict(diff.pooled, bool(diff.differences), moved > diff.tolerance_db, changed)
+    cause = changed_verdict(diff.pooled, bool(diff.differences), moved > diff.tolerance_db, changed)
     listed = " and ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in changed.items() if n)
     verb = "differs" if sum(changed.values()) == 1 else "differ"
-    if found.cause == "none" and not listed:
+    if cause.cause == "none" and not listed:
         return ""
-    names = [str(getattr(one, "key", None) or getattr(one, "path", "")) for items in kinds.values() for one in items]
+    names = [
+        str(getattr(entry, "key", None) or getattr(entry, "path", "")) for items in kinds.values() for entry in items
+    ]
     shown = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
-    keep = KEEP.get(found.where, KEEP["no interval"])
-    return " " + said_of(found, CAUSES, listed=listed, verb=verb, moved=moved, names=shown, keep=keep)
+    keep = KEEP.get(cause.where, KEEP["no interval"])
+    return " " + said_of(cause, CAUSES, listed=listed, verb=verb, moved=moved, names=shown, keep=keep)
 
 
 def _level_verdict(diff: ReportDiff) -> str:
@@ -111,15 +113,15 @@ def _level_verdict(diff: ReportDiff) -> str:
         though = f", though the replay moved by up to {moved:.2g} dB" if moved > diff.tolerance_db else ""
         return f"RSS errors agree on the common samples{though}."
     pooled = diff.pooled
-    both, most = (count(sum(getattr(item.samples, name) for item in scored)) for name in ("common", "first"))
-    text = f"RSS over {both} common samples of {most}: RMSE {pooled.other_rmse_db:.2f} dB in the first, "
+    common, most = (count(sum(getattr(item.samples, name) for item in scored)) for name in ("common", "first"))
+    text = f"RSS over {common} common samples of {most}: RMSE {pooled.other_rmse_db:.2f} dB in the first, "
     text += f"{pooled.rmse_db:.2f} dB in the second. "
     text += DIFFERENCE[pooled.verdict].format(
         difference=pooled.difference_db, interval=_bounds(pooled.difference_ci95_db, 2)
     )
     if len(scored) > 1:
-        said: list[str] = [item.rmse.verdict for item in scored]
-        text += " Links: " + ", ".join(f"{said.count(word)} {word}" for word in KEEP if said.count(word)) + "."
+        verdicts: list[str] = [item.rmse.verdict for item in scored]
+        text += " Links: " + ", ".join(f"{verdicts.count(word)} {word}" for word in KEEP if verdicts.count(word)) + "."
     return text
 
 
@@ -134,7 +136,9 @@ def _rank_verdict(diff: ReportDiff) -> str:
         return ""
     if not moved:
         return "Simulated ranks agree on the common samples."
-    most = max(moved, key=lambda one: abs(one.agreement.difference) if math.isfinite(one.agreement.difference) else -1)
+    most = max(
+        moved, key=lambda entry: abs(entry.agreement.difference) if math.isfinite(entry.agreement.difference) else -1
+    )
     return (
         f"Rank at {most.tower}, K = {most.k}: {count(most.n_changed)} of {count(most.samples.common)} simulated ranks "
         f"differ, agreement {_arrow(most.agreement)}, kappa {_arrow(most.kappa)}."

@@ -35,17 +35,17 @@ def chosen_formats(*lists: str | Iterable[str]) -> tuple[str, ...]:
     ('geojson', 'kmz', 'netcdf')
     """
     names = [name for some in lists for name in ([some] if isinstance(some, str) else some)]
-    wanted = [part.strip().lower() for name in names for part in name.split(",") if part.strip()]
-    unknown = [name for name in wanted if name not in (*FORMATS, ALL)]
+    chosen = [part.strip().lower() for name in names for part in name.split(",") if part.strip()]
+    unknown = [name for name in chosen if name not in (*FORMATS, ALL)]
     if unknown:
         raise UsageError(f"export {unknown[0]!r}", expected=", ".join((*FORMATS, ALL)))
-    for name in wanted:
+    for name in chosen:
         if name != ALL and (missing := missing_module(name)):
             raise UsageError(
                 f"export {name} needs {missing}, which is not installed",
                 expected="pip install 'aerpaw-cmp[geo]', or another format",
             )
-    return tuple(name for name in FORMATS if name in wanted or ALL in wanted)
+    return tuple(name for name in FORMATS if name in chosen or ALL in chosen)
 
 
 def missing_module(name: str) -> str:

@@ -46,9 +46,9 @@ def write_kmz(export: Export, folder: Path) -> list[Path]:
     scales = {item.scale.key: item.scale for item in shown}
     budget = POINTS // max(1, len(shown))
     body = [_towers(export), *_flown(export)]
-    for number, one in enumerate(shown):
-        lines = "".join(_lines(one, budget, clock=export.clock, visible=number == 0))
-        body.append(kml.folder(one.name, _legend_name(one.scale), lines, visible=number == 0))
+    for number, link in enumerate(shown):
+        lines = "".join(_lines(link, budget, clock=export.clock, visible=number == 0))
+        body.append(kml.folder(link.name, _legend_name(link.scale), lines, visible=number == 0))
     words = [*export.remarks, "Lines stand at their height above the ground below."]
     if max((len(item.rows) for item in shown), default=0) > budget:
         words.append(
@@ -192,15 +192,15 @@ def scales_of(export: Export) -> dict[str, dict[str, Scale]]:
     scales: dict[str, dict[str, Scale]] = {}
     for points in export.sets:
         names = {c.name for c in points.columns}
-        here = {c: RANKS for c in names if c == "measured_rank" or c.startswith("simulated_rank_k")}
+        by_column = {c: RANKS for c in names if c == "measured_rank" or c.startswith("simulated_rank_k")}
         levels = sorted(names & {"calibrated_db", "simulated_dbm"})
         if levels:
             values = points.table[levels].to_numpy().ravel()
-            here |= dict.fromkeys(levels, _level_scale(values[np.isfinite(values)]))
+            by_column |= dict.fromkeys(levels, _level_scale(values[np.isfinite(values)]))
         if "residual_db" in names:
             apart = np.abs(points.table["residual_db"].to_numpy())
-            here["residual_db"] = _residual_scale(apart[np.isfinite(apart)])
-        scales[points.kind] = {c.name: here[c.name] for c in points.columns if c.name in here}
+            by_column["residual_db"] = _residual_scale(apart[np.isfinite(apart)])
+        scales[points.kind] = {c.name: by_column[c.name] for c in points.columns if c.name in by_column}
     return scales
 
 

@@ -48,12 +48,12 @@ def points_dataset(export: Export, points: Points) -> Any:
     axes = {"latitude_deg": "Y", "longitude_deg": "X", "up_m": "Z"}
     for name, (unit, meaning) in PLACES.items():
         short = name.rpartition("_")[0]
-        said = {"long_name": meaning, "units": unit}
+        attributes = {"long_name": meaning, "units": unit}
         if name in axes:
-            said |= {"standard_name": "height" if short == "up" else short, "axis": axes[name]}
+            attributes |= {"standard_name": "height" if short == "up" else short, "axis": axes[name]}
         if short == "up":
-            said["positive"] = "up"
-        variables[short] = ("obs", points.table[name].to_numpy(), said)
+            attributes["positive"] = "up"
+        variables[short] = ("obs", points.table[name].to_numpy(), attributes)
     variables["crs"] = ((), np.int32(0), WGS84)
     for item in points.columns:
         variables[item.name.replace(".", "p")] = ("obs", *_values(item, points.table[item.name].to_numpy()))
@@ -71,7 +71,7 @@ def _seconds(export: Export, times: Any) -> tuple[Any, dict[str, str]]:
     """Seconds after the first whole second, and their attributes."""
     known = times[~np.isnat(times)]
     start = known.min().astype("datetime64[s]") if len(known) and export.clock else np.datetime64("1970-01-01", "s")
-    said = {
+    attributes = {
         "standard_name": "time",
         "long_name": "instant of the sample",
         "units": f"seconds since {str(start).replace('T', ' ')} UTC",
@@ -80,8 +80,8 @@ def _seconds(export: Export, times: Any) -> tuple[Any, dict[str, str]]:
         "axis": "T",
     }
     if not export.clock:
-        said["comment"] = "the logs have relative times and no origin: the date is none"
-    return np.where(np.isnat(times), np.nan, (times - start) / np.timedelta64(1, "s")), said
+        attributes["comment"] = "the logs have relative times and no origin: the date is none"
+    return np.where(np.isnat(times), np.nan, (times - start) / np.timedelta64(1, "s")), attributes
 
 
 def _values(column: Column, values: Any) -> tuple[Any, ...]:
@@ -89,7 +89,7 @@ def _values(column: Column, values: Any) -> tuple[Any, ...]:
     shared = {"long_name": column.meaning, "coordinates": "time latitude longitude up", "grid_mapping": "crs"}
     if column.flags:
         codes = np.where(np.isfinite(values), values, NO_CODE).astype(np.int8)
-        said = {"flag_values": np.arange(len(column.flags), dtype=np.int8), "flag_meanings": " ".join(column.flags)}
-        return codes, shared | said, {"_FillValue": np.int8(NO_CODE)}
-    other = {} if column.shown_unit in ("", column.unit) else {"comment": f"unit: {column.shown_unit}"}
-    return values, {**shared, "units": column.unit, **other}, {"_FillValue": np.nan}
+        flags = {"flag_values": np.arange(len(column.flags), dtype=np.int8), "flag_meanings": " ".join(column.flags)}
+        return codes, shared | flags, {"_FillValue": np.int8(NO_CODE)}
+    comment = {} if column.shown_unit in ("", column.unit) else {"comment": f"unit: {column.shown_unit}"}
+    return values, {**shared, "units": column.unit, **comment}, {"_FillValue": np.nan}

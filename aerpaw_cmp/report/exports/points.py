@@ -148,15 +148,17 @@ class Export:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Remarks that whoever opens a file must know."""
-        said = [
+        texts = [
             "Heights (up_m) are metres above the ground at the site origin.",
             "A missing number is out of coverage or unknown; a simulated rank of 0 means that there is no path.",
         ]
         if not self.clock:
-            said.append("The logs have relative times and no origin: instants count from 1970-01-01, the date is none.")
+            texts.append(
+                "The logs have relative times and no origin: instants count from 1970-01-01, the date is none."
+            )
         if self.synthetic:
-            said.append("The logs are synthetic: made by simulation, they measure nothing.")
-        return tuple(said)
+            texts.append("The logs are synthetic: made by simulation, they measure nothing.")
+        return tuple(texts)
 
     def towers(self) -> Iterator[tuple[str, float, float, float]]:
         """Name, latitude, longitude [deg] and height above the ground at the origin [m]."""
@@ -296,10 +298,10 @@ def _nanoseconds(seconds: FloatArray) -> AnyArray:
     return np.round(seconds * 1e9).astype("timedelta64[ns]")
 
 
-def _flown(one: RssRow | FlownRank) -> dict[str, Any]:
-    time = np.datetime64(one.start_ns, "ns") + _nanoseconds(one.time_s)
-    places = dict(zip(("east_m", "north_m", "up_m"), one.position_m.T, strict=True))
-    return {"time": time, **named(one, "flight tower"), **places}
+def _flown(series: RssRow | FlownRank) -> dict[str, Any]:
+    time = np.datetime64(series.start_ns, "ns") + _nanoseconds(series.time_s)
+    places = dict(zip(("east_m", "north_m", "up_m"), series.position_m.T, strict=True))
+    return {"time": time, **named(series, "flight tower"), **places}
 
 
 def _rss_link(row: RssRow) -> dict[str, Any]:
@@ -314,6 +316,6 @@ def _rss_link(row: RssRow) -> dict[str, Any]:
     }
 
 
-def _rank_link(one: FlownRank) -> dict[str, Any]:
-    ranks = {f"simulated_rank_k{k_key(k)}": rank for k, rank in one.simulated.items()}
-    return {**_flown(one), "measured_rank": one.rank, **ranks}
+def _rank_link(flown_rank: FlownRank) -> dict[str, Any]:
+    ranks = {f"simulated_rank_k{k_key(k)}": rank for k, rank in flown_rank.simulated.items()}
+    return {**_flown(flown_rank), "measured_rank": flown_rank.rank, **ranks}

@@ -125,7 +125,7 @@ def _is_joint(layer: MapLayer) -> bool:
 def _packed(data: MapsData, layers: Sequence[MapLayer], stride: int) -> dict[str, Any]:
     arrays = PackedArrays()
     east, north = data.east_m[::stride], data.north_m[::stride]
-    by_quantity = grouped(layers, lambda one: one.quantity)
+    by_quantity = grouped(layers, lambda layer: layer.quantity)
     quantities = [_quantity(name, members, arrays, stride) for name, members in by_quantity.items()]
     return {
         "east": arrays.add(east, "f8"),

@@ -156,10 +156,10 @@ def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]
     """Each tower alone and all jointly, for one antenna choice and height, on one colour scale [dBm]."""
     fig, axes = map_axes(data, len(maps))
     image = None
-    for ax, one in zip(axes, maps, strict=True):
-        alone = None if one.tower == JOINT else one.tower
-        image = draw_map(ax, data, one.rss_dbm, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
-        ax.set_title(f"{one.tower}: {100 * one.coverage:.0f} %", fontsize=9)
+    for ax, shown in zip(axes, maps, strict=True):
+        alone = None if shown.tower == JOINT else shown.tower
+        image = draw_map(ax, data, shown.rss_dbm, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
+        ax.set_title(f"{shown.tower}: {100 * shown.coverage:.0f} %", fontsize=9)
     levels = np.concatenate([entry.rss_dbm.ravel() for entry in maps])
     colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits))
     entries = overlay_legend(data, borders=any(entry.tower == JOINT for entry in maps))
@@ -175,9 +175,9 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
     fig, axes = map_axes(data, len(maps))
     colours = ListedColormap([rank_colour(r) for r in RANKS])
     norm = BoundaryNorm([0.5, 1.5, 2.5, 3.5, 4.5], 4)
-    for ax, one in zip(axes, maps, strict=True):
-        draw_map(ax, data, np.where(one.rank > 0, one.rank, np.nan), cmap=colours, norm=norm)
-        ax.set_title(f"{one.altitude_m:g} m", fontsize=9)
+    for ax, shown in zip(axes, maps, strict=True):
+        draw_map(ax, data, np.where(shown.rank > 0, shown.rank, np.nan), cmap=colours, norm=norm)
+        ax.set_title(f"{shown.altitude_m:g} m", fontsize=9)
     entries = [Patch(facecolor=rank_colour(r), edgecolor="black", label=f"rank {r}") for r in RANKS]
     fig.legend(handles=[*entries, *overlay_legend(data, borders=True)], loc="outside lower center", ncols=5)
     return fig
@@ -195,9 +195,9 @@ def layer_maps(data: MapsData, layers: Sequence[MapLayer]) -> Figure:
             reach = max(float(np.abs(finite).max(initial=0.0)), 1e-6)
         options = {"cmap": "cividis", "vmin": -reach, "vmax": reach}  # dark to light: signs differ in grey too
     image = None
-    for ax, one in zip(axes, layers, strict=True):
-        image = draw_map(ax, data, one.values, **options)
-        ax.set_title(one.axes["Height"], fontsize=9)
+    for ax, shown in zip(axes, layers, strict=True):
+        image = draw_map(ax, data, shown.values, **options)
+        ax.set_title(shown.axes["Height"], fontsize=9)
     bar = colour_bar(fig, image, axes, layers[0].label, beyond(finite, options["vmin"], options["vmax"]))
     if np.array_equal(finite, np.round(finite)):  # ranks: no colour stands for half of one
         from matplotlib.ticker import MaxNLocator
@@ -209,18 +209,19 @@ def layer_maps(data: MapsData, layers: Sequence[MapLayer]) -> Figure:
 
 def cdfs(maps: Sequence[RssMap]) -> Figure:
     """Distribution of RSS per tower and jointly: a panel per height, positions out of coverage counted as below."""
-    panels = grouped(maps, lambda one: one.altitude_m)
+    panels = grouped(maps, lambda m: m.altitude_m)
     fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, sharex=True, squeeze=False)
     for ax, (height, members) in zip(axes, panels.items(), strict=True):
-        for number, one in enumerate(members):
-            level = np.sort(one.rss_dbm[np.isfinite(one.rss_dbm)])
-            missing = one.rss_dbm.size - len(level)
-            share = (missing + np.arange(1, len(level) + 1)) / one.rss_dbm.size
+        for number, tower_map in enumerate(members):
+            level = np.sort(tower_map.rss_dbm[np.isfinite(tower_map.rss_dbm)])
+            missing = tower_map.rss_dbm.size - len(level)
+            share = (missing + np.arange(1, len(level) + 1)) / tower_map.rss_dbm.size
             shown = spread_out(len(level), 400)  # steps of a four-hundredth cannot be seen
-            joint = one.tower == JOINT
+            joint = tower_map.tower == JOINT
             ax.plot(
                 level[shown], share[shown], **curve_style(number),
-                linewidth=2.0 if joint else 1.2, label=f"tower {one.tower}" if one.tower.startswith("_") else one.tower,
+                linewidth=2.0 if joint else 1.2,
+                label=f"tower {tower_map.tower}" if tower_map.tower.startswith("_") else tower_map.tower,
             )  # fmt: skip
         ax.set(title=f"{height:g} m", xlabel="RSS [dBm]", ylim=(0, 1.0))
     axes[0].set_ylabel("Share of positions below")
@@ -230,7 +231,7 @@ def cdfs(maps: Sequence[RssMap]) -> Figure:
 
 def rank_shares(maps: Sequence[RankMap]) -> Figure:
     """Shares of Z and rank 1 to 4 against height, a panel per K and learned receiver."""
-    panels = grouped(maps, lambda one: one.source)
+    panels = grouped(maps, lambda entry: entry.source)
     fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, squeeze=False)
     for ax, (source, members) in zip(axes, panels.items(), strict=True):
         at = np.arange(len(members))
@@ -274,11 +275,11 @@ def correlations(curves: Sequence[Correlation]) -> Figure:
 
 def error_curves(errors: Sequence[MapError]) -> Figure:
     """MAE against height for every method, a panel per K."""
-    panels = grouped(errors, lambda one: one.k)
+    panels = grouped(errors, lambda e: e.k)
     fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, squeeze=False)
     for ax, (k, members) in zip(axes, panels.items(), strict=True):
-        for number, (method, rows) in enumerate(grouped(members, lambda one: one.method).items()):
-            rows = sorted(rows, key=lambda one: one.altitude_m)
+        for number, (method, rows) in enumerate(grouped(members, lambda e: e.method).items()):
+            rows = sorted(rows, key=lambda e: e.altitude_m)
             ax.plot(
                 [entry.altitude_m for entry in rows], [entry.mae for entry in rows], **curve_style(number, marked=True),
                 linewidth=1.2, label=method,
@@ -330,7 +331,7 @@ def _under(foliage: str) -> str:
 def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
     levels = (*data.rss, *data.corrected)
     limits = level_limits(levels)
-    by_height = grouped(levels, lambda one: (f"{one.antennas}{_under(one.foliage)}", one.altitude_m))
+    by_height = grouped(levels, lambda m: (f"{m.antennas}{_under(m.foliage)}", m.altitude_m))
     for (antennas, height), maps in by_height.items():
         words = f"{antennas}, {height:g} m"
         yield FigureSpec(
@@ -339,7 +340,7 @@ def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
             "coverage. One colour scale for all RSS maps.",
             partial(rss_maps, data, maps, limits),
         )  # fmt: skip
-    for words, maps in grouped(levels, lambda one: f"{one.antennas}{_under(one.foliage)}").items():
+    for words, maps in grouped(levels, lambda m: f"{m.antennas}{_under(m.foliage)}").items():
         yield FigureSpec(
             f"rss_cdf_{safe_name(words)}", "rss", f"Distribution of RSS, {words}",
             "Share of positions with an RSS below the value; a curve starts at its share of Z.",
@@ -348,22 +349,22 @@ def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
 
 
 def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
-    for words, maps in grouped(data.rank, lambda one: f"{one.source}{_under(one.foliage)}").items():
+    for words, maps in grouped(data.rank, lambda m: f"{m.source}{_under(m.foliage)}").items():
         yield FigureSpec(
             f"rank_map_{safe_name(words)}", "rank", f"Rank, {words}", "The nearest tower serves. Hatched: no path.",
             partial(rank_grid, data, maps),
         )  # fmt: skip
-    for words, maps in grouped(data.rank, lambda one: _under(one.foliage)).items():
+    for words, maps in grouped(data.rank, lambda m: _under(m.foliage)).items():
         yield FigureSpec(
             "_".join(["rank_share", *([safe_name(words)] if words else [])]), "rank", f"Rank against height{words}",
             "Share of positions with each rank; Z is out of coverage.",
             partial(rank_shares, maps),
         )  # fmt: skip
-    for tower, maps in grouped(data.corrected_rank, lambda one: one.tower).items():
+    for tower, maps in grouped(data.corrected_rank, lambda m: m.tower).items():
         yield FigureSpec(
             f"rank_map_learned_{safe_name(tower)}", "rank", f"Rank of {tower}, corrected",
             "Most probable rank by the receiver that flights taught; all headings count alike.",
-            partial(rank_grid, data, [one for one in maps if one.k is None]),
+            partial(rank_grid, data, [m for m in maps if m.k is None]),
         )  # fmt: skip
         yield FigureSpec(
             f"rank_share_learned_{safe_name(tower)}", "rank", f"Rank of {tower} against height, raw and corrected",
@@ -371,7 +372,7 @@ def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
             "receiver: mean probability of each rank.",
             partial(rank_shares, maps),
         )  # fmt: skip
-    for name, layers in grouped((one for one in data.layers if one.label), lambda one: one.quantity).items():
+    for name, layers in grouped((m for m in data.layers if m.label), lambda m: m.quantity).items():
         caption = f"{layers[0].label[0].upper()}{layers[0].label[1:]}. Hatched: no path."
         yield FigureSpec(f"layer_{safe_name(name)}", "layers", name, caption, partial(layer_maps, data, layers))
 
@@ -384,7 +385,7 @@ def _kriging_specs(data: MapsData) -> Iterator[FigureSpec]:
             + " ".join(f"{c.title}: {c.excluded} constant positions left out." for c in data.correlation),
             partial(correlations, data.correlation),
         )  # fmt: skip
-    for evaluation, errors in grouped(data.errors, lambda one: one.evaluation).items():
+    for evaluation, errors in grouped(data.errors, lambda error: error.evaluation).items():
         yield FigureSpec(
             f"mae_{safe_name(evaluation)}", "kriging", f"Error of interpolated rank, {evaluation}",
             "Mean absolute error against height; lower is better.",

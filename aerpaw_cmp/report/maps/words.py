@@ -40,8 +40,8 @@ def first_words(data: MapsData) -> str:
     heights = coverage(data)
     if not heights:
         return ""
-    worst = min(heights, key=lambda one: one.covered)
-    said = said_of(
+    worst = min(heights, key=lambda height: height.covered)
+    sentence = said_of(
         coverage_verdict(heights),
         CAUSES,
         percent=100.0 * worst.covered,
@@ -49,10 +49,10 @@ def first_words(data: MapsData) -> str:
         outside=100.0 * worst.outside,
         threshold=float(data.settings.get("threshold_dbm", -np.inf)),
     )
-    best = max(heights, key=lambda one: one.covered)
+    best = max(heights, key=lambda height: height.covered)
     more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""
     measured = "" if data.corrected else "Nothing here was measured. "
-    return f"{measured}{more}{said}"
+    return f"{measured}{more}{sentence}"
 
 
 def coverage(data: MapsData) -> list[Coverage]:
@@ -61,8 +61,8 @@ def coverage(data: MapsData) -> list[Coverage]:
     if not shown:
         return []
     first = shown[0]
-    kept = [item for item in shown if (item.tower, item.antennas) == (first.tower, first.antennas)]
-    clear = {item.altitude_m: item.coverage for item in kept if item.foliage == "none" != first.foliage}
+    same_link = [item for item in shown if (item.tower, item.antennas) == (first.tower, first.antennas)]
+    clear = {item.altitude_m: item.coverage for item in same_link if item.foliage == "none" != first.foliage}
     return [
         Coverage(
             height_m=item.altitude_m,
@@ -71,14 +71,14 @@ def coverage(data: MapsData) -> list[Coverage]:
             reached=_reached(data, item),
             outside=data.outside_flown,
         )
-        for item in kept
+        for item in same_link
         if item.foliage == first.foliage
     ]
 
 
-def _reached(data: MapsData, one: RssMap) -> float:
+def _reached(data: MapsData, levels: RssMap) -> float:
     """Share of positions that any path reaches: those with a rank."""
-    share = [1.0 - m.share[0] for m in data.rank if (m.altitude_m, m.foliage) == (one.altitude_m, one.foliage)]
+    share = [1.0 - m.share[0] for m in data.rank if (m.altitude_m, m.foliage) == (levels.altitude_m, levels.foliage)]
     return float(share[0]) if share else np.nan
 
 
@@ -106,8 +106,8 @@ def warnings(data: MapsData) -> list[str]:
 
 def notes(data: MapsData) -> list[str]:
     """Notes on how the maps were made."""
-    made = list(_made(data)) if "foliage" in data.settings else []
-    return [*data.site.notes, *made, *data.notes]
+    how = list(_made(data)) if "foliage" in data.settings else []
+    return [*data.site.notes, *how, *data.notes]
 
 
 def _made(data: MapsData) -> Iterator[str]:

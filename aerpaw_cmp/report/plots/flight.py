@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 
 def figure_specs(data: ReportData) -> list[FigureSpec]:
     """Every figure that the data allow, in reading order; where two names became one file name, a number is added."""
-    seen: dict[str, int] = {}
+    used: dict[str, int] = {}
     result = []
     for spec in _figures(data):
-        times = seen[spec.name] = seen.get(spec.name, 0) + 1
+        times = used[spec.name] = used.get(spec.name, 0) + 1
         result.append(spec if times == 1 else replace(spec, name=f"{spec.name}_{times}"))
     return result
 
@@ -76,10 +76,10 @@ def _figures(data: ReportData) -> Iterator[FigureSpec]:
 
 
 def _track_specs(data: ReportData, track: Track) -> Iterator[FigureSpec]:
-    there = [word for word, some in (("buildings", data.site.buildings), ("forests", data.site.forests)) if some]
+    present = [word for word, some in (("buildings", data.site.buildings), ("forests", data.site.forests)) if some]
     invented = (
-        f" {' and '.join(there).capitalize()} are illustrative: they do not exist and show the method."
-        if data.site.illustrative and there
+        f" {' and '.join(present).capitalize()} are illustrative: they do not exist and show the method."
+        if data.site.illustrative and present
         else ""
     )
     yield FigureSpec(
@@ -101,9 +101,9 @@ def _band_words(panel: RssResult) -> str:
     if not bars:
         return ""
     parts = ", ".join(f"{what} {bars[name]:.1f} dB" for name, what in SPREAD_PARTS.items())
-    held = bars.get("inside_90")
+    inside = bars.get("inside_90")
     return f" Band: 90 % interval of a sample about the prediction; its standard deviation joins {parts}." + (
-        "" if held is None else f" It holds {100 * held:.0f} % of the samples of this flight."
+        "" if inside is None else f" It holds {100 * inside:.0f} % of the samples of this flight."
     )
 
 
@@ -201,13 +201,13 @@ def shown_confusion(serving: ServingComparison, most: int = MOST_CELLS) -> tuple
     counts = np.asarray(serving.confusion)
     weight = counts.sum(axis=1) + counts[:, :-1].sum(axis=0)
     order = [int(i) for i in np.argsort(-weight, kind="stable") if weight[i] > 0]
-    first, rest = sorted(order[:most]), sorted(order[most:])
+    first, few = sorted(order[:most]), sorted(order[most:])
     names = [serving.cells[i] for i in first]
-    columns = np.column_stack([counts[:, first], counts[:, rest].sum(axis=1)] if rest else [counts[:, first]])
+    columns = np.column_stack([counts[:, first], counts[:, few].sum(axis=1)] if few else [counts[:, first]])
     columns = np.column_stack([columns, counts[:, -1]])
     table = columns[first]
-    if rest:
-        table, names = np.vstack([table, columns[rest].sum(axis=0)]), [*names, OTHER]
+    if few:
+        table, names = np.vstack([table, columns[few].sum(axis=0)]), [*names, OTHER]
     return names, table
 
 
@@ -283,12 +283,12 @@ def _over_time(s: AgainstSeries) -> Figure:
 
 
 def _reliability(against: Against) -> Figure:
-    fig, (left, right) = subplots((9.2, 3.6), 1, 2)
-    left.plot([0, 100], [0, 100], color="0.6", linewidth=1)
+    fig, (coverage, right) = subplots((9.2, 3.6), 1, 2)
+    coverage.plot([0, 100], [0, 100], color="0.6", linewidth=1)
     for s in against.series:
-        left.plot(100 * SHARES, [100 * s.coverage(share) for share in SHARES], "o-", markersize=3, label=s.name)
+        coverage.plot(100 * SHARES, [100 * s.coverage(share) for share in SHARES], "o-", markersize=3, label=s.name)
         right.hist(s.sd_db, bins=30, histtype="step", label=s.name)
-    left.set(xlabel="nominal [%]", ylabel="observed [%]")
-    left.legend(fontsize=8)
+    coverage.set(xlabel="nominal [%]", ylabel="observed [%]")
+    coverage.legend(fontsize=8)
     right.set(xlabel="standard deviation of one sample [dB]", ylabel="samples")
     return fig

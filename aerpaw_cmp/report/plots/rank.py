@@ -62,11 +62,11 @@ def rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: Fl
         number = int(at.sum())
         if not number:
             continue
-        look: dict[str, Any] = {"color": "black", "linewidths": 0.8}
+        style: dict[str, Any] = {"color": "black", "linewidths": 0.8}
         if value:
-            look = {"facecolor": rank_colour(value), "edgecolors": "#222222", "linewidths": 0.25}
+            style = {"facecolor": rank_colour(value), "edgecolors": "#222222", "linewidths": 0.25}
         ax.scatter(
-            east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **look,
+            east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **style,
             label=f"{'Z: no path' if value == 0 else f'rank {value}'} ({count(number)})",
             zorder=3.0 + 1.0 / number,  # the rarer a rank, the higher it lies: a few points must not vanish under many
         )  # fmt: skip
@@ -193,10 +193,10 @@ def rank_forecast(data: ReportData, panel: RankResult) -> Figure:
 
 def draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankResult) -> None:
     """Reported ranks as ticks; those held over from an earlier report are smaller and grey."""
-    held = ~panel.score.staleness.fresh
+    held_over = ~panel.score.staleness.fresh
     for mask, label, colour, size in (
-        (~held, "measured", "#0072B2", 7),
-        (held, "measured, held over", "#9A9A9A", 4),
+        (~held_over, "measured", "#0072B2", 7),
+        (held_over, "measured, held over", "#9A9A9A", 4),
     ):
         if mask.any():
             ax.plot(

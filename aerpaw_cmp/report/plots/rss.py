@@ -81,14 +81,14 @@ def draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
 
 def trajectory(data: ReportData, track: Track) -> Figure:
     """The flight on the plan of the whole site, and closer, coloured by height."""
-    fig, (whole, close) = subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
-    draw_site(whole, data.site)
+    fig, (site_plan, close) = subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
+    draw_site(site_plan, data.site)
     draw_site(close, data.site)
     nodes = {item.tower: item for item in data.series}.values()
     for panel in nodes:
-        draw_node(whole, panel)
+        draw_node(site_plan, panel)
         draw_node(close, panel)
-    whole.plot(*thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.0, label="flight", zorder=4)
+    site_plan.plot(*thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.0, label="flight", zorder=4)
     points = close.scatter(
         track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,
         label="flight (colour: height)",
@@ -96,7 +96,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     towers = list(data.site.towers.values())
     whole_east = np.concatenate([[t.east_m for t in towers], track.east_m[np.isfinite(track.east_m)]])
     whole_north = np.concatenate([[t.north_m for t in towers], track.north_m[np.isfinite(track.north_m)]])
-    frame_around(whole, whole_east, whole_north, least_m=200.0, shape=0.75)
+    frame_around(site_plan, whole_east, whole_north, least_m=200.0, shape=0.75)
     near = [data.site.towers[name] for name in used_towers(data)]
     extent = float(np.nanmax([np.ptp(track.east_m), np.ptp(track.north_m), 100.0])) if len(track.east_m) else 100.0
     centre = np.array([np.nanmean(track.east_m), np.nanmean(track.north_m)])
@@ -113,9 +113,9 @@ def trajectory(data: ReportData, track: Track) -> Figure:
             bbox={"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": WAYPOINT},
         )  # fmt: skip
     colour_bar(fig, points, close, "Height above ground [m]")
-    whole.set_title("Whole site")
+    site_plan.set_title("Whole site")
     close.set_title("The flight")
-    whole.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    site_plan.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
     close.legend(
         *legend_of(close, lambda label: label.startswith("flight")), loc="upper center", bbox_to_anchor=(0.5, -0.12)
     )
@@ -197,12 +197,17 @@ def _offset(offset_db: float) -> str:
 
 def detection_reliability(score: DetectionScore) -> Figure:
     """Share of detected samples over the probability that the predicted level gave them; area: samples."""
-    said, seen, n = np.array(score.reliability, dtype=np.float64).T
+    predicted, detected, n = np.array(score.reliability, dtype=np.float64).T
     fig, ax = subplots((4.8, 3.6))
     ax.plot([0, 100], [0, 100], color="0.6", linewidth=1, label="calibrated")
-    ax.plot(100 * said, 100 * seen, color=SIMULATED, linewidth=1)
+    ax.plot(100 * predicted, 100 * detected, color=SIMULATED, linewidth=1)
     ax.scatter(
-        100 * said, 100 * seen, s=12 + 120 * n / n.max(), color=SIMULATED, zorder=3, label="fifths of the samples"
+        100 * predicted,
+        100 * detected,
+        s=12 + 120 * n / n.max(),
+        color=SIMULATED,
+        zorder=3,
+        label="fifths of the samples",
     )
     ax.set(xlabel="Predicted probability of detection [%]", ylabel="Detected samples [%]", xlim=(0, 100), ylim=(0, 100))
     ax.legend(loc="upper left")
@@ -215,17 +220,21 @@ def ladder(rows: Sequence[LadderRow]) -> Figure:
     channels = list(dict.fromkeys((row.tower, row.channel) for row in rows))
     fig, ax = subplots((9.2, 0.36 * len(models) + 1.5))
     for number, (tower, channel) in enumerate(channels):
-        own = [row for row in rows if (row.tower, row.channel) == (tower, channel) and np.isfinite(row.rmse_heldout_db)]
-        at = np.array([models.index(row.model) for row in own]) + 0.5 * ((number + 0.5) / len(channels) - 0.5)
-        rmse = np.array([row.rmse_heldout_db for row in own])
-        bounds = np.array([row.difference_to_best_ci95_db for row in own]) - np.array(
-            [[row.difference_to_best_db] for row in own]
+        scored = [
+            row for row in rows if (row.tower, row.channel) == (tower, channel) and np.isfinite(row.rmse_heldout_db)
+        ]
+        at = np.array([models.index(row.model) for row in scored]) + 0.5 * ((number + 0.5) / len(channels) - 0.5)
+        rmse = np.array([row.rmse_heldout_db for row in scored])
+        bounds = np.array([row.difference_to_best_ci95_db for row in scored]) - np.array(
+            [[row.difference_to_best_db] for row in scored]
         )
         colour = f"C{number % 10}"
         spread = np.nan_to_num(np.abs(bounds.T))
         ax.errorbar(rmse, at, xerr=spread, fmt="none", ecolor=colour, elinewidth=1.0, capsize=2.0)
-        ax.scatter(rmse, at, s=26, facecolor=[colour if row.recommended else "white" for row in own], edgecolor=colour,
-                   marker="os^Dvp"[number % 6], zorder=3, label=f"{tower} {channel}".strip())  # fmt: skip
+        ax.scatter(
+            rmse, at, s=26, facecolor=[colour if row.recommended else "white" for row in scored], edgecolor=colour,
+            marker="os^Dvp"[number % 6], zorder=3, label=f"{tower} {channel}".strip(),
+        )  # fmt: skip
     ax.set_yticks(range(len(models)), models)
     ax.invert_yaxis()
     ax.set_xlabel("RMSE on held-out segments [dB]")

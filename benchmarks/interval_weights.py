@@ -58,7 +58,7 @@ def cell(kind: str, x: FloatArray, y: FloatArray, noise: float, size: float, wei
             below += np.where(rest > 0.0, share, 0.0) / len(normals)
         width = square / count * known.power + fast[:, None]
     else:
-        reach = np.sqrt(square / count * known.left)
+        reach = np.sqrt(square / count * known.variance)
         below = stdtr(count, (away - slow @ known.slope.T) / reach)
         width = reach**2
     return likelihood, below, width / np.median(width.min(axis=1)), weight

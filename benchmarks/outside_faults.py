@@ -67,7 +67,7 @@ FAULTS = (
     Fault("RMSE about zero in place of the offset", "aerpaw_cmp/compare/offset.py", "rmse = float(np.hypot(np.sqrt(variance), mean - grid[best]))", "rmse = float(np.hypot(np.sqrt(variance), mean))", "tests/compare/test_offset.py"),
     Fault("95 % interval made 90 %", "aerpaw_cmp/compare/statistics.py", "np.nanquantile(drawn, [0.025, 0.975])", "np.nanquantile(drawn, [0.05, 0.95])", "tests/compare/test_statistics.py", "the audit computes no interval"),
     Fault("95 % interval of a pair made 90 %", "aerpaw_cmp/compare/statistics.py", "low, high = np.quantile(drawn, [0.025, 0.975])", "low, high = np.quantile(drawn, [0.05, 0.95])", "tests/compare/test_statistics.py", "the audit computes no interval"),
-    Fault("a part left out gets an offset from inside", "aerpaw_cmp/compare/learning/calibration.py", "rest = (o.samples.residual_db - gain)[outside]", "rest = (o.samples.residual_db - gain)[inside]", "tests/compare/test_calibration.py", NO_LEVEL),
+    Fault("a part left out gets an offset from inside", "aerpaw_cmp/compare/learning/calibration.py", "error = (o.samples.residual_db - gain)[outside]", "error = (o.samples.residual_db - gain)[inside]", "tests/compare/test_calibration.py", NO_LEVEL),
     Fault("noise figure with the wrong sign", "aerpaw_cmp/common/units.py", "np.log10(bandwidth_hz)) + noise_figure_db", "np.log10(bandwidth_hz)) - noise_figure_db", "tests/common/test_units.py", NO_LEVEL),
     Fault("K compared with powers", "aerpaw_cmp/compare/rank.py", "(1.0 / k + margin)", "(1.0 / k**2 + margin)", "tests/compare/test_rank.py", "single elements; the audit of links compares ranks"),
 )  # fmt: skip

@@ -129,8 +129,10 @@ def likely_cause(evidence: LevelEvidence) -> Cause:
         (fit.log_likelihood - plain.log_likelihood - cost * unit, name, estimate, where, fit)
         for cost, name, estimate, where, fit in _troubles(binned)
     ]
-    gain, name, estimate, where, fit = max(scored, key=lambda one: one[0], default=(0.0, "none", _NOTHING, "", plain))
-    rmse, rmse_with = (float(np.sqrt(np.mean(item.residual_db**2))) for item in (plain, fit))
+    gain, name, estimate, where, fit = max(
+        scored, key=lambda trial: trial[0], default=(0.0, "none", _NOTHING, "", plain)
+    )
+    rmse, rmse_with = (float(np.sqrt(np.mean(model.residual_db**2))) for model in (plain, fit))
     if gain < MARGIN or rmse_with > (1.0 - LEAST_SHARE) * rmse:
         return NO_CAUSE
     value, low, high = estimate
@@ -147,19 +149,19 @@ def likely_cause(evidence: LevelEvidence) -> Cause:
 
 def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
     """Means over :data:`BIN_S` of the samples with both levels; None where they are too few."""
-    known = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
-    if not known.any():
+    finite = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
+    if not finite.any():
         return None
-    _, place = np.unique(np.floor(evidence.time_s[known] / BIN_S), return_inverse=True)
+    _, place = np.unique(np.floor(evidence.time_s[finite] / BIN_S), return_inverse=True)
     count = np.bincount(place).astype(np.float64)
     if len(count) < FEWEST_BINS:
         return None
 
     def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(place, values[known]) / count)
+        return np.asarray(np.bincount(place, values[finite]) / count)
 
     def direction(values: FloatArray) -> FloatArray:
-        turn = np.exp(1j * np.radians(values[known]))
+        turn = np.exp(1j * np.radians(values[finite]))
         return np.degrees(np.angle(np.bincount(place, turn.real) + 1j * np.bincount(place, turn.imag)))
 
     return LevelEvidence(
@@ -189,13 +191,13 @@ def _fitted(residual: FloatArray, columns: FloatArray | None = None) -> _Fit:
         likelihood = -0.5 * n * math.log(max(variance, 1e-12)) + math.log(root)
         if likelihood > best.log_likelihood:
             best = _Fit(likelihood, residual - design @ coefficients)
-    left = best.residual_db - best.residual_db.mean()
-    return _Fit(best.log_likelihood, left)
+    centred = best.residual_db - best.residual_db.mean()
+    return _Fit(best.log_likelihood, centred)
 
 
 # Of six harmonics; with ``MARGIN`` chance reaches it in fewer than one of a thousand.
 _PATTERN_COST = 3.0
-_Found = tuple[str, _Estimate, str, _Fit]
+_Trouble = tuple[str, _Estimate, str, _Fit]
 
 
 def _troubles(e: LevelEvidence) -> Iterator[tuple[float, str, _Estimate, str, _Fit]]:
@@ -213,7 +215,7 @@ def _troubles(e: LevelEvidence) -> Iterator[tuple[float, str, _Estimate, str, _F
         yield 1.0 + _PATTERN_COST, "pattern", _NOTHING, "", further
     if e.other_towers_db:
         fits = {name: _fitted(e.measured_db - level) for name, level in e.other_towers_db.items()}
-        name = max(fits, key=lambda one: fits[one].log_likelihood)
+        name = max(fits, key=lambda tower: fits[tower].log_likelihood)
         yield 1.0, "tower", _NOTHING, name, fits[name]
     waves = _harmonics(e)
     yield _PATTERN_COST, "pattern", _NOTHING, "", _fitted(residual, waves)
@@ -224,7 +226,7 @@ def _troubles(e: LevelEvidence) -> Iterator[tuple[float, str, _Estimate, str, _F
         yield 2.0, *step
 
 
-def _profiled(name: str, fits: Mapping[float, _Fit]) -> _Found:
+def _profiled(name: str, fits: Mapping[float, _Fit]) -> _Trouble:
     """The best of some values, and the range of those that are nearly as likely, half way to the next that are not."""
     best = max(fits, key=lambda value: fits[value].log_likelihood)
     tried = sorted(fits)
@@ -266,7 +268,7 @@ _LEAST_BINS = 5
 _MOST_STARTS = 600
 
 
-def _blocked(e: LevelEvidence, residual: FloatArray) -> _Found | None:
+def _blocked(e: LevelEvidence, residual: FloatArray) -> _Trouble | None:
     """A loss in a sector of directions from the tower: searched by 5 degrees, then by one."""
     coarse = [(first, width) for width in _WIDTHS_DEG for first in np.arange(0.0, 360.0, 5.0).tolist()]
     best = None
@@ -291,13 +293,13 @@ def _best_sector(
     """Start and width [deg] of the sector whose loss takes off most; None where no sector has a loss."""
     turned = {first: (e.tower_azimuth_deg - first) % 360.0 for first in {first for first, _ in sectors}}
     masks = np.array([turned[first] < width for first, width in sectors])
-    shift, taken = _shift(residual, masks, phi)
+    shift, gain = _shift(residual, masks, phi)
     inside = masks.sum(axis=1)
     possible = (inside >= _LEAST_BINS) & (masks.shape[1] - inside >= _LEAST_BINS) & (shift < 0.0)
-    return sectors[int(np.argmax(np.where(possible, taken, -1.0)))] if possible.any() else None
+    return sectors[int(np.argmax(np.where(possible, gain, -1.0)))] if possible.any() else None
 
 
-def _stepped(e: LevelEvidence, residual: FloatArray) -> _Found | None:
+def _stepped(e: LevelEvidence, residual: FloatArray) -> _Trouble | None:
     """A shift that lasts from an instant to the end."""
     n = len(residual)
     starts = np.arange(_LEAST_BINS * 2, n - _LEAST_BINS * 2)
@@ -305,16 +307,16 @@ def _stepped(e: LevelEvidence, residual: FloatArray) -> _Found | None:
         return None
     starts = starts[:: 1 + len(starts) // _MOST_STARTS]
     masks = np.arange(n)[None, :] >= starts[:, None]
-    found = []
+    steps = []
     for phi in _SEARCHED_PHI:
-        shift, taken = _shift(residual, masks, phi)
-        at = int(np.argmax(taken))
+        shift, gain = _shift(residual, masks, phi)
+        at = int(np.argmax(gain))
         fit = _fitted(residual, masks[at][:, None].astype(np.float64))
-        found.append((_bounded(residual, masks[at], float(shift[at]), phi), f"{e.time_s[starts[at]]:.0f}", fit))
-    return "gain step", *max(found, key=lambda one: one[2].log_likelihood)
+        steps.append((_bounded(residual, masks[at], float(shift[at]), phi), f"{e.time_s[starts[at]]:.0f}", fit))
+    return "gain step", *max(steps, key=lambda step: step[2].log_likelihood)
 
 
-def _floored(e: LevelEvidence) -> _Found:
+def _floored(e: LevelEvidence) -> _Trouble:
     """A receiver that shows no level below its floor; what it shows there spreads less."""
     floors = np.quantile(e.measured_db, np.linspace(0.02, 0.7, 35))
     return _profiled("floor", {floor: _above_floor(e, floor) for floor in floors.tolist()})

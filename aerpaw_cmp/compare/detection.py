@@ -62,7 +62,7 @@ def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> Detectio
     from scipy.optimize import minimize
 
     flights = [flight for flight in flights if len(flight[0])]
-    detected = np.concatenate([np.zeros(0, dtype=np.bool_), *(seen for _, seen in flights)])
+    detected = np.concatenate([np.zeros(0, dtype=np.bool_), *(locked for _, locked in flights)])
     if min(int(detected.sum()), int((~detected).sum())) < _FEWEST:
         return None
     level = np.concatenate([each for each, _ in flights])
@@ -79,7 +79,7 @@ def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> Detectio
     constant, slope = minimize(loss, np.zeros(2), jac=True).x
     if slope <= 0.0:
         return None
-    share = float(np.mean([seen.mean() for _, seen in flights]))
+    share = float(np.mean([locked.mean() for _, locked in flights]))
     return DetectionForecast(
         level_db=centre - scale * float(constant / slope), per_db=float(slope) / scale, share=share
     )
@@ -155,35 +155,35 @@ def score_detection(
     -------
     DetectionScore or None
     """
-    known = np.isfinite(simulated_db) & np.isfinite(time_s)
-    time, simulated, detected = time_s[known], simulated_db[known], detected[known]
-    measured = np.maximum(np.nan_to_num(measured_db[known], nan=floor_db), floor_db)
+    finite = np.isfinite(simulated_db) & np.isfinite(time_s)
+    time, simulated, detected = time_s[finite], simulated_db[finite], detected[finite]
+    measured = np.maximum(np.nan_to_num(measured_db[finite], nan=floor_db), floor_db)
     if min(int(detected.sum()), int((~detected).sum())) < _FEWEST:
         return None
     outcome = detected.astype(np.int64) + 1
     if forecast is None:
-        said, constant = _held_out(time, simulated, outcome)
+        stated, constant = _held_out(time, simulated, outcome)
     else:
-        said, constant = (
+        stated, constant = (
             np.stack([1.0 - p, p], axis=1)
             for p in (forecast.probability(simulated), np.full(len(simulated), forecast.share))
         )
     fit = floored_fit(measured, simulated, floor_db)
-    free = simulated if free_space_db is None else free_space_db[known]
+    free = simulated if free_space_db is None else free_space_db[finite]
     residual = measured - np.maximum(simulated - fit.offset_db, floor_db)
     return DetectionScore(
         floor_db=floor_db,
         n=len(time),
         n_detected=int(detected.sum()),
-        brier=float(brier_losses(said, outcome).mean()) / 2.0,
+        brier=float(brier_losses(stated, outcome).mean()) / 2.0,
         constant_brier=float(brier_losses(constant, outcome).mean()) / 2.0,
-        log_score=float(log_losses(said, outcome).mean()),
+        log_score=float(log_losses(stated, outcome).mean()),
         constant_log_score=float(log_losses(constant, outcome).mean()),
         offset_db=fit.offset_db,
         rmse_db=fit.rmse_db,
         free_space_rmse_db=floored_fit(measured, free, floor_db).rmse_db,
         detected_rmse_db=float(np.sqrt(np.mean(residual[detected] ** 2))),
-        reliability=_reliability(said[:, 1], detected),
+        reliability=_reliability(stated[:, 1], detected),
         learned_on="held-out segments" if forecast is None else "other flights",
     )
 
@@ -191,18 +191,18 @@ def score_detection(
 def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> tuple[FloatArray, FloatArray]:
     """Probabilities (n, 2) of each segment from the others: by the level, and of a constant."""
     segment = np.minimum((time_s - time_s.min()) / max(np.ptp(time_s), 1e-9) * SEGMENTS, SEGMENTS - 1).astype(np.int64)
-    said = out_of_group(level_db[:, None], outcome, segment, _PENALTY)[:, :2]
-    said = said / said.sum(axis=1, keepdims=True)  # two outcomes of the four that a receiver of ranks knows
-    constant = np.zeros_like(said)
-    for item in np.unique(segment):
-        constant[segment == item] = constant_forecast(outcome[segment != item], 2)
-    return said, constant
+    stated = out_of_group(level_db[:, None], outcome, segment, _PENALTY)[:, :2]
+    stated = stated / stated.sum(axis=1, keepdims=True)  # two outcomes of the four that a receiver of ranks knows
+    constant = np.zeros_like(stated)
+    for left_out in np.unique(segment):
+        constant[segment == left_out] = constant_forecast(outcome[segment != left_out], 2)
+    return stated, constant
 
 
 def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> OffsetFit:
     """:func:`floored_offset` within 60 dB of the median above the floor; pairs (n,) with a NaN do not count."""
-    known = np.isfinite(measured_db) & np.isfinite(simulated_db)
-    measured, simulated = np.maximum(measured_db[known], floor_db), simulated_db[known]
+    finite = np.isfinite(measured_db) & np.isfinite(simulated_db)
+    measured, simulated = np.maximum(measured_db[finite], floor_db), simulated_db[finite]
     above = measured > floor_db
     middle = float(np.median((simulated - measured)[above])) if above.any() else 0.0
     span = (middle - _SPAN_DB, middle + _SPAN_DB)
@@ -245,10 +245,10 @@ def floored_offset(
     return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), n, best in (0, len(grid) - 1))
 
 
-def _reliability(said: FloatArray, detected: BoolArray) -> tuple[tuple[float, float, int], ...]:
-    fifth = np.minimum((said * 5.0).astype(np.int64), 4)
+def _reliability(stated: FloatArray, detected: BoolArray) -> tuple[tuple[float, float, int], ...]:
+    fifth = np.minimum((stated * 5.0).astype(np.int64), 4)
     groups = [fifth == i for i in range(5)]
-    return tuple((float(said[g].mean()), float(detected[g].mean()), int(g.sum())) for g in groups if g.any())
+    return tuple((float(stated[g].mean()), float(detected[g].mean()), int(g.sum())) for g in groups if g.any())
 
 
 # Between two values of AERPAW's sounder [s]: 4095 chips and the rest of its correlation.
@@ -274,11 +274,11 @@ def aligned_quality(time_s: FloatArray, power_db: FloatArray, quality_db: FloatA
     (n,), float
         Quality, NaN where none is left, and the largest shift [s]; 0 where the rows are paired in time.
     """
-    own = np.arange(len(time_s)) * BASE_S + time_s[0]
-    moved = np.interp(time_s, own, quality_db, right=np.nan)
-    shift = float(np.abs(own - time_s).max())
-    known = np.isfinite(moved) & np.isfinite(power_db) & np.isfinite(quality_db)
-    if shift < 2.0 or known.sum() < _FEWEST:
+    base_s = np.arange(len(time_s)) * BASE_S + time_s[0]
+    moved = np.interp(time_s, base_s, quality_db, right=np.nan)
+    shift = float(np.abs(base_s - time_s).max())
+    finite = np.isfinite(moved) & np.isfinite(power_db) & np.isfinite(quality_db)
+    if shift < 2.0 or finite.sum() < _FEWEST:
         return quality_db, 0.0
-    paired, based = (float(np.corrcoef(power_db[known], q[known])[0, 1]) for q in (quality_db, moved))
+    paired, based = (float(np.corrcoef(power_db[finite], q[finite])[0, 1]) for q in (quality_db, moved))
     return (moved, shift) if based > paired + _BETTER else (quality_db, 0.0)

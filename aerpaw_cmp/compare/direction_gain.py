@@ -88,15 +88,15 @@ class LinkSamples:
         A bin mixes directions only as far as the UAV turns within it; a few seconds are less than the lengths of the
         kernels.
         """
-        good = np.isfinite(self.residual_db) & np.isfinite(self.at_uav).all(axis=1)
-        if not good.any():
-            return self.part(good)
-        kept = self.part(good)
-        _, member = np.unique(np.floor((kept.time_s - kept.time_s[0]) / width_s).astype(np.int64), return_inverse=True)
-        means: dict[str, Any] = {name: _bin_means(getattr(kept, name), member) for name in _ARRAYS}
+        finite = np.isfinite(self.residual_db) & np.isfinite(self.at_uav).all(axis=1)
+        if not finite.any():
+            return self.part(finite)
+        part = self.part(finite)
+        _, member = np.unique(np.floor((part.time_s - part.time_s[0]) / width_s).astype(np.int64), return_inverse=True)
+        means: dict[str, Any] = {name: _bin_means(getattr(part, name), member) for name in _ARRAYS}
         for name in ("at_uav", "at_tower"):
             means[name] /= np.linalg.norm(means[name], axis=1, keepdims=True)
-        return dataclasses.replace(kept, floor_db=None, **means)
+        return dataclasses.replace(part, floor_db=None, **means)
 
 
 _ARRAYS = ("time_s", "position_m", "at_uav", "at_tower", "residual_db")
@@ -182,7 +182,7 @@ def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
     return -samples.at_tower if frame == "world" else samples.position_m
 
 
-def _kernel(term: Term, one: FloatArray, other: FloatArray) -> FloatArray:
+def _kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
     """Covariance (n, m) of a term between arguments [dB^2].
 
     Gains of airframes have details of every size: an exponential leaves 0.1 dB less than sums of Gaussians.
@@ -190,18 +190,18 @@ def _kernel(term: Term, one: FloatArray, other: FloatArray) -> FloatArray:
     from scipy.spatial.distance import cdist
 
     if term.frame == "pair":
-        return term.sd_db**2 * gaussian_kernel(one, other, term.length)
-    return np.asarray(term.sd_db**2 * np.exp(cdist(one, other) / -term.length))
+        return term.sd_db**2 * gaussian_kernel(at, to, term.length)
+    return np.asarray(term.sd_db**2 * np.exp(cdist(at, to) / -term.length))
 
 
-def _covariance(terms: Sequence[Term], one: Sequence[LinkSamples], other: Sequence[LinkSamples]) -> FloatArray:
+def _covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Sequence[LinkSamples]) -> FloatArray:
     """Covariance (n, m) of the gains between samples of some series and of others [dB^2]."""
-    names = [[s.antenna for s in series for _ in range(len(s))] for series in (one, other)]
+    names = [[s.antenna for s in series for _ in range(len(s))] for series in (first, second)]
     codes = np.unique(names[0] + names[1], return_inverse=True)[1]
     same = codes[: len(names[0]), None] == codes[None, len(names[0]) :]
     out = np.zeros(same.shape)
     for term in terms:
-        at, to = (np.concatenate([argument_of(s, term.frame) for s in series]) for series in (one, other))
+        at, to = (np.concatenate([argument_of(s, term.frame) for s in series]) for series in (first, second))
         out += _kernel(term, at, to) * (same if term.per == "antenna" else 1.0)
     return out
 
@@ -212,11 +212,11 @@ def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> Floa
 
     out, start = _covariance(model.terms, rows, rows), 0
     for samples in rows:
-        own = slice(start, start + len(samples))
+        block = slice(start, start + len(samples))
         distance = cdist(samples.position_m, samples.position_m)
-        out[own, own] += model.own_sd_db**2 * np.exp(-distance / model.own_length_m)
-        out[own, own] += (OFFSET_SD * model.noise_sd_db) ** 2
-        start = own.stop
+        out[block, block] += model.own_sd_db**2 * np.exp(-distance / model.own_length_m)
+        out[block, block] += (OFFSET_SD * model.noise_sd_db) ** 2
+        start = block.stop
     out[np.diag_indices(len(out))] += model.noise_sd_db**2
     return out
 
@@ -306,19 +306,19 @@ class GainFit:
             If no flight of the fit had this tower and channel.
         """
         gain, sd = np.full(len(samples), np.nan), np.full(len(samples), np.nan)
-        terms, good = self._terms(frames), self._known_rows(samples)
-        for start in range(0, len(good), AT_ONCE):
-            part = good[start : start + AT_ONCE]
-            gain[part], sd[part] = self._moments(terms, samples.part(part), self._own(samples.antenna))
+        terms, known = self._terms(frames), self._known_rows(samples)
+        for start in range(0, len(known), AT_ONCE):
+            part = known[start : start + AT_ONCE]
+            gain[part], sd[part] = self._moments(terms, samples.part(part), self._rows_of(samples.antenna))
         return gain, sd
 
     def mean(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> FloatArray:
         """The gain of :meth:`predict` alone (n,) [dB]."""
         gain = np.full(len(samples), np.nan)
-        terms, good, own = self._terms(frames), self._known_rows(samples), self._own(samples.antenna)
-        zero = float((_covariance(terms, own, self.rows) @ self._weights).mean())
-        for start in range(0, len(good), AT_ONCE):
-            part = good[start : start + AT_ONCE]
+        terms, known, rows = self._terms(frames), self._known_rows(samples), self._rows_of(samples.antenna)
+        zero = float((_covariance(terms, rows, self.rows) @ self._weights).mean())
+        for start in range(0, len(known), AT_ONCE):
+            part = known[start : start + AT_ONCE]
             gain[part] = _covariance(terms, [samples.part(part)], self.rows) @ self._weights - zero
         return gain
 
@@ -331,28 +331,30 @@ class GainFit:
 
     def seen(self, frame: Frame, antenna: str) -> FloatArray:
         """Directions (m, 3) of the bins of the fit at one end, the UAV's of all antennas together; (m, 6) of pairs."""
-        return np.concatenate([argument_of(s, frame) for s in (self.rows if frame == "body" else self._own(antenna))])
+        return np.concatenate(
+            [argument_of(s, frame) for s in (self.rows if frame == "body" else self._rows_of(antenna))]
+        )
 
     def sd_about_mean(self, samples: LinkSamples) -> FloatArray:
         """Standard deviation (n,) of the gain along samples about its mean over them, as an own offset leaves it [dB].
 
         Every sample must have both directions.
         """
-        self._own(samples.antenna)
+        self._rows_of(samples.antenna)
         return self._moments(self.model.terms, samples, [samples])[1]
 
     def _terms(self, frames: Iterable[Frame] | None) -> tuple[Term, ...]:
         chosen = None if frames is None else set(frames)
         return tuple(t for t in self.model.terms if chosen is None or t.frame in chosen)
 
-    def _own(self, antenna: str) -> list[LinkSamples]:
+    def _rows_of(self, antenna: str) -> list[LinkSamples]:
         """Rows of an antenna."""
-        own = [s for s in self.rows if s.antenna == antenna]
-        if not own:
+        rows = [s for s in self.rows if s.antenna == antenna]
+        if not rows:
             raise UsageError(
                 f"tower and channel {antenna!r} were not fitted", expected="one of " + ", ".join(self.antennas)
             )
-        return own
+        return rows
 
     @staticmethod
     def _known_rows(samples: LinkSamples) -> IntArray:

@@ -99,23 +99,23 @@ def level_scores(series: Sequence[LevelSeries]) -> dict[str, float]:
     }
 
 
-def _series_scores(one: LevelSeries) -> dict[str, float]:
-    error = one.error_db
-    slow = local_mean_db(one.time_s, one.measured_db, WINDOW_S) - local_mean_db(one.time_s, one.level_db, WINDOW_S)
-    slow = slow - slow.mean() if one.own_offset else slow
+def _series_scores(s: LevelSeries) -> dict[str, float]:
+    error = s.error_db
+    slow = local_mean_db(s.time_s, s.measured_db, WINDOW_S) - local_mean_db(s.time_s, s.level_db, WINDOW_S)
+    slow = slow - slow.mean() if s.own_offset else slow
     scores = {
         "rmse_db": float(np.sqrt(np.mean(error**2))),
         "rmse_4s_db": float(np.sqrt(np.mean(slow**2))),
-        "bias_db": abs(one.bias_db),
+        "bias_db": abs(s.bias_db),
         "crps_db": np.nan,
         "log_score": np.nan,
         "coverage_90": np.nan,
         "n": float(len(error)),
     }
-    if one.sd_db is not None:
-        scores["crps_db"] = float(crps_normal(error, one.sd_db).mean())
-        scores["log_score"] = float(np.mean(0.5 * (error / one.sd_db) ** 2 + np.log(np.sqrt(2.0 * np.pi) * one.sd_db)))
-        scores["coverage_90"] = float(np.mean(np.abs(error) <= ndtri(0.5 + COVERAGE / 2) * one.sd_db))
+    if s.sd_db is not None:
+        scores["crps_db"] = float(crps_normal(error, s.sd_db).mean())
+        scores["log_score"] = float(np.mean(0.5 * (error / s.sd_db) ** 2 + np.log(np.sqrt(2.0 * np.pi) * s.sd_db)))
+        scores["coverage_90"] = float(np.mean(np.abs(error) <= ndtri(0.5 + COVERAGE / 2) * s.sd_db))
     return scores
 
 
@@ -128,11 +128,11 @@ def rmse_replicates(series: Sequence[LevelSeries]) -> FloatArray:
     Blocks of one series are the same for every entrant, so differences of replicates are paired.
     """
     total = np.zeros(REPLICATES)
-    for number, one in enumerate(series):
-        error = one.error_db
+    for number, levels in enumerate(series):
+        error = levels.error_db
         columns = np.column_stack([error**2, error])
-        drawn = bootstrap_means(columns, one.block, replicates=REPLICATES, seed=SEED + number)
-        offset = drawn[:, 1] ** 2 if one.own_offset else 0.0
+        drawn = bootstrap_means(columns, levels.block, replicates=REPLICATES, seed=SEED + number)
+        offset = drawn[:, 1] ** 2 if levels.own_offset else 0.0
         total += np.sqrt(np.maximum(drawn[:, 0] - offset, 0.0))
     return total / len(series)
 
@@ -141,7 +141,9 @@ def intervals(
     series: Sequence[LevelSeries], baselines: Mapping[str, Sequence[LevelSeries]]
 ) -> dict[str, tuple[float, float]]:
     """95 % intervals of the mean RMSE, and of its difference from each baseline [dB]."""
-    own = rmse_replicates(series)
-    spread = {"rmse_ci95_db": own}
-    spread |= {f"difference_to_{name}_ci95_db": own - rmse_replicates(other) for name, other in baselines.items()}
+    replicates = rmse_replicates(series)
+    spread = {"rmse_ci95_db": replicates}
+    spread |= {
+        f"difference_to_{name}_ci95_db": replicates - rmse_replicates(baseline) for name, baseline in baselines.items()
+    }
     return {key: (float(np.quantile(v, 0.025)), float(np.quantile(v, 0.975))) for key, v in spread.items()}

@@ -144,48 +144,50 @@ def score_forecast(
     ValueError
         If the three are not of one length.
     """
-    ri, said = np.asarray(measured, dtype=np.float64).ravel(), np.asarray(decided, dtype=np.float64).ravel()
-    if not len(ri) == len(said) == len(probability):
-        raise ValueError(f"{len(ri)} measured ranks, {len(probability)} forecasts, {len(said)} decisions: not in pairs")
-    good = (ri >= 1) & (said >= 1) & np.isfinite(probability).all(axis=1)
-    rank, choice, p = ri[good].astype(np.int64), said[good].astype(np.int64), probability[good]
+    ri, decision = np.asarray(measured, dtype=np.float64).ravel(), np.asarray(decided, dtype=np.float64).ravel()
+    if not len(ri) == len(decision) == len(probability):
+        raise ValueError(
+            f"{len(ri)} measured ranks, {len(probability)} forecasts, {len(decision)} decisions: not in pairs"
+        )
+    counts = (ri >= 1) & (decision >= 1) & np.isfinite(probability).all(axis=1)
+    rank, choice, p = ri[counts].astype(np.int64), decision[counts].astype(np.int64), probability[counts]
     if not len(rank):
-        none = np.full(MAX_RANK, np.nan)
+        absent = np.full(MAX_RANK, np.nan)
         return ForecastScore(
-            n=0, expected_histogram=none, expected_histogram_ci95=(NO_INTERVAL,) * MAX_RANK, measured_histogram=none
+            n=0, expected_histogram=absent, expected_histogram_ci95=(NO_INTERVAL,) * MAX_RANK, measured_histogram=absent
         )
     flat = np.broadcast_to(constant, p.shape)
     reported, chosen = one_hot(rank), one_hot(choice)
     log, log_constant = log_losses(p, rank), log_losses(flat, rank)
     columns = np.column_stack([log, log - log_constant, p, rank == choice, reported, chosen]).astype(np.float64)
-    paired = columns[:, -1 - 2 * MAX_RANK :]  # agreement and the two ranks, as kappa takes them
-    known = max((autocorrelation(c) for c in (paired[:, 0], *columns[:, :2].T)), key=lambda m: m.block_length)
-    drawn = bootstrap_means(columns, known.block_length, replicates=replicates)
+    pair_columns = columns[:, -1 - 2 * MAX_RANK :]  # agreement and the two ranks, as kappa takes them
+    memory = max((autocorrelation(c) for c in (pair_columns[:, 0], *columns[:, :2].T)), key=lambda m: m.block_length)
+    drawn = bootstrap_means(columns, memory.block_length, replicates=replicates)
     drawn_p, drawn_pair = drawn[:, 2 : 2 + MAX_RANK], drawn[:, 2 + MAX_RANK :]
     mean = columns.mean(axis=0)
-    expected, share = mean[2 : 2 + MAX_RANK], paired.mean(axis=0)[1 : 1 + MAX_RANK]
+    expected, share = mean[2 : 2 + MAX_RANK], pair_columns.mean(axis=0)[1 : 1 + MAX_RANK]
     kappa = cohen_kappa(rank, choice)
     spread = total_variation(share, expected)
     varied = variation_of_means(np.column_stack([drawn_pair[:, : 1 + MAX_RANK], drawn_p]))
     return ForecastScore(
         n=len(rank),
         kappa=kappa,
-        kappa_ci95=interval(kappa, kappa_of_means(drawn_pair), known, bounds=(-1.0, 1.0)),
+        kappa_ci95=interval(kappa, kappa_of_means(drawn_pair), memory, bounds=(-1.0, 1.0)),
         agreement=float(np.mean(rank == choice)),
         majority_agreement=float(share.max()),
         log_score=float(mean[0]),
-        log_score_ci95=interval(float(mean[0]), drawn[:, 0], known, bounds=(0.0, np.inf)),
+        log_score_ci95=interval(float(mean[0]), drawn[:, 0], memory, bounds=(0.0, np.inf)),
         constant_log_score=float(log_constant.mean()),
         log_score_gain=float(1.0 - mean[0] / log_constant.mean()),
-        log_score_difference_ci95=interval(float(mean[1]), drawn[:, 1], known),
+        log_score_difference_ci95=interval(float(mean[1]), drawn[:, 1], memory),
         brier_score=float(brier_losses(p, rank).mean()),
         constant_brier_score=float(brier_losses(flat, rank).mean()),
         total_variation_expected=spread,
-        total_variation_ci95=interval(spread, varied, known, bounds=(0.0, 1.0)),
+        total_variation_ci95=interval(spread, varied, memory, bounds=(0.0, 1.0)),
         constant_total_variation=total_variation(share, constant),
         expected_histogram=expected,
         expected_histogram_ci95=tuple(
-            interval(float(expected[r]), drawn_p[:, r], known, bounds=(0.0, 1.0)) for r in range(MAX_RANK)
+            interval(float(expected[r]), drawn_p[:, r], memory, bounds=(0.0, 1.0)) for r in range(MAX_RANK)
         ),
         measured_histogram=share,
     )

@@ -279,10 +279,10 @@ def held_out_lines(values: FloatArray, x: FloatArray, block: IntArray, blocks: i
         NaN offset where no sample is left.
     """
     centre = float(x.mean()) if len(x) else 0.0
-    away = x - centre
+    centred = x - centre
     sums = np.array(
         [np.bincount(block, weights=w, minlength=blocks)
-         for w in (np.ones(len(x)), away, values, away * away, away * values)]
+         for w in (np.ones(len(x)), centred, values, centred * centred, centred * values)]
     )  # fmt: skip
     count, sx, sy, sxx, sxy = sums.sum(axis=1, keepdims=True) - sums
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -314,16 +314,16 @@ def log_distance_level_db(
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         x = 10.0 * np.log10(distance_m)
-    good = np.isfinite(measured_db) & np.isfinite(x)
+    finite = np.isfinite(measured_db) & np.isfinite(x)
     level = np.full(len(x), np.nan)
-    if not good.any():
+    if not finite.any():
         return level
-    away = x - x[good].mean()
-    place = places_of(position_m[good], blocks)
-    slope = held_out_lines(measured_db[good], away[good], place, blocks)[1]
-    overall = held_out_lines(measured_db[good], away[good], np.zeros(int(good.sum()), np.int64), 2)[1][1]
-    level[np.isfinite(away)] = overall * away[np.isfinite(away)]
-    level[good] = slope[place] * away[good]
+    centred = x - x[finite].mean()
+    place = places_of(position_m[finite], blocks)
+    slope = held_out_lines(measured_db[finite], centred[finite], place, blocks)[1]
+    overall = held_out_lines(measured_db[finite], centred[finite], np.zeros(int(finite.sum()), np.int64), 2)[1][1]
+    level[np.isfinite(centred)] = overall * centred[np.isfinite(centred)]
+    level[finite] = slope[place] * centred[finite]
     return level
 
 
@@ -338,9 +338,9 @@ def _as_good(error: FloatArray, best: FloatArray) -> bool:
 
 
 def _covers(measured: Sequence[FloatArray], rung: Rung) -> bool:
-    wanted = sum(int(np.isfinite(m).sum()) for m in measured)
-    both = (int((np.isfinite(m) & np.isfinite(x)).sum()) for m, x in zip(measured, rung.level_db, strict=True))
-    return sum(both) >= LEAST_COVERED * max(wanted, 1)
+    measurements = sum(int(np.isfinite(m).sum()) for m in measured)
+    pairs = (int((np.isfinite(m) & np.isfinite(x)).sum()) for m, x in zip(measured, rung.level_db, strict=True))
+    return sum(pairs) >= LEAST_COVERED * max(measurements, 1)
 
 
 def _shared(measured: FloatArray, levels: Sequence[FloatArray]) -> BoolArray:

@@ -111,8 +111,8 @@ def level_track(
         At most :data:`MOST_BINS` of them.
     """
     time, place, level = (np.asarray(v, dtype=np.float64) for v in (time_s, position_m, level_db))
-    known = np.isfinite(level) & np.isfinite(place).all(axis=1) & np.isfinite(time)
-    time, place, level = time[known], place[known], np.maximum(level[known], floor_db)
+    finite = np.isfinite(level) & np.isfinite(place).all(axis=1) & np.isfinite(time)
+    time, place, level = time[finite], place[finite], np.maximum(level[finite], floor_db)
     if not len(time):
         return LevelTrack(time, place, level, floor_db)
     window = max(WINDOW_S, float(np.ptp(time)) / MOST_BINS * 1.001)
@@ -163,16 +163,16 @@ def _shadowing(track: LevelTrack) -> tuple[FloatArray, float]:
     lag = np.abs(track.time_s[:, None] - track.time_s)
     variance, vectors = np.linalg.eigh(SHADOW_SD_DB**2 * np.exp(-lag / SHADOW_S))
     terms = vectors[:, -_TERMS:] * np.sqrt(np.maximum(variance[-_TERMS:], 0.0))
-    rest = max(float(variance[:-_TERMS].sum()), 0.0) / len(lag)
-    return terms, float(np.hypot(SCATTER_SD_DB, np.sqrt(rest)))
+    unresolved = max(float(variance[:-_TERMS].sum()), 0.0) / len(lag)
+    return terms, float(np.hypot(SCATTER_SD_DB, np.sqrt(unresolved)))
 
 
 def _features(track: LevelTrack, places: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean (m, n) of the level before one was seen, and what coefficients of unit variance add (m, n, 4)."""
-    away = track.position_m[None] - places[:, None]
-    across = np.hypot(away[..., 0], away[..., 1])
-    decades = np.log10(np.maximum(np.hypot(across, away[..., 2]), 1.0) / 100.0)
-    elevation = np.arctan2(away[..., 2], across)
+    ray = track.position_m[None] - places[:, None]
+    across = np.hypot(ray[..., 0], ray[..., 1])
+    decades = np.log10(np.maximum(np.hypot(across, ray[..., 2]), 1.0) / 100.0)
+    elevation = np.arctan2(ray[..., 2], across)
     columns = [
         np.full(across.shape, _FREE_DB),
         -10.0 * SLOPE_SD * decades,
@@ -181,7 +181,7 @@ def _features(track: LevelTrack, places: FloatArray) -> tuple[FloatArray, FloatA
     ]
     mean = _middle(track) - 10.0 * SLOPE * decades
     if track.airframe_db is not None:
-        mean = mean + track.airframe_db(-away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9))
+        mean = mean + track.airframe_db(-ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9))
     return mean, np.stack(columns, axis=-1)
 
 
@@ -255,8 +255,8 @@ class NodeEstimate:
 
     def __contains__(self, place_m: ArrayLike) -> bool:
         """Check whether a place lies within the 90 % region."""
-        away = np.asarray(place_m, dtype=np.float64)[:2] - self.place_m[:2]
-        return bool(np.hypot(*away) <= self.radius90_m)
+        step = np.asarray(place_m, dtype=np.float64)[:2] - self.place_m[:2]
+        return bool(np.hypot(*step) <= self.radius90_m)
 
 
 def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
@@ -337,8 +337,8 @@ def _radius(apart_m: FloatArray, share: FloatArray) -> float:
     from scipy.stats import ncx2
 
     def held(radius: float) -> float:
-        inside = ncx2.cdf((radius / SYSTEMATIC_M) ** 2, 2, np.maximum((apart_m / SYSTEMATIC_M) ** 2, 1e-12))
-        return float(share @ inside) - 0.9
+        shares = ncx2.cdf((radius / SYSTEMATIC_M) ** 2, 2, np.maximum((apart_m / SYSTEMATIC_M) ** 2, 1e-12))
+        return float(share @ shares) - 0.9
 
     return float(brentq(held, 1.0, float(apart_m.max()) + 10.0 * SYSTEMATIC_M, xtol=0.1))
 

@@ -47,14 +47,14 @@ class Memories:
     """All memories (m,) at ``terms`` cosine terms: normal distributions of the mean and the terms, up to a scale.
 
     ``whiten`` (m, terms, terms) makes the terms independent, ``log_det`` (m,) is the logarithm of its determinant;
-    ``slope`` (m, terms) and ``left`` (m,) give mean and variance of the sequence's mean once the terms are known;
+    ``slope`` (m, terms) and ``variance`` (m,) give mean and variance of the sequence's mean once the terms are known;
     ``power`` (m,) is that of the mean and of the terms together.
     """
 
     whiten: FloatArray
     log_det: FloatArray
     slope: FloatArray
-    left: FloatArray
+    variance: FloatArray
     power: FloatArray
 
 
@@ -67,8 +67,8 @@ def memories(terms: int = TERMS) -> Memories:
             covariance = (1.0 - share) * 0.5 * rate * _exponential(rate, terms) + share * np.eye(terms + 1)
             whiten = np.linalg.inv(np.linalg.cholesky(covariance[1:, 1:]))
             slope = whiten.T @ (whiten @ covariance[0, 1:])
-            left = covariance[0, 0] - covariance[0, 1:] @ slope
-            parts.append((whiten, np.log(np.diag(whiten)).sum(), slope, left, np.trace(covariance)))
+            variance = covariance[0, 0] - covariance[0, 1:] @ slope
+            parts.append((whiten, np.log(np.diag(whiten)).sum(), slope, variance, np.trace(covariance)))
     return Memories(*(np.array(column) for column in zip(*parts, strict=True)))
 
 
@@ -162,7 +162,7 @@ def mean_draws(values: FloatArray, kind: Kind = "mean") -> FloatArray:
     known = memories(len(slow))
     index, scale = _picked(slow, kind)
     centre = -(known.slope[index] @ slow)
-    reach = np.sqrt(scale * known.left[index]) * _random(len(slow))[2]
+    reach = np.sqrt(scale * known.variance[index]) * _random(len(slow))[2]
     return np.asarray(np.concatenate([centre + reach, centre - reach]))
 
 
@@ -174,17 +174,17 @@ def power_draws(values: FloatArray) -> FloatArray:
     values : (n,)
         In time order, at least :data:`FEWEST`. Tails heavier than normal widen the draws.
     """
-    away = values - values.mean()
-    mean_square = float(np.mean(away * away))
+    deviation = values - values.mean()
+    mean_square = float(np.mean(deviation * deviation))
     if mean_square == 0.0:
         return np.zeros(2 * _PAIRS)
     terms = cosine_terms(values)
     index, scale = _picked(terms.slow, "power")
-    *_, normal, other = _random(len(terms.slow))
+    *_, normal, second_normal = _random(len(terms.slow))
     third = 2.0 / (9.0 * terms.fast_freedom)
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
-    fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * other, 0.05) ** 3
+    fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
     # a short normal sequence shows heavy tails by chance: only what is beyond counts
-    excess = max(float(np.mean(away**4)) / mean_square**2 - 3.0 - np.sqrt(24.0 / terms.freedom), 0.0)
+    excess = max(float(np.mean(deviation**4)) / mean_square**2 - 3.0 - np.sqrt(24.0 / terms.freedom), 0.0)
     tails = np.exp(np.sqrt(excess / terms.freedom) * normal)
     return np.tile((scale * memories(len(terms.slow)).power[index] + fast) * tails, 2)

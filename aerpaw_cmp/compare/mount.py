@@ -157,26 +157,26 @@ def _quadratic_forms(
 def _best_together(forms: _Forms) -> tuple[dict[str, int], dict[str, FloatArray]]:
     """Most probable candidate of each name, and its marginal probabilities."""
     names = list(forms.columns)
-    first, rest = names[0], names[1:]
+    first, further = names[0], names[1:]
     size = forms.columns[first].stop - forms.columns[first].start
     value, choices, conditional = np.empty(size), [], []
     for candidate in range(size):
-        chosen = {first: candidate, **dict.fromkeys(rest, 0)}
-        given: dict[str, FloatArray] = {}
+        chosen = {first: candidate, **dict.fromkeys(further, 0)}
+        conditionals: dict[str, FloatArray] = {}
         for _ in range(4):
-            for name in rest:
-                given[name] = _given_others(forms, chosen, name)
-                chosen[name] = int(given[name].argmax())
+            for name in further:
+                conditionals[name] = _given_others(forms, chosen, name)
+                chosen[name] = int(conditionals[name].argmax())
         value[candidate] = _given_others(forms, chosen, first)[candidate]
         choices.append(chosen)
-        conditional.append(given)
+        conditional.append(conditionals)
     weight = np.exp(value - value.max())
     weight /= weight.sum()
     marginal = {first: weight}
-    for name in rest:
+    for name in further:
         parts = []
-        for given in conditional:
-            share = np.exp(given[name] - given[name].max())
+        for conditionals in conditional:
+            share = np.exp(conditionals[name] - conditionals[name].max())
             parts.append(share / share.sum())
         marginal[name] = weight @ np.array(parts)
     return choices[int(value.argmax())], marginal
@@ -184,10 +184,10 @@ def _best_together(forms: _Forms) -> tuple[dict[str, int], dict[str, FloatArray]
 
 def _given_others(forms: _Forms, chosen: Mapping[str, int], name: str) -> FloatArray:
     """Log likelihood of all candidates of one name, those of the others given."""
-    form, own = forms.form, forms.columns[name]
-    others = [forms.columns[other].start + at for other, at in chosen.items() if other != name]
+    form, candidates = forms.form, forms.columns[name]
+    chosen_columns = [forms.columns[end].start + at for end, at in chosen.items() if end != name]
     sign = np.zeros(len(form))
     sign[0] = 1.0
-    sign[others] = -1.0
-    left = form @ sign
-    return np.asarray(-0.5 * (sign @ left - 2.0 * left[own] + np.diag(form)[own]))
+    sign[chosen_columns] = -1.0
+    product = form @ sign
+    return np.asarray(-0.5 * (sign @ product - 2.0 * product[candidates] + np.diag(form)[candidates]))

@@ -98,8 +98,8 @@ def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB
     count = np.arange(first, last + 1, dtype=np.float64)
     per_db = 1.0 / step_db
     # 3 / 10 is 0.3; 3 * 0.1 is not
-    whole = abs(per_db - round(per_db)) < 1e-9 * per_db and round(per_db) >= 1
-    return count / round(per_db) if whole else count * step_db
+    integral = abs(per_db - round(per_db)) < 1e-9 * per_db and round(per_db) >= 1
+    return count / round(per_db) if integral else count * step_db
 
 
 def nearest_offset(grid_db: FloatArray, target_db: float, step_db: float = STEP_DB) -> int:
@@ -249,19 +249,19 @@ def trimmed_offset(
     n = len(difference)
     if not n:
         return OffsetFit(float("nan"), float("nan"), 0, False)
-    kept = int(np.ceil(keep * n - 1e-9))
+    count = int(np.ceil(keep * n - 1e-9))
     centre = float(difference.mean())
     d = difference - centre
     sums = np.concatenate([[0.0], np.cumsum(d)])
     squares = np.concatenate([[0.0], np.cumsum(d * d)])
     # moving the window by one pays off once the offset passes the middle of what leaves and what enters
-    first = np.searchsorted(0.5 * (d[: n - kept] + d[kept:]), grid - centre)
-    mean = (sums[first + kept] - sums[first]) / kept
-    variance = np.maximum((squares[first + kept] - squares[first]) / kept - mean**2, 0.0)
+    first = np.searchsorted(0.5 * (d[: n - count] + d[count:]), grid - centre)
+    mean = (sums[first + count] - sums[first]) / count
+    variance = np.maximum((squares[first + count] - squares[first]) / count - mean**2, 0.0)
     mse = variance + (mean - (grid - centre)) ** 2
     near = np.flatnonzero(mse <= mse.min() + _TIE * step_db**2)
     best = int(near[np.argmin(np.abs(grid[near]))])
-    return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), kept, best in (0, len(grid) - 1))
+    return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), count, best in (0, len(grid) - 1))
 
 
 def censored_offset(
@@ -412,16 +412,16 @@ def pooled_moments(
         groups.setdefault(tuple(key[axis] for axis in axes), []).append(key)
     fits: dict[tuple[str, str, str], OffsetFit] = {}
     for members in groups.values():
-        known = [moments[key] for key in members if moments[key].n]
-        if not known:
+        filled = [moments[key] for key in members if moments[key].n]
+        if not filled:
             fits |= {key: OffsetFit(float("nan"), float("nan"), 0, False) for key in members}
             continue
-        total = sum(item.n for item in known)
-        mean = known[0].mean_db + sum((item.mean_db - known[0].mean_db) * (item.n / total) for item in known)
+        total = sum(item.n for item in filled)
+        mean = filled[0].mean_db + sum((item.mean_db - filled[0].mean_db) * (item.n / total) for item in filled)
         best = nearest_offset(grid, mean, step_db)
         offset, at_edge = float(grid[best]), best in (0, len(grid) - 1)
         for key in members:
-            own = moments[key]
-            rmse = float(np.hypot(np.sqrt(own.variance_db2), own.mean_db - offset))
-            fits[key] = OffsetFit(offset, rmse, own.n, at_edge)
+            sequence = moments[key]
+            rmse = float(np.hypot(np.sqrt(sequence.variance_db2), sequence.mean_db - offset))
+            fits[key] = OffsetFit(offset, rmse, sequence.n, at_edge)
     return {key: fits[key] for key in moments}

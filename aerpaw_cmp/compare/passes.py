@@ -56,12 +56,12 @@ class Repeated:
 
 def repeatability(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> Repeated:
     """Standard deviation of the difference of levels of two passes: two flights, or two parts of one."""
-    here, there = same_places(first, second, radius_m)
-    if not len(here):
+    rows, partners = same_places(first, second, radius_m)
+    if not len(rows):
         return Repeated(rmse_db=float("nan"), rmse_ci95_db=NO_INTERVAL, n=0)
-    level, other = first.value[here], second.value[there]
-    bounds = error_intervals(level, other).rmse_db
-    return Repeated(rmse_db=float((other - level).std()), rmse_ci95_db=bounds, n=len(here))
+    level, repeated = first.value[rows], second.value[partners]
+    bounds = error_intervals(level, repeated).rmse_db
+    return Repeated(rmse_db=float((repeated - level).std()), rmse_ci95_db=bounds, n=len(rows))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,19 +153,19 @@ class _Places:
             return near, near
         distance, nearest = other.tree.query(self.position_m[near], distance_upper_bound=radius_m)
         paired = np.isfinite(distance)
-        here, there = near[paired], nearest[paired]
+        rows, nearest_rows = near[paired], nearest[paired]
         if within_deg is not None and self.heading_deg is not None and other.heading_deg is not None:
-            turn = wrap_degrees(other.heading_deg[there] - self.heading_deg[here])
+            turn = wrap_degrees(other.heading_deg[nearest_rows] - self.heading_deg[rows])
             same = np.abs(turn) <= within_deg
-            here, there = here[same], there[same]
-        return self.where[here], other.where[there]
+            rows, nearest_rows = rows[same], nearest_rows[same]
+        return self.where[rows], other.where[nearest_rows]
 
 
 @dataclass(slots=True)
 class _Prepared:
     """A pass ready to be paired: places of levels and of residuals (by key), and means by cell."""
 
-    one: Pass
+    flown: Pass
     level: bytes
     residual: bytes
     cells: IntArray
@@ -186,8 +186,8 @@ class PassTable:
     def __init__(self, passes: Sequence[Pass], cell_m: float) -> None:
         self._places: dict[bytes, _Places] = {}
         self._flights: dict[str, list[tuple[int, _Prepared]]] = {}
-        for number, one in enumerate(passes):
-            self._flights.setdefault(one.flight, []).append((number, _prepare(one, cell_m, self._places)))
+        for number, flown in enumerate(passes):
+            self._flights.setdefault(flown.flight, []).append((number, _prepare(flown, cell_m, self._places)))
 
     def pairs(self, *, radius_m: float, heading_within_deg: float | None) -> Iterator[PassPair]:
         """Every pair of two flights' passes on one link, by first flight, second flight and link.
@@ -209,14 +209,14 @@ class PassTable:
             shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
             partners: dict[str, list[tuple[int, _Prepared]]] = {}
             for number, entry in self._flights[second]:
-                partners.setdefault(entry.one.link, []).append((number, entry))
-            for number, here in self._flights[first]:
-                for other, there in partners.get(here.one.link, ()):
+                partners.setdefault(entry.flown.link, []).append((number, entry))
+            for number, mine in self._flights[first]:
+                for partner, theirs in partners.get(mine.flown.link, ()):
                     yield _pair(
                         first=number,
-                        here=here,
-                        second=other,
-                        there=there,
+                        mine=mine,
+                        second=partner,
+                        theirs=theirs,
                         places=self._places,
                         known=known,
                         shared=shared,
@@ -224,29 +224,29 @@ class PassTable:
                     )
 
 
-def _prepare(one: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:
-    placed = np.isfinite(one.position_m).all(axis=1)
-    scored = placed & np.isfinite(one.residual_db)
-    cells, means, heights = cell_means(one.position_m, one.residual_db, scored, cell_m)
+def _prepare(flown: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:
+    placed = np.isfinite(flown.position_m).all(axis=1)
+    scored = placed & np.isfinite(flown.residual_db)
+    cells, means, heights = cell_means(flown.position_m, flown.residual_db, scored, cell_m)
     return _Prepared(
-        one=one,
-        level=_entered(one, placed & np.isfinite(one.level_db), places),
-        residual=_entered(one, scored, places),
+        flown=flown,
+        level=_entered(flown, placed & np.isfinite(flown.level_db), places),
+        residual=_entered(flown, scored, places),
         cells=cells,
         means=means,
         heights=heights,
     )
 
 
-def _entered(one: Pass, good: BoolArray, places: dict[bytes, _Places]) -> bytes:
+def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> bytes:
     """Key of the places of some samples: links that were sampled together have one."""
     digest = hashlib.blake2b(good.tobytes(), digest_size=16)
-    digest.update(np.ascontiguousarray(one.position_m).tobytes())
-    if one.heading_deg is not None:
-        digest.update(np.ascontiguousarray(one.heading_deg).tobytes())
+    digest.update(np.ascontiguousarray(flown.position_m).tobytes())
+    if flown.heading_deg is not None:
+        digest.update(np.ascontiguousarray(flown.heading_deg).tobytes())
     key = digest.digest()
     if key not in places:
-        places[key] = _Places(one.position_m, one.heading_deg, np.flatnonzero(good))
+        places[key] = _Places(flown.position_m, flown.heading_deg, np.flatnonzero(good))
     return key
 
 
@@ -282,9 +282,9 @@ def cell_means(
 
 def _pair(
     first: int,
-    here: _Prepared,
+    mine: _Prepared,
     second: int,
-    there: _Prepared,
+    theirs: _Prepared,
     places: dict[bytes, _Places],
     known: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]],
     shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]],
@@ -296,15 +296,15 @@ def _pair(
         i, j = known[key, other_key]
         return b[j] - a[i]
 
-    level = difference(here.level, there.level, here.one.level_db, there.one.level_db)
-    residual = difference(here.residual, there.residual, here.one.residual_db, there.one.residual_db)
-    cells = here.residual, there.residual  # the same places, so the same cells and heights
+    level = difference(mine.level, theirs.level, mine.flown.level_db, theirs.flown.level_db)
+    residual = difference(mine.residual, theirs.residual, mine.flown.residual_db, theirs.flown.residual_db)
+    cells = mine.residual, theirs.residual  # the same places, so the same cells and heights
     if cells not in shared:
-        i, j = _common(here.cells, there.cells)
-        height = float(np.median(there.heights[j] - here.heights[i])) if len(i) else float("nan")
+        i, j = _common(mine.cells, theirs.cells)
+        height = float(np.median(theirs.heights[j] - mine.heights[i])) if len(i) else float("nan")
         shared[cells] = i, j, height
     i, j, height = shared[cells]
-    change, nan = there.means[j] - here.means[i], float("nan")
+    change, nan = theirs.means[j] - mine.means[i], float("nan")
     return PassPair(
         first=first,
         second=second,
@@ -314,7 +314,7 @@ def _pair(
         rmse_ci95_db=spread_interval(level),
         residual_rmse_db=float(residual.std()) if len(residual) else nan,
         place_rmse_db=float(change.std()) if len(i) else nan,
-        place_correlation=correlation(here.means[i], there.means[j]),
+        place_correlation=correlation(mine.means[i], theirs.means[j]),
         cells=len(i),
         height_difference_m=height,
     )

@@ -144,13 +144,13 @@ def channel_rank(h: ArrayLike, k: float) -> IntArray:
     rank = np.zeros(len(flat), dtype=np.int64)
     for start in range(0, len(flat), LANES):
         part = flat[start : start + LANES]
-        some, certain = certain_rank(part, k)
+        counted, certain = certain_rank(part, k)
         doubtful = np.flatnonzero(~certain)
         if len(doubtful):
-            there = part[doubtful].any(axis=(1, 2))  # most matrices in doubt have no path at all
-            some[doubtful] = 0
-            some[doubtful[there]] = rank_from_singular_values(singular_values(part[doubtful[there]]), k)
-        rank[start : start + LANES] = some
+            has_path = part[doubtful].any(axis=(1, 2))  # most matrices in doubt have no path at all
+            counted[doubtful] = 0
+            counted[doubtful[has_path]] = rank_from_singular_values(singular_values(part[doubtful[has_path]]), k)
+        rank[start : start + LANES] = counted
     return rank.reshape(matrix.shape[:-2])
 
 
@@ -177,11 +177,11 @@ def histogram(rank: ArrayLike) -> FloatArray:
     [0.333, 0.667, 0.0, 0.0]
     """
     values = _ranks(rank)
-    some = values[np.isfinite(values) & (values >= 1)]
-    if np.any(some > MAX_RANK) or np.any(some != np.round(some)):
+    existing = values[np.isfinite(values) & (values >= 1)]
+    if np.any(existing > MAX_RANK) or np.any(existing != np.round(existing)):
         raise ValueError(f"ranks must be whole numbers up to {MAX_RANK}")
-    bars = np.bincount(some.astype(np.int64), minlength=MAX_RANK + 1)[1:]
-    return np.asarray(bars / len(some)) if len(some) else np.full(MAX_RANK, np.nan)
+    bars = np.bincount(existing.astype(np.int64), minlength=MAX_RANK + 1)[1:]
+    return np.asarray(bars / len(existing)) if len(existing) else np.full(MAX_RANK, np.nan)
 
 
 def one_hot(rank: IntArray | FloatArray, ranks: int = MAX_RANK) -> FloatArray:
@@ -236,8 +236,8 @@ def _both(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray
 def _pairs(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
     """Both ranks as integers, where both exist (not NaN, not 0)."""
     first, second = _both(measured, simulated)
-    both = (first > 0) & (second > 0)
-    return first[both], second[both]
+    existing = (first > 0) & (second > 0)
+    return first[existing], second[existing]
 
 
 def confusion_matrix(measured: ArrayLike, simulated: ArrayLike) -> IntArray:
@@ -422,8 +422,8 @@ def k_curve(
     grid = k_grid() if k is None else np.asarray(k, dtype=np.float64)
     ri = _ranks(measured)
     profile = np.asarray(sigma, dtype=np.float64)
-    both = (ri >= 1) & (rank_from_singular_values(profile, 10.0) >= 1)
-    ri, profile = ri[both].astype(np.int64), profile[both]
+    paired = (ri >= 1) & (rank_from_singular_values(profile, 10.0) >= 1)
+    ri, profile = ri[paired].astype(np.int64), profile[paired]
     if not len(ri):
         nothing = np.full(len(grid), np.nan)
         return KCurve(
@@ -565,7 +565,7 @@ class Staleness:
     verdict: str
 
 
-def stale_reports(time_s: ArrayLike, rank: ArrayLike, others: Mapping[str, ArrayLike] | None = None) -> Staleness:
+def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, ArrayLike] | None = None) -> Staleness:
     """Recognise an RI that is held between reports.
 
     Parameters
@@ -574,7 +574,7 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, others: Mapping[str, Array
         Instants [s], increasing.
     rank : array_like, (n,)
         RI, NaN where none.
-    others : mapping of str to array_like (n,), optional
+    further : mapping of str to array_like (n,), optional
         Further numbers of the same report (RSRP, SINR, CQI). A row that repeats **all** of them is a repetition;
         RSRP and SINR hardly ever repeat by chance. Without them the hold is read off the changes of RI alone: if
         all changes keep to multiples of a period of several rows, the report comes once per period.
@@ -583,7 +583,7 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, others: Mapping[str, Array
     known = np.isfinite(ri)
     if not known.any():
         return Staleness(np.zeros(len(ri), dtype=bool), 0, float("nan"), "no rank")
-    columns = [ri, *(np.asarray(v, dtype=np.float64) for v in (others or {}).values())]
+    columns = [ri, *(np.asarray(v, dtype=np.float64) for v in (further or {}).values())]
     if len(columns) > 1:
         has_values = np.any(
             [np.isfinite(c) for c in columns[1:]], axis=0
@@ -594,8 +594,8 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, others: Mapping[str, Array
     constant = all(np.ptp(c[np.isfinite(c)]) == 0 for c in columns if np.isfinite(c).any())
     reports = int(fresh.sum())
     hold = float(np.median(np.diff(time[fresh]))) if reports > 1 else float("nan")
-    held = reports < 0.9 * int(known.sum())
-    return Staleness(fresh, reports, hold, "constant" if constant else "held" if held else "fresh")
+    repeats = reports < 0.9 * int(known.sum())
+    return Staleness(fresh, reports, hold, "constant" if constant else "held" if repeats else "fresh")
 
 
 def _changes(columns: Sequence[FloatArray]) -> BoolArray:
@@ -763,9 +763,9 @@ def compare_rank(
 def _histogram_intervals(rank: FloatArray, replicates: int) -> list[Interval]:
     if len(rank) < 2:
         return [NO_INTERVAL] * MAX_RANK
-    intervals, whole = [], autocorrelation(rank)
+    intervals, overall = [], autocorrelation(rank)
     for bar in one_hot(rank).T:
-        known = autocorrelation(bar) if np.ptp(bar) else whole  # a rank never seen says nothing about its own memory
+        known = autocorrelation(bar) if np.ptp(bar) else overall  # a rank never seen says nothing about its own memory
         drawn = bootstrap_means(bar[:, None], known.block_length, replicates=replicates)
         intervals.append(share_interval(float(bar.mean()), float(drawn.std()), known))
     return intervals
@@ -790,13 +790,13 @@ def compare_ranks(measured: ArrayLike, simulated: ArrayLike, *, replicates: int 
         Agreement, kappa and distances with their 95 % intervals and permutation tests.
     """
     measured_rank, simulated_rank = _ranks(measured), _ranks(simulated)
-    bars_one, bars_two = histogram(measured_rank), histogram(simulated_rank)
+    bars, simulated_bars = histogram(measured_rank), histogram(simulated_rank)
     a, b = _pairs(measured_rank, simulated_rank)
     agree, kappa = agreement(a, b), cohen_kappa(a, b)
-    tv, move = total_variation(bars_one, bars_two), wasserstein(bars_one, bars_two)
+    tv, move = total_variation(bars, simulated_bars), wasserstein(bars, simulated_bars)
     bounds = _pair_intervals(a, b, (agree, kappa, tv, move), replicates)
     return RankFit(
-        histogram=bars_two,
+        histogram=simulated_bars,
         histogram_ci95=_histogram_intervals(simulated_rank[simulated_rank >= 1], replicates),
         out_of_coverage=int((simulated_rank == 0).sum()),
         agreement=agree,
@@ -882,10 +882,10 @@ def repeat_rank(
         NaN without a pair.
     """
     ranks = [np.where(visit.value >= 1, visit.value, np.nan) for visit in (first, second)]
-    here, there = same_places(replace(first, value=ranks[0]), replace(second, value=ranks[1]), radius_m)
-    if not len(here):
+    rows, partners = same_places(replace(first, value=ranks[0]), replace(second, value=ranks[1]), radius_m)
+    if not len(rows):
         return RankRepeat(kappa=float("nan"), kappa_ci95=NO_INTERVAL, agreement=float("nan"), n=0)
-    a, b = _pairs(ranks[0][here], ranks[1][there])
+    a, b = _pairs(ranks[0][rows], ranks[1][partners])
     agree, kappa = agreement(a, b), cohen_kappa(a, b)
     if replicates:
         bounds = _pair_intervals(a, b, (agree, kappa, float("nan"), float("nan")), replicates)[1]
@@ -946,7 +946,7 @@ def _pair_statistics(
     p, q = first.mean(axis=0), second.mean(axis=0)
     agree, chance = float(equal.mean()), float(p @ q)
     by_chance = first @ q + second @ p
-    left = max(1.0 - chance, 1e-12)
+    beyond_chance = max(1.0 - chance, 1e-12)
     apart = np.sign(np.cumsum(p - q))
 
     def move(means: FloatArray) -> FloatArray:
@@ -954,7 +954,7 @@ def _pair_statistics(
 
     return [
         (equal, lambda means: means[:, 0], (0.0, 1.0)),
-        (equal / left + (agree - 1.0) / left**2 * by_chance, kappa_of_means, (-1.0, 1.0)),
+        (equal / beyond_chance + (agree - 1.0) / beyond_chance**2 * by_chance, kappa_of_means, (-1.0, 1.0)),
         ((first - second) @ np.sign(p - q), variation_of_means, (0.0, 1.0)),
         (np.cumsum(first - second, axis=1) @ apart, move, (0.0, MAX_RANK - 1.0)),
     ]

@@ -117,9 +117,9 @@ def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8)
 
     Sectors left out are directions that the fit never saw; neighbouring samples in time mostly share one.
     """
-    away = position_m[:, :2] - np.asarray(tower_m)[:2]
+    ray = position_m[:, :2] - np.asarray(tower_m)[:2]
     # cut where the tower has seen nothing, so that the seam splits no sector
-    azimuth = np.arctan2(away[:, 1], away[:, 0])
+    azimuth = np.arctan2(ray[:, 1], ray[:, 0])
     order = np.sort(azimuth)
     gap = np.diff(np.append(order, order[0] + 2.0 * np.pi))
     turned = (azimuth - order[(np.argmax(gap) + 1) % len(order)]) % (2.0 * np.pi)
@@ -353,14 +353,14 @@ def decision_weights(probability: FloatArray, rank: IntArray, groups: IntArray) 
     groups : (n,) int
         Each is decided once with the weights that suit the others.
     """
-    said, plain_said = np.zeros_like(rank), decide(probability, np.ones(MAX_RANK))
+    weighed, plain = np.zeros_like(rank), decide(probability, np.ones(MAX_RANK))
     for group in np.unique(groups):
         out = groups == group
         if np.ptp(rank[~out]) > 0:
-            said[out] = decide(probability[out], _kappa_weights(probability[~out], rank[~out]))
+            weighed[out] = decide(probability[out], _kappa_weights(probability[~out], rank[~out]))
         else:
-            said[out] = plain_said[out]
-    if cohen_kappa(rank, said) > np.nan_to_num(cohen_kappa(rank, plain_said)):
+            weighed[out] = plain[out]
+    if cohen_kappa(rank, weighed) > np.nan_to_num(cohen_kappa(rank, plain)):
         return _kappa_weights(probability, rank)
     return np.ones(MAX_RANK)
 
@@ -404,7 +404,7 @@ class ReceiverMixture:
         if len(features) != len(self.members):
             raise ValueError(f"features of {len(features)} geometries for {len(self.members)} receivers")
         return np.asarray(
-            np.mean([one.probabilities(x) for one, x in zip(self.members, features, strict=True)], axis=0)
+            np.mean([member.probabilities(x) for member, x in zip(self.members, features, strict=True)], axis=0)
         )
 
     def decide(self, probability: FloatArray) -> IntArray:

@@ -120,13 +120,13 @@ def level_difference(
         How far levels, offset and RMSE moved, with an interval.
     """
     moved = _apart(first[1], second[1])
-    both = np.isfinite(first[2]) & np.isfinite(second[2])
-    first_error, second_error = first[2][both], second[2][both]
+    scored_in_both = np.isfinite(first[2]) & np.isfinite(second[2])
+    first_error, second_error = first[2][scored_in_both], second[2][scored_in_both]
     return LevelDifference(
         tower=tower,
         channel=channel,
         samples=samples,
-        scored=Overlap(first=scored[0], second=scored[1], common=int(both.sum())),
+        scored=Overlap(first=scored[0], second=scored[1], common=int(scored_in_both.sum())),
         measured_max_db=_largest(_apart(first[0], second[0])),
         simulated_max_db=_largest(moved),
         simulated_rms_db=float(np.sqrt(np.mean(moved**2))) if len(moved) else float("nan"),
@@ -137,8 +137,8 @@ def level_difference(
 
 def _apart(first: FloatArray, second: FloatArray) -> FloatArray:
     """Differences where both sides have a value."""
-    both = np.isfinite(first) & np.isfinite(second)
-    return np.asarray(second[both] - first[both], dtype=np.float64)
+    finite = np.isfinite(first) & np.isfinite(second)
+    return np.asarray(second[finite] - first[finite], dtype=np.float64)
 
 
 def _largest(values: FloatArray) -> float:
@@ -163,11 +163,11 @@ def pooled_difference(links: Sequence[tuple[FloatArray, FloatArray, FloatArray]]
     """
     time, errors, other_errors = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for instants, first, second in links:
-        both = np.isfinite(first) & np.isfinite(second)
-        if both.any():
-            time.append(instants[both])
-            errors.append(first[both] - first[both].mean())
-            other_errors.append(second[both] - second[both].mean())
+        finite = np.isfinite(first) & np.isfinite(second)
+        if finite.any():
+            time.append(instants[finite])
+            errors.append(first[finite] - first[finite].mean())
+            other_errors.append(second[finite] - second[finite].mean())
     order = np.argsort(np.concatenate(time), kind="stable")
     return statistics.paired_difference(
         np.concatenate(other_errors)[order], np.concatenate(errors)[order], free_offset=False
@@ -197,8 +197,8 @@ def rank_difference(
     """
     pairs = [np.nan_to_num(np.column_stack(pair)) for pair in (first, second)]
     usable = np.column_stack([*pairs])
-    both = (usable >= 1).all(axis=1) & (usable <= MAX_RANK).all(axis=1)
-    first_rank, second_rank = (pair[both].astype(np.int64) for pair in pairs)
+    ranked = (usable >= 1).all(axis=1) & (usable <= MAX_RANK).all(axis=1)
+    first_rank, second_rank = (pair[ranked].astype(np.int64) for pair in pairs)
     agree, kappa = _agreement_change(first_rank, second_rank)
     return RankDifference(
         tower=tower,
@@ -218,11 +218,11 @@ def _agreement_change(first: IntArray, second: IntArray) -> tuple[Changed, Chang
     if len(first) < 2:
         return _changed(*agree), _changed(*kappa)
     (columns, influence), (other_columns, other_influence) = (kappa_parts(*pairs.T) for pairs in (first, second))
-    both, width = np.column_stack([columns, other_columns]), columns.shape[1]
+    joined, width = np.column_stack([columns, other_columns]), columns.shape[1]
 
     def change(of: list[float], influence: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -> Changed:
         known = statistics.autocorrelation(influence)
-        drawn = statistics.bootstrap_means(both, known.block_length)
+        drawn = statistics.bootstrap_means(joined, known.block_length)
         shift = statistic(drawn[:, width:]) - statistic(drawn[:, :width])
         return replace(_changed(*of), ci95=statistics.interval(of[1] - of[0], shift, known))
 

@@ -142,8 +142,8 @@ def compare_rss(
     time, measured, simulated = seconds(time_s), _levels(measured_db), _levels(simulated_db)
     if not time.shape == measured.shape == simulated.shape or time.ndim != 1:
         raise ValueError(f"time {time.shape}, measured {measured.shape} and simulated {simulated.shape} must be (n,)")
-    known = np.ones(len(time), dtype=bool) if posed is None else np.asarray(posed, dtype=bool)
-    use = known & np.isfinite(measured) & np.isfinite(simulated)
+    has_pose = np.ones(len(time), dtype=bool) if posed is None else np.asarray(posed, dtype=bool)
+    use = has_pose & np.isfinite(measured) & np.isfinite(simulated)
     order = np.flatnonzero(use)[np.argsort(time[use], kind="stable")]
     m, s = measured[order], simulated[order]
     fit = grid_offset(m, s, step_db=step_db, span_db=span_db)
@@ -151,10 +151,10 @@ def compare_rss(
     simple = {name: _levels(levels) for name, levels in (baselines or {}).items()}
     return RssComparison(
         **named(fit, "offset_db rmse_db n at_edge"),
-        n_out_of_coverage=int((known & ~use).sum()),
-        n_measured_out=int((known & ~np.isfinite(measured)).sum()),
-        n_simulated_out=int((known & ~np.isfinite(simulated)).sum()),
-        n_no_pose=int((~known).sum()),
+        n_out_of_coverage=int((has_pose & ~use).sum()),
+        n_measured_out=int((has_pose & ~np.isfinite(measured)).sum()),
+        n_simulated_out=int((has_pose & ~np.isfinite(simulated)).sum()),
+        n_no_pose=int((~has_pose).sum()),
         correlation=correlation(m, s),
         intervals=error_intervals(m, s),
         identifiable_db=identifiable_range(offsets, curve),
@@ -299,16 +299,16 @@ def _window_sums(values: FloatArray, first: Any, last: Any) -> FloatArray:
     one more level down; log2(n) passes.
     """
     total = np.zeros(len(first))
-    at, left = first.copy(), last - first
+    at, remaining = first.copy(), last - first
     table = values
     width = 1
     tables = [table]
-    while width * 2 <= int(left.max(initial=1)):
+    while width * 2 <= int(remaining.max(initial=1)):
         table = table[: len(table) - width] + table[width:]
         tables.append(table)
         width *= 2
     for j in range(len(tables) - 1, -1, -1):
-        take = (left >> j) & 1 == 1
+        take = (remaining >> j) & 1 == 1
         total[take] += tables[j][at[take]]
         at = at + np.where(take, 1 << j, 0)
     return total
@@ -344,8 +344,8 @@ def averaged_fits(
     result: dict[str, dict[str, OffsetFit]] = {}
     for name, levels in simulations.items():
         simulated = _levels(levels)
-        both = np.isfinite(measured) & np.isfinite(simulated)
-        sides = [np.where(both, side, np.nan) for side in (measured, simulated)]
+        finite = np.isfinite(measured) & np.isfinite(simulated)
+        sides = [np.where(finite, side, np.nan) for side in (measured, simulated)]
         result[name] = {
             average: grid_offset(*(mean(side) for side in sides), step_db=step_db, span_db=span_db)
             for average, mean in averages.items()
@@ -399,8 +399,8 @@ def link_geometry(
         "azimuth_deg": np.degrees(np.arctan2(ray[:, 0], ray[:, 1])) % 360.0,
         "height_m": place[:, 2],
     }
-    seen = ray @ (np.eye(3) if tower_mount is None else tower_mount)
-    columns["tower_azimuth_deg"], columns["tower_elevation_deg"] = _direction_deg(seen)
+    in_array_frame = ray @ (np.eye(3) if tower_mount is None else tower_mount)
+    columns["tower_azimuth_deg"], columns["tower_elevation_deg"] = _direction_deg(in_array_frame)
     if rotation is not None:
         body = np.einsum("nji,nj->ni", rotation, -ray)
         columns["uav_azimuth_deg"], columns["uav_elevation_deg"] = _direction_deg(

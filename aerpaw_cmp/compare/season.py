@@ -52,13 +52,13 @@ def left_out_offsets(
     """
     count, mean = np.asarray(n, dtype=np.float64), np.asarray(mean_db, dtype=np.float64)
     total = np.where(count > 0, count * np.nan_to_num(mean), 0.0)
-    others = count.sum() - count
+    other_samples = count.sum() - count
     grid = offset_grid(step_db, span_db)
     result = np.full(len(count), np.nan)
-    for i in np.flatnonzero(others > 0):
+    for i in np.flatnonzero(other_samples > 0):
         # summed anew: the difference of two large sums would lose what one short flight says
-        rest = np.delete(total, i).sum() / others[i]
-        result[i] = grid[nearest_offset(grid, float(rest), step_db)]
+        mean_of_others = np.delete(total, i).sum() / other_samples[i]
+        result[i] = grid[nearest_offset(grid, float(mean_of_others), step_db)]
     return result
 
 
@@ -176,14 +176,14 @@ def trend(days: ArrayLike, values: ArrayLike) -> Trend:
     """
     from scipy.special import stdtrit
 
-    when, what = np.asarray(days, dtype=np.float64), np.asarray(values, dtype=np.float64)
-    good = np.isfinite(when) & np.isfinite(what)
-    t, y = when[good] / DAYS, what[good]
+    when, level = np.asarray(days, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    dated = np.isfinite(when) & np.isfinite(level)
+    t, y = when[dated] / DAYS, level[dated]
     if len(t) < FEWEST_FLIGHTS or np.ptp(t) <= 0:
         return Trend(n=len(t), slope=np.nan, low=np.nan, high=np.nan, scatter=np.nan)
     t = t - t.mean()
     slope = float(t @ (y - y.mean()) / (t @ t))
-    rest = y - y.mean() - slope * t
-    scatter = float(np.sqrt(rest @ rest / (len(t) - 2)))
+    residual = y - y.mean() - slope * t
+    scatter = float(np.sqrt(residual @ residual / (len(t) - 2)))
     reach = float(stdtrit(len(t) - 2.0, 0.975)) * scatter / float(np.sqrt(t @ t))
     return Trend(n=len(t), slope=slope, low=slope - reach, high=slope + reach, scatter=scatter)

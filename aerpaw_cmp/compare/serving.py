@@ -103,11 +103,11 @@ def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s:
     (n,)
         In the unit of ``values``.
     """
-    wanted, known = np.asarray(time_s, dtype=np.float64), np.asarray(of_s, dtype=np.float64)
+    instants, sampled_s = np.asarray(time_s, dtype=np.float64), np.asarray(of_s, dtype=np.float64)
     column = np.asarray(values, dtype=np.float64)
-    if not len(known):
-        return np.full(len(wanted), np.nan)
-    after = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
+    if not len(sampled_s):
+        return np.full(len(instants), np.nan)
+    after = np.clip(np.searchsorted(sampled_s, instants), 0, len(sampled_s) - 1)
     before = np.maximum(after - 1, 0)
-    near = np.where(np.abs(known[before] - wanted) <= np.abs(known[after] - wanted), before, after)
-    return np.where(np.abs(known[near] - wanted) <= within_s, column[near], np.nan)
+    near = np.where(np.abs(sampled_s[before] - instants) <= np.abs(sampled_s[after] - instants), before, after)
+    return np.where(np.abs(sampled_s[near] - instants) <= within_s, column[near], np.nan)

@@ -50,8 +50,8 @@ class Spread:
 
     def total_db(self, gain_sd_db: FloatArray) -> FloatArray:
         """Standard deviation (n,) of a sample about its prediction, from that of the gain (n,) [dB]."""
-        rest = self.own_sd_db**2 + self.noise_sd_db**2 + self.fading_sd_db**2
-        return np.asarray(np.sqrt(gain_sd_db**2 + rest))
+        variance = self.own_sd_db**2 + self.noise_sd_db**2 + self.fading_sd_db**2
+        return np.asarray(np.sqrt(gain_sd_db**2 + variance))
 
     def half_width_db(self, gain_sd_db: FloatArray, share: float) -> FloatArray:
         """Half of the interval (n,) that holds a share of the samples [dB].
@@ -140,18 +140,18 @@ def fading_of(series: Sequence[LinkSamples], bin_s: float) -> tuple[float, float
     """
     squares, fourth, count = 0.0, 0.0, 0
     for samples in series:
-        good = np.isfinite(samples.residual_db)
-        if not good.any():
+        finite = np.isfinite(samples.residual_db)
+        if not finite.any():
             continue
-        level, time = samples.residual_db[good], samples.time_s[good]
+        level, time = samples.residual_db[finite], samples.time_s[finite]
         _, member = np.unique(np.floor((time - time[0]) / bin_s).astype(np.int64), return_inverse=True)
         size = np.bincount(member)
-        away = level - (np.bincount(member, weights=level) / size)[member]
+        deviation = level - (np.bincount(member, weights=level) / size)[member]
         several = size[member] > 1
         # a deviation from the mean of n samples is too small by (n - 1) / n
-        away = away[several] * np.sqrt(size[member] / np.maximum(size[member] - 1.0, 1.0))[several]
-        squares, fourth = squares + float((away**2).sum()), fourth + float((away**4).sum())
-        count += len(away)
+        deviation = deviation[several] * np.sqrt(size[member] / np.maximum(size[member] - 1.0, 1.0))[several]
+        squares, fourth = squares + float((deviation**2).sum()), fourth + float((deviation**4).sum())
+        count += len(deviation)
     if not count or not squares:
         return 0.0, 0.0
     variance = squares / count

@@ -105,8 +105,8 @@ def _significant(n: int) -> float:
 def _cutoff(correlation: FloatArray, n: int) -> int:
     """Last lag before the autocorrelation stays insignificant for :data:`_RUN` lags (Politis and White's rule)."""
     small = np.abs(correlation[1:]) < _significant(n)
-    seen = np.concatenate([[0], np.cumsum(small)])
-    runs = seen[_RUN:] - seen[:-_RUN] == _RUN
+    small_so_far = np.concatenate([[0], np.cumsum(small)])
+    runs = small_so_far[_RUN:] - small_so_far[:-_RUN] == _RUN
     return int(np.argmax(runs)) if runs.any() else len(small)
 
 
@@ -133,8 +133,8 @@ def _exponential(covariance: FloatArray, n: int) -> tuple[float, float]:
     earlier, later = correlation[1:last], correlation[2 : last + 1]
     decay = float(np.clip(earlier @ later / (earlier @ earlier), 0.0, 1.0 - 1.0 / n))
     share = min(1.0, float(correlation[1]) / decay) if decay > 0 else 0.0
-    kept = covariance[0] * share * decay
-    return float(covariance[0] + 2.0 * kept / (1.0 - decay)), float(kept / (1.0 - decay) ** 2)
+    correlated = covariance[0] * share * decay
+    return float(covariance[0] + 2.0 * correlated / (1.0 - decay)), float(correlated / (1.0 - decay) ** 2)
 
 
 def autocorrelation(values: ArrayLike) -> Autocorrelation:
@@ -174,10 +174,10 @@ def autocorrelation(values: ArrayLike) -> Autocorrelation:
     if n < 8 or np.ptp(x) == 0.0:
         return Autocorrelation(n, 1 if n else 0, float(n) if n > 1 else float("nan"), 1.0)
     lags = n // 2
-    seen = autocovariance(x, lags) * n / (n - np.arange(lags + 1))
-    hidden, long_run, reach = 0.0, float(seen[0]), 0.0
+    unbiased = autocovariance(x, lags) * n / (n - np.arange(lags + 1))
+    hidden, long_run, reach = 0.0, float(unbiased[0]), 0.0
     for _ in range(12):
-        covariance = seen + hidden
+        covariance = unbiased + hidden
         by_window, width, window_reach = _flat_top(covariance, n)
         by_decay, decay_reach = _exponential(covariance, n)
         # the window's own sum holds the hidden part width / n times over
@@ -186,15 +186,15 @@ def autocorrelation(values: ArrayLike) -> Autocorrelation:
         if long_run >= n * covariance[0]:
             return Autocorrelation(n, max(1, n // 5), 1.0, 2.0)
         if long_run <= 0.0:  # oscillating: the mean is known at least as well as from independent samples
-            long_run = float(seen[0])
-        if abs(long_run / n - hidden) < 1e-3 * seen[0]:
+            long_run = float(unbiased[0])
+        if abs(long_run / n - hidden) < 1e-3 * unbiased[0]:
             break
         hidden = long_run / n
     slope = max(0.0, 2.0 * reach / long_run)
     length = _LONGER * (1.5 * slope**2 * n) ** (1.0 / 3.0)
     block = int(np.clip(np.ceil(length), 1, max(1, n // 5)))
     factor = 1.0 / (1.0 - min(0.5, slope / block))
-    return Autocorrelation(n, block, float(np.clip(n * (seen[0] + hidden) / long_run, 1.0, n)), factor)
+    return Autocorrelation(n, block, float(np.clip(n * (unbiased[0] + hidden) / long_run, 1.0, n)), factor)
 
 
 def bootstrap_means(
@@ -237,11 +237,11 @@ def bootstrap_means(
     for start in range(0, replicates, chunk):
         count = min(chunk, replicates - start)
         begin = rng.integers(0, n, (count, blocks))
-        whole = begin[:, :-1]
+        full_blocks = begin[:, :-1]
         if few:
-            total = sums[whole].sum(axis=1)
+            total = sums[full_blocks].sum(axis=1)
         else:
-            cell = np.arange(count)[:, None] * n + whole
+            cell = np.arange(count)[:, None] * n + full_blocks
             total = np.bincount(cell.ravel(), minlength=count * n).reshape(count, n).astype(np.float64) @ sums
         result[start : start + count] = (total + last[begin[:, -1]]) / n
     return result
@@ -265,8 +265,8 @@ def block_variance(values: FloatArray, block_length: int) -> float:
     n = len(values)
     blocks = -(-n // block_length)
     column = values[:, None]
-    whole, last = _block_sums(column, block_length), _block_sums(column, n - (blocks - 1) * block_length)
-    return float(((blocks - 1) * whole.var() + last.var()) / n**2)
+    full_sums, last_sums = _block_sums(column, block_length), _block_sums(column, n - (blocks - 1) * block_length)
+    return float(((blocks - 1) * full_sums.var() + last_sums.var()) / n**2)
 
 
 def _block_sums(columns: FloatArray, length: int) -> FloatArray:
@@ -361,9 +361,9 @@ def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray) -> 
     if spread == 0.0 or not m.any():
         return NO_INTERVAL
     slope = float(m @ s) / len(s) / spread
-    rest = m - slope * s
-    along = (slope + mean_draws(rest * s) / spread) * np.sqrt(spread)
-    return _around(correlation(measured_db, simulated_db), along / np.sqrt(along**2 + power_draws(rest)))
+    residual = m - slope * s
+    along = (slope + mean_draws(residual * s) / spread) * np.sqrt(spread)
+    return _around(correlation(measured_db, simulated_db), along / np.sqrt(along**2 + power_draws(residual)))
 
 
 def mean_interval(values: FloatArray) -> Interval:
@@ -431,20 +431,22 @@ class PairedDifference:
     mean_square_ci95_db2: Interval
     verdict: Literal["better", "worse", "not significant", "no interval"]
 
-    def in_words(self, other: str) -> str:
+    def in_words(self, other_model: str) -> str:
         """A clause for a report, such as "worse than free space by 0.6 dB [0.2, 1.0]"."""
         if not self.n:
-            return f"no sample in common with {other}"
+            return f"no sample in common with {other_model}"
         size = f"{abs(self.difference_db):.1f} dB"
         if self.verdict == "no interval":
             more = "more" if self.difference_db > 0 else "less"
-            return f"{size} {more} error than {other}, too few samples for an interval"
+            return f"{size} {more} error than {other_model}, too few samples for an interval"
         low, high = self.difference_ci95_db
         if self.verdict == "not significant":
-            return f"no significant difference from {other} ({self.difference_db:+.1f} dB [{low:+.1f}, {high:+.1f}])"
+            return (
+                f"no significant difference from {other_model} ({self.difference_db:+.1f} dB [{low:+.1f}, {high:+.1f}])"
+            )
         near, far = sorted((abs(low), abs(high)))
         digits = 1 if near >= 0.05 else 2
-        return f"{self.verdict} than {other} by {size} [{near:.{digits}f}, {far:.{digits}f}]"
+        return f"{self.verdict} than {other_model} by {size} [{near:.{digits}f}, {far:.{digits}f}]"
 
 
 def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_offset: bool = True) -> PairedDifference:
@@ -482,30 +484,30 @@ def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_of
     first, second = (np.asarray(values, dtype=np.float64).ravel() for values in (error_db, other_error_db))
     if first.shape != second.shape:
         raise ValueError(f"errors to compare must be of one length, found {len(first)} and {len(second)}")
-    both = np.isfinite(first) & np.isfinite(second)
-    first, second = first[both], second[both]
+    finite = np.isfinite(first) & np.isfinite(second)
+    first, second = first[finite], second[finite]
     if free_offset and len(first):
         first, second = first - first.mean(), second - second.mean()
     nan = float("nan")
     square, other_square = (float(np.mean(e * e)) if len(e) else nan for e in (first, second))
-    found, squares, spread = NO_INTERVAL, NO_INTERVAL, nan
+    bounds, squares, spread = NO_INTERVAL, NO_INTERVAL, nan
     if len(first) >= FEWEST:
         drawn, other_drawn = _power_pairs(first, second, square, other_square)
         root = np.sqrt(drawn) - np.sqrt(other_drawn)
-        found = _ends(root)
+        bounds = _ends(root)
         squares = _ends(drawn - other_drawn)
         spread = float(0.5 * np.diff(np.quantile(root, [0.1587, 0.8413]))[0])
-    rmse, other = float(np.sqrt(square)), float(np.sqrt(other_square))
+    rmse, other_rmse = float(np.sqrt(square)), float(np.sqrt(other_square))
     return PairedDifference(
         n=len(first),
         rmse_db=rmse,
-        other_rmse_db=other,
-        difference_db=rmse - other,
-        difference_ci95_db=found,
+        other_rmse_db=other_rmse,
+        difference_db=rmse - other_rmse,
+        difference_ci95_db=bounds,
         standard_error_db=spread,
         mean_square_difference_db2=square - other_square,
         mean_square_ci95_db2=squares,
-        verdict=paired_verdict(*found),
+        verdict=paired_verdict(*bounds),
     )
 
 

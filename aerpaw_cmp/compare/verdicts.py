@@ -85,9 +85,9 @@ def campaign_verdict(
     Each candidate splits the flights in two; its two-sample t test with pooled variance is that of the externally
     Studentised residual for one flight. The smallest chance counts times the number of candidates (Bonferroni).
     """
-    found = [shift for shift in _shifts(errors_db, offsets_db, order) if math.isfinite(shift.chance)]
-    best = min(found, key=lambda one: one.chance, default=None)
-    if best is None or best.chance * len(found) >= FALSE_ALARMS:
+    shifts = [shift for shift in _shifts(errors_db, offsets_db, order) if math.isfinite(shift.chance)]
+    best = min(shifts, key=lambda candidate: candidate.chance, default=None)
+    if best is None or best.chance * len(shifts) >= FALSE_ALARMS:
         return Verdict()
     small = best.verdict.cause != "outlying error" and abs(best.verdict.effect) < LEAST_DB
     return Verdict() if small else best.verdict
@@ -103,13 +103,13 @@ def _shifts(
         yield _Shift(chance if effect > 0.0 else math.nan, ratio)
     about: dict[str, list[float]] = {}
     for link, of in offsets_db.items():
-        here = [name for name in order if math.isfinite(of.get(name, math.nan))]
-        values = np.array([of[name] for name in here])
-        for name, value in zip(here, values - values.mean() if len(here) else values, strict=True):
+        flown_here = [name for name in order if math.isfinite(of.get(name, math.nan))]
+        values = np.array([of[name] for name in flown_here])
+        for name, value in zip(flown_here, values - values.mean() if len(flown_here) else values, strict=True):
             about.setdefault(name, []).append(float(value))
-        for k in range(2, len(here) - 1):
-            chance, effect, ends = _split(values, np.arange(len(here)) >= k)
-            where = f"{link} from {here[k]}"
+        for k in range(2, len(flown_here) - 1):
+            chance, effect, ends = _split(values, np.arange(len(flown_here)) >= k)
+            where = f"{link} from {flown_here[k]}"
             yield _Shift(chance, Verdict(cause="gain step", effect=effect, interval=ends, where=where))
     flown = [name for name in order if name in about]
     for i, chance, effect, ends in _each_alone(np.array([np.mean(about[name]) for name in flown])):
@@ -129,9 +129,9 @@ def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interva
     freedom, n = len(values) - 2, int(inside.sum())
     if len(values) < FEWEST_TO_COMPARE or not 0 < n < len(values):
         return math.nan, math.nan, NO_INTERVAL
-    one, other = values[inside], values[~inside]
-    effect = float(one.mean() - other.mean())
-    square = float(((one - one.mean()) ** 2).sum() + ((other - other.mean()) ** 2).sum()) / freedom
+    within, without = values[inside], values[~inside]
+    effect = float(within.mean() - without.mean())
+    square = float(((within - within.mean()) ** 2).sum() + ((without - without.mean()) ** 2).sum()) / freedom
     error = math.sqrt(max(square, 1e-12) * (1.0 / n + 1.0 / (len(values) - n)))
     reach = float(stdtrit(freedom, 0.975)) * error
     return 2.0 * float(stdtr(freedom, -abs(effect) / error)), effect, (effect - reach, effect + reach)
@@ -191,12 +191,14 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
     known = [item for item in against if math.isfinite(item.effect)]
     if not known:
         return Verdict()
-    said = {item.cause for item in known}
-    nearest = max((item for item in known if item.cause == "worse" or "worse" not in said), key=lambda one: one.effect)
-    if "worse" in said:
+    causes = {item.cause for item in known}
+    nearest = max(
+        (item for item in known if item.cause == "worse" or "worse" not in causes), key=lambda verdict: verdict.effect
+    )
+    if "worse" in causes:
         cause = "place"
     else:
-        cause = {"better": "antenna", "no interval": "no interval"}.get("".join(said), "not separable")
+        cause = {"better": "antenna", "no interval": "no interval"}.get("".join(causes), "not separable")
     return Verdict(cause=cause, effect=nearest.effect, interval=nearest.interval, where=nearest.where)
 
 
@@ -285,7 +287,7 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
     """
     if not heights:
         return Verdict()
-    worst = min(heights, key=lambda one: one.covered)
+    worst = min(heights, key=lambda height: height.covered)
     gap = {
         "level": _fraction(worst.reached - worst.covered),
         "trees": _fraction(worst.clear - worst.covered),

@@ -195,12 +195,12 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     """
     models = list(channels[0].along.predicted_db)
     groups = _at_one_time(channels)
-    places = {place: some[0].along for (place, *_), some in groups.items()}
+    places = {place: group[0].along for (place, *_), group in groups.items()}
     features = {place: along.features() for place, along in places.items()}
     bins = {
-        tuple(c.name for c in some): b
-        for (place, *_), some in groups.items()
-        if (b := _Bins.of(some, features[place], window_s)) is not None
+        tuple(c.name for c in group): b
+        for (place, *_), group in groups.items()
+        if (b := _Bins.of(group, features[place], window_s)) is not None
     }
     if not bins:
         return _nothing(NO_OVERLAP, window_s)
@@ -209,13 +209,13 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # of each model, and of clocks that agree
     parts = {names: b.fitted(starts) for names, b in bins.items()}
 
-    def likelihood(some: FloatArray) -> FloatArray:
-        return np.concatenate([b.likelihood(some, parts[names]) for names, b in bins.items()])
+    def likelihood(block: FloatArray) -> FloatArray:
+        return np.concatenate([b.likelihood(block, parts[names]) for names, b in bins.items()])
 
-    tried, own = _finer(lags, likelihood, window_s)
+    tried, nats = _finer(lags, likelihood, window_s)
     names = [name for together in bins for name in together]
-    estimate = _judged(tried, own, names, window_s)
-    total = own.sum(axis=0).max(axis=1)  # of each model at its likeliest lag
+    estimate = _judged(tried, nats, names, window_s)
+    total = nats.sum(axis=0).max(axis=1)  # of each model at its likeliest lag
     n = sum(b.n * len(together) for together, b in bins.items())
     estimate = replace(estimate, model=models[int(total.argmax())], n=n)
     explained = total.max() - sum(b.constant() for b in bins.values())
@@ -231,9 +231,9 @@ NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
 def _at_one_time(channels: Sequence[ClockChannel]) -> dict[tuple[Hashable, ...], list[ClockChannel]]:
     """Channels in groups that share all but the levels: place, instants, and which levels are missing."""
     groups: dict[tuple[Hashable, ...], list[ClockChannel]] = {}
-    for one in channels:
-        known = [np.isfinite(v).tobytes() for v in (one.measured_db, *one.along.predicted_db.values())]
-        groups.setdefault((one.along.place, np.asarray(one.time_s).tobytes(), *known), []).append(one)
+    for channel in channels:
+        finite = [np.isfinite(v).tobytes() for v in (channel.measured_db, *channel.along.predicted_db.values())]
+        groups.setdefault((channel.along.place, np.asarray(channel.time_s).tobytes(), *finite), []).append(channel)
     return groups
 
 
@@ -241,19 +241,19 @@ def _finer(
     lags: FloatArray, likelihood: Callable[[FloatArray], FloatArray], window_s: float
 ) -> tuple[FloatArray, FloatArray]:
     """Lags (m,), finer where the log likelihood (channels, models, m) of all channels is near its largest."""
-    own, step = likelihood(lags), _STEP_S
+    nats, step = likelihood(lags), _STEP_S
     while step > _FINEST_S:
-        total = own.sum(axis=0).max(axis=0)
+        total = nats.sum(axis=0).max(axis=0)
         near = lags[total > total.max() - EVIDENCE_NAT - 2.0]
         if len(near) > _MOST_FINE:
             break
         step /= 5.0
         fine = np.unique(np.round((near[:, None] + step * np.arange(-4, 5)).ravel(), 6))
         fine = fine[(np.abs(fine) <= window_s) & ~np.isin(fine, np.round(lags, 6))]
-        lags, own = np.concatenate([lags, fine]), np.concatenate([own, likelihood(fine)], axis=-1)
+        lags, nats = np.concatenate([lags, fine]), np.concatenate([nats, likelihood(fine)], axis=-1)
         order = np.argsort(lags)
-        lags, own = lags[order], own[..., order]
-    return lags, own
+        lags, nats = lags[order], nats[..., order]
+    return lags, nats
 
 
 def _symmetric(limit: float, step: float) -> FloatArray:
@@ -269,16 +269,17 @@ def _nothing(reason: str, window_s: float) -> ClockEstimate:
     )  # fmt: skip
 
 
-def _judged(lags: FloatArray, own: FloatArray, names: Sequence[str], window_s: float) -> ClockEstimate:
+def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: float) -> ClockEstimate:
     """The verdict of log likelihoods (channels, models, lags)."""
-    models = own.sum(axis=0)
+    models = nats.sum(axis=0)
     best, total = int(models.max(axis=1).argmax()), models.max(axis=0) - models.max()
-    left = np.flatnonzero(total > -EVIDENCE_NAT)
-    first, last = lags[max(left[0] - 1, 0)], lags[min(left[-1] + 1, len(lags) - 1)]  # the nearest that are excluded
+    near = np.flatnonzero(total > -EVIDENCE_NAT)
+    # the nearest that are excluded
+    first, last = lags[max(near[0] - 1, 0)], lags[min(near[-1] + 1, len(lags) - 1)]
     low, high = max(float(first) - STAMPS_S, -window_s), min(float(last) + STAMPS_S, window_s)
     against = -float(total[np.abs(lags) <= SAME_S + 1e-9].max())
     verdict, reason = CANNOT_TELL, f"lags from {low:+.1f} to {high:+.1f} s explain the level about as well"
-    if against > EVIDENCE_NAT and (left[0] == 0 or left[-1] == len(lags) - 1):
+    if against > EVIDENCE_NAT and (near[0] == 0 or near[-1] == len(lags) - 1):
         reason = f"the best lag lies near the edge of the window ({window_s:g} s): widen rss.advanced.lag_window_s"
     elif against > EVIDENCE_NAT and not low <= 0.0 <= high:
         verdict, reason = SHIFTED, ""
@@ -289,7 +290,7 @@ def _judged(lags: FloatArray, own: FloatArray, names: Sequence[str], window_s: f
         ci95_s=(low, high),
         verdict=verdict,
         reason=reason,
-        channels_s={name: float(lags[value.argmax()]) for name, value in zip(names, own[:, best], strict=True)},
+        channels_s={name: float(lags[value.argmax()]) for name, value in zip(names, nats[:, best], strict=True)},
         window_s=window_s,
         against_zero_nat=against,
     )
@@ -373,9 +374,9 @@ class _Bins:
     def likelihood(self, lags: FloatArray, parts: Sequence[Sequence[_Parts]]) -> FloatArray:
         """Log likelihood (channels, models, lags), of the likeliest of each channel's parts."""
         every = list(dict.fromkeys(chain(*parts)))
-        own = np.array([[one in mine for mine in parts] for one in every])[:, None, :, None]
-        few = np.array_split(lags, -(-len(lags) // _AT_ONCE))
-        tried = [np.where(own, self._tried(some, every), -np.inf).max(axis=0) for some in few]
+        belongs = np.array([[part in mine for mine in parts] for part in every])[:, None, :, None]
+        blocks = np.array_split(lags, -(-len(lags) // _AT_ONCE))
+        tried = [np.where(belongs, self._tried(block, every), -np.inf).max(axis=0) for block in blocks]
         return np.moveaxis(np.concatenate(tried), 0, -1)
 
     def fitted(self, lags: FloatArray) -> list[list[_Parts]]:
@@ -405,29 +406,29 @@ def _averaged(table: FloatArray, width: float) -> FloatArray:
     """
     from scipy.ndimage import correlate1d
 
-    known: BoolArray = np.asarray(np.isfinite(table).all(axis=1))
+    finite: BoolArray = np.asarray(np.isfinite(table).all(axis=1))
     reach = int(width / 2 + 0.5)
     weights = np.clip(width / 2 + 0.5 - np.abs(np.arange(-reach, reach + 1)), 0.0, 1.0)  # about the row: no lag
-    share = correlate1d(known.astype(np.float64), weights, mode="nearest")
-    out = correlate1d(np.where(known[:, None], table, 0.0), weights, axis=0, mode="nearest")
-    return np.asarray(np.where(known[:, None], out / np.where(known, share, 1.0)[:, None], np.nan))
+    share = correlate1d(finite.astype(np.float64), weights, mode="nearest")
+    out = correlate1d(np.where(finite[:, None], table, 0.0), weights, axis=0, mode="nearest")
+    return np.asarray(np.where(finite[:, None], out / np.where(finite, share, 1.0)[:, None], np.nan))
 
 
 def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray:
     """Features (g, q) whose products are the covariance of a gain of unit variance over directions (g, 3)."""
     from scipy.linalg import solve_triangular
 
-    known = np.isfinite(direction).all(axis=1)
-    unit = direction[known] / np.linalg.norm(direction[known], axis=1, keepdims=True)
+    finite = np.isfinite(direction).all(axis=1)
+    unit = direction[finite] / np.linalg.norm(direction[finite], axis=1, keepdims=True)
 
-    def covariance(one: FloatArray, two: FloatArray) -> FloatArray:
-        return np.asarray(np.mean([gaussian_kernel(one, two, chord) for chord in chords], axis=0))
+    def covariance(first: FloatArray, second: FloatArray) -> FloatArray:
+        return np.asarray(np.mean([gaussian_kernel(first, second, chord) for chord in chords], axis=0))
 
     some = unit[:: max(1, len(unit) // 1500)]
     base = some[determining(some, covariance, _LEFT, _FEATURES)]
     lower = np.linalg.cholesky(covariance(base, base) + 1e-9 * np.eye(len(base)))
     out = np.full((len(direction), len(base)), np.nan)
-    out[known] = solve_triangular(lower, covariance(unit, base).T, lower=True).T
+    out[finite] = solve_triangular(lower, covariance(unit, base).T, lower=True).T
     return out
 
 
@@ -441,17 +442,17 @@ def _whitened(
     """
     memory, white = np.array(memories).T
     keeps = np.exp(-np.append(np.diff(time_s), 0.0)[:, None] / memory)
-    variances, gains, left = np.empty_like(keeps), np.empty_like(keeps), np.ones(len(memory))
+    variances, gains, uncertainty = np.empty_like(keeps), np.empty_like(keeps), np.ones(len(memory))
     for row, keep in enumerate(keeps):
-        variances[row] = left + white**2
-        gains[row] = keep * left / variances[row]
-        left = keep**2 * left * white**2 / variances[row] + 1.0 - keep**2
+        variances[row] = uncertainty + white**2
+        gains[row] = keep * uncertainty / variances[row]
+        uncertainty = keep**2 * uncertainty * white**2 / variances[row] + 1.0 - keep**2
     flat = columns.reshape(len(columns), 1, -1)
     out = np.empty((len(columns), len(memory), flat.shape[2]))  # first what is expected of each row
-    out[0], kept = 0.0, np.empty_like(out[0])
+    out[0], buffer = 0.0, np.empty_like(out[0])
     np.multiply(flat[:-1], gains[:-1, :, None], out=out[1:])
     for last, expected, keep in zip(out[:-1], out[1:], (keeps - gains)[..., None], strict=False):
-        np.add(expected, np.multiply(last, keep, out=kept), out=expected)
+        np.add(expected, np.multiply(last, keep, out=buffer), out=expected)
     np.subtract(flat, out, out=out)
     out /= np.sqrt(variances)[..., None]
     return out.reshape(len(columns), len(memory), *columns.shape[1:]), np.log(variances).sum(axis=0)
@@ -462,20 +463,20 @@ def _likelihood(columns: FloatArray, time_s: FloatArray, residuals: int, parts: 
 
     Offset, slope and gains are integrated out, the scale is profiled.
     """
-    memories = list(dict.fromkeys((one.memory_s, one.white) for one in parts))
+    memories = list(dict.fromkeys((part.memory_s, part.white) for part in parts))
     white, log_det = _whitened(columns, time_s, memories)
     lags = range(columns.shape[1])
     gram = np.stack([[white[:, m, lag].T @ white[:, m, lag] for lag in lags] for m in range(len(memories))])
     n, p = len(columns), columns.shape[2] - residuals
     out = np.empty((len(parts), len(lags), residuals))
-    for row, one in enumerate(parts):
-        which = memories.index((one.memory_s, one.white))
-        spread = np.concatenate([[_FREE] * 2, np.full(p - 2, one.gain), np.ones(residuals)])
+    for row, part in enumerate(parts):
+        which = memories.index((part.memory_s, part.white))
+        spread = np.concatenate([[_FREE] * 2, np.full(p - 2, part.gain), np.ones(residuals)])
         bordered = spread[:, None] * gram[which] * spread
-        left = np.diagonal(bordered, axis1=1, axis2=2)[:, p:]
+        square = np.diagonal(bordered, axis1=1, axis2=2)[:, p:]
         # of the factor's last rows only what stands left of the diagonal counts: the 1 keeps the matrix definite
         lower = np.linalg.cholesky(bordered + np.eye(len(spread)))
-        left = np.maximum(left - (lower[:, p:, :p] ** 2).sum(axis=2), np.finfo(np.float64).tiny)
+        square = np.maximum(square - (lower[:, p:, :p] ** 2).sum(axis=2), np.finfo(np.float64).tiny)
         determinant = np.log(np.diagonal(lower, axis1=1, axis2=2)[:, :p]).sum(axis=1)[:, None] + 0.5 * log_det[which]
-        out[row] = -0.5 * n * np.log(left / n) - determinant
+        out[row] = -0.5 * n * np.log(square / n) - determinant
     return out

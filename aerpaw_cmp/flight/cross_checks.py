@@ -31,39 +31,39 @@ _OF_THE_MINUTE = timedelta(minutes=15)
 GROUND_M = 5.0
 
 
-def questions(file: IngestedFile, kept: Sequence[Stream], timezone: str | None) -> list[str]:
+def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | None) -> list[str]:
     """Questions of a draft about the streams of a log that it keeps, each with both values.
 
     Parameters
     ----------
     file : IngestedFile
-    kept : sequence of Stream
+    streams : sequence of Stream
     timezone : str or None
         Of clocks without a zone.
     """
-    asked = []
-    start = _start(kept)
+    texts = []
+    start = _start(streams)
     if start is not None:
         zone = ZoneInfo(timezone) if timezone else None
-        told = [*_name_starts(file.path), *_summary_starts(Path(file.path))]
-        asked += [
-            f"{where} says {said:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is right?"
-            for where, said, form, slack in told
-            if _apart(said, start, zone, exact=slack == _OF_THE_MINUTE) > slack
+        starts = [*_name_starts(file.path), *_summary_starts(Path(file.path))]
+        texts += [
+            f"{where} says {time:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is right?"
+            for where, time, form, slack in starts
+            if _apart(time, start, zone, exact=slack == _OF_THE_MINUTE) > slack
         ]
-        if any(s.attributes.get("clock_from") == "assumed" for s in kept):
-            asked.append(f"the times are read as {_source(kept, 'clock') or 'local wall time'}: right?")
-    if any(s.attributes.get("height_from") == "assumed" for s in kept):
-        asked.append(f"the heights are read as {_source(kept, 'height') or 'above take-off'}: right?")
-    for stream in kept:
+        if any(s.attributes.get("clock_from") == "assumed" for s in streams):
+            texts.append(f"the times are read as {_source(streams, 'clock') or 'local wall time'}: right?")
+    if any(s.attributes.get("height_from") == "assumed" for s in streams):
+        texts.append(f"the heights are read as {_source(streams, 'height') or 'above take-off'}: right?")
+    for stream in streams:
         if stream.kind == "telemetry" and (low := _lowest_m(stream)) is not None and abs(low) > GROUND_M:
-            asked.append(f"the lowest height is {low:.0f} m, expected 0 m: does the track begin in the air?")
-    return list(dict.fromkeys(asked))
+            texts.append(f"the lowest height is {low:.0f} m, expected 0 m: does the track begin in the air?")
+    return list(dict.fromkeys(texts))
 
 
-def _start(kept: Sequence[Stream]) -> datetime | None:
+def _start(streams: Sequence[Stream]) -> datetime | None:
     """First time (UTC) of some streams; None without a wall clock."""
-    first = min((span[0] for stream in kept if (span := stream_span(stream)) is not None), default=None)
+    first = min((span[0] for stream in streams if (span := stream_span(stream)) is not None), default=None)
     if first is None or not has_wall_clock(first):
         return None
     start: datetime = first.astype("datetime64[us]").item().replace(tzinfo=zones.utc)
@@ -76,14 +76,14 @@ def _name_starts(path: str) -> list[tuple[str, datetime, str, timedelta]]:
     for match in _IN_NAME.finditer(Path(path).name):
         parts = [int(part) for part in match.groups() if part is not None]
         try:
-            said = datetime(*parts, tzinfo=zones.utc)  # type: ignore[misc, arg-type]
+            time = datetime(*parts, tzinfo=zones.utc)  # type: ignore[misc, arg-type]
         except ValueError:
             continue
         exact = len(parts) > 3
         starts.append(
             (
                 "the file's name",
-                said,
+                time,
                 "%Y-%m-%d %H:%M" if exact else "%Y-%m-%d",
                 _OF_THE_MINUTE if exact else _OF_THE_DAY,
             )
@@ -97,8 +97,8 @@ def _summary_starts(path: Path) -> list[tuple[str, datetime, str, timedelta]]:
     stem = path.name.split(".")[0]
     for name, head in _tables_beside(path):
         if name.startswith(stem) and (match := _NEMO_START.search(head)) is not None:
-            said = datetime.strptime(match[1], "%Y %b %d %H:%M").replace(tzinfo=zones.utc)
-            starts.append((f"Measurement start in {name}", said, "%Y-%m-%d %H:%M", _OF_THE_MINUTE))
+            time = datetime.strptime(match[1], "%Y %b %d %H:%M").replace(tzinfo=zones.utc)
+            starts.append((f"Measurement start in {name}", time, "%Y-%m-%d %H:%M", _OF_THE_MINUTE))
     return starts
 
 
@@ -110,27 +110,27 @@ def _tables_beside(path: Path) -> Iterator[tuple[str, str]]:
                 yield table.name, stream.read(_HEAD_BYTES).decode("utf-8", "replace")
         return
     if (part := archives.inside(path)) is not None:
-        place, own = part
+        place, inner = part
         for name, member in archives.members(read_bytes(place)[0], place).items():
-            if name != own and name.endswith(".csv") and PurePosixPath(name).parent == PurePosixPath(own).parent:
+            if name != inner and name.endswith(".csv") and PurePosixPath(name).parent == PurePosixPath(inner).parent:
                 yield PurePosixPath(name).name, member.read(_HEAD_BYTES).decode("utf-8", "replace")
 
 
 _HEAD_BYTES = 2000
 
 
-def _apart(said: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
+def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
     """Least distance of a time from the start, read as UTC and as local; without a zone in any zone."""
     if not exact:
-        return abs(start - said - timedelta(hours=12))
+        return abs(start - time - timedelta(hours=12))
     if zone is not None:
         offset = start.astimezone(zone).utcoffset() or timedelta(0)
-        return min(abs(start - said), abs(start + offset - said))
-    return min(abs(start - said + timedelta(minutes=30 * half)) for half in range(-28, 29))
+        return min(abs(start - time), abs(start + offset - time))
+    return min(abs(start - time + timedelta(minutes=30 * half)) for half in range(-28, 29))
 
 
-def _source(kept: Sequence[Stream], what: str) -> str:
-    sources = [s.attributes.get(f"{what}_source") for s in kept if s.attributes.get(f"{what}_from") == "assumed"]
+def _source(streams: Sequence[Stream], what: str) -> str:
+    sources = [s.attributes.get(f"{what}_source") for s in streams if s.attributes.get(f"{what}_from") == "assumed"]
     return next((str(source) for source in sources if source), "")
 
 

@@ -215,8 +215,8 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
     latitude, longitude = (frame[key].to_numpy(np.float64) for key in ("latitude_deg", "longitude_deg"))
     middle = float(np.median(latitude)), float(np.median(longitude))
     east, north = site.frame.to_local(latitude, longitude)
-    there = site.frame.to_local(np.array([middle[0]]), np.array([middle[1]]))
-    away = float(np.hypot(east - there[0], north - there[1]).max())
+    centre = site.frame.to_local(np.array([middle[0]]), np.array([middle[1]]))
+    reach_m = float(np.hypot(east - centre[0], north - centre[1]).max())
     up = np.maximum(frame["altitude_m"].to_numpy(np.float64) + site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
     height = float(np.nanmedian(up)) if logged and np.isfinite(up).any() else float("nan")
     if logged and not np.isfinite(height):
@@ -227,7 +227,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
     stands = _NodePlace(
         latitude_deg=middle[0], longitude_deg=middle[1], height_m=height if logged else node.antenna_height_m
     )
-    if max(away, rises) <= STANDS_STILL_M:
+    if max(reach_m, rises) <= STANDS_STILL_M:
         return stands
     track = Track(
         frame if logged else frame.assign(altitude_m=0.0),
@@ -242,7 +242,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
             cause="relative times want 'time_origin', local ones 'timezone', beside the track's path",
             path=path,
         )
-    remarks = [f"moves {away:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
+    remarks = [f"moves {reach_m:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
     remarks += [text for text in track.account.warnings if "attitude" not in text]
     return dataclasses.replace(stands, track=track, remarks=tuple(remarks))
 
@@ -260,8 +260,8 @@ def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | Non
         latitude, longitude = (frame[key].to_numpy(np.float64) for key in ("latitude_deg", "longitude_deg"))
         frame = frame.loc[good_positions(latitude, longitude, np.zeros(len(frame)))]
         if len(frame):
-            whole: pd.DataFrame = frame.reindex(columns=["time", *_TELEMETRY])
-            return whole
+            records: pd.DataFrame = frame.reindex(columns=["time", *_TELEMETRY])
+            return records
     raise InputError("no positions in this log", expected=f"those of towers.{name}", path=path)
 
 
@@ -279,9 +279,9 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     InputError
         A missing file, a log of another kind than the flight file says, a log without any record.
     """
-    root, held = logs_root or folder, Held()
+    root, cache = logs_root or folder, Held()
     return tuple(
-        read_log(root, log.path, log.options(settings.timezone), reader=log.reader, held=held) for log in settings.logs
+        read_log(root, log.path, log.options(settings.timezone), reader=log.reader, held=cache) for log in settings.logs
     )
 
 
@@ -345,8 +345,8 @@ def gather(
         streams = [stream for stream in file.result.streams if stream.name not in log.skip]
         telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
         for stream in (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s)):
-            others = (other for source in files if source is not file for other in source.result.streams)
-            locked, remark = lock_of(stream, [*file.result.streams, *others])
+            elsewhere = (candidate for source in files if source is not file for candidate in source.result.streams)
+            locked, remark = lock_of(stream, [*file.result.streams, *elsewhere])
             warnings += [f"{log.path}: {remark}"] if remark else []
             rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number, locked=locked)))
         tower = log.node or settings.rank.tower
@@ -408,8 +408,8 @@ def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 
 def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
     """Remarks on streams that are compared with a level over noise, or as if they were one."""
-    kept = [s for s in streams if is_ratio(s) and s.name not in log.skip]
-    blind = [s.name for s in kept if _noise(s, _link_of(links, log, s))[0] is None]
+    ratios = [s for s in streams if is_ratio(s) and s.name not in log.skip]
+    blind = [s.name for s in ratios if _noise(s, _link_of(links, log, s))[0] is None]
     if not blind:
         return []
     shown = ", ".join(map(repr, blind)) + (" is a ratio" if len(blind) == 1 else " are ratios")
@@ -613,16 +613,16 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
     if len(group) == 1:
         return group[0][1]
     parts = sorted((p for p in group if len(p[1].time)), key=lambda p: p[1].time.min()) or [group[0]]
-    for (path, before), (other, after) in itertools.pairwise(parts):
+    for (path, before), (later_path, after) in itertools.pairwise(parts):
         if after.time.min() < before.time.max() or _form(before) != _form(after):
-            where = "two logs" if path != other else "two streams of a log"
+            where = "two logs" if path != later_path else "two streams of a log"
             raise UsageError(
-                f"{where} hold {what} at the same time or in another form: {path!r} and {other!r}",
+                f"{where} hold {what} at the same time or in another form: {path!r} and {later_path!r}",
                 expected="one record of each channel and of each tower's rank",
                 cause="a copy: leave one out, by its path or by 'skip'; another radio: give it its own 'channel'",
             )
     first = parts[0][1]
-    series = [one for _, one in parts]
+    series = [part for _, part in parts]
     arrays: dict[str, Any] = {
         field.name: joined for field in dataclasses.fields(first) if len(joined := _joined(series, field.name))
     }
@@ -632,11 +632,11 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
 
 def _joined(parts: Sequence[RssSeries | RankSeries], name: str) -> AnyArray:
     """A column of all parts, NaN where a part does not have it (a log that says no serving cell); empty if none has."""
-    given = [getattr(part, name) for part in parts]
-    if not any(isinstance(value, np.ndarray) for value in given):
+    arrays = [getattr(part, name) for part in parts]
+    if not any(isinstance(value, np.ndarray) for value in arrays):
         return np.empty(0)
     return np.concatenate(
-        [np.full(len(part.time), np.nan) if value is None else value for part, value in zip(parts, given, strict=True)]
+        [np.full(len(part.time), np.nan) if value is None else value for part, value in zip(parts, arrays, strict=True)]
     )
 
 

@@ -126,11 +126,11 @@ def draft(
     proof = _proof(text, folder, {file.path: file for file in files}, list(entries.lines))
     if proof.reason:
         text = text.replace(HEAD, f"{HEAD}# No sample of this draft can be compared: {proof.reason}.\n", 1)
-    asked = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
+    checks = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
     proved = [f"no sample of this draft can be compared: {proof.reason}"]
     if not proof.reason:
         proved = [f"{proof.samples} samples can be compared", *proof.lost]
-    return text, proved + asked + [f"left out: {remark}" for remark in entries.out]
+    return text, proved + checks + [f"left out: {remark}" for remark in entries.out]
 
 
 def _proof(text: str, folder: Path, files: Mapping[str, IngestedFile], paths: Sequence[str]) -> DryRun:
@@ -202,17 +202,17 @@ def drafts(
     complete = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
     options_of_clock = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping, "site": site}
     groups = [flight.files for flight in complete] if len(complete) > 1 else [list(files)]
-    made = []
+    written = []
     for group in groups:
         text, remarks = draft(group, folder, **options_of_clock)  # type: ignore[arg-type]
-        made.append(Draft(_name(_flown(group), group), text, tuple(remarks)))
+        written.append(Draft(_name(_flown(group), group), text, tuple(remarks)))
     home = {file.path for group in groups for file in group}
-    left = [one_line(os.path.relpath(Path(f.path).resolve(), folder)) for f in files if f.path not in home]
-    if left:
-        first = made[0]
-        out = tuple(f"left out: {path}: it goes with no flight here" for path in left)
-        made[0] = Draft(first.name, first.text, (*first.remarks, *out))
-    return made
+    homeless = [one_line(os.path.relpath(Path(f.path).resolve(), folder)) for f in files if f.path not in home]
+    if homeless:
+        first = written[0]
+        out = tuple(f"left out: {path}: it goes with no flight here" for path in homeless)
+        written[0] = Draft(first.name, first.text, (*first.remarks, *out))
+    return written
 
 
 # Samples below it are take-off, landing and waiting: at 2 m an airframe, its pilot and the grass decide the level.
@@ -361,7 +361,7 @@ class _Entries:
     out: list[str] = field(default_factory=list)
     without_track: bool = False
     """A record was entered that needs a track, and there is none."""
-    taken: dict[tuple[str, ...], list[tuple[Span, str]]] = field(default_factory=dict)
+    entered: dict[tuple[str, ...], list[tuple[Span, str]]] = field(default_factory=dict)
     """By tower, kind and channel: when, and from which log."""
     contents: dict[str, str] = field(default_factory=dict)
     """Path by SHA-256."""
@@ -413,89 +413,91 @@ class _Entries:
 
     def _enter(self, file: IngestedFile, path: str, shown: str) -> None:
         streams = [s for s in file.result.streams if s.kind != "kpi"]  # no report compares these
-        entry, asked = _entry(file, path)
+        entry, comment = _entry(file, path)
         origin = None if self.time_origin else self._origin(streams)
         if self.placer is not None:
             levels = [s for s in streams if s.kind == "rss" and not is_ratio(s)]
-            if asked:
-                asked = self._place(file, entry, asked, levels, self.placer)
+            if comment:
+                comment = self._place(file, entry, comment, levels, self.placer)
             else:
-                asked = self._doubt(entry, levels, self.placer)
+                comment = self._doubt(entry, levels, self.placer)
         if self.is_utc(file):
             entry["clock"] = "utc"
-            asked = _also(asked, "as local time it misses the telemetry, as UTC it meets it: is it UTC?")
+            comment = _also(comment, "as local time it misses the telemetry, as UTC it meets it: is it UTC?")
         refused = self._refused(streams, entry, shown, dated=origin is not None)
-        kept = [s for s in streams if s.name not in refused]
+        compared = [s for s in streams if s.name not in refused]
         reasons = list(dict.fromkeys(refused.values()))
-        if not kept and reasons == [RATIO] and all(may_lose_lock(s) for s in streams):
-            asked = "  # says when the receiver was in lock"
+        if not compared and reasons == [RATIO] and all(may_lose_lock(s) for s in streams):
+            comment = "  # says when the receiver was in lock"
             skip = [s.name for s in streams]
-            self.lines[file.path] = f"  - {_flow({'path': path, 'reader': file.result.reader, 'skip': skip})}{asked}\n"
+            self.lines[file.path] = (
+                f"  - {_flow({'path': path, 'reader': file.result.reader, 'skip': skip})}{comment}\n"
+            )
             return
-        if not kept:
+        if not compared:
             self.out.append(f"{shown}: {'; '.join(reasons) or 'no samples'}")
             return
         self.out += [f"{shown}: {name}: {reason}" for name, reason in refused.items() if reason != RATIO]
-        if all(s.kind == "telemetry" for s in kept):
-            entry, asked = {"path": path, "reader": file.result.reader}, ""
-        if self.time_origin and any("clock" in s.attributes for s in kept):
+        if all(s.kind == "telemetry" for s in compared):
+            entry, comment = {"path": path, "reader": file.result.reader}, ""
+        if self.time_origin and any("clock" in s.attributes for s in compared):
             entry["time_origin"] = self.time_origin
         elif origin is not None:
             entry["time_origin"] = f"{origin.time.astype('datetime64[ms]')}Z"
-            asked = _also(asked, f"time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?")
+            comment = _also(comment, f"time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?")
         if file.result.reader == "generic_csv":
             entry |= self.mapping
         if refused:
             entry["skip"] = sorted(refused)
-        asked = self._ask_heights_and_floor(kept, entry, path, asked)
-        for question in questions(file, kept, self.timezone):
-            asked = _also(asked, question)
-        self.lines[file.path] = f"  - {_flow(entry)}{asked}\n"
+        comment = self._ask_heights_and_floor(compared, entry, path, comment)
+        for question in questions(file, compared, self.timezone):
+            comment = _also(comment, question)
+        self.lines[file.path] = f"  - {_flow(entry)}{comment}\n"
         if self.placer is not None:
-            self.offsets_db += [o for s in kept if (o := self._offset_db(s, entry, self.placer)) is not None]
-        self.kinds |= {s.kind for s in kept}
-        self.tops_m += [_top_m(s) for s in kept if _has_positions(s)]
-        self.series += [(*_key(s, entry), file.result.reader) for s in kept if s.kind in ("rss", "rank")]
-        self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
+            self.offsets_db += [o for s in compared if (o := self._offset_db(s, entry, self.placer)) is not None]
+        self.kinds |= {s.kind for s in compared}
+        self.tops_m += [_top_m(s) for s in compared if _has_positions(s)]
+        self.series += [(*_key(s, entry), file.result.reader) for s in compared if s.kind in ("rss", "rank")]
+        self.without_track |= self.flown is None and not all(_has_positions(s) for s in compared)
 
-    def _ask_heights_and_floor(self, kept: Sequence[Stream], entry: dict[str, Any], path: str, asked: str) -> str:
+    def _ask_heights_and_floor(self, compared: Sequence[Stream], entry: dict[str, Any], path: str, comment: str) -> str:
         """Fill in a missing height and the floor of the receiver; gives what there is to ask.
 
         Parameters
         ----------
-        kept : sequence of Stream
+        compared : sequence of Stream
             Of the file, those that are compared.
         entry : dict
             Of the file in ``logs:``; receives height and floor.
         path : str
-        asked : str
+        comment : str
             What is asked already.
 
         Returns
         -------
         str
         """
-        if any(lacks_height(s) for s in kept if s is self._track or _has_positions(s)):
+        if any(lacks_height(s) for s in compared if s is self._track or _has_positions(s)):
             height = height_in_name(path)
             entry |= {} if height is None else {"height_m": height}
             question = (
                 "no altitude in the log: which height_m?" if height is None else "height_m as the file's name says?"
             )
-            asked = _also(asked, question)
+            comment = _also(comment, question)
         levels = [
-            s for s in kept if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"
+            s for s in compared if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"
         ]  # whole decibels repeat
         if (floor := receiver_floor_db(levels)) is not None:
             entry["floor_db"] = round(floor + 0.01, 2)  # at the floor is below it
-            asked = _also(
-                asked, f"floor of the receiver at {floor:.1f} dB?" if asked else f"receiver floor {floor:.1f} dB?"
+            comment = _also(
+                comment, f"floor of the receiver at {floor:.1f} dB?" if comment else f"receiver floor {floor:.1f} dB?"
             )
-        if any(is_ratio(s) for s in kept):
-            asked = _also(asked, "a ratio to the noise as a level?")
-        return asked
+        if any(is_ratio(s) for s in compared):
+            comment = _also(comment, "a ratio to the noise as a level?")
+        return comment
 
     def _place(
-        self, file: IngestedFile, entry: dict[str, Any], asked: str, levels: Sequence[Stream], placer: Placer
+        self, file: IngestedFile, entry: dict[str, Any], comment: str, levels: Sequence[Stream], placer: Placer
     ) -> str:
         """Fill in the nodes that the levels fit; gives what is left to ask.
 
@@ -504,7 +506,7 @@ class _Entries:
         file : IngestedFile
         entry : dict
             Of the file in ``logs:``; receives the nodes.
-        asked : str
+        comment : str
             The question where no level fits.
         levels : sequence of Stream
             Of the file.
@@ -531,15 +533,15 @@ class _Entries:
                 entry["node"] = place.node
                 return f"  # {place.question}" if place.tower is None and place.question else ""
             entry["cells"][pci] = place.node
-        return asked
+        return comment
 
     def _doubt(self, entry: Mapping[str, Any], levels: Sequence[Stream], placer: Placer) -> str:
         """Ask about a tower that a name gives and the levels contradict."""
         for level in levels:
             node = str(entry.get("node") or level.attributes.get("node"))
-            other = placer.contradiction(placer.levels(level, self._floor_db(level)), node)
-            if other is not None:
-                return f"  # the name says {node}, the levels fit {other} far better: which tower?"
+            better = placer.contradiction(placer.levels(level, self._floor_db(level)), node)
+            if better is not None:
+                return f"  # the name says {node}, the levels fit {better} far better: which tower?"
         return ""
 
     def _floor_db(self, level: Stream) -> float:
@@ -560,7 +562,7 @@ class _Entries:
         if self.flown is None or not has_wall_clock(self.flown[1][0]):
             return None
         relative = [s for s in streams if s.attributes.get("clock") == "relative"]
-        return next((one for s in relative if (one := origin_of(s, self.flown[0])) is not None), None)
+        return next((origin for s in relative if (origin := origin_of(s, self.flown[0])) is not None), None)
 
     def _refused(
         self, streams: Sequence[Stream], entry: Mapping[str, Any], shown: str, *, dated: bool
@@ -580,18 +582,18 @@ class _Entries:
             if stream.name in leading:
                 return f"of the same receiver and cell as {leading[stream.name]}, which is compared"
             why = self._reason(stream, span, dated=dated)
-            return why or (None if stream.kind == "telemetry" else self._taken(_key(stream, entry), span, shown))
+            return why or (None if stream.kind == "telemetry" else self._enter_series(_key(stream, entry), span, shown))
 
         ordered = sorted(streams, key=_missing)
         return {stream.name: why for stream in ordered if (why := reason(stream)) is not None}
 
-    def _taken(self, key: tuple[str, ...], span: Span, shown: str) -> str | None:
+    def _enter_series(self, key: tuple[str, ...], span: Span, shown: str) -> str | None:
         """Enter a series; the reason where one of that tower, channel and time is there already."""
-        same = [other for when, other in self.taken.get(key, []) if _meet(span, when)]
+        same = [source for when, source in self.entered.get(key, []) if _meet(span, when)]
         if same:
             where = "another stream of the log" if same[0] == shown else same[0]
             return f"{where} has {key[1]} of that tower and time already"
-        self.taken.setdefault(key, []).append((span, shown))
+        self.entered.setdefault(key, []).append((span, shown))
         return None
 
     def is_utc(self, file: IngestedFile) -> bool:
@@ -617,8 +619,8 @@ class _Entries:
             return "the track is that of other telemetry" if _meet(span, self.flown[1]) else _late(span, self.flown[1])
         if self.flown is None and self.positioned and not _has_positions(stream):
             return "it has no positions, and no telemetry is here"
-        beside = self.flown is not None and not has_wall_clock(self.flown[1][0])  # the track counts as the log does
-        if relative and not (dated or beside or _has_positions(stream)):
+        same_clock = self.flown is not None and not has_wall_clock(self.flown[1][0])  # the track counts as the log does
+        if relative and not (dated or same_clock or _has_positions(stream)):
             return "its times are relative; read it again with --time-origin"
         if self.flown is not None and not relative and not _meet(span, self.flown[1]):
             return _late(span, self.flown[1], self.timezone)
@@ -687,7 +689,7 @@ def _samples(file: IngestedFile) -> int:
 def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
     """The telemetry that most levels and ranks go with, first and last time; of equals, the longest."""
     timed = [(stream, span, file) for file in files for stream in file.result.streams if (span := stream_span(stream))]
-    others = [span for s, span, _ in timed if s.kind != "telemetry" and has_wall_clock(span[0])]
+    measured = [span for s, span, _ in timed if s.kind != "telemetry" and has_wall_clock(span[0])]
     tracks = [(s, span, file) for s, span, file in timed if s.kind == "telemetry"]
     telemetry = [(s, span) for s, span, _ in tracks if has_wall_clock(span[0])]
     relative = [
@@ -697,14 +699,14 @@ def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
     ]
 
     def worth(flight: tuple[Stream, Span]) -> tuple[int, np.timedelta64]:
-        return sum(_meet(flight[1], other) for other in others), flight[1][1] - flight[1][0]
+        return sum(_meet(flight[1], span) for span in measured), flight[1][1] - flight[1][0]
 
     # without any wall clock, a log that holds both levels and positions is a flight in its own time
     return max(telemetry or relative[:1], key=worth, default=None)
 
 
-def _meet(one: Span, other: Span) -> bool:
-    return bool(one[0] <= other[1] and other[0] <= one[1])
+def _meet(first: Span, second: Span) -> bool:
+    return bool(first[0] <= second[1] and second[0] <= first[1])
 
 
 # Of a log's cells, those told most often are proposed; in a city a phone hears a hundred.
@@ -715,8 +717,8 @@ def _cells(streams: Sequence[Stream]) -> list[int]:
     """PCIs of a log of several cells, those with a twentieth of the samples of the first and more."""
     counts = {int(s.attributes["pci"]): len(s.frame) for s in streams if "pci" in s.attributes}
     most = max(counts.values(), default=0)
-    kept = sorted(counts, key=lambda pci: -counts[pci])[:MOST_CELLS]
-    return sorted(pci for pci in kept if 20 * counts[pci] >= most)
+    most_sampled = sorted(counts, key=lambda pci: -counts[pci])[:MOST_CELLS]
+    return sorted(pci for pci in most_sampled if 20 * counts[pci] >= most)
 
 
 def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
@@ -738,9 +740,9 @@ def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
     return entry, "" if near else "  # which tower?"
 
 
-def _also(asked: str, question: str) -> str:
+def _also(comment: str, question: str) -> str:
     """The comment behind a line of ``logs:`` with one more question."""
-    return f"{asked} {question}" if asked else f"  # {question}"
+    return f"{comment} {question}" if comment else f"  # {question}"
 
 
 def _plain(entry: Mapping[str, Any]) -> str:

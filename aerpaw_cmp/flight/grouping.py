@@ -55,22 +55,22 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     """
     timed = [(file, span) for file in files if (span := span_of(file)) is not None]
     groups: list[Flight] = []
-    for file, span in sorted(timed, key=lambda one: (not _has_track(one[0]), one[1][0])):
+    for file, span in sorted(timed, key=lambda entry: (not _has_track(entry[0]), entry[1][0])):
         place = _place(file)
         near = [flight for flight in groups if _meet(flight, span, place)]
-        flight = max(near, key=lambda one: _shared(one.span, span), default=None)
+        flight = max(near, key=lambda group: _shared(group.span, span), default=None)
         if flight is None:
             flight = Flight(span=span, place=place)
             groups.append(flight)
         flight.files.append(file)
-        if _has_track(file) or not any(_has_track(other) for other in flight.files):
+        if _has_track(file) or not any(_has_track(member) for member in flight.files):
             assert flight.span is not None
             flight.span = (min(flight.span[0], span[0]), max(flight.span[1], span[1]))
             flight.place = flight.place or place
     for file in files:
         if span_of(file) is None:
             _home(file, groups).files.append(file)
-    return sorted(groups, key=lambda one: (one.span is None, one.span[0] if one.span else np.datetime64(0, "ns")))
+    return sorted(groups, key=lambda group: (group.span is None, (group.span or ())[:1]))
 
 
 def span_of(file: IngestedFile) -> Span | None:
@@ -114,17 +114,17 @@ def _meet(flight: Flight, span: Span, place: tuple[float, float] | None) -> bool
     return max(abs(place[0] - flight.place[0]), abs(place[1] - flight.place[1])) < APART_DEG
 
 
-def _shared(one: Span | None, other: Span) -> np.timedelta64:
+def _shared(first: Span | None, second: Span) -> np.timedelta64:
     """Time that two spans share; negative where they do not."""
-    assert one is not None
-    return min(one[1], other[1]) - max(one[0], other[0])
+    assert first is not None
+    return min(first[1], second[1]) - max(first[0], second[0])
 
 
 def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
     """Origin under which a log with positions lies on the track of a flight."""
-    tracks = [track for other in flight.files for track in _tracks(other)]
+    tracks = [track for member in flight.files for track in _tracks(member)]
     origins = [origin_of(stream, track) for stream in file.result.streams for track in tracks[:1]]
-    return min((item for item in origins if item is not None), key=lambda one: one.distance_m, default=None)
+    return min((item for item in origins if item is not None), key=lambda origin: origin.distance_m, default=None)
 
 
 def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
@@ -138,7 +138,7 @@ def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
     if by_track:
         return known[min(by_track)[1]]
     folder = Path(file.path).parent
-    near = [flight for flight in known if any(Path(other.path).parent == folder for other in flight.files)]
+    near = [flight for flight in known if any(Path(member.path).parent == folder for member in flight.files)]
     if len(near) != 1:
         near = known if len(known) == 1 else []
     if not near:

@@ -47,15 +47,15 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
         replace(s, frame=s.frame.assign(altitude_m=float(log.height_m))) if lacks_height(s) else s
         for s in file.result.streams
     ]
-    if all(one is other for one, other in zip(streams, file.result.streams, strict=True)):
+    if all(after is before for after, before in zip(streams, file.result.streams, strict=True)):
         raise UsageError(
             f"{log.path}: 'height_m' acts on nothing",
             expected="a log with positions and no altitude",
             cause="the log has altitudes of its own, or no positions",
         )
-    said = f"no altitude in the log: {log.height_m:g} m above take-off in all of it, as height_m says"
+    note = f"no altitude in the log: {log.height_m:g} m above take-off in all of it, as height_m says"
     warnings = [text for text in file.result.warnings if not text.startswith("the log has no altitude")]
-    return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, said)))
+    return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, note)))
 
 
 def height_in_name(path: str) -> float | None:

@@ -54,7 +54,7 @@ def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain 
     for end, array in (("uav", link.uav_array), ("tower", tower_array)):
         pattern = array.patterns[0]
         if isinstance(pattern, SpherePattern):
-            ends[end] = pattern, _own(array, towards[end])
+            ends[end] = pattern, _in_mount(array, towards[end])
     if not ends:
         return None
     pair_db, sd_db = pair_and_sd_db(ends)
@@ -66,7 +66,7 @@ def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tupl
 
     ``ends``: pattern and directions (n, 3) in its frame, of ``uav`` and ``tower``, or one of them.
     """
-    square = sum(pattern.gain_sd_db(*sphere_angles(own)) ** 2 for pattern, own in ends.values())
+    square = sum(pattern.gain_sd_db(*sphere_angles(direction)) ** 2 for pattern, direction in ends.values())
     sd_db = np.sqrt(square)
     if len(ends) == 2:
         (uav, at_uav), (tower, at_tower) = ends["uav"], ends["tower"]
@@ -87,5 +87,5 @@ def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | floa
     return 0.0 if gain is None else gain.pair_db
 
 
-def _own(array: Array, direction: FloatArray) -> FloatArray:
+def _in_mount(array: Array, direction: FloatArray) -> FloatArray:
     return np.asarray(direction @ array.mount)

@@ -34,13 +34,13 @@ def is_sounder_power(stream: Stream) -> bool:
     return stream.kind == "rss" and stream.name == "power" and stream.attributes.get("unit") == "dB re full scale"
 
 
-def lock_of(power: Stream, others: Iterable[Stream]) -> tuple[FloatArray | None, str]:
+def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | None, str]:
     """Lock state of a sounder's receiver at each row of its level.
 
     Parameters
     ----------
     power : Stream
-    others : iterable of Stream
+    candidates : iterable of Stream
         Of the flight, those of the same file first; the first lock quality that shares time with the level is taken.
 
     Returns
@@ -51,22 +51,22 @@ def lock_of(power: Stream, others: Iterable[Stream]) -> tuple[FloatArray | None,
     if not is_sounder_power(power):
         return None, ""
     time = _seconds(power)
-    for other in others:
-        if not may_lose_lock(other):
+    for candidate in candidates:
+        if not may_lose_lock(candidate):
             continue
-        at, quality = _seconds(other), other.frame["rss_db"].to_numpy(np.float64)
-        said = ""
+        at, quality = _seconds(candidate), candidate.frame["rss_db"].to_numpy(np.float64)
+        remark = ""
         if len(at) == len(time) and np.array_equal(at, time):
             quality, shift_s = aligned_quality(time, power.frame["rss_db"].to_numpy(np.float64), quality)
             if shift_s:
-                said = (
+                remark = (
                     f"the quality is paired with the power by row and runs up to {shift_s:.0f} s ahead: it is taken "
                     "at its own times, 0.032768 s a row"
                 )
         else:
             quality = _nearest(time, at, quality)
         if np.isfinite(quality).any():
-            return np.where(np.isfinite(quality), (quality > LOST_QUALITY_DB).astype(np.float64), np.nan), said
+            return np.where(np.isfinite(quality), (quality > LOST_QUALITY_DB).astype(np.float64), np.nan), remark
     return None, ""
 
 

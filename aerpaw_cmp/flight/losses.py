@@ -108,17 +108,17 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
     wavelength = wavelength_m(carrier_hz)
 
     def loss(paths: PathSet, sources_m: FloatArray, _targets_m: FloatArray) -> FloatArray:
-        total, here = np.zeros(len(paths)), sources_m[paths.tower]
+        total, ray_start = np.zeros(len(paths)), sources_m[paths.tower]
         for step in range(paths.vertices_m.shape[1]):
             corner = paths.vertices_m[:, step]
             on = np.abs(corner[:, 2:] - heights).min(axis=1) < ON_GROUND_M  # NaN where the path has no such corner
             if site.dem is not None:
                 on |= np.abs(corner[:, 2] - site.dem.ground_m(corner[:, 0], corner[:, 1])) < NEAR_TERRAIN_M
             on &= paths.tree[:, step] < 0
-            ray = corner[on] - here[on]
+            ray = corner[on] - ray_start[on]
             sine = np.abs(ray[:, 2]) / np.maximum(np.linalg.norm(ray, axis=1), ON_GROUND_M)
             total[on] += 40.0 * np.log10(np.e) * (2.0 * np.pi / wavelength * sigma * sine) ** 2
-            here = np.where(np.isfinite(corner), corner, here)
+            ray_start = np.where(np.isfinite(corner), corner, ray_start)
         return total
 
     return loss

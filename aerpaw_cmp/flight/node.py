@@ -112,17 +112,17 @@ class Placer:
         place = np.where((poses.position_m[:, 2] > self.track.ground_m + LOW_M)[:, None], poses.position_m, np.nan)
         time = frame["time"].to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
         level = frame["rss_db"].to_numpy(np.float64)
-        heard = frame["flag"].astype(str).str.contains("out_of_coverage").to_numpy()
-        level = np.where(np.isnan(level) & heard & np.isfinite(floor_db), floor_db, level)
+        below_floor = frame["flag"].astype(str).str.contains("out_of_coverage").to_numpy()
+        level = np.where(np.isnan(level) & below_floor & np.isfinite(floor_db), floor_db, level)
         track = level_track(time, place, level, floor_db=floor_db)
         if airframe is None or not len(track.time_s):
             return track
         rotation = self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation
 
         def gain_db(towards: FloatArray) -> FloatArray:
-            own = np.einsum("nji,mnj->mni", rotation, towards)
-            theta = np.arctan2(np.hypot(own[..., 0], own[..., 1]), own[..., 2])
-            return airframe.gain_dbi(theta, np.arctan2(own[..., 1], own[..., 0]))
+            in_body = np.einsum("nji,mnj->mni", rotation, towards)
+            theta = np.arctan2(np.hypot(in_body[..., 0], in_body[..., 1]), in_body[..., 2])
+            return airframe.gain_dbi(theta, np.arctan2(in_body[..., 1], in_body[..., 0]))
 
         return replace(track, airframe_db=gain_db)
 
@@ -138,8 +138,8 @@ class Placer:
         if len(listed) and odds_listed.max() >= max(TOWER_ODDS, odds_tower.max()):
             order = np.argsort(-odds_listed)
             place, least = listed[order[0]], odds_listed[order[0]] - UNDECIDED
-            others = [listed[i] for i in order[1:] if odds_listed[i] > least]
-            also = "".join(f" or line {other.line}" for other in others)
+            undecided = [listed[i] for i in order[1:] if odds_listed[i] > least]
+            also = "".join(f" or line {tie.line}" for tie in undecided)
             about = f"line {place.line} of {place.file}{also}: is the node there?"
             return self._node(self._local(place), place.latitude_deg, place.longitude_deg, 1.5, about)
         best = int(odds_tower.argmax())
@@ -177,7 +177,7 @@ class Placer:
         return float(np.median(free - track.level_db))
 
     def _node(self, place: FloatArray, latitude: float, longitude: float, height: float, about: str) -> Placement:
-        same = [name for name, other in self.nodes.items() if np.hypot(*(other[:2] - place[:2])) < 100.0]
+        same = [name for name, placed in self.nodes.items() if np.hypot(*(placed[:2] - place[:2])) < 100.0]
         name = same[0] if same else "NODE" + (str(len(self.nodes) + 1) if self.nodes else "")
         tower = {"latitude_deg": round(latitude, 7), "longitude_deg": round(longitude, 7), "antenna_height_m": height}
         if same:

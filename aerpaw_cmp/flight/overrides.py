@@ -43,44 +43,44 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
 
 
 def _set(plain: dict[str, Any], key: str, value: Any) -> None:
-    here: Any = plain
+    level: Any = plain
     parts = key.split(".")
     for depth, part in enumerate(parts):
         last = depth == len(parts) - 1
-        if isinstance(here, list):
-            if not part.isdigit() or int(part) >= len(here):
-                raise UsageError(f"the override {key!r} has no element {part!r}", expected=f"0 to {len(here) - 1}")
+        if isinstance(level, list):
+            if not part.isdigit() or int(part) >= len(level):
+                raise UsageError(f"the override {key!r} has no element {part!r}", expected=f"0 to {len(level) - 1}")
             if last:
-                here[int(part)] = value
+                level[int(part)] = value
             else:
-                here = here[int(part)]
+                level = level[int(part)]
             continue
-        if not isinstance(here, dict):
+        if not isinstance(level, dict):
             raise UsageError(f"the override {key!r} goes below {'.'.join(parts[:depth])!r}, which is a value")
-        if part not in here and part in here.get("advanced", ()):
-            here = here["advanced"]  # as dotted keys of 0.3 name it
-        if part not in here:
-            _add(plain, here, parts[:depth], part, key)
+        if part not in level and part in level.get("advanced", ()):
+            level = level["advanced"]  # as dotted keys of 0.3 name it
+        if part not in level:
+            _add(plain, level, parts[:depth], part, key)
         if last:
-            here[part] = value
-        elif isinstance(here[part], (dict, list)):
-            here = here[part]
+            level[part] = value
+        elif isinstance(level[part], (dict, list)):
+            level = level[part]
         else:
             raise UsageError(f"the override {key!r} goes below {'.'.join(parts[: depth + 1])!r}, which is a value")
 
 
-def _add(plain: dict[str, Any], here: dict[str, Any], above: list[str], part: str, key: str) -> None:
+def _add(plain: dict[str, Any], level: dict[str, Any], above: list[str], part: str, key: str) -> None:
     """Make an entry of a mapping with free names; every other unknown key is a mistake."""
     if above == ["link", "channels"]:
-        here[part] = deepcopy(plain["link"]["rss"])
+        level[part] = deepcopy(plain["link"]["rss"])
         return
     if above[-1:] == ["towers"] and above[0] == "link":
         parent: Any = plain
         for name in above[:-1]:
             parent = parent[name]
-        here[part] = deepcopy(parent["tower"])
+        level[part] = deepcopy(parent["tower"])
         return
-    near = nearest(part, here)
+    near = nearest(part, level)
     raise UsageError(
         f"the override {key!r}: there is no key {part!r}" + (f" below {'.'.join(above)!r}" if above else ""),
         expected="a key of flight.yaml in dotted form",

@@ -135,8 +135,8 @@ def allowed_area(fence: Any, avoid: Sequence[Any], towers_m: FloatArray, distanc
         Nothing is left.
     """
     circles = [shapely.Point(*place).buffer(distance_m) for place in towers_m[:, :2]] if distance_m > 0 else []
-    left = fence.buffer(0).difference(shapely.union_all([*avoid, *circles])).buffer(-MARGIN_M)
-    parts = [p for p in getattr(left, "geoms", [left]) if p.area > 0]
+    remaining = fence.buffer(0).difference(shapely.union_all([*avoid, *circles])).buffer(-MARGIN_M)
+    parts = [p for p in getattr(remaining, "geoms", [remaining]) if p.area > 0]
     if not parts:
         raise UsageError(
             "no route fits: the geofence leaves no area",
@@ -174,8 +174,8 @@ def cross(area: Any, azimuth_deg: float) -> list[FloatArray]:
     legs = []
     for course in (azimuth_deg, azimuth_deg + 90.0):
         step = reach * np.array([math.sin(math.radians(course)), math.cos(math.radians(course))])
-        here = np.array([middle.x, middle.y])
-        cut = area.intersection(shapely.LineString([here - step, here + step]))
+        centre = np.array([middle.x, middle.y])
+        cut = area.intersection(shapely.LineString([centre - step, centre + step]))
         pieces = [p for p in getattr(cut, "geoms", [cut]) if p.distance(middle) < 1e-6 and p.length >= LEAST_LEG_M]
         legs += [np.array(p.coords)[[0, -1]] for p in pieces]
     return legs
@@ -193,12 +193,12 @@ def path_within(area: Any, begin: FloatArray, end: FloatArray) -> list[FloatArra
         if len(met) < 2:
             continue
         met = met[np.argsort(np.linalg.norm(met - begin, axis=1))]
-        one, two = (ring.project(shapely.Point(*p)) for p in (met[0], met[-1]))
-        there = substring(ring, one, two)
-        first, last = min(one, two), max(one, two)
-        other = shapely.LineString([*substring(ring, last, ring.length).coords, *substring(ring, 0.0, first).coords])
-        other = other if one > two else other.reverse()
-        arc = min((there, other), key=lambda a: a.length).simplify(1.0)
+        begin_m, end_m = (ring.project(shapely.Point(*p)) for p in (met[0], met[-1]))
+        forth = substring(ring, begin_m, end_m)
+        first, last = min(begin_m, end_m), max(begin_m, end_m)
+        back = shapely.LineString([*substring(ring, last, ring.length).coords, *substring(ring, 0.0, first).coords])
+        back = back if begin_m > end_m else back.reverse()
+        arc = min((forth, back), key=lambda a: a.length).simplify(1.0)
         corners += [np.array(c) for c in arc.coords]
     return sorted(corners, key=lambda c: float(np.linalg.norm(c - begin))) if len(area.interiors) > 1 else corners
 
@@ -223,13 +223,13 @@ def waypoints_of(legs: Sequence[FloatArray], area: Any, height_m: float, nose: N
             corners += [(c, number) for c in path_within(area, corners[-1][0], leg[0])]
         corners += [(leg[0], number), (leg[1], number)]
     out: list[Waypoint] = []
-    for (here, number), (there, _) in pairwise([*corners, corners[-1]]):
-        step = there - here
+    for (place, number), (following, _) in pairwise([*corners, corners[-1]]):
+        step = following - place
         course = math.degrees(math.atan2(step[0], step[1])) if step.any() else (out[-1].yaw_deg if out else 0.0)
         yaw = {"along": course, "fixed": 0.0, "four headings": course + 90.0 * (number % 4)}[nose]
         if not step.any() and out:
             yaw = out[-1].yaw_deg
-        out.append(Waypoint(east_m=float(here[0]), north_m=float(here[1]), height_m=height_m, yaw_deg=yaw % 360.0))
+        out.append(Waypoint(east_m=float(place[0]), north_m=float(place[1]), height_m=height_m, yaw_deg=yaw % 360.0))
     return out
 
 
@@ -319,17 +319,17 @@ def cut(route: Route, most_s: float, speed_mps: float) -> Route:
     """The part of a route that a battery allows: waypoints and samples."""
     if route.duration_s <= most_s:
         return route
-    kept: list[Waypoint] = []
+    within: list[Waypoint] = []
     clock = 0.0
     for w, after in zip(route.waypoints, [*route.waypoints[1:], route.waypoints[-1]], strict=True):
-        kept.append(w)
+        within.append(w)
         clock += w.hold_s
         step = np.array([after.east_m - w.east_m, after.north_m - w.north_m, after.height_m - w.height_m])
         needed = float(np.linalg.norm(step)) / speed_mps
         if clock + needed > most_s:
             end = np.array([w.east_m, w.north_m, w.height_m]) + max(most_s - clock, 0.0) / max(needed, 1e-9) * step
             east, north, up = end.tolist()
-            kept.append(replace(w, east_m=east, north_m=north, height_m=up, hold_s=0.0))
+            within.append(replace(w, east_m=east, north_m=north, height_m=up, hold_s=0.0))
             break
         clock += needed
-    return flown(route.name, kept, speed_mps, most_s)
+    return flown(route.name, within, speed_mps, most_s)

@@ -49,7 +49,7 @@ class Remembered:
         """Gain of both ends (n,) and its standard deviation (n,) [dB]."""
         ends = {"uav": (self.uav, samples.at_uav), "tower": (self.tower, samples.at_tower)}
         pair_db, sd_db = pair_and_sd_db(ends)
-        return pair_db + sum(pattern.gain_dbi(*sphere_angles(own)) for pattern, own in ends.values()), sd_db
+        return pair_db + sum(pattern.gain_dbi(*sphere_angles(direction)) for pattern, direction in ends.values()), sd_db
 
 
 def remembered(site: str | Path) -> dict[str, Remembered]:
@@ -166,8 +166,8 @@ def searching_airframe(
     SpherePattern or None
     """
     with suppress(InputError, UsageError):
-        others = (entry for entry in learned.read_learned(site).entries.values() if log not in entry.trained_on)
-        every = (s for entry in others for s in entry.series if s.tower not in towers)
+        unseen = (entry for entry in learned.read_learned(site).entries.values() if log not in entry.trained_on)
+        every = (s for entry in unseen for s in entry.series if s.tower not in towers)
         file = next((s.uav_file for s in every if (s.channel, s.reader) == series), None)
         return None if file is None else read_sphere_csv(learned.folder_of(site) / file)
     return None
@@ -216,15 +216,15 @@ def lock_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path)
 SOUNDER = {"flight_mat", "sounder_log"}
 
 
-def _placed(one: learned.LearnedSeries, tower: str, nodes: Nodes) -> bool:
-    return tower in nodes.placed and one.tower not in nodes.fixed
+def _placed(s: learned.LearnedSeries, tower: str, nodes: Nodes) -> bool:
+    return tower in nodes.placed and s.tower not in nodes.fixed
 
 
-def _alike(one: learned.LearnedSeries, key: SeriesKey, nodes: Nodes) -> bool:
+def _alike(s: learned.LearnedSeries, key: SeriesKey, nodes: Nodes) -> bool:
     """Check whether a series has the channel and the receiver of one that was learned from, whatever its tower."""
     tower, channel, reader = key
-    same = one.reader == reader or (_placed(one, tower, nodes) and {one.reader, reader} <= SOUNDER)
-    return one.channel == channel and same
+    same = s.reader == reader or (_placed(s, tower, nodes) and {s.reader, reader} <= SOUNDER)
+    return s.channel == channel and same
 
 
 def _fits(entry: learned.Entry, series: Sequence[SeriesKey], nodes: Nodes) -> tuple[int, int]:

@@ -141,15 +141,15 @@ def replay_rss(
         channels = ", ".join(data.rss[i].channel for i in members)
         progress(f"replay RSS {tower} {channels}: {len(joined)} poses")
         towers_m = None if tower not in data.nodes else np.concatenate(places)
-        whole = replay_poses(data.site, rt, link, joined, towers_m=towers_m, progress=progress)
+        replayed = replay_poses(data.site, rt, link, joined, towers_m=towers_m, progress=progress)
         fixed_m, start = data.site.towers[tower].position_m[None, :], 0
-        for index, here, track, part, place in zip(members, valid, tracks, poses, places, strict=True):
+        for index, posed, track, part, place in zip(members, valid, tracks, poses, places, strict=True):
             stop = start + len(part)
             out[index] = Replayed(
                 link=link,
                 poses=part,
-                valid=here,
-                replay=part_of(whole, start, stop),
+                valid=posed,
+                replay=part_of(replayed, start, stop),
                 track=track,
                 clock=shifts[index],
                 tower_m=None if towers_m is None else place,
@@ -189,18 +189,18 @@ def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock
 
     Predictions are the image engine's RSS along the track with at most one reflection.
     """
-    wanted = data.settings.rss.lag
-    if wanted == "off" or data.track is None:
+    lag = data.settings.rss.lag
+    if lag == "off" or data.track is None:
         return [None] * len(data.rss)
-    if isinstance(wanted, float):
-        return [_given_clock(series.tower, wanted, len(series.time)) for series in data.rss]
+    if isinstance(lag, float):
+        return [_given_clock(series.tower, lag, len(series.time)) for series in data.rss]
     estimated = dict[str, ClockEstimate]()
     towers = list(dict.fromkeys(series.tower for series in data.rss))
     for tower in towers:
         progress(f"clock {tower}")
         channels = clock_channels(data, [s for s in data.rss if s.tower == tower])
         estimated[tower] = judge_clock(channels, window_s=data.settings.rss.advanced.lag_window_s)
-    return [_clock_of(series, estimated[series.tower], apply=wanted == "apply") for series in data.rss]
+    return [_clock_of(series, estimated[series.tower], apply=lag == "apply") for series in data.rss]
 
 
 def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) -> Clock:
@@ -315,26 +315,26 @@ def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
 PathsT = TypeVar("PathsT", PathSet, EdgePaths)
 
 
-def part_of(whole: Replay, start: int, stop: int) -> Replay:
+def part_of(replayed: Replay, start: int, stop: int) -> Replay:
     """The replay of poses ``start`` to ``stop``."""
-    if (start, stop) == (0, len(whole.rss_dbm)):
-        return whole
+    if (start, stop) == (0, len(replayed.rss_dbm)):
+        return replayed
 
     def cut(paths: PathsT) -> PathsT:
         rows = (paths.pose >= start) & (paths.pose < stop)
         return dataclasses.replace(paths.select(rows), pose=paths.pose[rows] - start)
 
-    through = whole.through
-    share = (stop - start) / max(len(whole.rss_dbm), 1)
-    columns: dict[str, Any] = {name: getattr(whole, name)[start:stop] for name in PER_LINK}
+    through = replayed.through
+    share = (stop - start) / max(len(replayed.rss_dbm), 1)
+    columns: dict[str, Any] = {name: getattr(replayed, name)[start:stop] for name in PER_LINK}
     return dataclasses.replace(
-        whole,
+        replayed,
         **columns,
-        paths=cut(whole.paths),
-        edge_paths=None if whole.edge_paths is None else cut(whole.edge_paths),
+        paths=cut(replayed.paths),
+        edge_paths=None if replayed.edge_paths is None else cut(replayed.edge_paths),
         through=None if through is None else dataclasses.replace(through, paths=cut(through.paths)),
-        seconds=whole.seconds * share,
-        search_seconds=whole.search_seconds * share,
+        seconds=replayed.seconds * share,
+        search_seconds=replayed.search_seconds * share,
     )
 
 

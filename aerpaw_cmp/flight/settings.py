@@ -71,12 +71,12 @@ class GroupedSettings(StrictModel):
         knobs = set(type(group.default).model_fields) if group else set()
         cls.refuse_gone(data)
         moved = {key: data[key] for key in data if key in knobs}
-        gone = [key for key in data if key in cls.WITHOUT_EFFECT]
-        content = {key: value for key, value in data.items() if key not in moved and key not in gone}
+        without_effect = [key for key in data if key in cls.WITHOUT_EFFECT]
+        content = {key: value for key, value in data.items() if key not in moved and key not in without_effect}
         if moved:
             content["advanced"] = {**dict(data.get("advanced") or {}), **moved}
         settings = handler(content)
-        settings._old = {key: f"write advanced.{key}" for key in moved} | dict.fromkeys(gone, "has no effect")
+        settings._old = {key: f"write advanced.{key}" for key in moved} | dict.fromkeys(without_effect, "has no effect")
         return settings
 
 
@@ -362,8 +362,8 @@ class GroundNode(StrictModel):
 
     @model_validator(mode="after")
     def _a_place_or_a_track(self) -> GroundNode:
-        given = (self.latitude_deg is not None, self.longitude_deg is not None)
-        if given not in ((True, True), (False, False)) or all(given) == (self.track is not None):
+        stated = (self.latitude_deg is not None, self.longitude_deg is not None)
+        if stated not in ((True, True), (False, False)) or all(stated) == (self.track is not None):
             raise ValueError("a tower needs latitude_deg and longitude_deg, or a track")
         if self.height == "logged" and self.track is None:
             raise ValueError("height: logged needs a track, which is where it is logged")
@@ -626,10 +626,10 @@ def _joined(settings: FlightFile, learned: Mapping[str, Any], path: Path) -> Fli
     """The settings of a flight with what was learned in place of its own."""
     stated: dict[str, Any] = settings.model_dump(mode="json", exclude_unset=True)
     link = dict(stated.get("link", {}))
-    whole = settings.link.rss.model_dump(mode="json", exclude_unset=True)
+    rss_link = settings.link.rss.model_dump(mode="json", exclude_unset=True)
     channels = dict(link.get("channels", {}))
-    for name, one in learned.get("link", {}).get("channels", {}).items():
-        channels[name] = {**whole, **channels.get(name, {}), **one}
+    for name, channel in learned.get("link", {}).get("channels", {}).items():
+        channels[name] = {**rss_link, **channels.get(name, {}), **channel}
     stated["link"] = {**link, **({"channels": channels} if channels else {})}
     for key in ("rt", "rank"):
         stated[key] = {**stated.get(key, {}), **learned.get(key, {})}

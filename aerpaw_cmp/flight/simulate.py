@@ -85,17 +85,17 @@ def plan_trajectory(plan: PlanSettings) -> Trajectory:
     points = plan.waypoints
     positions.append((points[0].east_m, points[0].north_m, points[0].height_m))
     for index, point in enumerate(points):
-        here = (point.east_m, point.north_m, point.height_m)
+        corner = (point.east_m, point.north_m, point.height_m)
         if index:
             last = positions[-1]
-            horizontal = np.hypot(here[0] - last[0], here[1] - last[1])
-            duration = max(horizontal / plan.speed_mps, abs(here[2] - last[2]) / plan.climb_mps)
+            horizontal = np.hypot(corner[0] - last[0], corner[1] - last[1])
+            duration = max(horizontal / plan.speed_mps, abs(corner[2] - last[2]) / plan.climb_mps)
             if duration > 0:
                 times.append(times[-1] + float(duration))
-                positions.append(here)
+                positions.append(corner)
         if point.hold_s > 0:
             times.append(times[-1] + point.hold_s)
-            positions.append(here)
+            positions.append(corner)
     shortest = min(plan.telemetry_interval_s, plan.rss_interval_s, plan.rank_interval_s)
     if times[-1] / shortest > MAXIMUM_SAMPLES:
         raise UsageError(

@@ -47,22 +47,22 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     track : Stream
         Telemetry with a wall clock.
     """
-    mine, there = _points(log.frame, _POINTS), _points(track.frame, None)
-    if mine is None or there is None or has_wall_clock(mine[0][0].astype("datetime64[ns]")):
+    mine, tracked = _points(log.frame, _POINTS), _points(track.frame, None)
+    if mine is None or tracked is None or has_wall_clock(mine[0][0].astype("datetime64[ns]")):
         return None
-    zero_s = float(there[0][0].astype(np.int64)) / 1e9
+    zero_s = float(tracked[0][0].astype(np.int64)) / 1e9
     time_s = mine[0].astype(np.int64) / 1e9
-    track_s = there[0].astype(np.int64) / 1e9 - zero_s
-    here, way = _metres(mine[1], there[1]), _metres(there[1], there[1])
+    track_s = tracked[0].astype(np.int64) / 1e9 - zero_s
+    log_m, track_m = _metres(mine[1], tracked[1]), _metres(tracked[1], tracked[1])
     length = time_s[-1] - time_s[0]
     shifts = np.arange(-time_s[0] - 0.5 * length, track_s[-1] - time_s[0] - 0.5 * length, 1.0)
-    misses = np.array([_median_distance(time_s + shift, here, track_s, way) for shift in shifts])
+    misses = np.array([_median_distance(time_s + shift, log_m, track_s, track_m) for shift in shifts])
     if not len(misses) or not np.isfinite(misses).any():
         return None
     best = int(np.nanargmin(misses))
     apart = np.abs(shifts - shifts[best]) > 60
     fine = shifts[best] + np.arange(-15, 16) / 10
-    finer = np.array([_median_distance(time_s + shift, here, track_s, way) for shift in fine])
+    finer = np.array([_median_distance(time_s + shift, log_m, track_s, track_m) for shift in fine])
     distance = float(np.nanmin(finer))
     second = float(np.nanmin(misses[apart])) if np.isfinite(misses[apart]).any() else np.inf
     # like with like: the other places were tried each second, and between two seconds an aircraft flies some metres
@@ -93,12 +93,12 @@ def _metres(points: FloatArray, about: FloatArray) -> FloatArray:
     return np.stack([east, north, np.nan_to_num(points[:, 2])], axis=1)
 
 
-def _median_distance(time_s: FloatArray, here: FloatArray, track_s: FloatArray, way: FloatArray) -> float:
+def _median_distance(time_s: FloatArray, log_m: FloatArray, track_s: FloatArray, track_m: FloatArray) -> float:
     """Median distance; NaN where less than half of the log lies within the track."""
     inside = (time_s >= track_s[0]) & (time_s <= track_s[-1])
     if 2 * inside.sum() < len(time_s):
         return float("nan")
-    there = np.stack([np.interp(time_s[inside], track_s, way[:, i]) for i in range(3)], axis=1)
-    apart = here[inside] - there
+    interpolated = np.stack([np.interp(time_s[inside], track_s, track_m[:, i]) for i in range(3)], axis=1)
+    apart = log_m[inside] - interpolated
     apart[:, 2] -= np.median(apart[:, 2])  # the logs count heights from grounds of their own
     return float(np.median(np.linalg.norm(apart, axis=1)))

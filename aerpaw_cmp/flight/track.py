@@ -187,9 +187,9 @@ def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
     onward, mirrored = stamp >= before, stamp <= after
     ordered = onward if onward.sum() >= mirrored.sum() else mirrored
     keep = ordered.copy()
-    kept = np.flatnonzero(ordered)
-    repeated = np.concatenate([[False], np.diff(stamp[kept]) == 0])
-    keep[kept[repeated]] = False
+    rows = np.flatnonzero(ordered)
+    repeated = np.concatenate([[False], np.diff(stamp[rows]) == 0])
+    keep[rows[repeated]] = False
     return keep, int(repeated.sum()), int((~ordered).sum())
 
 
@@ -416,10 +416,10 @@ def _interpolate(t: FloatArray, at: FloatArray, values: FloatArray) -> FloatArra
 
 def _in_gap(t: FloatArray, at: FloatArray, limit_s: float) -> BoolArray:
     """Check whether an instant lies strictly inside an interval longer than the limit."""
-    right = np.clip(np.searchsorted(at, t, side="left"), 0, len(at) - 1)
-    left = np.maximum(right - 1, 0)
-    exact = np.minimum(np.abs(at[right] - t), np.abs(at[left] - t)) <= _SAME_S
-    return np.asarray((at[right] - at[left] > limit_s) & ~exact)
+    later = np.clip(np.searchsorted(at, t, side="left"), 0, len(at) - 1)
+    earlier = np.maximum(later - 1, 0)
+    exact = np.minimum(np.abs(at[later] - t), np.abs(at[earlier] - t)) <= _SAME_S
+    return np.asarray((at[later] - at[earlier] > limit_s) & ~exact)
 
 
 def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArray:

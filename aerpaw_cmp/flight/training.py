@@ -37,12 +37,12 @@ def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, 
 
     Antenna files of 0.3 name flights, not logs: there the name decides.
     """
-    own, patterns = logs_of(data, series), learned_patterns(link)
+    logs, patterns = logs_of(data, series), learned_patterns(link)
     if any(not p.trained_on and data.settings.flight.name in p.learned_from for p in patterns):
-        return own
+        return logs
     if learned_of(series, patterns):
-        return own
-    return common(own, [data.settings.trained_on, *(p.trained_on for p in patterns)])
+        return logs
+    return common(logs, [data.settings.trained_on, *(p.trained_on for p in patterns)])
 
 
 # Readings of a run; marks that a learned file keeps of a log; marks that two logs share if one is of the other.
@@ -70,7 +70,7 @@ def marks(series: RssSeries) -> AnyArray:
 def marks_note(flights: Sequence[FlightData]) -> str:
     """Comment of an antenna table: marks of the logs that it was learned from, of all channels: they share a fit."""
     every = [marks(s)[:MARKS] for data in flights for s in data.rss]
-    return "marks: " + " ".join(f"{mark:016x}" for own in every for mark in own)
+    return "marks: " + " ".join(f"{mark:016x}" for ours in every for mark in ours)
 
 
 def learned_of(series: RssSeries, patterns: Iterable[SpherePattern]) -> bool:
@@ -80,10 +80,10 @@ def learned_of(series: RssSeries, patterns: Iterable[SpherePattern]) -> bool:
     return bool(len(known)) and len(np.intersect1d(known, marks(series))) >= SHARED
 
 
-def common(own: Sequence[str], learned: Iterable[Iterable[str]]) -> tuple[str, ...]:
+def common(logs: Sequence[str], learned: Iterable[Iterable[str]]) -> tuple[str, ...]:
     """Those of some logs that something was learned from."""
     known = set(union(*learned))
-    return tuple(digest for digest in own if digest in known)
+    return tuple(digest for digest in logs if digest in known)
 
 
 def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[str]]:
@@ -92,26 +92,26 @@ def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[
     A log that comes twice, renamed, copied or packed, would be predicted from itself.
     """
     home: dict[str, str] = {}
-    kept: list[FlightData] = []
-    said: list[str] = []
+    counted: list[FlightData] = []
+    remarks: list[str] = []
     known: list[tuple[str, AnyArray]] = []
     for data in flights:
         name = data.settings.flight.name
         again = {digest: home[digest] for digest in flight_logs(data) if digest in home}
         for digest, first in again.items():
-            said.append(f"{name} holds the same log as {first} (SHA-256 {digest[:12]}...): it is counted once")
-        own = [(s, logs_of(data, s), marks(s)) for s in data.rss]
-        for _, logs, mine in own:
-            earlier = [one for one, held in known if len(np.intersect1d(held, mine)) >= SHARED]
+            remarks.append(f"{name} holds the same log as {first} (SHA-256 {digest[:12]}...): it is counted once")
+        marked = [(s, logs_of(data, s), marks(s)) for s in data.rss]
+        for _, logs, ours in marked:
+            earlier = [flight for flight, earlier_marks in known if len(np.intersect1d(earlier_marks, ours)) >= SHARED]
             if earlier and not set(logs) & set(again):
-                said.append(f"{name} holds readings of {earlier[0]} in another log: they are counted once")
+                remarks.append(f"{name} holds readings of {earlier[0]} in another log: they are counted once")
                 again |= dict.fromkeys(logs, earlier[0])
-        known += [(name, mine) for _, _, mine in own]
+        known += [(name, ours) for _, _, ours in marked]
         rss = tuple(s for s in data.rss if not set(logs_of(data, s)) & set(again))
         rank = tuple(s for s in data.rank if not set(logs_of(data, s)) & set(again))
         if not again:
-            kept.append(data)
+            counted.append(data)
         elif rss or rank:
-            kept.append(dataclasses.replace(data, rss=rss, rank=rank))
+            counted.append(dataclasses.replace(data, rss=rss, rank=rank))
         home |= {digest: name for digest in flight_logs(data) if digest not in home}
-    return kept, list(dict.fromkeys(said))
+    return counted, list(dict.fromkeys(remarks))

@@ -159,7 +159,7 @@ def leaving(parts: Parts, flights: list[Observed]) -> tuple[calibration.Score, .
     """Scores of a split by parts, each flight predicted from the other."""
     kept: dict[str, calibration.Learned] = {}
     flight_left_out(flights, RECIPE, kept)
-    return calibration.parts_left_out(flights, RECIPE, kept, parts, own=False)
+    return calibration.parts_left_out(flights, RECIPE, kept, parts, own_rest=False)
 
 
 def planted(o: Observed, part: np.ndarray, fault_db: float) -> Observed:
@@ -187,7 +187,7 @@ def test_an_antenna_that_no_other_flight_has_is_not_scored() -> None:
     split = calibration.heading_parts
     assert [(s.flight, s.channel) for s in leaving(split, [*flights, alone])] == [("a", "USRP1"), ("b", "USRP1")]
     kept = {"a": calibration.learn([flights[1].samples], RECIPE)}
-    assert calibration.parts_left_out(flights[:1], RECIPE, kept, split, own=False) == ()
+    assert calibration.parts_left_out(flights[:1], RECIPE, kept, split, own_rest=False) == ()
 
 
 @pytest.mark.parametrize("split", ["altitude", "heading", "sector"])

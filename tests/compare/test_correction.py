@@ -56,18 +56,18 @@ def test_flights_are_asked_of_others_and_a_single_one_block_by_block() -> None:
         flight(name, k, channel) for k, (name, channel) in enumerate([("a", "A"), ("a", "B"), ("b", "A"), ("c", "A")])
     ]
     folds = correction._folds(three)
-    assert [[s.flight for s in fold.asked] for fold in folds] == [["a", "a"], ["b"], ["c"]]
+    assert [[s.flight for s in fold.left_out] for fold in folds] == [["a", "a"], ["b"], ["c"]]
     for fold in folds:
-        assert {s.flight for s in fold.known} | {s.flight for s in fold.asked} == {"a", "b", "c"}
-        assert not {s.flight for s in fold.known} & {s.flight for s in fold.asked}
+        assert {s.flight for s in fold.known} | {s.flight for s in fold.left_out} == {"a", "b", "c"}
+        assert not {s.flight for s in fold.known} & {s.flight for s in fold.left_out}
     place = np.random.default_rng(1).uniform(0, [900, 900, 1], (400, 3))
     alone = samples("a", np.arange(400.0), place)
     folds = correction._folds([alone])
-    counts = [len(fold.asked[0]) for fold in folds]
+    counts = [len(fold.left_out[0]) for fold in folds]
     assert len(folds) == 6  # the fullest of nine blocks
     assert counts == sorted(counts, reverse=True)
     for fold in folds:
-        (asked,), (known,) = fold.asked, fold.known
+        (asked,), (known,) = fold.left_out, fold.known
         assert len(asked) + len(known) == 400
         assert sorted([*asked.residual_db, *known.residual_db]) == list(range(400))
         block = {tuple(row) for row in (asked.position_m[:, :2] // 300.0).tolist()}

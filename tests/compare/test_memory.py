@@ -33,7 +33,7 @@ def test_a_memory_whitens_its_terms_and_foretells_the_mean(share: int, rate: int
     whiten = known.whiten[at]
     np.testing.assert_allclose(whiten @ inner @ whiten.T, np.eye(6), atol=1e-9)
     np.testing.assert_allclose(known.slope[at], np.linalg.solve(inner, cross), atol=1e-9)
-    assert known.left[at] == pytest.approx(covariance[0, 0] - cross @ np.linalg.solve(inner, cross))
+    assert known.variance[at] == pytest.approx(covariance[0, 0] - cross @ np.linalg.solve(inner, cross))
     assert known.log_det[at] == pytest.approx(-0.5 * np.linalg.slogdet(inner)[1])
     assert known.power[at] == pytest.approx(np.trace(covariance))
 
@@ -111,7 +111,7 @@ def test_each_draw_is_one_memory_by_its_weight_its_scale_and_two_normals(
     for kind in ("mean", "ratio"):
         drawn = mean_draws(values, kind)  # type: ignore[arg-type]
         for k, i in enumerate(picked(kind)):  # type: ignore[arg-type]
-            reach = normal[k] * np.sqrt(square[i] / chi_squared[k] * known.left[i])
+            reach = normal[k] * np.sqrt(square[i] / chi_squared[k] * known.variance[i])
             expected = (-known.slope[i] @ slow + reach, -known.slope[i] @ slow - reach)
             assert (drawn[k], drawn[k + 4]) == pytest.approx(expected)
     every = np.append(slow, np.sqrt(terms.fast_power))

@@ -133,8 +133,8 @@ class Learned:
 
     def mean_error(self, samples: LinkSamples) -> float:
         """Mean of measured minus :meth:`mean` [dB]; NaN without a sample that has both."""
-        left = samples.residual_db - self.mean(samples)
-        return float(np.nanmean(left)) if np.isfinite(left).any() else math.nan
+        error = samples.residual_db - self.mean(samples)
+        return float(np.nanmean(error)) if np.isfinite(error).any() else math.nan
 
     def mean(self, samples: LinkSamples) -> FloatArray:
         """The gain of :meth:`predict` alone, along a flight in the order of time."""
@@ -172,8 +172,8 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None
     bare = Learned(recipe, recipe.model, mounts, None)
     if not recipe.model.terms:
         return bare
-    left = [dataclasses.replace(s, residual_db=s.residual_db - bare.mean(s)) for s in series]
-    fit = chosen_fit(left, recipe.model) if model is None else fit_gain(left, model)
+    residuals = [dataclasses.replace(s, residual_db=s.residual_db - bare.mean(s)) for s in series]
+    fit = chosen_fit(residuals, recipe.model) if model is None else fit_gain(residuals, model)
     if any(s.floor_db is not None for s in series):  # once more; another time changes nothing on flights left out
         fit = fit_gain([_at_floor(s, bare.mean(s), fit) for s in series], fit.model)
     antennas = dict.fromkeys(s.antenna for s in series)
@@ -183,13 +183,13 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None
 
 def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkSamples:
     """Residual minus ``known_db``; below the floor, the value that the fit expects, no higher than the floor."""
-    left = samples.residual_db - known_db
+    residual = samples.residual_db - known_db
     if samples.floor_db is None:
-        return dataclasses.replace(samples, residual_db=left)
+        return dataclasses.replace(samples, residual_db=residual)
     floor, gain = samples.floor_db - known_db, _mean_along(fit, samples)
-    offset_db = floored_fit(left - floor, gain - floor, 0.0).offset_db
-    lost = np.minimum(gain - offset_db, floor)
-    return dataclasses.replace(samples, residual_db=np.where(left < floor, lost, left))
+    offset_db = floored_fit(residual - floor, gain - floor, 0.0).offset_db
+    unseen = np.minimum(gain - offset_db, floor)
+    return dataclasses.replace(samples, residual_db=np.where(residual < floor, unseen, residual))
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,28 +238,28 @@ def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None)
     """
     s = observed.samples
     free = np.zeros(len(s)) if simple is None else simple.free_db
-    good = np.isfinite(s.residual_db - gain_db) & np.isfinite(free)
-    if good.sum() < LEAST_SAMPLES:
+    finite = np.isfinite(s.residual_db - gain_db) & np.isfinite(free)
+    if finite.sum() < LEAST_SAMPLES:
         return None
-    time, level, left = s.time_s[good], observed.free_space_db[good], (s.residual_db - gain_db)[good]
-    measured = s.residual_db[good] + level
+    time, level, error = s.time_s[finite], observed.free_space_db[finite], (s.residual_db - gain_db)[finite]
+    measured = s.residual_db[finite] + level
     if simple is None:
-        constant = np.zeros(len(left))
-        line = log_distance_level_db(measured, 10.0 ** (-level / 20.0), s.position_m[good])
+        constant = np.zeros(len(error))
+        line = log_distance_level_db(measured, 10.0 ** (-level / 20.0), s.position_m[finite])
     else:
-        constant, line = simple.constant_db[good], simple.line_db[good]
-    means = local_mean_db(time, measured, 4.0) - local_mean_db(time, gain_db[good] + level, 4.0)
+        constant, line = simple.constant_db[finite], simple.line_db[finite]
+    means = local_mean_db(time, measured, 4.0) - local_mean_db(time, gain_db[finite] + level, 4.0)
     return Score(
         flight=s.flight,
         tower=s.tower,
         channel=s.channel,
-        rmse_db=float(left.std()),
+        rmse_db=float(error.std()),
         rmse_4s_db=float(means.std()),
-        free_space_rmse_db=float((s.residual_db - free)[good].std()),
+        free_space_rmse_db=float((s.residual_db - free)[finite].std()),
         constant_rmse_db=float((measured - constant).std()),
         log_distance_rmse_db=float((measured - line).std()),
-        n=int(good.sum()),
-        offset_db=float(left.mean()),
+        n=int(finite.sum()),
+        offset_db=float(error.mean()),
     )
 
 
@@ -315,26 +315,26 @@ def groups_of(flights: Sequence[str]) -> list[list[str]]:
 
 
 def flight_left_out(
-    observed: Sequence[Observed], recipe: Recipe, kept: dict[str, Learned] | None = None
+    observed: Sequence[Observed], recipe: Recipe, without: dict[str, Learned] | None = None
 ) -> tuple[Score, ...]:
     """Each flight predicted from others (:func:`groups_of`); ``kept`` receives what was learned without each flight."""
-    out: list[Score | None] = []
+    scores: list[Score | None] = []
     for group in groups_of(flights_of(observed)):
         train = [o.samples for o in observed if o.samples.flight not in group]
         learned = learn(train, recipe)
-        if kept is not None:
-            kept |= dict.fromkeys(group, learned)
+        if without is not None:
+            without |= dict.fromkeys(group, learned)
         offsets = _offsets(train, learned)
         for o in observed:
             if o.samples.flight in group and o.samples.antenna in offsets:
-                out.append(_scored_with(o, learned, offsets[o.samples.antenna], spread=kept is not None))
-    return tuple(s for s in out if s is not None)
+                scores.append(_scored_with(o, learned, offsets[o.samples.antenna], spread=without is not None))
+    return tuple(s for s in scores if s is not None)
 
 
-def score_with(learned: Learned, others: Sequence[Observed], train: Sequence[Observed]) -> tuple[Score, ...]:
+def score_with(learned: Learned, unseen: Sequence[Observed], train: Sequence[Observed]) -> tuple[Score, ...]:
     """Scores of flights that were not learned from, at antennas that were."""
     offsets = _offsets([o.samples for o in train], learned)
-    scored = [_scored_with(o, learned, offsets[o.samples.antenna], spread=True) for o in others]
+    scored = [_scored_with(o, learned, offsets[o.samples.antenna], spread=True) for o in unseen]
     return tuple(s for s in scored if s is not None)
 
 
@@ -381,23 +381,28 @@ Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]
 
 
 def parts_left_out(
-    observed: Sequence[Observed], recipe: Recipe, kept: Mapping[str, Learned], parts: Parts, *, own: bool
+    observed: Sequence[Observed],
+    recipe: Recipe,
+    without: Mapping[str, Learned],
+    parts: Parts,
+    *,
+    own_rest: bool,
 ) -> tuple[Score, ...]:
     """Each flight predicted part by part, from other flights without what is like the part.
 
-    ``own``: the rest of the flight is learned from, too. The offset of a part comes from the flight's samples outside
-    it, so that nothing of the part is fitted.
+    ``own_rest``: the rest of the flight is learned from, too. The offset of a part comes from the flight's samples
+    outside it, so that nothing of the part is fitted.
 
     Parameters
     ----------
     observed : sequence of Observed
         Of all flights.
     recipe : Recipe
-    kept : mapping of str to Learned
+    without : mapping of str to Learned
         What was learned without each flight: its strengths are used again.
     parts : callable
         :func:`altitude_parts`, :func:`heading_parts`, :func:`sector_parts` or :func:`route_parts`.
-    own : bool
+    own_rest : bool
         Learn from the rest of the flight, too.
 
     Returns
@@ -412,79 +417,79 @@ def parts_left_out(
     # one part after the other: what the flights learn from is much the same, and kept
     for k in range(max(len(parts(mine[0], mine[0])) for mine in of.values())):
         for flight, mine in of.items():
-            others = list(observed) if own else [o for o in observed if o.samples.flight != flight]
-            train = [o.part(parts(mine[0], o)[k][1]).samples for o in others]
+            sources = list(observed) if own_rest else [o for o in observed if o.samples.flight != flight]
+            train = [o.part(parts(mine[0], o)[k][1]).samples for o in sources]
             train = [s for s in train if np.isfinite(s.residual_db).sum() >= LEAST_SAMPLES]
             if not train or not any(parts(o, o)[k][0].any() for o in mine):
                 continue
             try:
-                learned = learn(train, recipe, kept[flight].model)
+                learned = learn(train, recipe, without[flight].model)
             except InputError:
                 continue
             known = {s.antenna for s in train}
-            for o, whole, baselines in zip(mine, stitched[flight], simple[flight], strict=True):
+            for o, predicted, baselines in zip(mine, stitched[flight], simple[flight], strict=True):
                 inside, outside = parts(o, o)[k]
                 if o.samples.antenna not in known or not inside.any():
                     continue
                 gain = learned.mean(o.samples)
-                rest = (o.samples.residual_db - gain)[outside]
-                if np.isfinite(rest).sum() >= LEAST_SAMPLES:
-                    whole[inside] = gain[inside] + np.nanmean(rest)
+                error = (o.samples.residual_db - gain)[outside]
+                if np.isfinite(error).sum() >= LEAST_SAMPLES:
+                    predicted[inside] = gain[inside] + np.nanmean(error)
                     baselines.predict(o, inside, outside)
     out = [
-        score(o, whole, simple=baselines)
+        score(o, predicted, simple=baselines)
         for flight in flights
-        for o, whole, baselines in zip(of[flight], stitched[flight], simple[flight], strict=True)
+        for o, predicted, baselines in zip(of[flight], stitched[flight], simple[flight], strict=True)
     ]
     return tuple(s for s in out if s is not None)
 
 
-def altitude_parts(scored: Observed, other: Observed) -> list[tuple[BoolArray, BoolArray]]:
+def altitude_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
     """The commonest height of the scored flight, and all other heights."""
     height = scored.samples.position_m[:, 2]
-    whole, count = np.unique(np.round(height), return_counts=True)
-    cruise = float(whole[count.argmax()])
+    heights, count = np.unique(np.round(height), return_counts=True)
+    cruise = float(heights[count.argmax()])
     mine = np.abs(height - cruise) < CRUISE_M
-    return [(mine, np.abs(other.samples.position_m[:, 2] - cruise) >= CRUISE_M)]
+    return [(mine, np.abs(source.samples.position_m[:, 2] - cruise) >= CRUISE_M)]
 
 
-def sector_parts(scored: Observed, other: Observed) -> list[tuple[BoolArray, BoolArray]]:
+def sector_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
     """Sectors of azimuth at the tower, with a guard."""
 
     def azimuth(o: Observed) -> FloatArray:
         return np.degrees(np.arctan2(o.samples.at_tower[:, 1], o.samples.at_tower[:, 0]))
 
-    return _angular(azimuth(scored), azimuth(other), SECTORS, GUARD_DEG)
+    return _angular(azimuth(scored), azimuth(source), SECTORS, GUARD_DEG)
 
 
-def heading_parts(scored: Observed, other: Observed) -> list[tuple[BoolArray, BoolArray]]:
+def heading_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
     """Eighths of the compass for the nose, with a guard."""
-    return _angular(scored.heading_deg, other.heading_deg, 8, GUARD_DEG)
+    return _angular(scored.heading_deg, source.heading_deg, 8, GUARD_DEG)
 
 
-def _angular(mine: FloatArray, others: FloatArray, count: int, guard_deg: float) -> list[tuple[BoolArray, BoolArray]]:
+def _angular(mine: FloatArray, sources: FloatArray, count: int, guard_deg: float) -> list[tuple[BoolArray, BoolArray]]:
     half = 180.0 / count
     out = []
     for k in range(count):
         centre = 2.0 * half * (k + 0.5)
         near = np.abs((mine - centre + 180.0) % 360.0 - 180.0) <= half
-        far = np.abs((others - centre + 180.0) % 360.0 - 180.0) > half + guard_deg
+        far = np.abs((sources - centre + 180.0) % 360.0 - 180.0) > half + guard_deg
         out.append((near, far))
     return out
 
 
-def route_parts(scored: Observed, other: Observed) -> list[tuple[BoolArray, BoolArray]]:
+def route_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
     """Stretches of the scored flight in time, with a guard; other flights count whole."""
     time = scored.samples.time_s
     edges = np.linspace(time.min(), time.max() + 1e-6, STRETCHES + 1)
     out = []
     for low, high in itertools.pairwise(edges):
         mine = (time >= low) & (time < high)
-        if other.samples.flight == scored.samples.flight:
-            there = other.samples.time_s
-            outside = (there < low - GUARD_S) | (there >= high + GUARD_S)
+        if source.samples.flight == scored.samples.flight:
+            source_time = source.samples.time_s
+            outside = (source_time < low - GUARD_S) | (source_time >= high + GUARD_S)
         else:
-            outside = np.ones(len(other.samples), np.bool_)
+            outside = np.ones(len(source.samples), np.bool_)
         out.append((mine, outside))
     return out
 

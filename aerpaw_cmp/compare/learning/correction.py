@@ -124,7 +124,7 @@ class Correction:
         return self.over_headings([samples], flight, own_mean=own_mean)
 
     def over_headings(
-        self, each: Sequence[LinkSamples], flight: str | None = None, *, own_mean: bool = False, whole: int = 0
+        self, each: Sequence[LinkSamples], flight: str | None = None, *, own_mean: bool = False, all_targets: int = 0
     ) -> tuple[FloatArray, FloatArray]:
         """As :meth:`predict`, of an aircraft whose heading is not known: each of some counts alike.
 
@@ -134,7 +134,7 @@ class Correction:
             The same samples, as seen with each heading.
         flight : str, optional
         own_mean : bool
-        whole : int
+        all_targets : int
             Targets of the whole run, where these are a part: all parts are then solved alike.
 
         Returns
@@ -147,17 +147,17 @@ class Correction:
         if channel is None:
             raise InputError(f"no flight has {samples.antenna}", expected="one of " + ", ".join(self.channels))
         gains, gain_sds = (np.stack(part) for part in zip(*map(self.predictor, each), strict=True))
-        asked = self.rows_of(samples, flight)
+        targets = self.rows_of(samples, flight)
         if len(each) > 1:
-            asked = dataclasses.replace(asked, direction=np.stack([s.at_uav for s in each], axis=1))
-        if not self.on and flight not in self.flights and len(asked):
+            targets = dataclasses.replace(targets, direction=np.stack([s.at_uav for s in each], axis=1))
+        if not self.on and flight not in self.flights and len(targets):
             # without a field one target with a position stands for all
-            asked = asked.part(np.array([np.isfinite(asked.position_m).all(axis=1).argmax()]))
+            targets = targets.part(np.array([np.isfinite(targets.position_m).all(axis=1).argmax()]))
         fit = self.fits.setdefault(samples.antenna, FieldFit(self.model, channel.rows, channel.left_db))
-        exact = fit.fits(max(len(asked), whole))
-        mean, sd = fit.predict(asked, exact=exact)
+        exact = fit.fits(max(len(targets), all_targets))
+        mean, sd = fit.predict(targets, exact=exact)
         if own_mean:
-            _, sd = fit.predict(asked, ("place", "drift"), exact=exact)
+            _, sd = fit.predict(targets, ("place", "drift"), exact=exact)
         variance = sd**2 + (gain_sds**2).mean(axis=0) + gains.var(axis=0) + self.model.noise_sd_db**2
         return gains.mean(axis=0) + mean, self.sd_factor * np.sqrt(variance)
 
@@ -176,14 +176,14 @@ def _channels(series: Sequence[LinkSamples], predictor: Predictor, flights: Sequ
     for samples in series:
         binned = samples.binned(BIN_S)
         gain, sd = predictor(binned)
-        good = np.isfinite(gain)
-        one = Channel(
-            rows=Rows.of(binned, flights.index(samples.flight)).part(good),
-            left_db=(binned.residual_db - gain)[good],
-            base_sd_db=sd[good],
+        finite = np.isfinite(gain)
+        channel = Channel(
+            rows=Rows.of(binned, flights.index(samples.flight)).part(finite),
+            left_db=(binned.residual_db - gain)[finite],
+            base_sd_db=sd[finite],
         )
-        if good.any():
-            parts.setdefault(samples.antenna, []).append(one)
+        if finite.any():
+            parts.setdefault(samples.antenna, []).append(channel)
     return {
         antenna: Channel(
             rows=Rows.joined([p.rows for p in each]),
@@ -202,10 +202,10 @@ def _model(title: str, channels: Mapping[str, Channel]) -> FieldModel:
 
 @dataclass(frozen=True, slots=True)
 class _Fold:
-    """Known samples and asked samples of one part that is left out."""
+    """Samples of one part that is left out, and those that it is predicted from."""
 
     known: list[LinkSamples]
-    asked: list[LinkSamples]
+    left_out: list[LinkSamples]
 
 
 def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
@@ -221,8 +221,8 @@ def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
     out = []
     for cell in every[np.argsort(-count)[:6]]:
         inside: list[IntArray] = [np.flatnonzero((c == cell).all(axis=1)) for c in cells]
-        rest = [np.setdiff1d(np.arange(len(s)), rows) for s, rows in zip(series, inside, strict=True)]
-        out.append(_Fold([s.part(r) for s, r in zip(series, rest, strict=True) if len(r)],
+        outside = [np.setdiff1d(np.arange(len(s)), rows) for s, rows in zip(series, inside, strict=True)]
+        out.append(_Fold([s.part(r) for s, r in zip(series, outside, strict=True) if len(r)],
                          [s.part(r) for s, r in zip(series, inside, strict=True) if len(r)]))  # fmt: skip
     return out
 
@@ -250,24 +250,24 @@ def _score_fold(
     flights = list(dict.fromkeys(s.flight for s in fold.known))
     predictor = base(fold.known)
     channels = _channels(fold.known, predictor, flights)
-    asked = [s for s in fold.asked if np.isfinite(s.residual_db).any()]
-    own = bool(asked) and asked[0].flight not in flights
-    binned = [s.binned(BIN_S) for s in asked]
+    targets = [s for s in fold.left_out if np.isfinite(s.residual_db).any()]
+    new_flight = bool(targets) and targets[0].flight not in flights
+    binned = [s.binned(BIN_S) for s in targets]
     known = [predictor(s) if s.antenna in channels else None for s in binned]
     for title, known_model in models.items():
         model = known_model or _model(title, channels)
         if keep:
             models[title] = model
-        parts: tuple[Part, ...] = ("place", "drift") if own else PARTS
+        parts: tuple[Part, ...] = ("place", "drift") if new_flight else PARTS
         for samples, gains in zip(binned, known, strict=True):
             if gains is None:
                 tallies[title].append((np.full(len(samples), np.nan), np.ones(len(samples))))
                 continue
             channel, (gain, gain_sd) = channels[samples.antenna], gains
-            code = NEW_FLIGHT if own else flights.index(samples.flight)
+            code = NEW_FLIGHT if new_flight else flights.index(samples.flight)
             mean, sd = FieldFit(model, channel.rows, channel.left_db).predict(Rows.of(samples, code), parts)
             error = samples.residual_db - gain - mean
-            if own and np.isfinite(error).any():
+            if new_flight and np.isfinite(error).any():
                 error = error - np.nanmean(error)
             tallies[title].append((error, np.sqrt(sd**2 + gain_sd**2 + model.noise_sd_db**2)))
 
@@ -305,13 +305,13 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
     for name, base in bases.items():
         models: dict[str, FieldModel | None] = dict.fromkeys(titles)
         for fold in folds:
-            if fold.known and fold.asked:
+            if fold.known and fold.left_out:
                 many = len({s.flight for s in series}) > MOST_GROUPS
                 _score_fold(fold, base, models, {t: tallies[name, t] for t in titles}, keep=many)
     joined = {key: _joined(parts) for key, parts in tallies.items() if parts}
-    factors = {key: _sd_factor(*one) for key, one in joined.items()}
+    factors = {key: _sd_factor(*errors) for key, errors in joined.items()}
     held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
-    crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*one)) for key, one in held_out.items()}
+    crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*errors)) for key, errors in held_out.items()}
     sure = [key for key in held_out if key[1] == OFF or mean_interval(crps_difference(held_out, key))[1] < 0.0]
     best = min(sure or crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
     flights = tuple(dict.fromkeys(s.flight for s in series))
@@ -382,14 +382,14 @@ def by_degree(predictor: Predictor) -> Predictor:
         for ray in (samples.at_tower, samples.at_uav):
             for angle in (np.arctan2(ray[:, 1], ray[:, 0]), np.arcsin(np.clip(ray[:, 2], -1.0, 1.0))):
                 cells = 361 * cells + np.round(np.degrees(angle)).astype(np.int64) + 180
-        asked, first, member = np.unique(cells, return_index=True, return_inverse=True)
+        degrees, first, member = np.unique(cells, return_index=True, return_inverse=True)
         keys, values = known.get(samples.antenna, (np.zeros(0, dtype=np.int64), np.zeros((2, 0))))
-        new = ~np.isin(asked, keys)
+        new = ~np.isin(degrees, keys)
         if new.any():
-            keys, values = np.append(keys, asked[new]), np.hstack([values, predictor(samples.part(first[new]))])
+            keys, values = np.append(keys, degrees[new]), np.hstack([values, predictor(samples.part(first[new]))])
             order = np.argsort(keys)
             keys, values = known[samples.antenna] = keys[order], values[:, order]
-        gain, sd = values[:, np.searchsorted(keys, asked)[member.ravel()]]
+        gain, sd = values[:, np.searchsorted(keys, degrees)[member.ravel()]]
         return gain, sd
 
     return predict

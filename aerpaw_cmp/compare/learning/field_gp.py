@@ -141,21 +141,21 @@ class _Apart:
     same: FloatArray
 
     @classmethod
-    def of(cls, one: Rows, other: Rows) -> _Apart:
+    def of(cls, rows: Rows, columns: Rows) -> _Apart:
         """Of rows (..., n) from others (..., m)."""
-        a, b = (np.moveaxis(r.position_m, -1, 0) for r in (one, other))
+        a, b = (np.moveaxis(r.position_m, -1, 0) for r in (rows, columns))
         up = np.abs(a[2][..., :, None] - b[2][..., None, :])
         across = np.hypot(a[0][..., :, None] - b[0][..., None, :], a[1][..., :, None] - b[1][..., None, :])
-        if one.direction.ndim > one.position_m.ndim:  # (headings, ..., n, m)
-            inner = np.einsum("...nhk,...mk->h...nm", one.direction, other.direction, optimize=True)
+        if rows.direction.ndim > rows.position_m.ndim:  # (headings, ..., n, m)
+            inner = np.einsum("...nhk,...mk->h...nm", rows.direction, columns.direction, optimize=True)
         else:
-            inner = one.direction @ np.swapaxes(other.direction, -1, -2)
+            inner = rows.direction @ np.swapaxes(columns.direction, -1, -2)
         return cls(
             across,
             up,
             np.maximum(2.0 - 2.0 * inner, 0.0),
-            np.abs(one.time_s[..., :, None] - other.time_s[..., None, :]),
-            (one.flight[..., :, None] == other.flight[..., None, :]).astype(np.float64),
+            np.abs(rows.time_s[..., :, None] - columns.time_s[..., None, :]),
+            (rows.flight[..., :, None] == columns.flight[..., None, :]).astype(np.float64),
         )
 
 
@@ -172,13 +172,13 @@ def _drift(model: FieldModel, apart: _Apart) -> FloatArray:
     return np.asarray(model.drift_sd_db**2 * apart.same * np.exp(-apart.seconds / model.drift_s))
 
 
-def covariance(model: FieldModel, one: Rows, other: Rows, parts: Collection[Part] = PARTS) -> FloatArray:
+def covariance(model: FieldModel, rows: Rows, columns: Rows, parts: Collection[Part] = PARTS) -> FloatArray:
     """Covariance of some parts of the residual between rows (..., n, m), without noise [dB^2].
 
     Parameters
     ----------
     model : FieldModel
-    one, other : Rows
+    rows, columns : Rows
         (..., n) and (..., m).
     parts : collection of str
         Of :data:`PARTS`.
@@ -187,7 +187,7 @@ def covariance(model: FieldModel, one: Rows, other: Rows, parts: Collection[Part
     -------
     (..., n, m)
     """
-    return _covariance(model, _Apart.of(one, other), parts)
+    return _covariance(model, _Apart.of(rows, columns), parts)
 
 
 def _covariance(model: FieldModel, apart: _Apart, parts: Collection[Part]) -> FloatArray:
@@ -255,10 +255,10 @@ class FieldFit:
         ends = targets.direction.reshape(len(targets), -1)
         known = np.isfinite(np.column_stack([targets.position_m, ends, targets.time_s])).all(axis=1)
         exact = self.fits(int(known.sum())) if exact is None else exact
-        good, some = np.flatnonzero(known), targets.part(known)
+        places, some = np.flatnonzero(known), targets.part(known)
         step = max(AT_ONCE * 3 // max(ends.shape[1], 3), 1)
-        for block, one, two in (self._exact if exact else self._nearest)(some, step, parts):
-            mean[good[block]], sd[good[block]] = one, two
+        for block, block_mean, block_sd in (self._exact if exact else self._nearest)(some, step, parts):
+            mean[places[block]], sd[places[block]] = block_mean, block_sd
         return mean, sd
 
     def fits(self, targets: int) -> bool:
@@ -293,11 +293,11 @@ class FieldFit:
         from scipy.spatial import cKDTree
 
         levels, level_sd = self._levels(targets, parts)
-        own, _ = self._levels(self.rows, ("mean", "offset"))
-        value = np.zeros(len(self.rows)) if self.value_db is None else self.value_db - own
+        row_levels, _ = self._levels(self.rows, ("mean", "offset"))
+        value = np.zeros(len(self.rows)) if self.value_db is None else self.value_db - row_levels
         near: list[Part] = ["place", "drift"]
-        asked = [part for part in near if part in parts]
-        prior = prior_sd_db(self.model, asked) ** 2 if asked else 0.0
+        near_parts = [part for part in near if part in parts]
+        prior = prior_sd_db(self.model, near_parts) ** 2 if near_parts else 0.0
         turned = math.isfinite(self.model.turn) and targets.direction.ndim == 2
         tree, places = cKDTree(self._scaled(self.rows, turned)), self._scaled(targets, turned)
         for part, shared in _cells(places, step):
@@ -306,16 +306,16 @@ class FieldFit:
             index = tree.query(places[part].mean(axis=0) if shared else places[part], k=count)[1]
             rows, some = self.rows.part(index), targets.part(part)
             if shared:  # (targets, rows) of one set of rows
-                across = covariance(self.model, some, rows, asked)
+                across = covariance(self.model, some, rows, near_parts)
                 matrix = _noisy(self.model, covariance(self.model, rows, rows, near))
                 weight = np.linalg.solve(matrix, across.T).T
             else:  # a set of rows per target
-                across = covariance(self.model, some.part((slice(None), None)), rows, asked)[:, 0, :]
+                across = covariance(self.model, some.part((slice(None), None)), rows, near_parts)[:, 0, :]
                 matrix = _noisy(self.model, covariance(self.model, rows, rows, near))
                 weight = np.linalg.solve(matrix, across[..., None])[..., 0]
-            left = prior - np.einsum("tm,tm->t", weight, across)
+            variance = prior - np.einsum("tm,tm->t", weight, across)
             mean = levels[part] + np.einsum("tm,tm->t", weight, np.broadcast_to(value[index], weight.shape))
-            yield part, mean, np.sqrt(np.maximum(left, 0.0) + level_sd[part] ** 2)
+            yield part, mean, np.sqrt(np.maximum(variance, 0.0) + level_sd[part] ** 2)
 
     def _scaled(self, rows: Rows, turned: bool) -> FloatArray:
         """Coordinates in which the place part falls off evenly, with or without the direction."""
@@ -325,14 +325,14 @@ class FieldFit:
 
     def _levels(self, targets: Rows, parts: Collection[Part]) -> tuple[FloatArray, FloatArray]:
         """Mean and offsets (m,) at targets from thinned rows, with their standard deviation."""
-        asked: list[Part] = [part for part in ("mean", "offset") if part in parts]  # type: ignore[misc]
+        level_parts: list[Part] = [part for part in ("mean", "offset") if part in parts]  # type: ignore[misc]
         out, sd = np.zeros((2, len(targets)))
-        if not asked:
+        if not level_parts:
             return out, sd
-        thin = spread_out(len(self.rows), EXACT_ROWS // 2)
-        fit = FieldFit(self.model, self.rows.part(thin), None if self.value_db is None else self.value_db[thin])
+        thinned = spread_out(len(self.rows), EXACT_ROWS // 2)
+        fit = FieldFit(self.model, self.rows.part(thinned), None if self.value_db is None else self.value_db[thinned])
         _, first, member = np.unique(targets.flight, return_index=True, return_inverse=True)
-        mean_of, sd_of = fit.predict(targets.part(first), asked, exact=True)
+        mean_of, sd_of = fit.predict(targets.part(first), level_parts, exact=True)
         return mean_of[member], sd_of[member]
 
 
@@ -393,15 +393,15 @@ def left_out(
     lower = factor_of(_noisy(model, covariance(model, rows, rows)))
     inverse = cho_solve((lower, True), np.eye(len(rows)), check_finite=False)
     right = inverse @ value_db
-    mean, sd, own = np.empty((3, len(rows)))
+    mean, sd, own_sd = np.empty((3, len(rows)))
     for code in np.unique(block):
         mine = np.flatnonzero(block == code)
         spread = np.linalg.inv(inverse[np.ix_(mine, mine)])
         mean[mine] = value_db[mine] - spread @ right[mine]
         sd[mine] = np.sqrt(np.diag(spread))
         about = spread - spread.mean(axis=0) - spread.mean(axis=1)[:, None] + spread.mean()
-        own[mine] = np.sqrt(np.maximum(np.diag(about), 0.0))
-    return mean, sd, own
+        own_sd[mine] = np.sqrt(np.maximum(np.diag(about), 0.0))
+    return mean, sd, own_sd
 
 
 # --- scales --------------------------------------------------------------------------------------------------------
@@ -444,8 +444,8 @@ def fit_field(
         model = _with(start, names, logs)
         total, slope = 0.0, np.zeros(len(names))
         for (_, value), each in zip(used, apart, strict=True):
-            one, two = _likelihood(model, each, value, names)
-            total, slope = total - one, slope - two
+            value_nat, gradient = _likelihood(model, each, value, names)
+            total, slope = total - value_nat, slope - gradient
         return total, slope
 
     limits = [(math.log(BOUNDS[name][0]), math.log(BOUNDS[name][1])) for name in names]

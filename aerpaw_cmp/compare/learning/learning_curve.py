@@ -68,22 +68,22 @@ def learning_curve(observed: Sequence[Observed], recipe: Recipe) -> tuple[CurveP
         for subset in subsets:
             learned = learn([o.samples for o in observed if o.samples.flight in subset], recipe)
             known = {o.samples.antenna for o in observed if o.samples.flight in subset}
-            asked = [o for o in observed if o.samples.flight not in subset and o.samples.antenna in known]
-            for scored in filter(None, (score(o, learned.mean(o.samples)) for o in asked)):
+            targets = [o for o in observed if o.samples.flight not in subset and o.samples.antenna in known]
+            for scored in filter(None, (score(o, learned.mean(o.samples)) for o in targets)):
                 key = scored.flight, f"{scored.tower}.{scored.channel}"
                 errors[size].setdefault(key, []).append((scored.rmse_db, scored.rmse_4s_db))
     common = set.intersection(*(set(each) for each in errors.values()))
     if not common:
         return ()
-    out = []
+    points = []
     for size, each in errors.items():
         rmse, rmse_4s = np.mean([np.mean(each[key], axis=0) for key in sorted(common)], axis=0)
-        out.append(
+        points.append(
             CurvePoint(
                 flights=size, rmse_db=float(rmse), rmse_4s_db=float(rmse_4s), fits=fits[size], series=len(common)
             )
         )
-    return tuple(out)
+    return tuple(points)
 
 
 def _subsets(flights: Sequence[str], size: int) -> list[set[str]]:

@@ -73,8 +73,8 @@ class Known:
             return np.asarray(np.hypot(gain, self.field.place_sd_db))
         known = Rows.joined([Rows.of(s, i) for i, s in mine])
         place: tuple[Part, ...] = ("place",)
-        _, beside = FieldFit(self.field, known).predict(Rows.of(target, NEW_FLIGHT), place)
-        return np.asarray(np.hypot(gain, beside))
+        _, field_sd = FieldFit(self.field, known).predict(Rows.of(target, NEW_FLIGHT), place)
+        return np.asarray(np.hypot(gain, field_sd))
 
 
 def rms_db(sd_db: Mapping[str, FloatArray]) -> float:

@@ -171,8 +171,8 @@ class RouteAhead:
         across = covariance(model, targets, rows)
         prior = float(covariance(model, targets.part([0]), targets.part([0]))[0, 0])
         explained = np.einsum("mn,nm->m", across, cho_solve(factor, across.T, check_finite=False))
-        left = np.maximum(prior - explained, 0.0) + model.noise_sd_db**2
-        return [(middle[k] + across @ solved[:, k], np.sqrt(scale[k] * left)) for k in range(len(names))]
+        variance = np.maximum(prior - explained, 0.0) + model.noise_sd_db**2
+        return [(middle[k] + across @ solved[:, k], np.sqrt(scale[k] * variance)) for k in range(len(names))]
 
     def _predict(self, place: FloatArray) -> Ahead | None:
         """The rest of the route from where the UAV is."""

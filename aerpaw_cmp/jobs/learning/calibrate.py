@@ -474,7 +474,7 @@ def score_all(
         ("route_left_out", calibration.route_parts, True),
     ):
         stages.progress(f"scores: {split.replace('_', ' ')}")
-        scores[split] = calibration.parts_left_out(observed, recipe, kept, parts, own=own)
+        scores[split] = calibration.parts_left_out(observed, recipe, kept, parts, own_rest=own)
     return scores
 
 

@@ -181,7 +181,7 @@ class Flown:
     def levels(self, each: Sequence[LinkSamples], whole: int) -> Levels:
         """Levels at targets as seen with each of some headings, which count alike; ``whole``: targets of the run."""
         antenna = each[0].antenna
-        level, slow = self.correction.over_headings(each, whole=whole)
+        level, slow = self.correction.over_headings(each, all_targets=whole)
         guess = outside(each[0].position_m, self.sources[antenna].samples)
         beyond = between_blocks_db(self.correction.channels[antenna])
         return level, np.where(guess, np.hypot(slow, beyond), slow), guess

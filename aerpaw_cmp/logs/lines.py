@@ -23,6 +23,9 @@ TEXT_LIMIT = 500
 UNTERMINATED = "unterminated_line"
 
 
+# First bytes of a file of tags: no console or table.
+MARKUP = (b"<?xml", b"<kml", b"<gpx")
+
 # A decimal number of bounded length (bytes pattern, no group): what pandas' parser takes, see ``_table``.
 NUMBER = rb"[-+]?\d{1,400}(?:\.\d{0,400})?(?:[eE][-+]?\d{1,400})?"
 

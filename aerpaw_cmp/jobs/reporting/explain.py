@@ -214,7 +214,9 @@ def _pose(
     if isinstance(series, RssSeries):
         time = series.time
         if data.settings.rss.lag == "apply" or isinstance(data.settings.rss.lag, float):
-            clock = estimate_clocks(data, progress)[[s is series for s in data.rss].index(True)]
+            receiver = tuple(s for s in data.rss if s.tower == series.tower)  # it has a clock of its own
+            clocks = estimate_clocks(dataclasses.replace(data, rss=receiver), progress)
+            clock = clocks[[s is series for s in receiver].index(True)]
             time = telemetry_time(time, clock)
             if clock is not None and clock.applied_s[at]:
                 notes.append(f"{clock.applied_s[at]:.3f} s are taken off the radio's clock")

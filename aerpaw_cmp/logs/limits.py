@@ -73,7 +73,7 @@ FEW_SHARE = 0.01
 FEW_ROWS = 3
 
 # Flags of rows that no comparison scores (`flight/scored.py`). The other flags void the doubtful value itself.
-UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports", "no_number")
+UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports", "no_number", "unterminated_line")
 
 
 def check(result: ReadResult) -> ReadResult:

@@ -171,6 +171,11 @@ def _stream(rows: _rows.Rows, found: Table, pick: IntArray, served: FloatArray, 
     row, level = found.row[pick], found.rsrp_dbm[pick]
     flag = rows.flag[row]
     outside = ~((level >= RANGE_DBM[0]) & (level <= RANGE_DBM[1]))
+    if 2 * outside.sum() > len(level):
+        rows.warnings.append(
+            f"{cell.name}: {outside.sum()} of {len(level)} levels lie outside {RANGE_DBM[0]:g} .. {RANGE_DBM[1]:g} dBm "
+            f"(the first: {level[outside][0]:g}; another unit, or an index?): read as out of coverage"
+        )
     _lines.add_flag(flag, outside, "out_of_coverage")
     _lines.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
     level[outside] = np.nan

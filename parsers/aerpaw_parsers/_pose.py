@@ -92,8 +92,8 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
         return None
     scale = 1e-7 if _is_px4_gps(sheet, latitude) else 1.0
     values: dict[str, AnyArray] = {
-        "latitude_deg": scale * sheet.numbers(latitude),
-        "longitude_deg": scale * sheet.numbers(longitude),
+        "latitude_deg": scale * _signed(sheet, latitude, "NS"),
+        "longitude_deg": scale * _signed(sheet, longitude, "EW"),
     }
     lost = clean(rows, values)
     values["altitude_m"] = _altitude(rows, sheet, lost)
@@ -107,6 +107,17 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
     where = None if lost.all() else ~lost
     return rows.stream("telemetry", name, values, where=where, source=source, height_from=rows.height_from)
+
+
+def _signed(sheet: _sheet.Sheet, column: int, letters: str) -> FloatArray:
+    """Angles, negative where a column of hemispheres behind them says S or W."""
+    angle = sheet.numbers(column)
+    if column + 1 == len(sheet.names):
+        return angle
+    side = np.array([text.upper() for text in sheet.texts(column + 1)])
+    if not np.isin(side, list(letters)).any() or not np.isin(side, [*letters, ""]).all():
+        return angle
+    return np.where(side == letters[1], -np.abs(angle), angle)
 
 
 def _is_px4_gps(sheet: _sheet.Sheet, latitude: int) -> bool:

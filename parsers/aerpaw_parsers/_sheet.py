@@ -31,8 +31,10 @@ _UNIT = re.compile(r"[\[(]([^\[\]()]{1,12})[\])]\s*$")
 _A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5%\u00b0]{1,7}(/[a-z]{1,3})?")
 # Units of values as they are read, and what one of each unit that a header may have is in them.
 _READ_IN = {
-    "m": {"ft": 0.3048, "feet": 0.3048, "m": 1.0, "meters": 1.0},
-    "m/s": {"mph": 0.44704, "m/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kts": 0.514444, "knots": 0.514444},
+    "m": {"ft": 0.3048, "feet": 0.3048, "m": 1.0, "meters": 1.0, "cm": 0.01, "mm": 1e-3, "km": 1e3},
+    "m/s": {
+        "mph": 0.44704, "m/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kts": 0.514444, "knots": 0.514444, "cm/s": 0.01,
+    },
     "deg": {"deg": 1.0, "degrees": 1.0, "rad": 180 / np.pi, "radians": 180 / np.pi},
     "bit/s": {
         "bps": 1.0, "bit/s": 1.0, "kbps": 1e3, "kbit/s": 1e3, "mbps": 1e6, "mbit/s": 1e6, "gbps": 1e9, "gbit/s": 1e9,
@@ -87,10 +89,11 @@ def starts(head: bytes, is_header: IsHeader) -> bool:
 
 
 def _number(text: str) -> float:
-    if not text or not _NUMBER.fullmatch(text):
+    plain_text = text.replace("\u2212", "-")  # the minus sign of typesetting, which word processors put in
+    if not text or not _NUMBER.fullmatch(plain_text):
         return np.nan
     try:
-        return float(text.replace(",", "."))
+        return float(plain_text.replace(",", "."))
     except ValueError:
         return np.nan
 
@@ -123,6 +126,7 @@ class Sheet:
     units: dict[int, str] = field(default_factory=dict)
     _silent: dict[int, BoolArray] = field(default_factory=dict)
     _numbers: dict[int, FloatArray] = field(default_factory=dict)
+    _words: dict[int, tuple[int, str]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the rows."""
@@ -173,12 +177,40 @@ class Sheet:
         """A column as numbers in the unit of its name's brackets made SI or degrees; what is none is NaN. Read only."""
         if column not in self._numbers:
             texts = self.texts(column)
+            if self._has_points and _are_thousands(texts):
+                texts = [text.replace(",", "") for text in texts]
             known = {text: _number(text) for text in set(texts)}  # tables repeat themselves
             made = np.array([known[text] for text in texts], dtype=np.float64)
+            words = [text for text in texts if np.isnan(known[text]) and text.lower() not in _NONE]
+            if 2 * len(words) > sum(text.lower() not in _NONE for text in texts):
+                self._words[column] = len(words), words[0]
             made *= _FACTORS.get(self.unit(column), ("", 1.0))[1]
             made.flags.writeable = False  # the next who asks gets the same
             self._numbers[column] = made
         return self._numbers[column]
+
+    @cached_property
+    def _has_points(self) -> bool:
+        """Check whether the first row has a decimal point: then no comma of the table is a decimal one."""
+        return bool(self.cells) and any(_DECIMAL_POINT.fullmatch(cell.strip()) for cell in self.cells[0])
+
+    def unread(self) -> list[str]:
+        """A sentence for each column that was to be numbers and mostly holds something else."""
+        return [
+            f"column {self.names[column]!r}: {count} cells are no number (the first: {text[:30]!r}) and read as missing"
+            for column, (count, text) in sorted(self._words.items())
+        ]
+
+
+_DECIMAL_POINT = re.compile(r"-?\d{1,9}\.\d{1,15}")
+_THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d{0,12})?")
+# Cells that say that there is no value.
+_NONE = {"", "-", "--", "nan", "na", "n/a", "#n/a", "none", "null", "inf", "-inf", "unavailable", "unknown", "invalid"}
+
+
+def _are_thousands(texts: Sequence[str]) -> bool:
+    """Check whether the commas of a column part thousands: ``1,300`` and never ``35,72``."""
+    return any("," in text for text in texts) and all(_THOUSANDS.fullmatch(text) for text in texts if "," in text)
 
 
 @cache
@@ -274,7 +306,9 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str]
     name, unit = sheet.plain[column], sheet.unit(column)
     in_ms = unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) is not None
     count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s" if unit or name.endswith(" s") else None
-    count = "us" if set(sheet.plain) >= PX4 and name == "timestamp" else count
+    # the sign for micro is no letter of a plain name: 'Time [\u00b5s]' is 'time s' there
+    in_us = unit in ("us", "\u00b5s", "\u03bcs") or (set(sheet.plain) >= PX4 and name == "timestamp")
+    count = "us" if in_us else count
     utc = re.search(r"\b(utc|gps|gmt)\b", name) is not None
     clock, cells, warnings = _stamps.read(texts, options, unit=count, european=_has_decimal_commas(sheet))
     if clock == "wall" and utc and not np.char.endswith(cells, b"Z").all():

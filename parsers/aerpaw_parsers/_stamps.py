@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs.readers import ReadOptions
@@ -23,6 +24,9 @@ _WORD_MONTH = re.compile(r"(\d{1,2})[- ]?([A-Z][a-z]{2})[a-z]{0,6}[- ]?(\d{4}|\d
 _DIGITS = re.compile(r"(20\d\d)(\d\d)(\d\d)[T_ -]?(\d\d)(\d\d)(\d\d(?:\.\d{1,9})?)()" + _ZONE)
 _OF_DAY = re.compile(r"T?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?) ?([AaPp][Mm])?" + _ZONE)
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,12})?(?:[eE][-+]?\d{1,3})?")
+# An epoch that a spreadsheet shortened, ``1.74093E+12``: fewer than nine digits behind the first leave out seconds.
+_ROUNDED = re.compile(r"\d(?:[.,]\d{0,8})?[eE]\+?0?(?:9|1\d)")
+_NO_SECONDS = re.compile(r".*[T _,]\d{1,2}[:.]\d\d(?: ?[AaPp][Mm])?" + _ZONE)
 _COMMON = re.compile((_time.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 # Dates with hyphens or none, and Nemo's year, month, day: its summary of ``24Feb09`` says ``2024 Feb 09``.
@@ -120,6 +124,7 @@ def read(
     """
     shown = [text.strip().strip('"').strip() for text in texts]
     some = [text for text in shown if text]
+    refuse_rounded(some)
     counts = sum(_NUMBER.fullmatch(text) is not None for text in some)
     if counts * 2 > len(some) and not any(_DIGITS.fullmatch(text) for text in some[:3]):
         return _numbers(shown, unit, options)
@@ -134,8 +139,27 @@ def read(
             first, reason = european, "as where decimal commas are written" if european else "a guess"
         word = "day" if first else "month"
         warnings = [f"the dates can be read with the day or the month first: the {word} was taken, {reason}"]
+    if len(set(some)) < len(some) and 2 * sum(_NO_SECONDS.fullmatch(text) is not None for text in some) > len(some):
+        warnings.append("the times have no seconds (a table saved by a spreadsheet?): rows of a minute share one time")
     made = [text.encode() if _COMMON.fullmatch(text) else _dated(text, bool(first)) or b"-" for text in shown]
     return "wall", np.array(made or [b"-"], dtype=np.bytes_)[: len(made)], warnings
+
+
+def refuse_rounded(texts: Sequence[str]) -> None:
+    """Refuse a column of epochs that lost their last digits: all rows of minutes or days would share a time.
+
+    Raises
+    ------
+    InputError
+        If most of the texts are such.
+    """
+    rounded = [text for text in texts if _ROUNDED.fullmatch(text)]
+    if 2 * len(rounded) > len(texts):
+        raise InputError(
+            f"the times are rounded, such as {rounded[0]}",
+            expected="all digits of the epoch",
+            cause="the table was saved by a spreadsheet, which shortens long numbers",
+        )
 
 
 def _numbers(texts: Sequence[str], unit: str | None, options: ReadOptions) -> tuple[str, AnyArray, list[str]]:
@@ -143,13 +167,34 @@ def _numbers(texts: Sequence[str], unit: str | None, options: ReadOptions) -> tu
     value = np.array([float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else np.nan for text in texts])
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
-        if middle >= 0.9 * scale:
+        if middle >= 0.9 * scale and scale >= _LEAST_EPOCH.get(unit or "", 0.0):
             return (form, value, []) if form else ("epoch_us", value / 1e3, [])
     if unit is None and 86_400 < middle < 86_400_000 and not (value % 1 > 0).any():
         if np.nanmin(value) < 3_600_000:
             return "relative_ms", value, [_MILLISECONDS]
         return _on_a_date(value / 1e3, options, [_MILLISECONDS + " of the day"])
+    for zero, low, high, program in _DAY_NUMBERS:
+        if unit is None and len(value) > 2 and _are_days(value, low, high):
+            text = f"the times are day numbers of {program}: read as local dates and times"
+            return "wall", _wall_cells(np.datetime64(zero, "us"), value * 86_400.0), [text]
     return f"relative_{unit or 's'}", value, []
+
+
+# An epoch in a unit that the head of the column says; 1e9 microseconds are a quarter of an hour of PX4's own clock.
+_LEAST_EPOCH = {"s": 1e9, "ms": 1e12, "us": 1e15}
+# Date of number zero, and the numbers of the years 2000 to 2099.
+_DAY_NUMBERS = (
+    ("1899-12-30", 36_526.0, 73_051.0, "a spreadsheet"),
+    ("-001-12-31", 730_486.0, 767_011.0, "MATLAB"),
+)
+
+
+def _are_days(value: FloatArray, low: float, high: float) -> bool:
+    """Check whether numbers are days with the time as fraction: within two days, from row to row less than 90 s."""
+    finite = value[np.isfinite(value)]
+    if len(finite) < 3 or finite.min() < low or finite.max() >= high or np.ptp(finite) > 2.0:
+        return False
+    return bool(0 < np.median(np.abs(np.diff(finite))) < 1e-3)
 
 
 _MILLISECONDS = "the times are whole numbers beyond a day of seconds: read as milliseconds"
@@ -188,11 +233,15 @@ def _on_a_date(seconds: FloatArray, options: ReadOptions, warnings: list[str]) -
     date = options.time_origin[:10] if options.time_origin else date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
         return "relative_s", seconds, [*warnings, "the times have no date and the file name has none either"]
-    stamps = np.datetime64(date, "us") + np.round(np.nan_to_num(seconds) * 1e6).astype("timedelta64[us]")
-    cells = np.datetime_as_string(stamps, unit="us").astype(np.bytes_)
-    cells = np.where(np.isnan(seconds), b"-", cells)
+    cells = _wall_cells(np.datetime64(date, "us"), seconds)
     source = "time_origin" if options.time_origin else "the file name"
     return "wall", cells, [f"the times have no date: it is that of {source}, {date}", *warnings]
+
+
+def _wall_cells(day: np.datetime64, seconds: FloatArray) -> AnyArray:
+    """Seconds after the beginning of a day as texts."""
+    stamps = day + np.round(np.nan_to_num(seconds) * 1e6).astype("timedelta64[us]")
+    return np.where(np.isnan(seconds), b"-", np.datetime_as_string(stamps, unit="us").astype(np.bytes_))
 
 
 def _seconds(parts: Sequence[str | None]) -> float:

@@ -188,6 +188,7 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
     levels = _cells.streams(rows, _readings(sheet, cells), source="drive test")
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
     streams = [(_rank if column in ranks else _other)(rows, sheet, column) for column in columns]
+    rows.warnings += sheet.unread()
     return rows.result(_distinct([track, *levels, *streams]))
 
 

@@ -204,10 +204,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         raise InputError(
             "the MATLAB file holds no flight", expected=f"variables such as {', '.join(sorted(_NAMES)[:5])}"
         )
-    lengths = {len(column) for column in table.values()}
-    if len(lengths) != 1:
-        raise InputError(f"the columns differ in length: {sorted(lengths)}", expected="one row per sample in each")
-    count = lengths.pop()
+    count = _common_length(table)
     wall, valid, clock = _wall(table)
     keep = np.flatnonzero(valid)
     kept = {name: column[keep] for name, column in table.items()}
@@ -225,6 +222,17 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     )
     instants.flag(rows.flag)
     return rows.result([_track(rows, kept, clock), *_measured(rows, kept)])
+
+
+def _common_length(table: dict[str, AnyArray]) -> int:
+    """Number of rows; of columns of several lengths nobody knows which rows belong together, ``succes`` included."""
+    lengths: dict[int, list[str]] = {}
+    for name, column in table.items():
+        lengths.setdefault(len(column), []).append(name)
+    if len(lengths) > 1:
+        sizes = "; ".join(f"{count} rows: {', '.join(names[:4])}" for count, names in sorted(lengths.items()))
+        raise InputError(f"the columns differ in length ({sizes})", expected="one row per sample in each")
+    return next(iter(lengths))
 
 
 def _track(rows: _rows.Rows, table: dict[str, AnyArray], clock: str) -> Stream | None:

@@ -126,6 +126,7 @@ def _times(cells: list[str], options: ReadOptions, *, comma: bool) -> tuple[str,
     texts = [_bare(cell) for cell in cells]
     if not _counts(texts):
         return _stamps.read([text.decode() for text in texts], options, european=comma)
+    _stamps.refuse_rounded([text.decode() for text in texts if text])
     seconds = np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in texts], dtype=np.float64)
     return "epoch_s" if options.time_origin is None else "relative_s", seconds, []
 

@@ -52,7 +52,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     unread = [name for name, text in zip(sheet.names, sheet.plain, strict=True) if _LIKE_A_LEVEL.search(text)]
     if unread:
         rows.warnings.append(f"columns that are not read: {', '.join(unread[:5])}; '--map' reads a level")
-    return rows.result([_pose.from_sheet(rows, sheet, name="vehicle", source="table of positions")])
+    track = _pose.from_sheet(rows, sheet, name="vehicle", source="table of positions")
+    rows.warnings += sheet.unread()
+    return rows.result([track])
 
 
 READER = Reader(

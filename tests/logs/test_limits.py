@@ -6,6 +6,7 @@ import pytest
 
 from aerpaw_cmp.flight.scored import unscored
 from aerpaw_cmp.logs.limits import UNSCORED, check
+from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream
 
 
@@ -96,3 +97,12 @@ def test_flags_add_to_those_of_the_reader() -> None:
     result = checked("rss", {"unit": "dBm"}, rss_db=np.array([-80.0, 1e9, -81.0, -82.0, -83.0]), flag=words)
     assert result.streams[0].frame["flag"][1] == "repeated;level_out_of_range"
     assert set(UNSCORED) >= {"level_out_of_range", "time_out_of_range", "rank_above_ports"}
+
+
+def test_a_record_of_a_line_without_its_end_is_not_scored() -> None:
+    """The level in the last line of a log whose writer was cut may be -8 of -85."""
+    cut = by_name("aadm_snr").read(
+        b"time,snr_lw1,snr_lw2\n2025-03-02 10:00:00.5,-1.25,-7.5\n2025-03-02 10:00:01.5,-1.25,-8",
+        ReadOptions(timezone="America/New_York"),
+    )
+    assert [unscored(stream.frame).tolist() for stream in cut.streams] == [[False, True]] * 2

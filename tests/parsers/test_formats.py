@@ -214,7 +214,8 @@ def test_mat_row_without_a_time_is_rejected() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"mX": np.zeros((3, 1))}, "differ in length"),
+        ({"mX": np.zeros((3, 1))}, "differ in length .3 rows: mX; 5 rows: "),
+        ({"succes": np.ones((4, 1))}, "differ in length .4 rows: succes; 5 rows: "),
         ({"timestamp_power": None, "timestamp_power_for_csv": None}, "no clock"),
         ({"mpower1": np.array(["a", "b", "c", "d", "e"])}, "not numeric"),
     ],

@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs.readers import by_name
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_parsers import _sheet
+from tests.parsers import samples
 from tests.parsers.samples import OPTIONS
 
 POSES = b"timestamp,Lat,Lng,Alt,Yaw\n"
@@ -156,3 +158,106 @@ def test_a_name_that_ends_in_nul_loses_no_row(kind: str) -> None:
     result = by_name("own_csv").read(data, OPTIONS)
     assert result.accepted == 2
     assert [len(stream.frame) for stream in result.streams] == [2]
+
+
+# --- tables that a person or a program wrote anew ---------------------------------------------------------------------
+
+SIX_COLUMNS = "Time,Latitude,Longitude,Altitude (m),RSRP (dBm)\n"
+
+
+def six_rows(row: str, *, head: str = SIX_COLUMNS) -> bytes:
+    """Six rows, ``{i}`` in them the number of the row."""
+    return (head + "".join(row.replace("{i}", str(i)) + "\n" for i in range(6))).encode()
+
+
+def drive_test(data: bytes, **options: str) -> ReadResult:
+    return read("drive_test", data, **options)
+
+
+def column_of(result: ReadResult, kind: str, name: str) -> list[float]:
+    return next(stream.frame[name].tolist() for stream in result.streams if stream.kind == kind)
+
+
+GOOD = "2025-03-02 10:00:0{i},35.72{i},-78.69,3{i},-8{i}"
+
+
+def test_cells_with_a_unit_behind_the_number_are_said() -> None:
+    result = drive_test(six_rows(GOOD.replace("-8{i}", "-8{i} dBm")))
+    assert not any(stream.kind == "rss" for stream in result.streams)
+    assert any("'RSRP (dBm)': 6 cells are no number (the first: '-80 dBm')" in text for text in result.warnings)
+    assert not any("no number" in text for text in drive_test(six_rows(GOOD)).warnings)
+
+
+def test_the_minus_sign_of_typesetting_is_one() -> None:
+    assert column_of(drive_test(six_rows(GOOD.replace("-8{i}", "\u22128{i}"))), "rss", "rss_db") == [
+        -80.0 - i for i in range(6)
+    ]
+
+
+def test_commas_of_thousands_are_no_decimal_commas() -> None:
+    """Where the table writes decimal points a quoted 1,300 is thirteen hundred; 30,5 in a table of commas is a half."""
+    heights = column_of(drive_test(six_rows(GOOD.replace("3{i}", '"1,30{i}"'))), "telemetry", "altitude_m")
+    assert heights == [1300.0 + i for i in range(6)]
+    commas = '2025-03-02 10:00:0{i},"35,72{i}","-78,69","30,{i}","-8{i},5"'
+    assert column_of(drive_test(six_rows(commas)), "telemetry", "altitude_m") == [30.0 + i / 10 for i in range(6)]
+
+
+def test_columns_of_hemispheres_give_the_sign() -> None:
+    head = "Time,Latitude,N/S,Longitude,E/W,Altitude (m),RSRP (dBm)\n"
+    result = drive_test(six_rows("2025-03-02 10:00:0{i},35.72{i},N,78.69,W,3{i},-8{i}", head=head))
+    assert column_of(result, "telemetry", "longitude_deg") == [-78.69] * 6
+    assert column_of(result, "telemetry", "latitude_deg") == [35.72 + i / 1000 for i in range(6)]
+
+
+def test_speeds_in_centimetres_per_second() -> None:
+    head = "Time,Latitude,Longitude,Height (m),xSpeed(cm/s),ySpeed [cm/s]\n"
+    result = read("pose_csv", six_rows("2025-03-02 10:00:0{i},35.72{i},-78.69,3{i},1{i},-250", head=head))
+    np.testing.assert_allclose(column_of(result, "telemetry", "velocity_north_mps"), [0.1 + i / 100 for i in range(6)])
+    np.testing.assert_allclose(column_of(result, "telemetry", "velocity_east_mps"), -2.5)
+
+
+@pytest.mark.parametrize("first", [0, 1_200_000_000])
+def test_microseconds_count_from_the_origin(first: int) -> None:
+    """The sign for micro is no letter; a column of microseconds reaches 1e9, an epoch in s, after a quarter hour."""
+    head = SIX_COLUMNS.replace("Time", "Time [\u00b5s]")
+    data = (head + "".join(f"{first + 1_000_000 * i},35.72,-78.69,30,-80\n" for i in range(6))).encode()
+    time = next(s.frame["time"] for s in drive_test(data, time_origin="2025-03-02T15:00:00Z").streams)
+    assert time.iloc[0].isoformat() == ("2025-03-02T15:20:00" if first else "2025-03-02T15:00:00")
+    assert (time.diff().iloc[1:].dt.total_seconds() == 1.0).all()
+
+
+@pytest.mark.parametrize(("zero", "program"), [(45718, "a spreadsheet"), (739678, "MATLAB")])
+def test_day_numbers_are_local_dates(zero: int, program: str) -> None:
+    """Day 45718 of a spreadsheet and datenum(2025, 3, 2) are both 2 March 2025."""
+    rows = "".join(f"{zero + (36_000 + i) / 86_400:.9f},35.72,-78.69,30,-80\n" for i in range(6))
+    result = drive_test((SIX_COLUMNS + rows).encode())
+    time = result.streams[0].frame["time"]
+    assert abs((time.iloc[0] - np.datetime64("2025-03-02T15:00:00")).total_seconds()) < 1e-3
+    assert any(program in text for text in result.warnings)
+
+
+@pytest.mark.parametrize("time", ["1.74093E+12", "1,740931e+09"])
+def test_epochs_that_a_spreadsheet_rounded_are_refused(time: str) -> None:
+    with pytest.raises(InputError, match="rounded"):
+        drive_test(six_rows(GOOD.replace("2025-03-02 10:00:0{i}", f'"{time}"')))
+    exact = drive_test(six_rows(GOOD.replace("2025-03-02 10:00:0{i}", "1.7409312{i}000E+09"))).streams[0].frame["time"]
+    assert (exact.diff().iloc[1:].dt.total_seconds() == 10.0).all()
+
+
+def test_times_without_seconds_are_said() -> None:
+    result = drive_test(six_rows(GOOD.replace("2025-03-02 10:00:0{i}", "3/22/2025 10:00")))
+    assert any("no seconds" in text for text in result.warnings)
+    assert not any("no seconds" in text for text in drive_test(six_rows(GOOD)).warnings)
+
+
+def test_levels_in_another_unit_are_said() -> None:
+    """RSRP as the index of the standard, or in tenths: out of coverage everywhere, and nobody would know why."""
+    result = drive_test(six_rows(GOOD.replace("-8{i}", "5{i}")))
+    assert any("6 of 6 levels lie outside" in text for text in result.warnings)
+
+
+def test_two_phone_lines_glued_by_a_torn_one_are_rejected() -> None:
+    """The cells of the second would get the time of the first."""
+    whole, second = samples.PAWPRINTS_TEXT.split(b"\n")[:2]
+    result = read("pawprints", whole[:60] + second + b"\n" + second + b"\n")
+    assert (result.accepted, [line.number for line in result.rejected]) == (1, [1])

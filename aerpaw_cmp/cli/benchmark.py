@@ -49,8 +49,8 @@ def benchmark(
     """Score channel models on published flights with frozen splits."""
     from ..jobs.benchmarks import benchmark_run as job
 
-    action, *rest = words or ["run"]
-    if action not in ACTIONS or len(rest) != (1 if action == "score" else 0):
+    action, *arguments = words or ["run"]
+    if action not in ACTIONS or len(arguments) != (1 if action == "score" else 0):
         raise UsageError(
             f"benchmark {' '.join(words or [])}", expected=f"one of {', '.join(ACTIONS)}; score takes a file"
         )
@@ -59,8 +59,8 @@ def benchmark(
         _print_tasks(job.open_bench(data, manifest), as_json)
         return 0
     if action == "fetch":
-        made = job.fetch(out or data, manifest=manifest, progress=say)
-        print_json({"files": [str(p) for p in made]}) if as_json else print(f"{len(made)} files in {out or data}")
+        fetched = job.fetch(out or data, manifest=manifest, progress=say)
+        print_json({"files": [str(p) for p in fetched]}) if as_json else print(f"{len(fetched)} files in {out or data}")
         return 0
     if action == "template":
         files = job.write_template(data, out or Path("predictions.csv"), tasks=tasks, manifest=manifest, force=force)
@@ -68,7 +68,12 @@ def benchmark(
         return 0
     if action == "score":
         result = job.score_predictions(
-            Path(rest[0]), data, tasks=tasks, manifest=manifest, leaderboard=leaderboard, accept_levels=accept_levels
+            Path(arguments[0]),
+            data,
+            tasks=tasks,
+            manifest=manifest,
+            leaderboard=leaderboard,
+            accept_levels=accept_levels,
         )
     else:
         result = job.run_benchmark(
@@ -86,15 +91,15 @@ def benchmark(
 
 def _print_tasks(bench: Any, as_json: bool) -> None:
     rows = {
-        name: {"title": one.title, "rule": one.rule, "missing": bench.skipped(name, training=True)}
-        for name, one in bench.manifest.tasks.items()
+        name: {"title": entry.title, "rule": entry.rule, "missing": bench.skipped(name, training=True)}
+        for name, entry in bench.manifest.tasks.items()
     }
     if as_json:
         print_json({"tasks": rows})
         return
-    for name, one in rows.items():
-        print(f"{name}: {one['title']}\n  {one['rule']}")
-        for text in one["missing"]:
+    for name, entry in rows.items():
+        print(f"{name}: {entry['title']}\n  {entry['rule']}")
+        for text in entry["missing"]:
             print(f"  not at hand: {text}")
 
 

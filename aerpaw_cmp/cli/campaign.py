@@ -72,7 +72,7 @@ def _print_status(status: Any) -> None:
         f"{status.name}: {len(status.states)} tasks, {status.kept} kept in {status.keep}, {status.failed} failed the "
         f"last time, {status.to_do} to do, {time} with {status.workers} worker{'s' if status.workers > 1 else ''}"
     )
-    rows = [[s.task.flight, s.task.setting, (s.failure or s.trouble)[:100]] for s in status.states if not s.kept]
+    rows = [[s.task.flight, s.task.setting, (s.failure or s.trouble)[:100]] for s in status.states if not s.stored]
     if rows:
         title = "To do" if len(rows) <= _SHOWN else f"To do: the first {_SHOWN} of {len(rows)}"
         table(["flight", "setting", "last failure"], rows[:_SHOWN], title)

@@ -62,7 +62,7 @@ def report(
     """Replay a flight, calibrate, compare, report."""
     from ..jobs import run
 
-    asked = run.ReportOptions(
+    chosen = run.ReportOptions(
         engine=engine,
         audit=audit,
         recommend=recommend,
@@ -74,9 +74,9 @@ def report(
     )
     options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
     if dry_run:
-        print_plan(run.plan_report(flight, asked, options), as_json)
+        print_plan(run.plan_report(flight, chosen, options), as_json)
         return 0
-    outcome = run.run_report(flight, asked, options)
+    outcome = run.run_report(flight, chosen, options)
     if as_json:
         print_json(outcome.metrics)
     else:
@@ -219,7 +219,7 @@ def calibrate(
         heads = ["left out", "RMSE dB", "4 s means dB", *(f"{title} dB" for title in BASELINES.values()), "series"]
         table(heads, rows, "Scores on what was left out, means")
     forecasts = [
-        {**one, "split": split.replace("_", " ")} for split, scores in m["rank"].items() for one in scores
+        {**forecast, "split": split.replace("_", " ")} for split, scores in m["rank"].items() for forecast in scores
     ]  # fmt: skip
     columns = {
         "left out": "split", "flight": "flight", "tower": "tower", "kappa": "kappa:.3f", "agree": "agreement:.3f",

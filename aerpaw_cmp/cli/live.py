@@ -21,13 +21,13 @@ class WebCommand(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the usual address behind a bare ``--web``: an address is what holds a colon and no slash."""
-        given = []
+        words = []
         for index, word in enumerate(args):
-            given.append(word)
+            words.append(word)
             following = args[index + 1] if index + 1 < len(args) else ""
             if word == "--web" and (":" not in following or "/" in following or following.startswith("-")):
-                given.append(WEB)
-        return super().parse_args(ctx, given)
+                words.append(WEB)
+        return super().parse_args(ctx, words)
 
 
 @command(
@@ -120,8 +120,8 @@ def tap(
 class StatusLine:
     """The status of one modem or more on standard error: on a terminal a line that is written over."""
 
-    def __init__(self, wanted: bool) -> None:
-        self._wanted, self._terminal = wanted, sys.stderr.isatty()
+    def __init__(self, enabled: bool) -> None:
+        self._enabled, self._terminal = enabled, sys.stderr.isatty()
         self._lines: dict[str, str] = {}
 
     @property
@@ -137,9 +137,9 @@ class StatusLine:
         if now.message:
             print(("\r\033[K" if self._terminal else "") + head + now.message, file=sys.stderr, flush=True)
         self._lines[name] = head + format_status(now)
-        if self._wanted and self._terminal:
+        if self._enabled and self._terminal:
             print("\r\033[K" + " | ".join(self._lines.values()), end="", file=sys.stderr, flush=True)
-        elif self._wanted:
+        elif self._enabled:
             print(self._lines[name], file=sys.stderr, flush=True)
         if now.alarm:
             print("\a", end="", file=sys.stderr, flush=True)

@@ -79,9 +79,9 @@ def formats(as_json: Json = False) -> None:
     from ..logs.readers import catalogue
 
     readers = sorted(catalogue(), key=lambda r: r.name)
-    found = [{"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers]
+    listed = [{"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers]
     if as_json:
-        print_json({"readers": found})
+        print_json({"readers": listed})
         return
     columns = {"reader": "name", "what": "title", "streams": "kinds", "a line of it": "sample"}
-    records([{**item, "kinds": ", ".join(item["kinds"])} for item in found], columns)
+    records([{**item, "kinds": ", ".join(item["kinds"])} for item in listed], columns)

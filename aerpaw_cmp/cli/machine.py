@@ -47,10 +47,10 @@ def bench(
         print(f"{name}: {ratio:.3g} times")
 
 
-def _conditions(made: Mapping[str, Any]) -> str:
+def _conditions(at: Mapping[str, Any]) -> str:
     """Conditions of a benchmark in words."""
-    towers = ", ".join(made["towers"])
-    return f"{made['poses']} positions, towers {towers}, {made['buildings']} buildings, {made['cpus']} CPUs"
+    towers = ", ".join(at["towers"])
+    return f"{at['poses']} positions, towers {towers}, {at['buildings']} buildings, {at['cpus']} CPUs"
 
 
 @command(

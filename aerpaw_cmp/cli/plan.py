@@ -53,10 +53,10 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Rank candidate flights by the standard deviation that they would leave."""
-    from ..jobs.prediction.next_flight import PlanAsked, run_plan
-    from ..jobs.prediction.where import Asked
+    from ..jobs.prediction.next_flight import PlanOptions, run_plan
+    from ..jobs.prediction.where import TargetOptions
 
-    asked = PlanAsked(
+    options = PlanOptions(
         minutes=minutes,
         speed_mps=speed,
         heights_m=tuple(height or (40.0,)),
@@ -65,16 +65,16 @@ def plan(
         avoid=tuple(avoid or ()),
         routes=tuple(routes or ()),
         towers=tuple(tower or ()),
-        target=Asked(heights_m=tuple(target_height or (40.0,)), spacing_m=60.0, site=site),
+        target=TargetOptions(heights_m=tuple(target_height or (40.0,)), spacing_m=60.0, site=site),
     )
     outcome = run_plan(
-        target, flights or (), asked, RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
+        target, flights or (), options, RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
     )
     print_json(outcome.metrics) if as_json else _print_summary(outcome)
 
 
-def _in_km(one: dict[str, Any]) -> dict[str, Any]:
-    return {**one, "km": one["length_m"] / 1000.0, "flown": one.get("refused") or "yes"}
+def _in_km(route: dict[str, Any]) -> dict[str, Any]:
+    return {**route, "km": route["length_m"] / 1000.0, "flown": route.get("refused") or "yes"}
 
 
 def _print_summary(outcome: Any) -> None:

@@ -50,12 +50,12 @@ def predict(
 ) -> None:
     """Predict level and rank with error bars where nobody has flown yet."""
     from ..jobs.prediction.predict import run_predict
-    from ..jobs.prediction.where import Asked
+    from ..jobs.prediction.where import TargetOptions
 
     outcome = run_predict(
         where,
         flights or (),
-        Asked(heights_m=tuple(height or (40.0,)), spacing_m=spacing, heading_deg=heading, site=site),
+        TargetOptions(heights_m=tuple(height or (40.0,)), spacing_m=spacing, heading_deg=heading, site=site),
         RunOptions(out=out, logs_root=logs_root, force=force, progress=say),
         threshold_db=threshold,
     )
@@ -65,7 +65,7 @@ def predict(
 def _print_summary(outcome: Any) -> None:
     m = outcome.metrics
     print(m["sentence"])
-    series = [{"name": name, "mean_p_above": None, **one} for name, one in m["series"].items()]
+    series = [{"name": name, "mean_p_above": None, **numbers} for name, numbers in m["series"].items()]
     columns = {
         "series": "name", "unit": "unit", "mean level": "mean_level_db:.1f", "mean SD dB": "mean_sd_db:.1f",
         "P(above)": "mean_p_above:.2f", "outside flown": "share_outside_flown:.0%", "points": "points",

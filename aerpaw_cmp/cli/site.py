@@ -63,10 +63,10 @@ def site_import(
 
     files = files or []
     if len(files) == 1 and site_scene.is_scene(files[0]):
-        asked = site_scene.SceneOptions(
+        facts = site_scene.SceneOptions(
             origin=origin, base=base, towers=tower or (), materials=material or (), turn_deg=turn, merge_m=merge_m
         )
-        actions = site_scene.run_scene_import(files[0], out, asked, force=force)
+        actions = site_scene.run_scene_import(files[0], out, facts, force=force)
     else:
         base = base or "lake_wheeler"
         actions = run.run_site_import(
@@ -195,7 +195,7 @@ def map_(
     from ..jobs.mapping.coverage_map import map_settings
 
     modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
-    wanted: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "foliage": modes,
         "crown_reflections": crown_reflections,
         "spacing_m": spacing,
@@ -210,7 +210,7 @@ def map_(
         "study": study,
         "tile_m": tile_m,
     }
-    settings = map_settings(wanted, quick=quick)
+    settings = map_settings(fields, quick=quick)
     options = RunOptions(out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say)
     if dry_run:
         print_plan(run.plan_map(site, settings, options, flight=flight), as_json)

@@ -167,13 +167,13 @@ class _Case:
             replay(self.site, self.link, _take(self.poses, slice(BATCH)), search, run=Run(cache_dir=""))
         result, spent = _measured(lambda: replay(self.site, self.link, self.poses, search, run=Run(cache_dir="")))
         difference = compare(result, self.reference, np.arange(len(self.poses)), RANK_K)
-        found = {"missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths}
+        path_counts = {"missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths}
         about: dict[str, Any] = {
             "engine": search.engine,
             "samples": search.samples if sionna else None,
             "depth": search.max_depth,
         }
-        return self._row(difference, spent, **about, **found)
+        return self._row(difference, spent, **about, **path_counts)
 
     def own_arrays(self, samples: int, kind: str, chosen: IntArray) -> Row:
         """Channels as Sionna evaluates them."""
@@ -195,8 +195,8 @@ class _Case:
     def _difference(self, h: ComplexArray, level: FloatArray, chosen: IntArray) -> Difference:
         """Levels and ranks of some poses against the reference; paths are not compared."""
         expected = self.reference.rss_dbm[chosen]
-        both = np.isfinite(level) & np.isfinite(expected)
-        error = np.abs(level[both] - expected[both])
+        covered = np.isfinite(level) & np.isfinite(expected)
+        error = np.abs(level[covered] - expected[covered])
         parted = {k: channel_rank(h, k) != channel_rank(self.reference.h[chosen], k) for k in RANK_K}
         return Difference(
             missing_paths=-1,
@@ -354,12 +354,12 @@ def kriging_shared_weights(fields: int = 27, neighbours: int = 20) -> dict[str, 
         model = Peer(*points.T, values[:, 0], "exponential", {"psill": 0.9, "range": 900.0, "nugget": 0.1})
         return model.execute("points", *targets.T, backend="C", n_closest_points=neighbours)
 
-    theirs, one, every = median_seconds(peer, 3), ours(1), ours(fields)
+    theirs, single, every = median_seconds(peer, 3), ours(1), ours(fields)
     return {
         "ratio": fields * theirs / every,
-        "ratio_one_field": theirs / one,
+        "ratio_one_field": theirs / single,
         "seconds_pykrige_one_field": theirs,
-        "seconds_ours_one_field": one,
+        "seconds_ours_one_field": single,
         "seconds_ours_all_fields": every,
         "fields": fields,
     }
@@ -401,18 +401,18 @@ def random_scene(poses: int, *, buildings: int = 12, towers: int = 1, seed: int 
     rng = np.random.default_rng(seed)
     places = rng.uniform(-200, 200, (towers, 2))
     places[0] = 0.0
-    made: list[Building] = []
-    while len(made) < buildings:
+    boxes: list[Building] = []
+    while len(boxes) < buildings:
         east, north = rng.uniform(-300, 300, 2)
         half = rng.uniform((5, 5), (20, 12))
         shape = box(east - half[0], north - half[1], east + half[0], north + half[1])
         shape = affinity.rotate(shape, rng.uniform(0, 180))
         near_tower = min(shape.distance(Point(p)) for p in places) < 10
-        if near_tower or any(shape.distance(b.footprint) < 3 for b in made):
+        if near_tower or any(shape.distance(b.footprint) < 3 for b in boxes):
             continue
-        made.append(Building(f"building {len(made) + 1}", shape, float(rng.uniform(4, 12))))
+        boxes.append(Building(f"building {len(boxes) + 1}", shape, float(rng.uniform(4, 12))))
     named = {f"LW{i + 1}": Tower(f"LW{i + 1}", 35.7, -78.7, float(p[0]), float(p[1])) for i, p in enumerate(places)}
-    site = Site("random boxes", SiteFrame(35.7275, -78.696), named, tuple(made))
+    site = Site("random boxes", SiteFrame(35.7275, -78.696), named, tuple(boxes))
     # a Lissajous curve of 4.6 km crosses the whole field
     along = np.linspace(0.0, 2.0 * np.pi, poses, endpoint=False)
     position = np.column_stack(

@@ -115,11 +115,11 @@ def _metrics(file: Path, named: Path) -> dict[str, Any]:
     try:
         content = json.loads(read_bounded(file, LARGEST_TABLE, "metrics.json"))
     except FileNotFoundError:
-        other = next((n for n in ("campaign.json", "diff.json") if (named / n).is_file()), None)
+        foreign = next((n for n in ("campaign.json", "diff.json") if (named / n).is_file()), None)
         raise InputError(
             "there is no metrics.json" if named.is_dir() else "there is no such file or folder",
             expected="the folder of a report, or its metrics.json",
-            cause=None if other is None else f"the folder holds {other}: only reports of a flight can be compared",
+            cause=None if foreign is None else f"the folder holds {foreign}: only reports of a flight can be compared",
             path=named,
         ) from None
     except OSError as error:
@@ -140,13 +140,13 @@ def _metrics(file: Path, named: Path) -> dict[str, Any]:
         )
     wrong = [] if missing else _misshapen(content)
     if missing or wrong:
-        found = f"has no {', '.join(map(repr, missing))}" if missing else f"{wrong[0]!r} is not of its kind"
+        fault = f"has no {', '.join(map(repr, missing))}" if missing else f"{wrong[0]!r} is not of its kind"
         versions = content.get("versions")
-        made = versions.get("aerpaw-cmp", "unknown") if isinstance(versions, dict) else "unknown"
+        version = versions.get("aerpaw-cmp", "unknown") if isinstance(versions, dict) else "unknown"
         raise InputError(
-            found,
+            fault,
             expected="a report of this version",
-            cause=f"made by version {one_line(str(made))}: run the report again",
+            cause=f"made by version {one_line(str(version))}: run the report again",
             path=file,
         )
     return content
@@ -177,7 +177,7 @@ def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
             stream.seek(0, 2)
             size = stream.tell()
             stream.seek(max(0, size - 1))
-            whole = size == 0 or stream.read() == b"\n"
+            last_line_ends = size == 0 or stream.read() == b"\n"
         if not size:
             raise InputError("is empty", expected="a header at least", cause="a torn copy", path=path)
         texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
@@ -189,7 +189,7 @@ def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
     except (ValueError, UnicodeError) as error:  # pandas' parser errors are ValueErrors
         raise InputError(f"is no table ({one_line(str(error))})", cause="a damaged or edited file", path=path) from None
     lines = len(table) + 1
-    if not whole:
+    if not last_line_ends:
         raise InputError("the last line does not end", cause="a torn copy", path=path, line=lines)
     missing = [name for name in columns if name not in table.columns]
     if missing:
@@ -315,10 +315,10 @@ def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterat
         a, b = first_inputs.get(key), second_inputs.get(key)
         if a is not None and b is not None and a.get("sha256") == b.get("sha256"):
             continue
-        here, mine, theirs = a or b or {}, a or {}, b or {}
+        entry, mine, theirs = a or b or {}, a or {}, b or {}
         if a is None or b is None:
-            others = first if a is None else second
-            if any(i.get("sha256") == here.get("sha256") and i.get("role") == here.get("role") for i in others):
+            opposite = first if a is None else second
+            if any(i.get("sha256") == entry.get("sha256") and i.get("role") == entry.get("role") for i in opposite):
                 continue
         yield InputEntry(
             role=key[0],
@@ -392,13 +392,13 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[report_differenc
     residuals: list[_Residuals] = []
     names = ("measured_db", "simulated_dbm", "residual_db")
     for (tower, channel), numbers in links_of(mine.metrics["rss"]).items():
-        other = theirs.metrics["rss"].get(tower, {}).get(channel)
-        if other is None or numbers.get(KEY) or other.get(KEY):
+        their_numbers = theirs.metrics["rss"].get(tower, {}).get(channel)
+        if their_numbers is None or numbers.get(KEY) or their_numbers.get(KEY):
             continue  # no error of a model is compared on a log that it was learned from
         tables = [s.rss[(s.rss["tower"] == tower) & (s.rss["channel"] == channel)] for s in (mine, theirs)]
         overlap, a, b = _matched(*tables)
         first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))
-        offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, other)]
+        offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, their_numbers)]
         scored = [int(table["residual_db"].notna().sum()) for table in tables]
         residuals.append((_instants(a), first[2], second[2]))
         differences.append(

@@ -131,8 +131,8 @@ class Flight:
         frame.insert(0, "time", _utc(times))
         frame["heading_deg"] = poses.heading_deg
         frame["attitude_known"] = poses.attitude_known
-        kept: pd.DataFrame = frame[poses.valid].reset_index(drop=True)
-        return kept
+        posed: pd.DataFrame = frame[poses.valid].reset_index(drop=True)
+        return posed
 
     @cached_property
     def rss(self) -> pd.DataFrame:
@@ -281,17 +281,17 @@ class ReplayedFlight:
     @property
     def rss_dbm(self) -> dict[Series, FloatArray]:
         """Simulated level (n,) [dBm] at every sample of a series; NaN without a pose or a path."""
-        return {key: one.spread(one.replay.rss_dbm[:, 0]) for key, one in self.series.items()}
+        return {key: replayed.spread(replayed.replay.rss_dbm[:, 0]) for key, replayed in self.series.items()}
 
     @property
     def h(self) -> dict[Series, ComplexArray]:
         """Channel matrices (poses, n_rx, n_tx), complex128, at the poses that are known."""
-        return {key: one.replay.h[:, 0] for key, one in self.series.items()}
+        return {key: replayed.replay.h[:, 0] for key, replayed in self.series.items()}
 
     @property
     def paths(self) -> dict[Series, PathSet]:
         """Paths of each series; ``pose`` counts the poses that are known."""
-        return {key: one.replay.paths for key, one in self.series.items()}
+        return {key: replayed.replay.paths for key, replayed in self.series.items()}
 
     def to_xarray(self) -> Any:
         """Levels and channel matrices on an index of time.
@@ -308,10 +308,10 @@ class ReplayedFlight:
         """
         times = {(s.tower, s.channel): s.time for _, s in self.data.series}
         nodes = {}
-        for key, one in self.series.items():
-            data = one.replay.to_xarray().rename(pose="time")
-            place = {name: ("time", values) for name, values in _place(one.poses.position_m).items()}
-            nodes[_node(key)] = data.assign_coords(time=times[key][one.valid], **place)
+        for key, replayed in self.series.items():
+            data = replayed.replay.to_xarray().rename(pose="time")
+            place = {name: ("time", values) for name, values in _place(replayed.poses.position_m).items()}
+            nodes[_node(key)] = data.assign_coords(time=times[key][replayed.valid], **place)
         return _tree(nodes)
 
     def compare(self) -> Comparison:

@@ -260,7 +260,7 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
                 settings, foliage=(mode,), spacing_m=settings.spacing_m * max(1.0, (positions / 80) ** 0.5)
             )
             tried = len(Grid.over_area(place.area_m, coarse.spacing_m))
-            seconds = _cpu_seconds(lambda one=coarse: make_maps(place, one, Stages())) * positions / tried
+            seconds = _cpu_seconds(lambda chosen=coarse: make_maps(place, chosen, Stages())) * positions / tried
         stages.append(PlannedStage(f"maps, foliage {mode}", work, seconds))
     if settings.study and not cells:
         stages.append(PlannedStage("study", "correlation and interpolation"))

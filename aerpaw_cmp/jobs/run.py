@@ -106,16 +106,18 @@ def run_ingest(
             home = drafted.target.parent
             if site is not None and Path(site).is_file():
                 site = os.path.relpath(Path(site).resolve(), home.resolve())
-            made = drafts(files, home, site=site or SITE, **options_of_clock)
-            numbered = (draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(made) + 1))
+            flight_drafts = drafts(files, home, site=site or SITE, **options_of_clock)
+            numbered = (
+                draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(flight_drafts) + 1)
+            )
             places = [draft, *numbered]
             further = [OutputFile(place, own=is_sealed, inputs=paths, force=force) for place in places[1:]]
-            for file, one in zip([drafted, *map(outputs.enter_context, further)], made, strict=True):
-                file.write(sealed(one.text))
+            for file, flight_draft in zip([drafted, *map(outputs.enter_context, further)], flight_drafts, strict=True):
+                file.write(sealed(flight_draft.text))
             account["draft"] = [
                 remark if place is draft else f"{place.name}: {remark}"
-                for place, one in zip(places, made, strict=True)
-                for remark in one.remarks
+                for place, flight_draft in zip(places, flight_drafts, strict=True)
+                for remark in flight_draft.remarks
             ]
             account["drafts"] = [str(place) for place in places]
         if target is not None:
@@ -194,13 +196,13 @@ class ReportOptions:
 AS_IT_COMES = ReportOptions()
 
 
-def run_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOptions = DEFAULT) -> JobOutcome:
+def run_report(flight: Path, chosen: ReportOptions = AS_IT_COMES, options: RunOptions = DEFAULT) -> JobOutcome:
     """Replay a flight, calibrate, compare, report.
 
     Parameters
     ----------
     flight : Path
-    asked : ReportOptions
+    chosen : ReportOptions
     options : RunOptions
         ``out`` is ``reports/<flight>`` by default.
 
@@ -226,27 +228,27 @@ def run_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOpt
     from .reporting.pose_paths import pose_paths
     from .tasks.manifest import other_inputs
 
-    for given, known in ((asked.figures, FIGURES), (asked.style, STYLES)):
-        if given not in known:
-            raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
-    if asked.recommend is not None:
-        _require_same_folder(asked.recommend, flight, options.logs_root)
-    settings, inputs, folder = _report_inputs(flight, asked, options)
-    stages, learned = Stages(options.progress), None if asked.learned is None else Path(asked.learned)
+    for word, words in ((chosen.figures, FIGURES), (chosen.style, STYLES)):
+        if word not in words:
+            raise UsageError(f"found {word!r}", expected="one of " + ", ".join(words), cause="--figures or --style")
+    if chosen.recommend is not None:
+        _require_same_folder(chosen.recommend, flight, options.logs_root)
+    settings, inputs, folder = _report_inputs(flight, chosen, options)
+    stages, learned = Stages(options.progress), None if chosen.learned is None else Path(chosen.learned)
     with ExitStack() as outputs:
         output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=options.force))
         target = None
-        if asked.recommend is not None:
-            file = OutputFile(asked.recommend, own=is_sealed, inputs=inputs, force=options.force)
+        if chosen.recommend is not None:
+            file = OutputFile(chosen.recommend, own=is_sealed, inputs=inputs, force=options.force)
             target = outputs.enter_context(file)
-        formats = chosen_formats(settings.report.export, asked.export)
+        formats = chosen_formats(settings.report.export, chosen.export)
         with stages("read"):
             data = load_data(settings, flight.parent, options.logs_root)
             before = None
-            if asked.against is not None:
+            if chosen.against is not None:
                 from .prediction.against import score_against  # loads what calibration and prediction need
 
-                before = score_against(data, Path(asked.against))
+                before = score_against(data, Path(chosen.against))
         replays = replay_flight(data, stages)
         flight_run = run_flight(data, stages, replays=replays, ladder=True)
         carriers = {replayed.link.carrier_hz for replayed in replays.all}
@@ -264,29 +266,29 @@ def run_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOpt
             target.write(sealed(recommended_text(load_flight(flight, learned), flight_run.ladder, flight.name)))
         with output.filling() as place:
             written = write_report(
-                record, place, drawn=asked.figures, style=asked.style, exports=formats, stages=stages
+                record, place, drawn=chosen.figures, style=chosen.style, exports=formats, stages=stages
             )
     metrics = metrics_of(written.data)
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=_failed_checks(metrics))
 
 
-def _report_inputs(flight: Path, asked: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:
+def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:
     """Settings with what the command line says instead, files that they name, folder of the results."""
     from ..flight.settings import load_flight
 
-    learned = None if asked.learned is None else Path(asked.learned)
-    settings = _overridden(load_flight(flight, learned), asked.engine, asked.audit)
+    learned = None if chosen.learned is None else Path(chosen.learned)
+    settings = _overridden(load_flight(flight, learned), chosen.engine, chosen.audit)
     inputs = [*input_files(settings, flight, options.logs_root), *([] if learned is None else [learned])]
     return settings, inputs, options.out or Path("reports") / settings.flight.name
 
 
-def plan_report(flight: Path, asked: ReportOptions = AS_IT_COMES, options: RunOptions = DEFAULT) -> Any:
+def plan_report(flight: Path, chosen: ReportOptions = AS_IT_COMES, options: RunOptions = DEFAULT) -> Any:
     """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing."""
     from .plan import report_plan
 
-    settings, inputs, folder = _report_inputs(flight, asked, options)
+    settings, inputs, folder = _report_inputs(flight, chosen, options)
     OutputFolder(folder, job="report", inputs=inputs, force=options.force).refuse()
-    return report_plan(settings, flight.parent, options.logs_root, inputs=inputs, out=folder, figures=asked.figures)
+    return report_plan(settings, flight.parent, options.logs_root, inputs=inputs, out=folder, figures=chosen.figures)
 
 
 def _require_same_folder(recommend: Path, flight: Path, logs_root: Path | None) -> None:
@@ -375,9 +377,9 @@ def run_site_import(
     rasters = [path for path in (canopy, surface) if path is not None]
     with OutputFile(out, own=is_sealed, inputs=[*files, *rasters, Path(base)], force=force) as output:
         model, actions = import_site(files, base=base, untagged=untagged, maps_needed=not rasters)
-        for path, made in ((canopy, with_canopy), (surface, with_heights)):
+        for path, with_raster in ((canopy, with_canopy), (surface, with_heights)):
             if path is not None:
-                model, more = made(model, path)
+                model, more = with_raster(model, path)
                 actions += more
         text = site_yaml(model, header=["made by 'aerpaw-cmp site import' from map data", *actions])
         output.write(sealed(text))
@@ -630,10 +632,10 @@ def run_campaign(
         with suppress(AerpawCmpError):  # a flight file that cannot be read is a row of the result
             inputs += input_files(load_flight(path.parent / entry), path.parent / entry, options.logs_root)
     folder = options.out or Path("reports") / campaign.campaign
-    kept = None if fresh else campaign_keep(campaign, path, keep)
-    left = f"finished tasks are kept in {kept}, and the same command computes the rest" if kept else "nothing is kept"
-    with OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output, noting_interrupts(left):
-        data = run_all(campaign, path.parent, options, keep=kept, stages=stages)
+    store = None if fresh else campaign_keep(campaign, path, keep)
+    note = f"finished tasks are kept in {store}, and the same command computes the rest" if store else "nothing is kept"
+    with OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output, noting_interrupts(note):
+        data = run_all(campaign, path.parent, options, keep=store, stages=stages)
         data = with_season(data, find_reports(data.flights, folder, [folder.parent, Path("reports")]))
         with stages("report"), output.filling() as place:
             finished = replace(data, stages_s=dict(stages.seconds))
@@ -738,19 +740,19 @@ def run_calibrate(
         OutputFolder(folder, job="calibrate", inputs=inputs, force=options.force) as output,
     ):
         with stages("read"):
-            flights, said = read_flights(settings, path.parent, options.logs_root)
+            flights, remarks = read_flights(settings, path.parent, options.logs_root)
         ranked, calibration = None, None
         if settings.rank is not None:
             with stages("rank"):
                 ranked = fit_rank(flights, settings.rank)
         if ranked is None or any(data.rss for data in flights):
             calibration = calibrate(settings, flights, path.parent, options.logs_root, stages=stages, score=score)
-        found = Calibrated(settings, tuple(flights), tuple(said), calibration, ranked)
+        calibrated = Calibrated(settings, tuple(flights), tuple(remarks), calibration, ranked)
         with output.filling() as place:
-            metrics, text = write_files(found, place, folder.name, stages.seconds)
+            metrics, text = write_files(calibrated, place, folder.name, stages.seconds)
         file.write(sealed(text))
     if into_site is not None:
         command = f"aerpaw-cmp calibrate {path.name} --into-site {into_site}"
-        entries = site_entries(found, command)
+        entries = site_entries(calibrated, command)
         metrics["into_site"] = [str(f) for entry in entries for f in remember(into_site, *entry)]
     return JobOutcome(folder=folder, metrics=metrics, files=(target,))

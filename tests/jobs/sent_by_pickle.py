@@ -3,10 +3,10 @@
 import pickle
 from typing import Any
 
-from aerpaw_cmp.jobs.tasks.workers import Here
+from aerpaw_cmp.jobs.tasks.workers import InProcess
 
 
-class SentByPickle(Here):
+class SentByPickle(InProcess):
     """Orders and results go through pickle, as to a process and back; ``sizes`` are those of the orders [bytes]."""
 
     count = 2

@@ -150,7 +150,7 @@ def test_nothing_of_a_fold_is_known(bench: benchmark.Bench) -> None:
         for question in benchmark.questions(bench, task, "asked"):
             folds += 1
             rows.append(question.rows[0])
-            asked = question.asked[0].samples
+            asked = question.targets[0].samples
             for known in question.train:
                 s = known.samples
                 if task == "sectors":

@@ -109,6 +109,6 @@ def test_points_without_a_position_are_left_out_and_counted(place: Path) -> None
 def test_without_a_geofence_the_area_is_that_of_the_site() -> None:
     site = load_site("lake_wheeler")
     west, east, south, north = site.area_m
-    area = next_flight._area(site, next_flight.PlanAsked(tower_distance_m=0.0))
+    area = next_flight._area(site, next_flight.PlanOptions(tower_distance_m=0.0))
     # routes stay 3 m inside
     np.testing.assert_allclose(area.bounds, (west + 3.0, south + 3.0, east - 3.0, north - 3.0), atol=0.1)

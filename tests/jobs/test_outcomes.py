@@ -23,7 +23,7 @@ from aerpaw_cmp.jobs.campaigns import campaign_tasks
 from aerpaw_cmp.jobs.campaigns.campaign_plan import campaign_status, compute, kept_outcomes
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Done, Order, Outcome, Task, carry_out, outcome_store, task_facts
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
-from aerpaw_cmp.jobs.tasks.workers import Here, Processes, Workers
+from aerpaw_cmp.jobs.tasks.workers import InProcess, Processes, Workers
 from aerpaw_cmp.report.campaign_data import Failure, FlownTrack
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -154,7 +154,7 @@ def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path
     """One task of the sample flight, through the store and back: the same numbers, the same nested records."""
     changes = {"rss.lag": "off", "rss.advanced.lag_window_s": 10, "rank.advanced.bootstrap": 10}
     task = Task(flight, "f", "as written", changes, None)
-    (first,) = run_tasks([task], Here(), keep=tmp_path)
+    (first,) = run_tasks([task], InProcess(), keep=tmp_path)
     assert first.failure is None
     key = task_facts(task).key
     again = outcome_store(tmp_path).load(key)
@@ -203,21 +203,21 @@ def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkey
 
     monkeypatch.setattr(campaign_tasks, "run_task", one)
     tasks = tasks_of(flight)
-    first = run_tasks(tasks, Here(), keep=tmp_path)
+    first = run_tasks(tasks, InProcess(), keep=tmp_path)
     assert asked == ["f0", "f1", "f2", "f3"]
     assert first[3].failure is not None
     status = campaign_status("c", tasks, [], outcome_store(tmp_path), workers=2)
     assert (status.kept, status.failed, status.to_do) == (3, 1, 1)
-    assert status.estimate_s == pytest.approx(np.mean([s.seconds for s in status.states if s.kept]))
+    assert status.estimate_s == pytest.approx(np.mean([s.seconds for s in status.states if s.stored]))
     assert [s.failure for s in status.states] == ["", "", "", "no luck"]
     assert "line 1" in next(tmp_path.glob("*.failed.json")).read_text()
-    again = run_tasks(tasks, Here(), keep=tmp_path)
+    again = run_tasks(tasks, InProcess(), keep=tmp_path)
     assert asked[4:] == ["f3"], "only the failure is tried again"
     assert all(equal(a, b) for a, b in zip(first[:3], again[:3], strict=True))
-    run_tasks(tasks, Here(), keep=tmp_path)
+    run_tasks(tasks, InProcess(), keep=tmp_path)
     assert len(asked) == 6
     assert not list(tmp_path.glob("*.failed.json")), "what succeeds is no failure any more"
-    run_tasks(tasks, Here())
+    run_tasks(tasks, InProcess())
     assert len(asked) == 10, "nothing is kept unless asked for"
 
 
@@ -227,9 +227,9 @@ def test_a_new_name_or_place_in_the_list_computes_nothing(
     """A setting put before the first, a label that is another: the outcomes are those that were kept, renamed."""
     asked: list[str] = []
     monkeypatch.setattr(campaign_tasks, "run_task", lambda task: asked.append(task.setting) or track(1.0))
-    run_tasks([Task(flight, "f", "a", {}, None, True)], Here(), keep=tmp_path)
+    run_tasks([Task(flight, "f", "a", {}, None, True)], InProcess(), keep=tmp_path)
     first = Task(flight, "g", "first", {"rss.advanced.lag_window_s": 3}, None, True)
-    found = run_tasks([first, Task(flight, "g", "b", {}, None, False)], Here(), keep=tmp_path)
+    found = run_tasks([first, Task(flight, "g", "b", {}, None, False)], InProcess(), keep=tmp_path)
     assert asked == ["a", "first"]
     assert [one.track.flight for one in found if one.track is not None] == ["g", "g"]
 
@@ -259,7 +259,7 @@ import os, signal, sys
 from pathlib import Path
 from aerpaw_cmp.jobs.campaigns import campaign_tasks
 from aerpaw_cmp.jobs.campaigns.campaign_plan import compute, kept_outcomes
-from aerpaw_cmp.jobs.tasks.workers import Here
+from aerpaw_cmp.jobs.tasks.workers import InProcess
 from aerpaw_cmp.report.campaign_data import FlownTrack
 import numpy as np
 
@@ -276,7 +276,7 @@ flight = Path(sys.argv[1])
 tasks = [campaign_tasks.Task(flight, f"f{i}", "as written", {"rss.advanced.lag_window_s": 10.0 + i}, None) for i in range(4)]
 store = campaign_tasks.outcome_store(Path(sys.argv[2]))
 outcomes, orders = kept_outcomes(tasks, store, print)
-compute(orders, Here(), outcomes, store, print)
+compute(orders, InProcess(), outcomes, store, print)
 """
 
 
@@ -289,7 +289,7 @@ def test_after_sigkill_only_what_is_missing_is_computed(
     monkeypatch.setattr(
         campaign_tasks, "run_task", lambda task: asked.append(task.flight) or track(float(task.flight[1:]))
     )
-    found = run_tasks(tasks_of(flight), Here(), keep=tmp_path)
+    found = run_tasks(tasks_of(flight), InProcess(), keep=tmp_path)
     assert asked == ["f2", "f3"]
     assert all(equal(one, track(float(i))) for i, one in enumerate(found))
 

@@ -23,7 +23,7 @@ from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.against import score_against
 from aerpaw_cmp.jobs.prediction.predict import write_maps
 from aerpaw_cmp.jobs.prediction.sources import named_flights
-from aerpaw_cmp.jobs.prediction.where import Asked, Targets, find_targets
+from aerpaw_cmp.jobs.prediction.where import TargetOptions, Targets, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.html import coded
@@ -133,7 +133,7 @@ def test_no_flight_that_shares_a_tower_is_one_message(small):
 def test_a_file_without_positions_is_refused(tmp_path):
     (tmp_path / "p.csv").write_text("east_m,north_m,height_m\n,,\n")
     with pytest.raises(InputError, match="no point has a position"):
-        find_targets(tmp_path / "p.csv", load_site("lake_wheeler"), Asked())
+        find_targets(tmp_path / "p.csv", load_site("lake_wheeler"), TargetOptions())
 
 
 def test_files_agree_with_each_other(tmp_path, prediction):
@@ -245,7 +245,7 @@ def test_a_prediction_of_another_place_is_no_score(said):
 
 def test_a_grid_has_its_heights_one_after_the_other():
     site = load_site("lake_wheeler")
-    targets = find_targets(Path("lake_wheeler"), site, Asked(heights_m=(30.0, 50.0), spacing_m=300.0))
+    targets = find_targets(Path("lake_wheeler"), site, TargetOptions(heights_m=(30.0, 50.0), spacing_m=300.0))
     half = len(targets) // 2
     assert half == len(targets.grid)
     assert set(targets.position_m[:half, 2]) == {30.0}
@@ -255,7 +255,7 @@ def test_a_grid_has_its_heights_one_after_the_other():
 def test_maps_of_a_grid_hold_levels_and_their_spread_height_by_height(prediction, tmp_path):
     rasterio = pytest.importorskip("rasterio")
     targets = find_targets(
-        Path("lake_wheeler"), load_site("lake_wheeler"), Asked(heights_m=(30.0, 50.0), spacing_m=300.0)
+        Path("lake_wheeler"), load_site("lake_wheeler"), TargetOptions(heights_m=(30.0, 50.0), spacing_m=300.0)
     )
     n = len(targets)
     level, sd = np.arange(float(n)) - 100.0, np.full(n, 3.0)
@@ -275,7 +275,7 @@ def test_maps_of_a_grid_hold_levels_and_their_spread_height_by_height(prediction
 
 
 def test_a_planned_flight_faces_its_course():
-    targets = find_targets(SAMPLE, load_site("lake_wheeler"), Asked())
+    targets = find_targets(SAMPLE, load_site("lake_wheeler"), TargetOptions())
     east = targets.position_m[:, 0]
     leg = (targets.time_s > 30) & (targets.time_s < 40)
     step = np.diff(targets.position_m[leg][:, :2], axis=0)[0]

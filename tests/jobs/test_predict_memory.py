@@ -13,7 +13,7 @@ from aerpaw_cmp.compare.spread import Spread
 from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.corrected_map import corrected_maps
 from aerpaw_cmp.jobs.prediction.sources import Memory, named_flights
-from aerpaw_cmp.jobs.prediction.where import Asked
+from aerpaw_cmp.jobs.prediction.where import TargetOptions
 from aerpaw_cmp.site.learned import Entry, Errors, LearnedLevel, LearnedSeries, folder_of, read_learned, remember
 from aerpaw_cmp.site.siteyaml import load_site
 from aerpaw_cmp.site.sphere_pattern import sphere_csv
@@ -65,7 +65,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_levels_are_free_space_and_the_remembered_gains(site: Path) -> None:
-    said = job.predict(site.parent / "p.csv", [], Asked(site=str(site)), threshold_db=-80.0)
+    said = job.predict(site.parent / "p.csv", [], TargetOptions(site=str(site)), threshold_db=-80.0)
     levels = said.table[said.table["channel"] == "A"][:3]
     assert list(said.table["flag"]) == ["", "", "outside_flown", "outside_flown"]  # behind the tower, and off the site
     free = 30.0 - 20 * np.log10(4 * np.pi * 300.0 * 3.3e9 / 299_792_458.0)
@@ -84,8 +84,8 @@ def test_levels_are_free_space_and_the_remembered_gains(site: Path) -> None:
 def test_an_unknown_heading_adds_the_spread_of_the_gain_over_headings(site: Path) -> None:
     points = pd.read_csv(site.parent / "p.csv").assign(yaw_deg=np.nan)
     points.to_csv(site.parent / "open.csv", index=False)
-    said = job.predict(site.parent / "open.csv", [], Asked(site=str(site)))
-    known = job.predict(site.parent / "p.csv", [], Asked(site=str(site)))
+    said = job.predict(site.parent / "open.csv", [], TargetOptions(site=str(site)))
+    known = job.predict(site.parent / "p.csv", [], TargetOptions(site=str(site)))
     one, other = (x.table[x.table["channel"] == "A"].iloc[0] for x in (said, known))
     # eight headings: the cosine has mean 0 and variance 1/2
     assert one["level_db"] - other["level_db"] == pytest.approx(2.0, abs=0.02)
@@ -96,7 +96,7 @@ def test_maps_are_corrected_by_the_memory_alone(site: Path) -> None:
     maps = corrected_maps(str(site), 300.0, ((40.0,), (60.0,)), [])
     assert [(item.link, item.height_m) for item in maps.levels] == [("LW1 A", 40.0)]
     assert maps.ranks == {}  # this memory has no receiver
-    said = job.predict(site, [], Asked(heights_m=(40.0,), spacing_m=300.0))
+    said = job.predict(site, [], TargetOptions(heights_m=(40.0,), spacing_m=300.0))
     np.testing.assert_allclose(maps.levels[0].corrected_dbm, said.table["level_db"] + 7.0, atol=1e-3)
 
 
@@ -140,7 +140,7 @@ def test_a_flight_is_predicted_before_it_from_the_memory_alone(flown: Path) -> N
 
 def test_remembered_antennas_stand_beside_other_bases_but_not_on_their_own_flights(flown: Path) -> None:
     known = {name: job.predict(flown / "aside.yaml", named_flights([flown / f"{name}.yaml"]),
-                               Asked(site=str(flown / "mine.yaml"))) for name in ("aside", "first")}  # fmt: skip
+                               TargetOptions(site=str(flown / "mine.yaml"))) for name in ("aside", "first")}  # fmt: skip
     bases = {name: {row["base"] for row in said.page.candidates} for name, said in known.items()}
     assert "antennas that the site remembers" in bases["aside"]
     assert "antennas that the site remembers" not in bases["first"]

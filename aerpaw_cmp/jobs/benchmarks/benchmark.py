@@ -96,8 +96,8 @@ class Task(StrictModel):
             if self.own_offset
             else "Levels count as they are."
         )
-        said = offset if self.kind == "level" else "Scored is the probability of each rank."
-        return f"Known: {known}. {said}"
+        scoring = offset if self.kind == "level" else "Scored is the probability of each rank."
+        return f"Known: {known}. {scoring}"
 
 
 class Manifest(StrictModel):
@@ -131,14 +131,14 @@ def locate(manifest: Manifest, folder: Path) -> dict[str, Path]:
     """
     if not folder.is_dir():
         raise InputError("no such folder", expected="the folder of the published logs (--data)", path=folder)
-    wanted = {digest: name for name, one in manifest.files.items() for digest in (one.sha256, *one.also)}
+    names_by_digest = {digest: name for name, entry in manifest.files.items() for digest in (entry.sha256, *entry.also)}
     sizes = {size for item in manifest.files.values() for size in (item.bytes, *item.also.values())}
     places: dict[str, Path] = {}
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-        name = wanted.get(_content_digest(path, sizes))
+        name = names_by_digest.get(_content_digest(path, sizes))
         if name is not None:
             places.setdefault(name, path)
-    known = {Path(one.path).name: name for name, one in manifest.files.items()}
+    known = {Path(entry.path).name: name for name, entry in manifest.files.items()}
     for path in folder.rglob("*.mat"):
         name = known.get(path.name, "")
         if name and name not in places:
@@ -214,8 +214,12 @@ class Bench:
 
     def skipped(self, task: str, *, training: bool) -> list[str]:
         """Files that a task lacks, each with its source; empty where it can be run."""
-        one = self.manifest.tasks[task]
-        absent = [name for flight in (*one.test, *(one.train if training else ())) for name in self.missing(flight)]
+        definition = self.manifest.tasks[task]
+        absent = [
+            name
+            for flight in (*definition.test, *(definition.train if training else ()))
+            for name in self.missing(flight)
+        ]
         return [
             f"{name}: {self.manifest.files[name].path} of {self.manifest.files[name].repository}"
             for name in dict.fromkeys(absent)
@@ -229,9 +233,9 @@ class Bench:
 # --- splits --------------------------------------------------------------------------------------------------------
 
 
-def folds_of(split: Split, one: Observed) -> IntArray:
+def folds_of(split: Split, observed: Observed) -> IntArray:
     """Fold (n,) of each test sample: those of one fold are predicted together."""
-    samples = one.samples
+    samples = observed.samples
     if split == "sectors":
         azimuth = np.degrees(np.arctan2(samples.at_tower[:, 0], samples.at_tower[:, 1])) % 360.0
         return np.asarray(azimuth // (360.0 / SECTORS), dtype=np.int64)
@@ -244,7 +248,7 @@ def folds_of(split: Split, one: Observed) -> IntArray:
     return np.zeros(len(samples), dtype=np.int64)
 
 
-def may_know(split: Split, known: Observed, asked: Observed, *, own: bool) -> BoolArray:
+def may_know(split: Split, known: Observed, fold: Observed, *, same_flight: bool) -> BoolArray:
     """Samples of ``known`` that a prediction of one fold may use.
 
     Parameters
@@ -252,9 +256,9 @@ def may_know(split: Split, known: Observed, asked: Observed, *, own: bool) -> Bo
     split : {"flights", "sectors", "blocks", "stretches"}
     known : Observed
         A series that may be learned from.
-    asked : Observed
+    fold : Observed
         Samples of one fold.
-    own : bool
+    same_flight : bool
         Both are of one flight.
 
     Returns
@@ -262,42 +266,46 @@ def may_know(split: Split, known: Observed, asked: Observed, *, own: bool) -> Bo
     (n,) bool
     """
     if split == "sectors":
-        azimuth, own_azimuth = (np.arctan2(o.samples.at_tower[:, 0], o.samples.at_tower[:, 1]) for o in (known, asked))
+        azimuth, fold_azimuth = (np.arctan2(o.samples.at_tower[:, 0], o.samples.at_tower[:, 1]) for o in (known, fold))
         width = 2.0 * np.pi / SECTORS
-        middle = (np.floor(own_azimuth[0] % (2 * np.pi) / width) + 0.5) * width
-        away = np.abs((azimuth - middle + np.pi) % (2.0 * np.pi) - np.pi)
-        return np.asarray(away > 0.5 * width + np.radians(SECTOR_GUARD_DEG))
-    if not own:
+        middle = (np.floor(fold_azimuth[0] % (2 * np.pi) / width) + 0.5) * width
+        from_middle = np.abs((azimuth - middle + np.pi) % (2.0 * np.pi) - np.pi)
+        return np.asarray(from_middle > 0.5 * width + np.radians(SECTOR_GUARD_DEG))
+    if not same_flight:
         return np.ones(len(known.samples), dtype=np.bool_)
     if split == "blocks":
-        place, cell = known.samples.position_m[:, :2], np.floor(asked.samples.position_m[0, :2] / BLOCK_M)
+        place, cell = known.samples.position_m[:, :2], np.floor(fold.samples.position_m[0, :2] / BLOCK_M)
         return np.asarray((np.abs(place - (cell + 0.5) * BLOCK_M) > 0.5 * BLOCK_M + BLOCK_GUARD_M).any(axis=1))
-    low, high = asked.samples.time_s[[0, -1]]
+    low, high = fold.samples.time_s[[0, -1]]
     return np.asarray((known.samples.time_s < low - STRETCH_GUARD_S) | (known.samples.time_s > high + STRETCH_GUARD_S))
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One fold of a task: what is known and what is asked. ``rows`` (n,) of each asked series of the flight."""
+    """One fold of a task: what is known and what is asked. ``rows`` (n,) of each target series of the flight."""
 
     train: list[Observed]
-    asked: list[Observed]
+    targets: list[Observed]
     rows: list[IntArray]
 
 
 def questions(bench: Bench, task: str, flight: str) -> Iterator[Question]:
     """The folds of one test flight."""
-    one = bench.manifest.tasks[task]
+    definition = bench.manifest.tasks[task]
     tests = bench.observed(flight)
-    folds = [folds_of(one.split, o) for o in tests]
+    folds = [folds_of(definition.split, o) for o in tests]
     for fold in np.unique(np.concatenate(folds)):
         rows = [np.flatnonzero(f == fold) for f in folds]
-        asked = [o.part(r) for o, r in zip(tests, rows, strict=True)]
-        some = next(o for o in asked if len(o.samples))
-        train = [o.part(may_know(one.split, o, some, own=False)) for name in one.train for o in bench.observed(name)]
-        if not one.own_offset:
-            train += [o.part(may_know(one.split, o, some, own=True)) for o in tests]
-        yield Question([o for o in train if len(o.samples)], asked, rows)
+        targets = [o.part(r) for o, r in zip(tests, rows, strict=True)]
+        some = next(o for o in targets if len(o.samples))
+        train = [
+            o.part(may_know(definition.split, o, some, same_flight=False))
+            for name in definition.train
+            for o in bench.observed(name)
+        ]
+        if not definition.own_offset:
+            train += [o.part(may_know(definition.split, o, some, same_flight=True)) for o in tests]
+        yield Question([o for o in train if len(o.samples)], targets, rows)
 
 
 # --- tables --------------------------------------------------------------------------------------------------------
@@ -343,9 +351,9 @@ def truth(bench: Bench, task: str, *, training: bool = False) -> pd.DataFrame:
     training : bool
         The training flights in place of the test flights.
     """
-    one = bench.manifest.tasks[task]
-    flights = [f for f in one.train if not bench.missing(f)] if training else bench.tests(task)
-    of = _rank_rows if one.kind == "rank" else _level_rows
+    definition = bench.manifest.tasks[task]
+    flights = [f for f in definition.train if not bench.missing(f)] if training else bench.tests(task)
+    of = _rank_rows if definition.kind == "rank" else _level_rows
     parts = [frame for flight in flights for frame in of(bench, task, flight)]
     if not parts:
         parts = [pd.DataFrame(columns=[*KEY, "fold", "measured"])]
@@ -451,8 +459,8 @@ def read_entry(path: Path) -> Entry:
 def check_training(bench: Bench, entry: Entry, tasks: Sequence[str]) -> None:
     """UsageError where the entrant declares a test file among what it was trained on."""
     declared = set(entry.head.get("trained_on", "").replace(",", " ").split())
-    held = [(task, flight) for task in tasks for flight in bench.manifest.tasks[task].test]
-    for task, flight in held if declared else ():
+    test_flights = [(task, flight) for task in tasks for flight in bench.manifest.tasks[task].test]
+    for task, flight in test_flights if declared else ():
         files = [bench.manifest.files[name] for name in bench.logs_of(flight)]
         known = declared & {digest for file in files for digest in (file.sha256, *file.also)}
         if known and bench.manifest.tasks[task].own_offset:
@@ -494,34 +502,38 @@ def score_task(
     series = _level_series(bench, task, table, entry)
     if not accept_levels:
         _check_levels(task, table, entry)
-    others = {name: _level_series(bench, task, table, other) for name, other in baselines.items() if other is not entry}
-    return {**level_scores(series), **intervals(series, others)}
+    baseline_series = {
+        name: _level_series(bench, task, table, baseline)
+        for name, baseline in baselines.items()
+        if baseline is not entry
+    }
+    return {**level_scores(series), **intervals(series, baseline_series)}
 
 
 def _joined(task: str, table: pd.DataFrame, entry: Entry, values: Sequence[str]) -> pd.DataFrame:
     """The rows of the truth with the predictions beside them."""
-    given = entry.frame[entry.frame["task"] == task]
-    if absent := [name for name in values if name not in given]:
+    predicted = entry.frame[entry.frame["task"] == task]
+    if absent := [name for name in values if name not in predicted]:
         raise UsageError(f"{task}: no column {absent[0]!r}", expected=f"{', '.join(values)} beside {', '.join(KEY)}")
-    both: pd.DataFrame = table.merge(given[[*KEY, *values]], on=KEY, how="left", validate="one_to_one")
-    lost = ~np.isfinite(both[list(values)]).all(axis=1)
+    joined: pd.DataFrame = table.merge(predicted[[*KEY, *values]], on=KEY, how="left", validate="one_to_one")
+    lost = ~np.isfinite(joined[list(values)]).all(axis=1)
     if lost.any():
-        first = both[lost].iloc[0]
+        first = joined[lost].iloc[0]
         raise UsageError(
-            f"{task}: {int(lost.sum())} of {len(both)} rows have no prediction, first {first['flight']} "
+            f"{task}: {int(lost.sum())} of {len(joined)} rows have no prediction, first {first['flight']} "
             f"{first['tower']} {first['channel']} {first['time']}",
             expected="a number for every row of 'aerpaw-cmp benchmark template'",
             cause="other times or channels, rows left out, or a flight that was not predicted",
         )
-    return both
+    return joined
 
 
 def _level_series(bench: Bench, task: str, table: pd.DataFrame, entry: Entry) -> list[LevelSeries]:
     has_sd = "sd_db" in entry.frame and bool(entry.frame.loc[entry.frame["task"] == task, "sd_db"].notna().all())
-    both = _joined(task, table, entry, ["level_db", "sd_db"] if has_sd else ["level_db"])
-    if has_sd and not (both["sd_db"] > 0).all():
-        raise UsageError(f"{task}: a standard deviation of {both['sd_db'].min():g} dB", expected="sd_db above 0")
-    own = bench.manifest.tasks[task].own_offset
+    joined = _joined(task, table, entry, ["level_db", "sd_db"] if has_sd else ["level_db"])
+    if has_sd and not (joined["sd_db"] > 0).all():
+        raise UsageError(f"{task}: a standard deviation of {joined['sd_db'].min():g} dB", expected="sd_db above 0")
+    own_offset = bench.manifest.tasks[task].own_offset
     return [
         LevelSeries(
             name=" ".join(map(str, name)),
@@ -529,45 +541,45 @@ def _level_series(bench: Bench, task: str, table: pd.DataFrame, entry: Entry) ->
             measured_db=rows["measured"].to_numpy(np.float64),
             level_db=rows["level_db"].to_numpy(np.float64),
             sd_db=rows["sd_db"].to_numpy(np.float64) if has_sd else None,
-            own_offset=own,
+            own_offset=own_offset,
         )
-        for name, rows in both.groupby(["flight", "tower", "channel"], sort=False)
+        for name, rows in joined.groupby(["flight", "tower", "channel"], sort=False)
     ]
 
 
 def _check_levels(task: str, table: pd.DataFrame, entry: Entry) -> None:
     """UsageError where levels rise with distance, or are spread as no dB are."""
-    both = _joined(task, table, entry, ["level_db"])
-    places = [both[f"{axis}_m"] - both[f"tower_{axis}_m"] for axis in ("east", "north", "up")]
+    joined = _joined(task, table, entry, ["level_db"])
+    places = [joined[f"{axis}_m"] - joined[f"tower_{axis}_m"] for axis in ("east", "north", "up")]
     distance = np.log10(np.maximum(np.sqrt(sum(p**2 for p in places)), 1.0))
-    spread, level = float(both["level_db"].std()), both["level_db"]
+    spread, level = float(joined["level_db"].std()), joined["level_db"]
     if spread < 1e-9:
         return  # a constant is an honest model
     slope = float(np.polyfit(distance, level, 1)[0]) if float(distance.std()) > 1e-6 else 0.0
-    measured = float(np.polyfit(distance, both["measured"], 1)[0]) if float(distance.std()) > 1e-6 else 0.0
+    measured = float(np.polyfit(distance, joined["measured"], 1)[0]) if float(distance.std()) > 1e-6 else 0.0
     if slope > 5.0 and measured < 0.0:
         raise UsageError(
             f"{task}: predicted levels rise by {slope:.0f} dB per decade of distance",
             expected="received levels, which fall",
             cause="path loss in place of a level; --accept-levels where it is meant",
         )
-    if spread < 0.02 * float(both["measured"].std()) or spread > 50.0 * float(both["measured"].std()):
+    if spread < 0.02 * float(joined["measured"].std()) or spread > 50.0 * float(joined["measured"].std()):
         raise UsageError(
-            f"{task}: predicted levels are spread by {spread:.2g}, measured ones by {both['measured'].std():.2g} dB",
+            f"{task}: predicted levels are spread by {spread:.2g}, measured ones by {joined['measured'].std():.2g} dB",
             expected="dB",
             cause="milliwatts or amplitudes; --accept-levels where it is meant",
         )
 
 
-def _score_rank(bench: Bench, task: str, both: pd.DataFrame) -> dict[str, Any]:
-    p = both[RANKS].to_numpy(np.float64)
+def _score_rank(bench: Bench, task: str, joined: pd.DataFrame) -> dict[str, Any]:
+    p = joined[RANKS].to_numpy(np.float64)
     if (p < 0.0).any() or not np.allclose(p.sum(axis=1), 1.0, atol=1e-3):
         raise UsageError(f"{task}: probabilities that do not add up to 1", expected=", ".join(RANKS))
     train = bench.manifest.tasks[task].train
-    known = [one.rank for flight in train if not bench.missing(flight) for one in bench.ranks(flight)]
+    known = [samples.rank for flight in train if not bench.missing(flight) for samples in bench.ranks(flight)]
     constant = constant_forecast(np.concatenate(known)) if known else np.full(4, 0.25)
-    said = p.argmax(axis=1) + 1
-    score = score_forecast(both["measured"].to_numpy(np.float64), p / p.sum(axis=1)[:, None], said, constant)
+    decided = p.argmax(axis=1) + 1
+    score = score_forecast(joined["measured"].to_numpy(np.float64), p / p.sum(axis=1)[:, None], decided, constant)
     return {name: tuple(v) if isinstance(v, np.ndarray) else v for name, v in fields_of(score).items()}
 
 

@@ -89,12 +89,12 @@ def run_benchmark(
         if name not in known:
             raise UsageError(f"unknown entrant {name!r}", expected=", ".join(known))
     names = list(only) or [name for name in known if name not in entrants.ONLY_ON_DEMAND]
-    wanted = chosen_tasks(bench.manifest, tasks)
-    skipped = {task: lack for task in wanted if (lack := bench.skipped(task, training=True))}
+    chosen = chosen_tasks(bench.manifest, tasks)
+    skipped = {task: lack for task in chosen if (lack := bench.skipped(task, training=True))}
     with OutputFolder(out, job="benchmark", inputs=list(bench.places.values()), force=force) as output:
         cost: dict[tuple[str, str], dict[str, float]] = {}
         written: dict[str, list[Any]] = {name: [] for name in names}
-        runnable = [t for t in wanted if t not in skipped and bench.tests(t)]
+        runnable = [t for t in chosen if t not in skipped and bench.tests(t)]
         for task, name in ((task, name) for task in runnable for name in names):
             progress(f"{task}: {name}")
             begin_peak()
@@ -111,7 +111,7 @@ def run_benchmark(
                 path.write_text(_entry_text(name, written[name]), encoding="utf-8")
                 entries[name] = benchmark.read_entry(path)
             scores = _score_all(bench, entries, cost)
-            rows = [benchmark.leaderboard_row(bench, e, _of(scores, n), __version__) for n, e in entries.items()]
+            rows = [benchmark.leaderboard_row(bench, e, _scores_of(scores, n), __version__) for n, e in entries.items()]
             (folder / "leaderboard.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
             (folder / "scores.csv").write_text(_scores_csv(scores), encoding="utf-8")
             (folder / "benchmark.html").write_text(_page(bench, scores), encoding="utf-8")
@@ -147,7 +147,7 @@ def _score_all(
     return scores
 
 
-def _of(scores: Scores, entrant: str) -> dict[str, dict[str, Any]]:
+def _scores_of(scores: Scores, entrant: str) -> dict[str, dict[str, Any]]:
     return {task: rows[entrant] for task, rows in scores.items() if entrant in rows}
 
 
@@ -173,8 +173,13 @@ def _page(bench: benchmark.Bench, scores: Scores) -> str:
 
     tables = []
     for task, rows in scores.items():
-        one = bench.manifest.tasks[task]
-        about = {"title": one.title, "rule": one.rule, "kind": one.kind, "flights": bench.tests(task)}
+        definition = bench.manifest.tasks[task]
+        about = {
+            "title": definition.title,
+            "rule": definition.rule,
+            "kind": definition.kind,
+            "flights": bench.tests(task),
+        }
         tables.append(task_table(task, {**about, "skipped": bench.skipped(task, training=False)}, rows))
     lacking = dict.fromkeys(text for task in bench.manifest.tasks for text in bench.skipped(task, training=True))
     return benchmark_page(tables, list(lacking), utc_now(), __version__)
@@ -209,20 +214,20 @@ def score_predictions(
     """
     bench = open_bench(data, manifest)
     entry = benchmark.read_entry(predictions)
-    given = list(dict.fromkeys(entry.frame["task"]))
-    chosen_tasks(bench.manifest, given)
-    wanted = [task for task in chosen_tasks(bench.manifest, tasks) if task in given]
-    skipped = {task: bench.skipped(task, training=False) for task in wanted}
-    benchmark.check_training(bench, entry, wanted)
+    answered = list(dict.fromkeys(entry.frame["task"]))
+    chosen_tasks(bench.manifest, answered)
+    chosen = [task for task in chosen_tasks(bench.manifest, tasks) if task in answered]
+    skipped = {task: bench.skipped(task, training=False) for task in chosen}
+    benchmark.check_training(bench, entry, chosen)
     scores: Scores = {}
     name = entry.head.get("entrant", predictions.stem)
-    for task in wanted:
+    for task in chosen:
         if not bench.tests(task):
             continue
         baselines = {}
         if bench.manifest.tasks[task].kind == "level" and not bench.skipped(task, training=True):
-            made = {b: entrants.predict(bench, task, b) for b in benchmark.BASELINES}
-            baselines = {b: benchmark.Entry(frame, {}, "") for b, frame in made.items() if frame is not None}
+            frames = {b: entrants.predict(bench, task, b) for b in benchmark.BASELINES}
+            baselines = {b: benchmark.Entry(frame, {}, "") for b, frame in frames.items() if frame is not None}
         scores[task] = {name: benchmark.score_task(bench, task, entry, baselines, accept_levels=accept_levels)}
     if not scores:
         lacking = "; ".join(text for texts in skipped.values() for text in texts)
@@ -234,7 +239,7 @@ def score_predictions(
     if leaderboard is not None:
         rows = [
             *benchmark.read_leaderboard(leaderboard),
-            benchmark.leaderboard_row(bench, entry, _of(scores, name), __version__),
+            benchmark.leaderboard_row(bench, entry, _scores_of(scores, name), __version__),
         ]
         with OutputFile(leaderboard, own=_is_leaderboard, inputs=[predictions]) as output:
             output.write((json.dumps(rows, indent=1) + "\n").encode())
@@ -272,19 +277,19 @@ def write_template(
     import pandas as pd
 
     bench = open_bench(data, manifest)
-    wanted = chosen_tasks(bench.manifest, tasks)
-    asked = [benchmark.truth(bench, task) for task in wanted]
-    known = [benchmark.truth(bench, task, training=True) for task in wanted]
-    test = pd.concat(asked, ignore_index=True).drop(columns="measured")
+    chosen = chosen_tasks(bench.manifest, tasks)
+    test_parts = [benchmark.truth(bench, task) for task in chosen]
+    train_parts = [benchmark.truth(bench, task, training=True) for task in chosen]
+    test = pd.concat(test_parts, ignore_index=True).drop(columns="measured")
     test["level_db"], test["sd_db"] = "", ""
-    if any(bench.manifest.tasks[task].kind == "rank" for task in wanted):
+    if any(bench.manifest.tasks[task].kind == "rank" for task in chosen):
         test = test.assign(p_rank1="", p_rank2="", p_rank3="", p_rank4="")
-    train = pd.concat(known, ignore_index=True)
-    beside = out.with_name(f"{out.stem}_train{out.suffix}")
-    for path, frame in ((out, test), (beside, train)):
+    train = pd.concat(train_parts, ignore_index=True)
+    train_file = out.with_name(f"{out.stem}_train{out.suffix}")
+    for path, frame in ((out, test), (train_file, train)):
         with OutputFile(path, own=is_sealed, inputs=list(bench.places.values()), force=force) as output:
             output.write(frame.to_csv(index=False, lineterminator="\n").encode())
-    return [out, beside]
+    return [out, train_file]
 
 
 def fetch(out: Path, *, manifest: Path | None = None, progress: Progress = silent) -> list[Path]:
@@ -301,26 +306,26 @@ def fetch(out: Path, *, manifest: Path | None = None, progress: Progress = silen
     """
     listing = benchmark.load_manifest(manifest)
     out.mkdir(parents=True, exist_ok=True)
-    made = []
-    for name, one in listing.files.items():
-        path = out / f"{name}{Path(one.path).suffix}"
-        if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == one.sha256:
+    fetched = []
+    for name, entry in listing.files.items():
+        path = out / f"{name}{Path(entry.path).suffix}"
+        if path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == entry.sha256:
             continue
-        progress(f"{name}: {one.bytes / 1e6:.1f} MB from {one.repository}")
+        progress(f"{name}: {entry.bytes / 1e6:.1f} MB from {entry.repository}")
         try:
-            with urllib.request.urlopen(one.url, timeout=60) as answer:
-                content = answer.read(one.bytes)
+            with urllib.request.urlopen(entry.url, timeout=60) as answer:
+                content = answer.read(entry.bytes)
         except (urllib.error.URLError, http.client.IncompleteRead, OSError) as error:
             raise OutputError(
-                f"{one.url} could not be fetched: {error}",
+                f"{entry.url} could not be fetched: {error}",
                 expected="a network, or the files copied by hand into the folder (docs/benchmark.md names them)",
                 path=path,
             ) from None
         digest = hashlib.sha256(content).hexdigest()
-        if digest != one.sha256:
-            cause = f"the answer was cut, or {one.repository} changed the file"
-            raise InputError(f"SHA-256 {digest} of {len(content)} bytes", expected=one.sha256, cause=cause, path=path)
+        if digest != entry.sha256:
+            cause = f"the answer was cut, or {entry.repository} changed the file"
+            raise InputError(f"SHA-256 {digest} of {len(content)} bytes", expected=entry.sha256, cause=cause, path=path)
         with atomic_path(path) as part:
             part.write_bytes(content)
-        made.append(path)
-    return made
+        fetched.append(path)
+    return fetched

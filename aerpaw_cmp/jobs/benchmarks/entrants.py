@@ -41,13 +41,15 @@ def anchored(question: Question, gain: GainOf) -> list[Answer]:
 
     The standard deviation is that of the training residuals about these offsets.
     """
-    left = [o.samples.residual_db - gain(o) for o in question.train]
+    residuals = [o.samples.residual_db - gain(o) for o in question.train]
     out = []
-    for item in question.asked:
-        mine = [r for o, r in zip(question.train, left, strict=True) if _same(o, item)]
+    for item in question.targets:
+        mine = [r for o, r in zip(question.train, residuals, strict=True) if _same(o, item)]
         if not mine:
-            mine = [r for o, r in zip(question.train, left, strict=True) if o.samples.antenna == item.samples.antenna]
-        mine = mine or left
+            mine = [
+                r for o, r in zip(question.train, residuals, strict=True) if o.samples.antenna == item.samples.antenna
+            ]
+        mine = mine or residuals
         offset = float(np.concatenate(mine).mean()) if mine else 0.0
         spread = float(np.sqrt(np.mean(np.concatenate([r - r.mean() for r in mine]) ** 2))) if mine else 10.0
         out.append((item.free_space_db + gain(item) + offset, np.full(len(item.samples), max(spread, 0.1))))
@@ -61,7 +63,7 @@ def _same(first: Observed, second: Observed) -> bool:
 def _log_distance(question: Question, _: Bench) -> list[Answer]:
     """A slope per antenna, fitted on what is known; offsets of each series are free."""
     slopes: dict[str, float] = {}
-    for antenna in {o.samples.antenna for o in (*question.train, *question.asked)}:
+    for antenna in {o.samples.antenna for o in (*question.train, *question.targets)}:
         known = [o for o in question.train if o.samples.antenna == antenna] or question.train
         x = np.concatenate([o.free_space_db - o.free_space_db.mean() for o in known])
         y = np.concatenate([o.samples.residual_db - o.samples.residual_db.mean() for o in known])
@@ -129,15 +131,15 @@ def _learned(question: Question, _: Bench) -> list[Answer]:
     fit = _fit([o.samples for o in question.train])
     answers = anchored(question, lambda o: fit.mean(o.samples))
     return [
-        (level, fit.spread(one.samples.antenna).total_db(fit.predict(one.samples)[1]))
-        for one, (level, _) in zip(question.asked, answers, strict=True)
+        (level, fit.spread(target.samples.antenna).total_db(fit.predict(target.samples)[1]))
+        for target, (level, _) in zip(question.targets, answers, strict=True)
     ]
 
 
 def _learned_residual(question: Question, _: Bench) -> list[Answer]:
     """Learned antennas, and the residual field on what they leave where it helps inside the training flights."""
     samples = [o.samples for o in question.train]
-    return _corrected(question, samples, lambda train: _fit(train).predict, [o.free_space_db for o in question.asked])
+    return _corrected(question, samples, lambda train: _fit(train).predict, [o.free_space_db for o in question.targets])
 
 
 def _kriging(question: Question, _: Bench) -> list[Answer]:
@@ -146,19 +148,19 @@ def _kriging(question: Question, _: Bench) -> list[Answer]:
         dataclasses.replace(o.samples, residual_db=o.samples.residual_db + o.free_space_db) for o in question.train
     ]
     constant = fixed_base(lambda s: np.zeros(len(s)))
-    return _corrected(question, levels, constant, [np.zeros(len(o.samples)) for o in question.asked])
+    return _corrected(question, levels, constant, [np.zeros(len(o.samples)) for o in question.targets])
 
 
 def _corrected(
     question: Question, train: Sequence[LinkSamples], base: Base, above: Sequence[FloatArray]
 ) -> list[Answer]:
-    """A base and its residual field; ``above`` (n,) is what both count from, of each asked series [dB]."""
+    """A base and its residual field; ``above`` (n,) is what both count from, of each target series [dB]."""
     correction = choose(train, {"base": base})
     out = []
-    for one, level in zip(question.asked, above, strict=True):
-        known = any(_same(o, one) for o in question.train)
-        fading, _ = fading_of([s for s in train if s.antenna == one.samples.antenna], BIN_S)
-        mean, sd = correction.predict(one.samples, one.samples.flight if known else None, own_mean=not known)
+    for target, level in zip(question.targets, above, strict=True):
+        known = any(_same(o, target) for o in question.train)
+        fading, _ = fading_of([s for s in train if s.antenna == target.samples.antenna], BIN_S)
+        mean, sd = correction.predict(target.samples, target.samples.flight if known else None, own_mean=not known)
         out.append((level + mean, np.hypot(sd, fading)))
     return out
 
@@ -184,9 +186,9 @@ def _trees(question: Question, _: Bench) -> list[Answer]:
 
     model = fitted(np.ones(len(y), dtype=np.bool_))
     # the spread is that of one half of each flight predicted from the other: trees know their own samples by heart
-    left = np.where(half, fitted(~half).predict(x), fitted(half).predict(x)) - y
+    error_db = np.where(half, fitted(~half).predict(x), fitted(half).predict(x)) - y
     answers = anchored(question, lambda o: np.asarray(model.predict(features(o))) if len(o.samples) else np.zeros(0))
-    return [(level, np.full(len(level), left.std())) for level, _ in answers]
+    return [(level, np.full(len(level), error_db.std())) for level, _ in answers]
 
 
 LEVEL: dict[str, Entrant] = {
@@ -211,7 +213,7 @@ ONLY_ON_DEMAND = ("replay_sionna",)
 
 
 def _rank_constant(bench: Bench, train: Sequence[str], flight: str) -> list[FloatArray]:
-    share = constant_forecast(np.concatenate([one.rank for name in train for one in bench.ranks(name)]))
+    share = constant_forecast(np.concatenate([samples.rank for name in train for samples in bench.ranks(name)]))
     return [np.tile(share, (len(item.rank), 1)) for item in bench.ranks(flight)]
 
 

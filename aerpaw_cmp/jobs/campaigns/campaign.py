@@ -104,15 +104,17 @@ def run(
         store.check()
     with stages("flights"):
         outcomes, orders = kept_outcomes(tasks, store, progress)
-    seen = _inputs_of(files, logs_root)
+    input_paths = _inputs_of(files, logs_root)
     with (
-        open_workers(options.workers, options.scheduler if orders else None, paths=seen, progress=progress) as crew,
+        open_workers(
+            options.workers, options.scheduler if orders else None, paths=input_paths, progress=progress
+        ) as crew,
         stages("flights"),
     ):
         compute(orders, crew, outcomes, store, progress)
     results = counted_once(tasks, [outcomes[number] for number in range(len(tasks))])
     rank = tuple(row for o in results for row in o.rank)
-    flown = tuple(one for o in results for one in o.flown)
+    flown = tuple(flown_rank for o in results for flown_rank in o.flown)
     failures += [o.failure for o in results if o.failure is not None]
     with stages("pool"):
         rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)

@@ -22,12 +22,12 @@ from .campaign_tasks import Done, Order, Outcome, Task, carry_out, fitted_to, ta
 class TaskState:
     """One task of a campaign before it runs.
 
-    ``seconds`` is what it cost, where it is kept; ``failure`` the message of the last run, where that failed, and
+    ``seconds`` is what it cost, where it is stored; ``failure`` the message of the last run, where that failed, and
     ``trouble`` which input cannot be read.
     """
 
     task: Task
-    kept: bool = False
+    stored: bool = False
     seconds: float | None = None
     failure: str = ""
     trouble: str = ""
@@ -51,12 +51,12 @@ class CampaignStatus:
     @property
     def kept(self) -> int:
         """Tasks whose outcome is kept."""
-        return sum(state.kept for state in self.states)
+        return sum(state.stored for state in self.states)
 
     @property
     def failed(self) -> int:
         """Tasks that failed the last time; they are to do."""
-        return sum(bool(state.failure) and not state.kept for state in self.states)
+        return sum(bool(state.failure) and not state.stored for state in self.states)
 
     @property
     def to_do(self) -> int:
@@ -65,7 +65,7 @@ class CampaignStatus:
 
     def metrics(self) -> dict[str, Any]:
         """For ``--json``."""
-        waiting = [state for state in self.states if not state.kept]
+        waiting = [state for state in self.states if not state.stored]
         return {
             "campaign": self.name,
             "tasks": len(self.states),
@@ -107,7 +107,7 @@ def campaign_status(
     everything = [seconds for some in by_setting.values() for seconds in some]
     estimate = None
     if everything:
-        costs = [float(np.mean(by_setting.get(s.task.setting, everything))) for s in states if not s.kept]
+        costs = [float(np.mean(by_setting.get(s.task.setting, everything))) for s in states if not s.stored]
         estimate = max(sum(costs) / max(workers, 1), max(costs, default=0.0))
     return CampaignStatus(
         name=name,
@@ -128,7 +128,7 @@ def _state(task: Task, store: OutcomeStore) -> TaskState:
     seconds = store.manifest(key).get("seconds")
     return TaskState(
         task=task,
-        kept=store.has(key),
+        stored=store.has(key),
         seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
         failure=str(store.manifest(key, failed=True).get("message", "")),
     )
@@ -204,7 +204,7 @@ def compute(
     """
     numbers, total, failed = list(orders), len(outcomes) + len(orders), 0
 
-    def through(place: int, result: Done | Lost) -> None:
+    def take(place: int, result: Done | Lost) -> None:
         nonlocal failed
         order = orders[numbers[place]]
         if isinstance(result, Lost):
@@ -216,11 +216,11 @@ def compute(
             if failure is None:
                 store.save(order.key, result.outcome, result.about)
             else:
-                told = {"message": failure.message, "traceback": failure.traceback}
-                store.save_failure(order.key, {**result.about, **told})
+                failure_facts = {"message": failure.message, "traceback": failure.traceback}
+                store.save_failure(order.key, {**result.about, **failure_facts})
         outcomes.put(numbers[place], result.outcome)
         failed += failure is not None
         progress(f"flights\t{len(outcomes)} of {total} done, {failed} failed", len(outcomes) / total)
 
     if orders:
-        workers.run(carry_out, [orders[number] for number in numbers], through)
+        workers.run(carry_out, [orders[number] for number in numbers], take)

@@ -60,15 +60,15 @@ def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Out
     A log that comes twice, renamed, copied or packed, would be pooled twice and predicted from itself.
     """
     home: dict[str, str] = {}
-    kept = []
+    counted = []
     for task, outcome in zip(tasks, outcomes, strict=True):
         logs = {digest for rows in (outcome.rss, outcome.rank) for row in rows for digest in row.logs}  # type: ignore[attr-defined]
         again = sorted(digest for digest in logs if home.setdefault(digest, task.flight) != task.flight)
         if again:
             message = f"it holds the same log as {home[again[0]]} (SHA-256 {again[0][:12]}...): it is counted once"
             outcome = Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message))
-        kept.append(outcome)
-    return kept
+        counted.append(outcome)
+    return counted
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -119,16 +119,16 @@ def run_task(task: Task) -> Outcome:
         return _failed(task, str(error), error)
     except Exception as error:  # one flight's fault must not cost the others their numbers
         return _failed(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
-    data, found = flight_run.data, flight_run.result
+    data, result = flight_run.data, flight_run.result
     return Outcome(
         rss=tuple(
-            _rss_row(task, data.settings.rss, one, logs_of(data, series))
-            for one, series in zip(found.rss, data.rss, strict=True)
+            _rss_row(task, data.settings.rss, compared, logs_of(data, series))
+            for compared, series in zip(result.rss, data.rss, strict=True)
         ),
         rank=tuple(
             row
-            for one, series in zip(found.rank, data.rank, strict=True)
-            for row in _rank_rows(task, one, logs_of(data, series))
+            for compared, series in zip(result.rank, data.rank, strict=True)
+            for row in _rank_rows(task, compared, logs_of(data, series))
         ),
         track=_flown(task, flight_run.result),
         flown=tuple(
@@ -248,14 +248,14 @@ def outcome_store(keep: Path) -> OutcomeStore:
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:
     """A kept outcome under the names of this campaign, without what only the first setting's figures need."""
 
-    def row(one: RssRow) -> RssRow:
-        named = dataclasses.replace(one, flight=task.flight, setting=task.setting)
+    def row(kept_row: RssRow) -> RssRow:
+        named = dataclasses.replace(kept_row, flight=task.flight, setting=task.setting)
         if task.reference:
             return named
         none = np.zeros(0)
         return dataclasses.replace(
             named,
-            difference=one.moments,
+            difference=kept_row.moments,
             time_s=none,
             measured_db=none,
             simulated_dbm=none,

@@ -30,7 +30,7 @@ class RepeatSettings(StrictModel):
 
 def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], list[PooledOffset]]:
     """Shared offsets of each setting, entered into the rows and listed by group."""
-    done: list[RssRow] = []
+    pooled_rows: list[RssRow] = []
     groups: list[PooledOffset] = []
     for setting in dict.fromkeys(row.setting for row in rows):
         members = [row for row in rows if row.setting == setting]
@@ -47,12 +47,12 @@ def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], li
             )
             for row in members
         ]  # fmt: skip
-        done += pooled
+        pooled_rows += pooled
         by_group: dict[str, list[RssRow]] = {}
         for row in pooled:
             by_group.setdefault(_group(row, per), []).append(row)
         groups += [_pooled(setting, name, some, fits) for name, some in by_group.items()]
-    return done, groups
+    return pooled_rows, groups
 
 
 def _group(row: RssRow, per: Pooling) -> str:
@@ -67,16 +67,16 @@ def _group(row: RssRow, per: Pooling) -> str:
 
 
 def _pooled(setting: str, name: str, rows: list[RssRow], fits: Mapping[Any, Any]) -> PooledOffset:
-    own = np.array([row.offset_db for row in rows])
-    own = own[np.isfinite(own)]
+    offsets_db = np.array([row.offset_db for row in rows])
+    offsets_db = offsets_db[np.isfinite(offsets_db)]
     nan = float("nan")
     return PooledOffset(
         setting=setting,
         group=name,
         members=tuple(f"{row.flight} {row.link}" for row in rows),
         offset_db=rows[0].pooled_offset_db,
-        spread_db=float(own.std(ddof=1)) if len(own) > 1 else nan,
-        range_db=(float(own.min()), float(own.max())) if len(own) else (nan, nan),
+        spread_db=float(offsets_db.std(ddof=1)) if len(offsets_db) > 1 else nan,
+        range_db=(float(offsets_db.min()), float(offsets_db.max())) if len(offsets_db) else (nan, nan),
         own_rmse_db=finite_mean([row.rmse_db for row in rows]),
         pooled_rmse_db=finite_mean([row.pooled_rmse_db for row in rows]),
         at_search_edge=any(fits[row.key].at_edge for row in rows),
@@ -156,13 +156,13 @@ def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
         for row in rows:
             if (row.setting, row.tower) == (setting, tower) and np.isfinite(row.total_variation):
                 by.setdefault(row.flight, {})[row.k] = row
-        for flight, own in by.items():
-            others = [at for name, at in by.items() if name != flight]
-            common = [k for k in own if others and all(k in at for at in others)]
+        for flight, fits in by.items():
+            other_flights = [at for name, at in by.items() if name != flight]
+            common = [k for k in fits if other_flights and all(k in at for at in other_flights)]
             if not common:
                 continue
-            chosen = min(common, key=lambda k: finite_mean([at[k].total_variation for at in others]))
-            best = min(own, key=lambda k: own[k].total_variation)
+            chosen = min(common, key=lambda k: finite_mean([at[k].total_variation for at in other_flights]))
+            best = min(fits, key=lambda k: fits[k].total_variation)
             out.append(
                 RankTransfer(
                     setting=setting,
@@ -170,10 +170,10 @@ def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
                     tower=tower,
                     chosen_on=tuple(name for name in by if name != flight),
                     k=chosen,
-                    total_variation=own[chosen].total_variation,
-                    kappa=own[chosen].kappa,
+                    total_variation=fits[chosen].total_variation,
+                    kappa=fits[chosen].kappa,
                     own_k=best,
-                    own_total_variation=own[best].total_variation,
+                    own_total_variation=fits[best].total_variation,
                 )
             )
     return out

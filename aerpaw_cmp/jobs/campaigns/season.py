@@ -77,7 +77,7 @@ def held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
     groups: dict[tuple[str, str, str, str], list[int]] = {}
     for i, row in enumerate(rows):
         groups.setdefault((row.setting, row.tower, row.channel, row.unit), []).append(i)
-    done = list(rows)
+    scored = list(rows)
     for members in groups.values():
         mine = [rows[i] for i in members]
         mean = np.array([row.moments.mean_db for row in mine])
@@ -89,8 +89,8 @@ def held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
         )
         error = season.error_at_offset(offset, [row.rmse_db for row in mine], [row.offset_db for row in mine], mean)
         for i, o, e in zip(members, offset, error, strict=True):
-            done[i] = dataclasses.replace(rows[i], held_out_offset_db=float(o), held_out_rmse_db=float(e))
-    return done
+            scored[i] = dataclasses.replace(rows[i], held_out_offset_db=float(o), held_out_rmse_db=float(e))
+    return scored
 
 
 def error_of(row: RssRow) -> float:
@@ -147,13 +147,15 @@ def rank_settings(
     return choices
 
 
-def _paired(one: Mapping[str, Any], other: Mapping[str, Any], flights: Sequence[str]) -> FloatArray:
+def _paired(errors: Mapping[str, Any], first_errors: Mapping[str, Any], flights: Sequence[str]) -> FloatArray:
     """Mean difference on the links that both settings scored, per flight, in the order of the dates."""
     differences = []
     for flight in flights:
-        both = sorted(set(one.get(flight, ())) & set(other.get(flight, ())))
-        if both:
-            differences.append(float(np.mean([one[flight][link] - other[flight][link] for link in both])))
+        common_links = sorted(set(errors.get(flight, ())) & set(first_errors.get(flight, ())))
+        if common_links:
+            differences.append(
+                float(np.mean([errors[flight][link] - first_errors[flight][link] for link in common_links]))
+            )
     return np.array(differences)
 
 
@@ -163,14 +165,14 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
     for row in rows:
         if np.isfinite(row.offset_db):
             groups.setdefault((row.setting, row.tower, row.channel), []).append(row)
-    made = []
+    fitted = []
     for (setting, tower, channel), members in groups.items():
         days = [started.get(row.flight, np.nan) / DAY_NS for row in members]
         # not the offsets themselves: three flights whose rounded offsets lie on a line would have no uncertainty
         exact = np.array([row.moments.mean_db for row in members])
         offsets = np.array([row.offset_db for row in members])
         line = season.trend(days, exact)
-        made.append(
+        fitted.append(
             Drift(
                 setting=setting,
                 tower=tower,
@@ -182,7 +184,7 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
                 spread_db=float(offsets.std(ddof=1)) if len(offsets) > 1 else float("nan"),
             )
         )
-    return made
+    return fitted
 
 
 # --- places -----------------------------------------------------------------------------------------------------------
@@ -202,15 +204,15 @@ def place_map(rows: Sequence[RssRow], cell_m: float) -> PlaceMap | None:
 # --- reports of the flights -------------------------------------------------------------------------------------------
 
 
-def find_reports(flights: Iterable[str], folder: Path, beside: Sequence[Path]) -> dict[str, str]:
-    """Relative addresses of the reports of flights that stand in one of the folders ``beside``.
+def find_reports(flights: Iterable[str], folder: Path, places: Sequence[Path]) -> dict[str, str]:
+    """Relative addresses of the reports of flights that stand in one of the folders ``places``.
 
     Parameters
     ----------
     flights : iterable of str
     folder : Path
         Of the campaign's page.
-    beside : sequence of Path
+    places : sequence of Path
         Each may hold ``NAME/report.html``, as ``aerpaw-cmp report`` writes it.
 
     Returns
@@ -220,7 +222,7 @@ def find_reports(flights: Iterable[str], folder: Path, beside: Sequence[Path]) -
     """
     reports: dict[str, str] = {}
     for name in flights:
-        for place in beside:
+        for place in places:
             page = place / name / "report.html"
             if page.is_file() and _flight_of(page.with_name("metrics.json")) == name:
                 relative = Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix()

@@ -187,19 +187,19 @@ def calibrate(
             place = calibration.learn(series, with_place)
     with stages("ground"):
         ground = fit_ground(flights, observed, learned) if settings.fit.ground else None
-    kept: dict[str, Learned] = {}
+    fits_without: dict[str, Learned] = {}
     with stages("scores"):
-        scores = score_all(observed, recipe, stages, kept)
+        scores = score_all(observed, recipe, stages, fits_without)
         stages.progress("scores: controls")
         controls = controls_of(observed, recipe)
-        locks = learned_locks(observed, recipe, kept)
+        locks = learned_locks(observed, recipe, fits_without)
     with stages("curve"):
         curve = learning_curve(observed, recipe)
     warnings += mount_warnings(learned)
     if score:
         with stages("score"):
-            others, said = _score_others(score, flights, logs_root, learned, observed)
-        scores, warnings = {**scores, "other_flights": others}, list(dict.fromkeys([*warnings, *said]))
+            further_scores, remarks = _score_further(score, flights, logs_root, learned, observed)
+        scores, warnings = {**scores, "other_flights": further_scores}, list(dict.fromkeys([*warnings, *remarks]))
     return Calibration(
         settings=settings,
         flights=tuple(flights),
@@ -219,7 +219,7 @@ def calibrate(
     )
 
 
-def _score_others(
+def _score_further(
     paths: Sequence[Path],
     flights: Sequence[FlightData],
     logs_root: Path | None,
@@ -227,19 +227,19 @@ def _score_others(
     observed: Sequence[Observed],
 ) -> tuple[tuple[Score, ...], list[str]]:
     """Scores of further flights with what was learned, and which of them were learned from."""
-    others = [load_data(load_flight(path), path.parent, logs_root) for path in paths]
-    kept, said = counted_once([*flights, *others])
-    fresh = [data for data in kept if not any(data is item for item in flights)]
+    further = [load_data(load_flight(path), path.parent, logs_root) for path in paths]
+    distinct, remarks = counted_once([*flights, *further])
+    fresh = [data for data in distinct if not any(data is item for item in flights)]
     if not fresh:
-        return (), said
-    seen = [one for data in fresh for one in observe([data])[0]]
+        return (), remarks
+    measured = [series for data in fresh for series in observe([data])[0]]
     known = {o.samples.antenna for o in observed}
-    said += [
+    remarks += [
         f"{o.samples.flight}: nothing was learned about {o.samples.antenna}"
-        for o in seen
+        for o in measured
         if o.samples.antenna not in known
     ]
-    return calibration.score_with(learned, [o for o in seen if o.samples.antenna in known], observed), said
+    return calibration.score_with(learned, [o for o in measured if o.samples.antenna in known], observed), remarks
 
 
 # --- flights -------------------------------------------------------------------------------------------------------
@@ -264,12 +264,12 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
     observed: list[Observed] = []
     warnings: list[str] = []
     carriers: dict[str, dict[str, float]] = {}
-    for data, series in [(flight, one) for flight in flights for one in flight.rss]:
-        seen, said = _observed_level(data, series)
-        warnings += said
-        if seen is not None:
-            carriers.setdefault(seen.samples.antenna, {})[data.settings.flight.name] = series.link.carrier_hz
-            observed.append(seen)
+    for data, series in [(flight, entry) for flight in flights for entry in flight.rss]:
+        level, remarks = _observed_level(data, series)
+        warnings += remarks
+        if level is not None:
+            carriers.setdefault(level.samples.antenna, {})[data.settings.flight.name] = series.link.carrier_hz
+            observed.append(level)
     if not observed:
         raise InputError("none of the flights has RSS at known poses", expected="RSS logs with telemetry")
     for antenna, per_flight in carriers.items():
@@ -296,22 +296,22 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
 
 def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | None, list[str]]:
     """One series of levels at known poses; None for ratios and without any, and what is to be said of it."""
-    name, said = f"{data.settings.flight.name}: {series.tower} {series.channel}", []
+    name, remarks = f"{data.settings.flight.name}: {series.tower} {series.channel}", []
     if series.channel.lower() in RATIOS:
         if series.channel.lower() != SNR or any(s.channel.lower() not in RATIOS for s in data.rss):
             return None, [f"{data.settings.flight.name}: {series.channel} is a ratio, no level: left out"]
-        said.append(
+        remarks.append(
             f"{data.settings.flight.name}: {series.tower} {SNR} stands for a level: the noise is taken as constant"
         )
-    one, guessed, lost = _observe(data, series)
-    if not np.isfinite(one.samples.residual_db).any():
-        return None, [*said, f"{name} has no level at a known pose and is left out"]
+    observed, guessed, lost = _observe(data, series)
+    if not np.isfinite(observed.samples.residual_db).any():
+        return None, [*remarks, f"{name} has no level at a known pose and is left out"]
     if guessed > 0.01:
         share = f"{100 * guessed:.0f} % of the attitudes at {series.tower} {series.channel} are unknown"
-        said.append(f"{data.settings.flight.name}: {share}: heading from the track, level flight")
+        remarks.append(f"{data.settings.flight.name}: {share}: heading from the track, level flight")
     if lost > 0.01:
-        said.append(f"{name}: {100 * lost:.0f} % of the levels have no position and are left out")
-    return one, said
+        remarks.append(f"{name}: {100 * lost:.0f} % of the levels have no position and are left out")
+    return observed, remarks
 
 
 def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float, float]:
@@ -411,11 +411,11 @@ def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
 def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:
     """Likelihood of a coherent ground ray of each roughness, the gains integrated out."""
     by_name = {data.settings.flight.name: data for data in flights}
-    kept = {(o.samples.flight, o.samples.antenna): o for o in observed}
+    by_series = {(o.samples.flight, o.samples.antenna): o for o in observed}
 
     def columns(samples: direction_gain.LinkSamples, bin_s: float) -> FloatArray:
         data = by_name[samples.flight]
-        o = kept[samples.flight, samples.antenna]
+        o = by_series[samples.flight, samples.antenna]
         link = next(s.link for s in data.rss if f"{s.tower}.{s.channel}" == samples.antenna)
         tower = data.site.towers[samples.tower]
         place = tower.position_m[None, :] if o.tower_m is None else o.tower_m[:, None, :]
@@ -432,12 +432,12 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
             )[:, 0]
             ripple = np.where(np.isfinite(samples.residual_db), level - o.free_space_db, np.nan)
             out.append(dataclasses.replace(samples, residual_db=ripple).binned(bin_s).residual_db)
-        whole = np.stack(out, axis=1)
-        return np.asarray(whole - whole.mean(axis=0))
+        stacked = np.stack(out, axis=1)
+        return np.asarray(stacked - stacked.mean(axis=0))
 
     series = [o.samples for o in observed]
-    left = [dataclasses.replace(s, residual_db=s.residual_db - learned.patterns_db(s)) for s in series]
-    form = direction_gain.column_forms(left, learned.model, columns)
+    unexplained = [dataclasses.replace(s, residual_db=s.residual_db - learned.patterns_db(s)) for s in series]
+    form = direction_gain.column_forms(unexplained, learned.model, columns)
     value = np.diag(form)[1:] - 2.0 * form[0, 1:]
     likelihood = -0.5 * (value - value[-1])
     return GroundFit(roughness_m=ROUGHNESS_M, log_likelihood=tuple(map(float, likelihood)))
@@ -447,7 +447,7 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
 
 
 def score_all(
-    observed: Sequence[Observed], recipe: Recipe, stages: Stages, kept: dict[str, Learned]
+    observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits_without: dict[str, Learned]
 ) -> dict[str, tuple[Score, ...]]:
     """Every split, on flights that had no part in the fit; fits of one are used by the next.
 
@@ -456,7 +456,7 @@ def score_all(
     observed : sequence of Observed
     recipe : Recipe
     stages : Stages
-    kept : dict of str to Learned
+    fits_without : dict of str to Learned
         Receives what was learned without each flight.
 
     Returns
@@ -466,15 +466,15 @@ def score_all(
     scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
     if len(calibration.flights_of(observed)) < 2:
         return scores
-    scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, kept)
-    for split, parts, own in (
+    scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, fits_without)
+    for split, parts, own_rest in (
         ("altitude_left_out", calibration.altitude_parts, False),
         ("heading_left_out", calibration.heading_parts, False),
         ("sector_left_out", calibration.sector_parts, False),
         ("route_left_out", calibration.route_parts, True),
     ):
         stages.progress(f"scores: {split.replace('_', ' ')}")
-        scores[split] = calibration.parts_left_out(observed, recipe, kept, parts, own_rest=own)
+        scores[split] = calibration.parts_left_out(observed, recipe, fits_without, parts, own_rest=own_rest)
     return scores
 
 

@@ -12,7 +12,9 @@ from ...flight.lock import LOCK_FLOOR_DB
 from ...site.learned import LearnedLock
 
 
-def learned_locks(observed: Sequence[Observed], recipe: Recipe, kept: Mapping[str, Learned]) -> dict[str, LearnedLock]:
+def learned_locks(
+    observed: Sequence[Observed], recipe: Recipe, fits_without: Mapping[str, Learned]
+) -> dict[str, LearnedLock]:
     """P(lock) by antenna, of levels that were predicted without the flight at hand, and its scores on flights left out.
 
     Parameters
@@ -20,7 +22,7 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, kept: Mapping[st
     observed : sequence of Observed
         Of all flights.
     recipe : Recipe
-    kept : mapping of str to Learned
+    fits_without : mapping of str to Learned
         What was learned without each flight; learned here where it is empty.
 
     Returns
@@ -31,12 +33,12 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, kept: Mapping[st
     able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
     if len({o.samples.flight for o in able}) < 2:
         return {}
-    if not kept:
-        kept = {}
-        flight_left_out(observed, recipe, kept)
+    if not fits_without:
+        fits_without = {}
+        flight_left_out(observed, recipe, fits_without)
     out = {}
     for antenna in dict.fromkeys(o.samples.antenna for o in able):
-        lock = _learned([_Levels(o, kept[o.samples.flight]) for o in able if o.samples.antenna == antenna])
+        lock = _learned([_Levels(o, fits_without[o.samples.flight]) for o in able if o.samples.antenna == antenna])
         if lock is not None:
             out[antenna] = lock
     return out
@@ -60,10 +62,10 @@ def _learned(flights: Sequence[_Levels]) -> LearnedLock | None:
     every = learn_detection([(f.level_db, f.detected) for f in flights])
     scores: list[DetectionScore] = []
     for item in flights:
-        others = learn_detection([(f.level_db, f.detected) for f in flights if f is not item])
-        score = None if others is None else score_detection(
+        from_others = learn_detection([(f.level_db, f.detected) for f in flights if f is not item])
+        score = None if from_others is None else score_detection(
             item.time_s, item.measured_db, item.level_db, item.detected, floor_db=LOCK_FLOOR_DB,
-            free_space_db=item.free_db, forecast=others,
+            free_space_db=item.free_db, forecast=from_others,
         )  # fmt: skip
         if score is not None:
             scores.append(score)

@@ -139,19 +139,19 @@ class FittedReceiver:
         }
 
     @classmethod
-    def from_dict(cls, tower: str, one: Mapping[str, Any]) -> FittedReceiver:
+    def from_dict(cls, tower: str, content: Mapping[str, Any]) -> FittedReceiver:
         """From :meth:`as_dict`; files of 0.3 have no timing and no logs."""
         return cls(
             tower=tower,
-            geometries=tuple(_geometry(g) for g in one["geometries"]),
-            tied=int(one["tied"]),
-            flights=tuple(str(name) for name in one["flights"]),
-            trained_on=tuple(str(digest) for digest in one.get(KEY, ())),
+            geometries=tuple(_geometry(g) for g in content["geometries"]),
+            tied=int(content["tied"]),
+            flights=tuple(str(name) for name in content["flights"]),
+            trained_on=tuple(str(digest) for digest in content.get(KEY, ())),
             mixture=receiver.ReceiverMixture(
-                members=tuple(receiver.Receiver.from_dict(m) for m in one["members"]),
-                decision_weight=np.asarray(one["decision_weight"], dtype=np.float64),
+                members=tuple(receiver.Receiver.from_dict(m) for m in content["members"]),
+                decision_weight=np.asarray(content["decision_weight"], dtype=np.float64),
             ),
-            timing=Timing(shift_s=float(one.get("shift_s", 0.0)), average_s=float(one.get("average_s", 0.0))),
+            timing=Timing(shift_s=float(content.get("shift_s", 0.0)), average_s=float(content.get("average_s", 0.0))),
         )
 
 
@@ -172,7 +172,7 @@ class RankCalibration:
 
     def text(self) -> str:
         """The receiver file."""
-        towers = {name: one.as_dict() for name, one in self.receivers.items()}
+        towers = {name: fitted.as_dict() for name, fitted in self.receivers.items()}
         return json.dumps({"format": FORMAT, "towers": towers}, indent=1) + "\n"
 
 
@@ -188,7 +188,7 @@ def read_receiver(path: Path) -> dict[str, FittedReceiver]:
         content = json.loads(read_table(path, "a receiver file"))
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")
-        return {tower: FittedReceiver.from_dict(tower, one) for tower, one in content["towers"].items()}
+        return {tower: FittedReceiver.from_dict(tower, entry) for tower, entry in content["towers"].items()}
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", expected="a receiver file", path=path) from None
     except (ValueError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
@@ -291,12 +291,12 @@ def fit_rank(flights: Sequence[FlightData], settings: RankFitSettings) -> RankCa
         if len(samples) < 2:
             warnings.append(f"rank at {tower}: one flight alone, no flight can be left out and nothing is scored")
             continue
-        for left, one in enumerate(samples):
-            others = [i for i in range(len(samples)) if i != left]
-            fitted, constant = tried.fit(others), constant_forecast(np.concatenate([samples[i].rank for i in others]))
-            p, said = fitted.forecast(one)
-            scores["flight_left_out"].append((one.flight, tower, score_forecast(one.rank, p, said, constant)))
-            scores["sector_left_out"].append((one.flight, tower, _sectors(one, fitted, constant)))
+        for held_out, test in enumerate(samples):
+            train = [i for i in range(len(samples)) if i != held_out]
+            fitted, constant = tried.fit(train), constant_forecast(np.concatenate([samples[i].rank for i in train]))
+            p, decided = fitted.forecast(test)
+            scores["flight_left_out"].append((test.flight, tower, score_forecast(test.rank, p, decided, constant)))
+            scores["sector_left_out"].append((test.flight, tower, _sectors(test, fitted, constant)))
         timing = receivers[tower].timing
         if timing.shift_s or timing.average_s:
             warnings.append(
@@ -313,9 +313,9 @@ def fit_rank(flights: Sequence[FlightData], settings: RankFitSettings) -> RankCa
     )
 
 
-def _sectors(one: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> ForecastScore:
+def _sectors(samples: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> ForecastScore:
     """Each sector forecast from the others of the same flight, with the geometries of the other flights."""
-    good = one.part(one.rank >= 1)
+    good = samples.part(samples.rank >= 1)
     groups = receiver.sector_groups(good.poses.position_m, good.tower_m)
     penalty = fitted.mixture.members[0].penalty
     forecast = receiver.out_of_group(
@@ -331,15 +331,15 @@ class Tried:
     settings: RankFitSettings
     samples: Sequence[RankSamples]
     geometries: tuple[Geometry, ...]
-    thin: Sequence[RankSamples]
+    thinned: Sequence[RankSamples]
     power: Sequence[FloatArray]
 
     @classmethod
     def of(cls, samples: Sequence[RankSamples], settings: RankFitSettings) -> Tried:
         """All candidates of the settings, for flights at one tower."""
         geometries = candidates(settings, samples[0])
-        thin = [sample.part(slice(None, None, settings.thin)) for sample in samples]
-        return cls(settings, samples, geometries, thin, [powers_of(geometries, item) for item in thin])
+        thinned = [sample.part(slice(None, None, settings.thin)) for sample in samples]
+        return cls(settings, samples, geometries, thinned, [powers_of(geometries, item) for item in thinned])
 
     def fit(self, flights: Sequence[int] | range) -> FittedReceiver:
         """Choose geometries and timing, and fit, on some of the flights.
@@ -350,35 +350,35 @@ class Tried:
         first = self.choose(flights, Timing())
         timing = self.choose_timing(flights, first.order[: self.settings.members])
         choice = first if timing.shift_s == timing.average_s == 0.0 else self.choose(flights, timing)
-        kept = tuple(self.geometries[i] for i in choice.tied[: self.settings.members])
-        whole = [self.samples[i] for i in flights]
+        chosen = tuple(self.geometries[i] for i in choice.tied[: self.settings.members])
+        train = [self.samples[i] for i in flights]
         mixture = receiver.fit_mixture(
-            np.concatenate([features_of(kept, item, timing) for item in whole], axis=1),
-            np.concatenate([item.rank for item in whole]),
-            _groups(whole),
+            np.concatenate([features_of(chosen, item, timing) for item in train], axis=1),
+            np.concatenate([item.rank for item in train]),
+            _groups(train),
             penalties=(3.0, 10.0, 30.0),
         )
         return FittedReceiver(
-            tower=whole[0].tower,
-            geometries=kept,
+            tower=train[0].tower,
+            geometries=chosen,
             tied=len(choice.tied),
-            flights=tuple(item.flight for item in whole),
-            trained_on=union(*(item.logs for item in whole)),
+            flights=tuple(item.flight for item in train),
+            trained_on=union(*(item.logs for item in train)),
             mixture=mixture,
             timing=timing,
         )
 
     def choose(self, flights: Sequence[int] | range, timing: Timing) -> receiver.FeatureChoice:
         """Compare all geometries on sectors left out within the flights."""
-        thin = [self.thin[i] for i in flights]
+        thinned = [self.thinned[i] for i in flights]
         return receiver.choose_features(
-            self.features(flights, timing), np.concatenate([item.rank for item in thin]), _groups(thin)
+            self.features(flights, timing), np.concatenate([item.rank for item in thinned]), _groups(thinned)
         )
 
     def choose_timing(self, flights: Sequence[int] | range, which: IntArray) -> Timing:
         """Least log score of the mean forecast of some geometries, on sectors left out within the flights."""
-        thin = [self.thin[i] for i in flights]
-        rank, groups = np.concatenate([item.rank for item in thin]), _groups(thin)
+        thinned = [self.thinned[i] for i in flights]
+        rank, groups = np.concatenate([item.rank for item in thinned]), _groups(thinned)
         candidates = [
             Timing(
                 shift_s=shift_s,
@@ -390,16 +390,16 @@ class Tried:
             for shift_s in self.settings.shift_s
             for average_s in self.settings.average_s
         ]
-        return min(candidates, key=lambda one: one.log_score)
+        return min(candidates, key=lambda timing: timing.log_score)
 
     def features(
         self, flights: Sequence[int] | range, timing: Timing, which: IntArray | slice = slice(None)
     ) -> FloatArray:
         """Features (geometries, n, 4) at the thinned samples of some flights."""
-        return np.concatenate([_features(self.power[i][which], self.thin[i], timing) for i in flights], axis=1)
+        return np.concatenate([_features(self.power[i][which], self.thinned[i], timing) for i in flights], axis=1)
 
 
 def _groups(samples: Sequence[RankSamples]) -> IntArray:
     """Sectors of directions; a sector is left out of all flights at once."""
-    whole = np.concatenate([sample.poses.position_m for sample in samples])
-    return receiver.sector_groups(whole, samples[0].tower_m)
+    position_m = np.concatenate([sample.poses.position_m for sample in samples])
+    return receiver.sector_groups(position_m, samples[0].tower_m)

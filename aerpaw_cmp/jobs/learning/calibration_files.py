@@ -59,14 +59,14 @@ def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
         for end, frame, name in ends:
             gain, sd = fit.gain(frame, antenna, flat)
             raw = (gain + calibration.learned.pattern_db(name, flat)).reshape(shape)
-            whole = unit_mean_gain(raw)
+            gain_dbi = unit_mean_gain(raw)
             out[antenna, end] = AntennaMap(
                 name=f"{antenna} {end}",
                 theta_deg=theta,
                 azimuth_deg=azimuth,
-                gain_dbi=whole,
+                gain_dbi=gain_dbi,
                 sd_db=sd.reshape(shape),
-                level_db=float((raw - whole).flat[0]),
+                level_db=float((raw - gain_dbi).flat[0]),
                 flown=fit.seen(frame, antenna),
             )
     return out
@@ -96,17 +96,19 @@ def antenna_files(
         "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
     )
     out: dict[str, str | bytes] = {}
-    for (antenna, end), one in maps.items():
+    for (antenna, end), sphere_map in maps.items():
         stem = safe_name(f"{antenna}.{end}")
-        out[f"{stem}.csv"] = sphere_csv(one.gain_dbi, one.sd_db, (*notes, *_notes(calibration, antenna, end)))
-        pattern = SpherePattern(stem, one.gain_dbi, one.sd_db)
+        out[f"{stem}.csv"] = sphere_csv(
+            sphere_map.gain_dbi, sphere_map.sd_db, (*notes, *_notes(calibration, antenna, end))
+        )
+        pattern = SpherePattern(stem, sphere_map.gain_dbi, sphere_map.sd_db)
         out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz)
         source = f"learned from the flights {names}, calibration {calibration.settings.calibration}"
-        said = file_attributes(
+        attributes = file_attributes(
             f"{antenna}, antenna at the {end}", source, utc_now(), __version__, "; ".join(notes[1:])
         )  # fmt: skip
-        said[KEY] = " ".join(calibration.trained_on)
-        sphere = sphere_netcdf(one.gain_dbi, one.sd_db, said, carrier_hz)
+        attributes[KEY] = " ".join(calibration.trained_on)
+        sphere = sphere_netcdf(sphere_map.gain_dbi, sphere_map.sd_db, attributes, carrier_hz)
         if sphere is not None:
             out[f"{stem}.nc"] = sphere
     return out
@@ -124,8 +126,10 @@ def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str
     term = next((t for t in fit.model.terms if t.frame == "pair"), None) if fit else None
     if fit is None or term is None or end == "uav":
         return ()
-    seen, length = fit.seen("pair", antenna), term.length
-    at = seen[determining(seen, lambda one, other: gaussian_kernel(one, other, length), PAIR_SHARE, MOST_PAIRS)]
+    directions, length = fit.seen("pair", antenna), term.length
+    at = directions[
+        determining(directions, lambda first, second: gaussian_kernel(first, second, length), PAIR_SHARE, MOST_PAIRS)
+    ]
     return PairGain(
         directions=at,
         gain_db=fit.gain("pair", antenna, at)[0],
@@ -221,10 +225,10 @@ def _place(calibration: Calibration, place: Learned) -> dict[str, FloatArray]:
     """The place field of the first antenna along all flights, thinned."""
     assert place.fit is not None
     first = place.fit.antennas[0]
-    own = [o.samples for o in calibration.observed if o.samples.antenna == first]
-    thin = [s.part(np.arange(0, len(s), max(1, len(s) // 1500))) for s in own]
-    gain = [place.fit.mean(s, ("place",)) for s in thin]
-    position = np.concatenate([s.position_m for s in thin])
+    samples = [o.samples for o in calibration.observed if o.samples.antenna == first]
+    thinned = [s.part(np.arange(0, len(s), max(1, len(s) // 1500))) for s in samples]
+    gain = [place.fit.mean(s, ("place",)) for s in thinned]
+    position = np.concatenate([s.position_m for s in thinned])
     return {"east_m": position[:, 0], "north_m": position[:, 1], "gain_db": np.concatenate(gain)}
 
 
@@ -234,19 +238,19 @@ class Calibrated:
 
     settings: CalibrationFile
     flights: tuple[FlightData, ...]
-    said: tuple[str, ...]
+    remarks: tuple[str, ...]
     calibration: Calibration | None
     ranked: RankCalibration | None
 
 
 def write_files(
-    found: Calibrated, folder: Path, name: str, stages_s: Mapping[str, float]
+    calibrated: Calibrated, folder: Path, name: str, stages_s: Mapping[str, float]
 ) -> tuple[dict[str, Any], str]:
     """Fill the folder of a calibration; gives its metrics and the text of calibrated.yaml.
 
     Parameters
     ----------
-    found : Calibrated
+    calibrated : Calibrated
     folder : Path
         Exists, and is swapped for the old one by the caller.
     name : str
@@ -260,27 +264,27 @@ def write_files(
     text : str
         calibrated.yaml.
     """
-    calibration, ranked = found.calibration, found.ranked
-    rank, said = (None, ()) if ranked is None else (ranked.metrics(), ranked.warnings)
+    calibration, ranked = calibrated.calibration, calibrated.ranked
+    rank, rank_warnings = (None, ()) if ranked is None else (ranked.metrics(), ranked.warnings)
     if calibration is not None:
         maps = antenna_maps(calibration)
-        carrier = next(s.link.carrier_hz for data in found.flights for s in data.rss)
+        carrier = next(s.link.carrier_hz for data in calibrated.flights for s in data.rss)
         for file, content in antenna_files(calibration, maps, carrier).items():
             write_file(folder / file, content)
         text = settings_text(calibration, name)
         record = dataclasses.replace(
             record_of(calibration, maps, text, stages_s),
             rank=rank,
-            warnings=(*found.said, *calibration.warnings, *said),
+            warnings=(*calibrated.remarks, *calibration.warnings, *rank_warnings),
         )
         write_calibration(record, folder)
         metrics = calibration_metrics(record)
     else:
         text = MARK + "\n"
         metrics = {
-            "scores": {}, "controls": {}, "words": [], "antennas": [], "calibration": found.settings.calibration,
-            "rank": rank, "warnings": [*found.said, *said], "flights": found.settings.flights,
-            KEY: list(union(*map(flight_logs, found.flights))),
+            "scores": {}, "controls": {}, "words": [], "antennas": [], "calibration": calibrated.settings.calibration,
+            "rank": rank, "warnings": [*calibrated.remarks, *rank_warnings], "flights": calibrated.settings.flights,
+            KEY: list(union(*map(flight_logs, calibrated.flights))),
         }  # fmt: skip
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
     if ranked is not None:
@@ -289,14 +293,14 @@ def write_files(
     return metrics, text
 
 
-def site_entries(found: Calibrated, command: str) -> list[tuple[str, Entry, dict[str, bytes]]]:
+def site_entries(calibrated: Calibrated, command: str) -> list[tuple[str, Entry, dict[str, bytes]]]:
     """Entries that a site remembers of a calibration: their names, the entries, and their tables by name."""
-    name, out = found.settings.calibration, []
-    if found.calibration is not None:
-        out.append((name, *site_entry(found.calibration, command)))
-    if found.ranked is not None:
-        own = f"{name}_rank" if out else name
-        out.append((own, *receiver_entry(found.settings, found.flights, found.ranked, command)))
+    name, out = calibrated.settings.calibration, []
+    if calibrated.calibration is not None:
+        out.append((name, *site_entry(calibrated.calibration, command)))
+    if calibrated.ranked is not None:
+        rank_name = f"{name}_rank" if out else name
+        out.append((rank_name, *receiver_entry(calibrated.settings, calibrated.flights, calibrated.ranked, command)))
     return out
 
 
@@ -308,22 +312,24 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
     for antenna in calibration.learned.fit.antennas if calibration.learned.fit else ():
         files = {}
         for end in ("tower", "uav"):
-            one = maps[antenna, end]
+            sphere_map = maps[antenna, end]
             files[end] = f"{safe_name(f'{name}.{antenna}.{end}')}.csv.gz"
             notes = (f"aerpaw-cmp calibrate: {name}, {antenna} {end}", *_notes(calibration, antenna, end))
-            tables[files[end]] = sphere_csv(one.gain_dbi, one.sd_db, notes, decimals=2).encode()
-        own = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
+            tables[files[end]] = sphere_csv(sphere_map.gain_dbi, sphere_map.sd_db, notes, decimals=2).encode()
+        samples = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
         first, ends = calibration.first_series(antenna), (maps[antenna, "uav"], maps[antenna, "tower"])
-        seen = np.concatenate([calibration.learned.predict(o.part(spread_out(len(o), SD_SAMPLES)))[1] for o in own])
+        sd_db = np.concatenate(
+            [calibration.learned.predict(o.part(spread_out(len(o), SD_SAMPLES)))[1] for o in samples]
+        )
         series.append(
             LearnedSeries(
-                tower=own[0].tower,
-                channel=own[0].channel,
+                tower=samples[0].tower,
+                channel=samples[0].channel,
                 reader=reader_of(*first),
                 carrier_hz=first[1].link.carrier_hz,
                 tower_file=files["tower"],
                 uav_file=files["uav"],
-                sd_db=round(float(np.nanmean(seen)), 2),
+                sd_db=round(float(np.nanmean(sd_db)), 2),
                 lock=_at_unit_gain(calibration.locks.get(antenna), *ends),
                 level=_level(calibration, first[1], *ends),
             )

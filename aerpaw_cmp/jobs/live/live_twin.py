@@ -122,17 +122,17 @@ class LiveTwin:
     ) -> dict[str, Any] | None:
         """The rest of the route for the log and the page, after a record; None between two bins."""
         free = float(self._free_space(place[None])[0])
-        rest = ahead.add(utc_ns / 1e9, place, rsrp_dbm, {"replay": level, "free space": free})
-        if rest is None:
+        forecast = ahead.add(utc_ns / 1e9, place, rsrp_dbm, {"replay": level, "free space": free})
+        if forecast is None:
             return None
-        low, high = rest.interval_db
-        columns = np.column_stack([ahead.route_m[rest.index, :2], rest.level_db, low, high])
+        low, high = forecast.interval_db
+        columns = np.column_stack([ahead.route_m[forecast.index, :2], forecast.level_db, low, high])
         columns = columns[np.isfinite(columns).all(axis=1)]
         if not len(columns):
             return None
         shown = columns[spread_out(len(columns), ROUTE_SHOWN)].round(1)
         median, least, most = columns[:, 2:].mean(axis=0).round(1).tolist()
-        return {"trend": rest.trend, "level_dbm": median, "interval_dbm": [least, most], "points": shown.tolist()}
+        return {"trend": forecast.trend, "level_dbm": median, "interval_dbm": [least, most], "points": shown.tolist()}
 
     def map(self) -> LiveMap:
         """Predicted rank and level over the site at several heights, the UAV level and heading north."""

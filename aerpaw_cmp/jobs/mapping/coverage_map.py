@@ -58,7 +58,7 @@ from ..prediction.corrected_map import CorrectedMaps
 from ..reporting.foliage_notes import p833_note
 from ..tasks.manifest import site_inputs
 from ..tasks.outcomes import code_digest
-from ..tasks.workers import Here, Lost, Workers
+from ..tasks.workers import InProcess, Lost, Workers
 
 # Modes of the trees, from no loss to total loss; the paper's is the last.
 FOLIAGE = ("none", "attenuating", "opaque")
@@ -172,9 +172,9 @@ class MapSettings:
 QUICK: dict[str, Any] = {"spacing_m": 120.0, "rss_altitudes_m": (30.0, 110.0), "rank_altitudes_m": (3.0, 30.0, 110.0)}
 
 
-def map_settings(given: Mapping[str, Any], *, quick: bool = False) -> MapSettings:
+def map_settings(fields: Mapping[str, Any], *, quick: bool = False) -> MapSettings:
     """Settings of a map from fields that were given; None leaves the default."""
-    stated = {name: value for name, value in given.items() if value is not None}
+    stated = {name: value for name, value in fields.items() if value is not None}
     return MapSettings(**({**QUICK, **stated} if quick else stated))
 
 
@@ -202,9 +202,9 @@ class SiteChannels:
         self.reach = Reach(site, budget, max_depth=settings.max_depth, every=cast, crowns=reflect)
         self.paths = self.paths_off_crowns = 0
         self._kept: dict[tuple[str, bytes], job.Evaluation] = {}
-        self._look_at(site)
+        self._take_site(site)
 
-    def _look_at(self, site: Site) -> None:
+    def _take_site(self, site: Site) -> None:
         """Take the part of the site that reaches a tile."""
         self.site = site
         apart_m = self.settings.element_spacing * wavelength_m(self.settings.carrier_hz)
@@ -235,7 +235,7 @@ class SiteChannels:
         grid = Tiling(Grid.over_area(self.reach.site.area_m, s.spacing_m), order.cells).grid_of(order.number)
         west, east, south, north = grid.area_m
         heights = (*s.rss_altitudes_m, *s.rank_altitudes_m)
-        self._look_at(self.reach.of(np.array([[west, south, min(heights)], [east, north, max(heights)]])))
+        self._take_site(self.reach.of(np.array([[west, south, min(heights)], [east, north, max(heights)]])))
         self.paths = self.paths_off_crowns = 0
         maps = self._maps(grid, progress)
         return TileDone(maps=maps, paths=self.paths, paths_off_crowns=self.paths_off_crowns)
@@ -253,7 +253,7 @@ class SiteChannels:
 
     def empty(self, grid: Grid) -> dict[str, job.MapResult]:
         """Maps by foliage mode without any coverage."""
-        self._look_at(replace(self.reach.site, towers={}))
+        self._take_site(replace(self.reach.site, towers={}))
         return self._maps(grid)
 
     def _all_modes(self, position_m: FloatArray) -> dict[str, job.Evaluation]:
@@ -272,15 +272,15 @@ class SiteChannels:
         result = {}
         for mode in s.foliage:
             loss = self._loss_db(mode, replayed.paths, poses)
-            one = self._shaded(siso, replayed, poses, self.siso, loss)
-            many = self._shaded(mimo, replayed, poses, self.mimo, loss)
+            shaded_siso = self._shaded(siso, replayed, poses, self.siso, loss)
+            shaded_mimo = self._shaded(mimo, replayed, poses, self.mimo, loss)
             if mode == "opaque" and self.mirrors:
-                one, many = self._with_bounces(self.mirrors, poses, one, many)
-            level = self._rss_dbm(many)
+                shaded_siso, shaded_mimo = self._with_bounces(self.mirrors, poses, shaded_siso, shaded_mimo)
+            level = self._rss_dbm(shaded_mimo)
             covered = np.isfinite(level)
-            spread = np.where(covered, level_sd_db(many), np.nan)
-            sigma = np.where(covered[..., None], singular_values(many), 0.0)
-            result[mode] = self._for_all_towers(job.Evaluation(self._rss_dbm(one), level, spread, sigma))
+            spread = np.where(covered, level_sd_db(shaded_mimo), np.nan)
+            sigma = np.where(covered[..., None], singular_values(shaded_mimo), 0.0)
+            result[mode] = self._for_all_towers(job.Evaluation(self._rss_dbm(shaded_siso), level, spread, sigma))
         return result
 
     def _for_all_towers(self, some: job.Evaluation) -> job.Evaluation:
@@ -465,7 +465,7 @@ def make_maps(
     """
     outcome = MapOutcome(site, settings)
     grid = Grid.over_area(site.area_m, settings.spacing_m)
-    crew = workers or Here()
+    crew = workers or InProcess()
     share = share_of(stages.progress, "maps")
     tile_cells = None if store is None else settings.tile_cells(grid)
     shared = math.ceil(math.sqrt(len(grid) / (4 * crew.count)))
@@ -574,8 +574,8 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
             outcome.peers.setdefault("blocks", {})[name] = blocked(peer, result.grid.points_m, rank, s.block_m)
             outcome.peers.setdefault("flight", {})[name] = along_trajectory(peer, result.grid, rank, line)
             if not isinstance(peer, ServingTowerMean):  # knows no height
-                held = altitude_held_out(peer, result.grid.points_m, heights, rank)
-                outcome.peers.setdefault("altitude", {})[f"{name}, 3-D"] = held
+                score = altitude_held_out(peer, result.grid.points_m, heights, rank)
+                outcome.peers.setdefault("altitude", {})[f"{name}, 3-D"] = score
             outcome.learning[name] = learning_curve(peer, result.grid.points_m, rank, sizes, seed=s.seed)
 
 
@@ -623,10 +623,12 @@ def maps_record(
     MapsData
     """
     s, result, flown = outcome.settings, outcome.shown, outcome.corrected
-    rss = tuple(one for mode, maps in outcome.ordered() for one in _rss_maps(maps, mode))
-    rank = tuple(one for mode, maps in outcome.ordered() for one in _rank_maps(maps, mode))
+    rss = tuple(panel for mode, maps in outcome.ordered() for panel in _rss_maps(maps, mode))
+    rank = tuple(panel for mode, maps in outcome.ordered() for panel in _rank_maps(maps, mode))
     towers = result.tower_names if len(result.tower_names) > 1 else ()
-    by_tower = (one for mode, maps in outcome.ordered() for tower in towers for one in _rank_maps(maps, mode, tower))
+    by_tower = (
+        panel for mode, maps in outcome.ordered() for tower in towers for panel in _rank_maps(maps, mode, tower)
+    )
     return page.MapsData(
         title=f"Coverage and rank maps, {outcome.site.name}",
         name=name,
@@ -750,11 +752,11 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
             )  # fmt: skip
         for column, k in enumerate(maps.ks if mode == s.shown else ()):
             for row, height in enumerate(maps.rank_altitudes_m):
-                seen = maps.ranks()[row, column] > 0
+                covered = maps.ranks()[row, column] > 0
                 yield page.MapLayer(
                     quantity=f"Rank change by foliage, {mode}, K = {k:g}", label="rank with minus without foliage",
                     unit="", axes=page.at_height(height), difference=True,
-                    values=raster(np.where(seen, change.rank_change[row, column], np.nan)),
+                    values=raster(np.where(covered, change.rank_change[row, column], np.nan)),
                 )  # fmt: skip
 
 
@@ -880,7 +882,7 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
     written = [
         export.write_csv(folder / "layers.csv", every_layer),
         export.write_geojson(folder / "layers.geojson", levels_and_ranks),
-        export.write_json(folder / "maps.json", all_joint, {"site": site.name, **_made()}),
+        export.write_json(folder / "maps.json", all_joint, {"site": site.name, **_provenance()}),
         export.write_kmz(folder / "maps.kmz", levels_and_ranks, title=site.name),
     ]
     maps = dict(outcome.ordered())
@@ -896,7 +898,7 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
     return written
 
 
-def _made() -> dict[str, str]:
+def _provenance() -> dict[str, str]:
     return {"generated": utc_now(), "version": versions()["aerpaw-cmp"]}
 
 
@@ -905,7 +907,7 @@ def about_maps(title: str) -> dict[str, str]:
     return file_attributes(
         title=title,
         source="ray tracing",
-        **_made(),
+        **_provenance(),
         comment="A missing level has no path or lies below the threshold. A rank of 0 is a code: no path.",
     )
 
@@ -914,13 +916,13 @@ def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:
     """Layers of all modes, with the mode in their names; the serving tower once."""
     result: list[cells.Layer] = []
     for mode, maps in outcome.ordered():
-        serving, *others = job.layers_of(maps, towers_too=towers_too)
+        serving, *layers = job.layers_of(maps, towers_too=towers_too)
         result += [] if result else [serving]
-        for other in others:
+        for layer in layers:
             # a hundredth of a dB is more than the site's data hold, and a third of the bytes
-            values = other.values if other.classes else np.round(other.values, 2)
-            if other.name.startswith(RATIOS):
+            values = layer.values if layer.classes else np.round(layer.values, 2)
+            if layer.name.startswith(RATIOS):
                 values = np.minimum(values, job.RATIO_LIMIT_DB)
-            title = f"{other.title}, foliage {mode}"
-            result.append(replace(other, name=f"{other.name}_{mode}", title=title, values=values))
+            title = f"{layer.title}, foliage {mode}"
+            result.append(replace(layer, name=f"{layer.name}_{mode}", title=title, values=values))
     return result

@@ -58,7 +58,7 @@ class SceneOptions:
     merge_m: float = 1e-3
 
 
-def run_scene_import(path: Path, out: Path, asked: SceneOptions, *, force: bool = False) -> list[str]:
+def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool = False) -> list[str]:
     """Write a site.yaml that names a Mitsuba scene; gives what was done.
 
     Parameters
@@ -67,7 +67,7 @@ def run_scene_import(path: Path, out: Path, asked: SceneOptions, *, force: bool 
         The XML file; it stays where it is.
     out : Path
         The site.yaml to write.
-    asked : SceneOptions
+    facts : SceneOptions
     force : bool
         Replace a file that this tool did not write.
 
@@ -81,11 +81,11 @@ def run_scene_import(path: Path, out: Path, asked: SceneOptions, *, force: bool 
     UsageError
         Where the scene lies, or where its towers stand, is not said.
     """
-    named = dict(_pair(text, "--material", "wall=concrete") for text in asked.materials)
-    given = None if asked.base is None else site_model(asked.base)
-    start = _origin(asked.origin, given)
+    named = dict(_pair(text, "--material", "wall=concrete") for text in facts.materials)
+    base_model = None if facts.base is None else site_model(facts.base)
+    start = _origin(facts.origin, base_model)
     with OutputFile(out, own=is_sealed, inputs=[path], force=force) as output:
-        scene = placed_scene(path, materials=named, turn_deg=asked.turn_deg)
+        scene = placed_scene(path, materials=named, turn_deg=facts.turn_deg)
         actions = [_summary(scene), *scene.notes]
         share = ground_share(scene)
         ground_plane = share < GROUND_SHARE
@@ -95,25 +95,27 @@ def run_scene_import(path: Path, out: Path, asked: SceneOptions, *, force: bool 
                 f"is added at its lowest point, up = {bounds(scene)[0][2]:g} m; scene.ground_plane: false leaves it out"
             )
         low, high = bounds(scene)
-        content: dict[str, Any] = {} if given is None else given.model_dump(mode="json", exclude_defaults=True)
+        content: dict[str, Any] = (
+            {} if base_model is None else base_model.model_dump(mode="json", exclude_defaults=True)
+        )
         for key in ("buildings", "dem", "tower_ground"):
             content.pop(key, None)
-        content["name"] = path.stem if given is None else f"{given.name}, {path.stem}"
+        content["name"] = path.stem if base_model is None else f"{base_model.name}, {path.stem}"
         content["origin"] = start
         content["scene"] = SceneModel(
             path=Path(os.path.relpath(path.resolve(), out.resolve().parent)).as_posix(),
             sha256=scene.sha256,
-            turn_deg=asked.turn_deg,
+            turn_deg=facts.turn_deg,
             materials=named,
-            merge_m=asked.merge_m,
+            merge_m=facts.merge_m,
             ground_plane=ground_plane,
         ).model_dump(mode="json", exclude_defaults=True)
-        if given is None or asked.towers:
+        if base_model is None or facts.towers:
             content["towers"] = _towers(
-                asked.towers, SiteFrame(start["latitude_deg"], start["longitude_deg"]), low, high
+                facts.towers, SiteFrame(start["latitude_deg"], start["longitude_deg"]), low, high
             )
         content.setdefault("area_m", [round(float(v), 2) for v in (low[0], high[0], low[1], high[1])])
-        if asked.origin == "local":
+        if facts.origin == "local":
             content["notes"] = [*content.get("notes", []), LOCAL_NOTE]
             actions.append(LOCAL_NOTE)
         model = SiteModel.model_validate(content)

@@ -51,17 +51,17 @@ def score_against(data: FlightData, folder: Path) -> Against:
             expected="the output folder of 'aerpaw-cmp predict'",
             path=folder,
         ) from None
-    if own := common(flight_logs(data), [learned]):
+    if shared := common(flight_logs(data), [learned]):
         raise UsageError(
-            f"the prediction learned from this flight's own log (SHA-256 {own[0][:12]}...)",
+            f"the prediction learned from this flight's own log (SHA-256 {shared[0][:12]}...)",
             expected="a prediction made before the flight, or from other flights",
             path=folder,
         )
     series = [
-        one
+        scored
         for o in (observe([data])[0] if data.rss else ())
         if (part := groups.get((o.samples.tower, o.samples.channel))) is not None
-        and (one := _matched(o, part)) is not None
+        and (scored := _matched(o, part)) is not None
     ]
     ranks = {
         s.tower: score
@@ -87,22 +87,22 @@ def score_against(data: FlightData, folder: Path) -> Against:
 def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
     """Samples near predicted points, each with the level that was predicted there."""
     good = np.isfinite(o.samples.residual_db)
-    one = o.part(good)
-    index, near = _nearest(one.samples.position_m, one.heading_deg, part)
+    finite = o.part(good)
+    index, near = _nearest(finite.samples.position_m, finite.heading_deg, part)
     if near.sum() < FEWEST:
         return None
-    said, s = part.iloc[index[near]], one.samples.part(near)
+    predicted, s = part.iloc[index[near]], finite.samples.part(near)
     return AgainstSeries(
         name=f"{s.tower} {s.channel}",
         time_s=s.time_s,
-        measured_db=s.residual_db + one.free_space_db[near],
-        level_db=said["level_db"].to_numpy(np.float64),
-        sd_db=said["sd_db"].to_numpy(np.float64),
-        low_db=said["q05_db"].to_numpy(np.float64),
-        high_db=said["q95_db"].to_numpy(np.float64),
+        measured_db=s.residual_db + finite.free_space_db[near],
+        level_db=predicted["level_db"].to_numpy(np.float64),
+        sd_db=predicted["sd_db"].to_numpy(np.float64),
+        low_db=predicted["q05_db"].to_numpy(np.float64),
+        high_db=predicted["q95_db"].to_numpy(np.float64),
         share_near=float(near.mean()),
-        common_db=said["slow_sd_db"].to_numpy(np.float64) if "slow_sd_db" in said else 0.0,
-        start=one.start,
+        common_db=predicted["slow_sd_db"].to_numpy(np.float64) if "slow_sd_db" in predicted else 0.0,
+        start=finite.start,
     )
 
 
@@ -114,8 +114,8 @@ def _rank_score(samples: RankSamples, part: pd.DataFrame) -> ForecastScore | Non
     if near.sum() < FEWEST:
         return None
     every = part[list(RANKS)].to_numpy(np.float64)
-    said = every[index[near]]
-    return score_forecast(samples.rank[near], said, said.argmax(axis=1) + 1, every.mean(axis=0))
+    forecast = every[index[near]]
+    return score_forecast(samples.rank[near], forecast, forecast.argmax(axis=1) + 1, every.mean(axis=0))
 
 
 def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame) -> tuple[IntArray, Any]:
@@ -132,5 +132,5 @@ def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame
 
     points = coordinates(part[["east_m", "north_m", "height_m"]].to_numpy(), part["yaw_deg"].to_numpy())
     heading = heading_deg if part["yaw_deg"].notna().all() else np.full(len(heading_deg), np.nan)
-    away, index = cKDTree(points).query(coordinates(position_m, heading))
-    return np.asarray(index), away <= np.sqrt(2.0)
+    distance, index = cKDTree(points).query(coordinates(position_m, heading))
+    return np.asarray(index), distance <= np.sqrt(2.0)

@@ -19,7 +19,7 @@ from ...report.maps import data as page
 from ...report.prediction_html import PredictionPage
 from .predict import RANKS, Prediction, predict
 from .sources import NamedFlight, Source
-from .where import Asked
+from .where import TargetOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,25 +129,25 @@ def corrected_maps(
     UsageError, InputError
         As :func:`.predict.predict`.
     """
-    asked = Asked(heights_m=tuple(sorted({*heights_m[0], *heights_m[1]})), spacing_m=spacing_m)
-    said = predict(Path(site), flights, asked, logs_root=logs_root, stages=stages)
-    grid = said.targets.grid
+    options = TargetOptions(heights_m=tuple(sorted({*heights_m[0], *heights_m[1]})), spacing_m=spacing_m)
+    prediction = predict(Path(site), flights, options, logs_root=logs_root, stages=stages)
+    grid = prediction.targets.grid
     assert grid is not None
-    levels = (one for source in said.sources.values() for one in _levels(said, source, len(grid)))
+    levels = (level for source in prediction.sources.values() for level in _levels(prediction, source, len(grid)))
     return CorrectedMaps(
-        levels=tuple(one for one in levels if one.height_m in heights_m[0]),
-        ranks={key: p for key, p in _ranks(said, len(grid)) if key[1] in heights_m[1]},
-        prediction=said.page,
+        levels=tuple(level for level in levels if level.height_m in heights_m[0]),
+        ranks={key: p for key, p in _ranks(prediction, len(grid)) if key[1] in heights_m[1]},
+        prediction=prediction.page,
     )
 
 
-def _levels(said: Prediction, source: Source, n: int) -> Iterator[CorrectedLevel]:
-    table = said.table
+def _levels(prediction: Prediction, source: Source, n: int) -> Iterator[CorrectedLevel]:
+    table = prediction.table
     mine = table[(table["tower"] == source.tower) & (table["channel"] == source.channel)]
-    position = said.targets.position_m
+    position = prediction.targets.position_m
     raw = source.replayed_db(source.targets(position, np.zeros(len(position)))) + source.free_space_db(position)
-    level = mine["level_db"].to_numpy() - said.model.offset_db(source.antenna)
-    for k, height in enumerate(said.targets.heights_m):
+    level = mine["level_db"].to_numpy() - prediction.model.offset_db(source.antenna)
+    for k, height in enumerate(prediction.targets.heights_m):
         part = slice(k * n, (k + 1) * n)
         yield CorrectedLevel(
             link=source.antenna.replace(".", " ", 1),
@@ -158,10 +158,10 @@ def _levels(said: Prediction, source: Source, n: int) -> Iterator[CorrectedLevel
         )
 
 
-def _ranks(said: Prediction, n: int) -> Iterator[tuple[tuple[str, float], FloatArray]]:
-    ranks = said.table[said.table["channel"] == "rank"]
+def _ranks(prediction: Prediction, n: int) -> Iterator[tuple[tuple[str, float], FloatArray]]:
+    ranks = prediction.table[prediction.table["channel"] == "rank"]
     for tower, rows in ranks.groupby("tower", sort=False, observed=True):
-        p = np.full((len(said.targets), 4), np.nan)
+        p = np.full((len(prediction.targets), 4), np.nan)
         p[rows["point"].to_numpy()] = rows[list(RANKS)].to_numpy()
-        for k, height in enumerate(said.targets.heights_m):
+        for k, height in enumerate(prediction.targets.heights_m):
             yield (str(tower), height), p[k * n : (k + 1) * n]

@@ -30,7 +30,7 @@ from ..learning.calibrate import learned_antennas, observe
 from ..options import DEFAULT, JobOutcome, RunOptions
 from .predict import site_of
 from .sources import NamedFlight, files_of, named_flights, sources_of
-from .where import Asked, Targets, find_targets, level_samples
+from .where import TargetOptions, Targets, find_targets, level_samples
 
 # Target: all directions of the tower seen from the UAV, at all headings.
 SPHERE = "sphere"
@@ -52,7 +52,7 @@ ALLOWED_OUTSIDE_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlanAsked:
+class PlanOptions:
     """Options of ``plan``.
 
     Parameters
@@ -71,7 +71,7 @@ class PlanAsked:
         Further candidates.
     towers : tuple of str
         Whose antennas count, where no flight names them.
-    target : Asked
+    target : TargetOptions
         Heights, spacing and heading of a target that is a grid, and the site where no flight names it.
     """
 
@@ -83,7 +83,7 @@ class PlanAsked:
     avoid: tuple[Path, ...] = ()
     routes: tuple[Path, ...] = ()
     towers: tuple[str, ...] = ()
-    target: Asked = field(default_factory=lambda: Asked(spacing_m=60.0))
+    target: TargetOptions = field(default_factory=lambda: TargetOptions(spacing_m=60.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +109,7 @@ Candidate = tuple[Route, Pattern | None, str]
 def plan_flight(
     target: str,
     flights: Sequence[NamedFlight],
-    asked: PlanAsked,
+    plan: PlanOptions,
     *,
     logs_root: Path | None = None,
     stages: Stages | None = None,
@@ -122,7 +122,7 @@ def plan_flight(
         ``sphere``, or what :func:`.where.find_targets` takes.
     flights : sequence of NamedFlight
         That were flown; none: antennas are unknown.
-    asked : PlanAsked
+    plan : PlanOptions
     logs_root : Path, optional
     stages : Stages, optional
 
@@ -138,60 +138,60 @@ def plan_flight(
     """
     stages = stages or Stages()
     with stages("read"):
-        datas, said = counted_once([flight.load(logs_root) for flight in flights])
+        datas, remarks = counted_once([flight.load(logs_root) for flight in flights])
         observed = observe(datas)[0] if datas else []
-        site, _ = site_of(None if target == SPHERE else Path(target), flights, datas, asked.target.site)
+        site, _ = site_of(None if target == SPHERE else Path(target), flights, datas, plan.target.site)
         sources = sources_of(datas, observed) if datas else {}
-        ends = {a: (s.tower, s.channel) for a, s in sources.items()} or _open_ends(site, asked)
+        ends = {a: (s.tower, s.channel) for a, s in sources.items()} or _open_ends(site, plan)
         series = [o.samples for o in observed if o.samples.antenna in ends]
-        area = _area(site, asked)
+        area = _area(site, plan)
     with stages("candidates"):
-        candidates = [*_own(asked, area, site), *_given(asked, area, site)]
+        candidates = [*_own_patterns(plan, area, site), *_file_routes(plan, area, site)]
         if not candidates:
             raise UsageError(
                 "no route fits: no pattern lies within the geofence",
                 expected="a larger area, or --route FILE",
             )
-        points = None if target == SPHERE else find_targets(Path(target), site, asked.target)
+        points = None if target == SPHERE else find_targets(Path(target), site, plan.target)
         if points is not None:
-            said += points.remarks
+            remarks += points.remarks
             _check_near("target", shapely.multipoints(points.position_m[points.known]), area, "that may be flown")
-        wanted = _targets(points, site, ends)
+        targets = _targets(points, site, ends)
     with stages("learn"):
-        known = _known(series)
-    thin = {a: _thinned(s, MOST_TARGETS) for a, s in wanted.items()}
+        known = _flown_knowledge(series)
+    few_targets = {a: _thinned(s, MOST_TARGETS) for a, s in targets.items()}
 
     def leaves_db(route: Route) -> float:
-        return rms_db(known.sd_db(_samples(route, ends, site), thin))
+        return rms_db(known.sd_db(_samples(route, ends, site), few_targets))
 
     with stages("rank"):
         ranked = _ranked(candidates, leaves_db, stages)
     with stages("curve"):
-        curve = _curve(ranked, leaves_db, site, area, asked)
+        curve = _curve(ranked, leaves_db, site, area, plan)
     with stages("map"):
-        shown = {a: _thinned(s, 6 * MOST_TARGETS) for a, s in wanted.items()}
+        shown = {a: _thinned(s, 6 * MOST_TARGETS) for a, s in targets.items()}
         before, after = known.sd_db([], shown), known.sd_db(_samples(ranked[0].route, ends, site), shown)
-    best, ways, speed = ranked[0], ranked[0].route.waypoints, asked.speed_mps
+    best, ways, speed = ranked[0], ranked[0].route.waypoints, plan.speed_mps
     return PlanPage(
         target=target,
-        sentence=_sentence(best, curve, rms_db(known.sd_db([], thin))),
+        sentence=_sentence(best, curve, rms_db(known.sd_db([], few_targets))),
         antennas=tuple(ends),
         flights=[data.settings.flight.name for data in datas],
-        candidates=[one.row for one in ranked],
+        candidates=[candidate.row for candidate in ranked],
         curve=curve,
         outline_m=np.array(area.exterior.coords),
         holes_m=[np.array(ring.coords) for ring in area.interiors],
         track_m=best.route.position_m,
         place_m=next(iter(shown.values())).position_m,
-        before_db=_over(before),
-        after_db=_over(after),
+        before_db=_rms_of_antennas(before),
+        after_db=_rms_of_antennas(after),
         towers={name: np.asarray(t.position_m) for name, t in site.towers.items()},
         files={
             "route.plan": plan_text(ways, site.frame, speed),
             "route.kml": kml_text(ways, site.frame, best.route.name),
             "route.csv": waypoints_csv(ways, site.frame),
         },
-        warnings=said,
+        warnings=remarks,
         stages_s=stages.seconds,
     )
 
@@ -214,7 +214,7 @@ def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float]
     for number, (route, pattern, refused) in enumerate(candidates):
         stages.progress(f"rank {route.name}", number / len(candidates))
         ranked.append(Ranked(route=route, pattern=pattern, sd_db=leaves_db(route), refused=refused))
-    ranked.sort(key=lambda one: (bool(one.refused), one.sd_db))
+    ranked.sort(key=lambda candidate: (bool(candidate.refused), candidate.sd_db))
     if ranked[0].refused:
         raise UsageError(
             f"no route fits: {ranked[0].route.name} {ranked[0].refused}",
@@ -223,24 +223,24 @@ def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float]
     return ranked
 
 
-def _open_ends(site: Site, asked: PlanAsked) -> dict[str, tuple[str, str]]:
+def _open_ends(site: Site, plan: PlanOptions) -> dict[str, tuple[str, str]]:
     """Antennas that nobody has measured: one per tower."""
-    towers = asked.towers or tuple(site.towers)
+    towers = plan.towers or tuple(site.towers)
     for name in towers:
         if name not in site.towers:
             raise UsageError(f"no tower {name!r}", expected="one of " + ", ".join(site.towers))
     return {f"{name}.level": (name, "level") for name in towers}
 
 
-def _area(site: Site, asked: PlanAsked) -> Any:
+def _area(site: Site, plan: PlanOptions) -> Any:
     """Area where a route may run."""
     west, east, south, north = site.area_m
     ground = shapely.box(west, south, east, north)
-    fence = ground if asked.fence is None else shapely.union_all(_polygons(asked.fence, site))
+    fence = ground if plan.fence is None else shapely.union_all(_polygons(plan.fence, site))
     _check_near("geofence", fence, ground, f"of site {site.name}")
-    avoid = [one for path in asked.avoid for one in _polygons(path, site)]
+    avoid = [polygon for path in plan.avoid for polygon in _polygons(path, site)]
     towers = np.array([t.position_m for t in site.towers.values()]).reshape(-1, 3)
-    return allowed_area(fence, avoid, towers, asked.tower_distance_m)
+    return allowed_area(fence, avoid, towers, plan.tower_distance_m)
 
 
 def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
@@ -254,28 +254,28 @@ def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
     return out
 
 
-def _own(asked: PlanAsked, area: Any, site: Site) -> list[Candidate]:
+def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     """The tool's own patterns; those that leave the area on the way between legs are dropped."""
     out: list[Candidate] = []
     shapes = [("lawnmower", 0.0, False), ("lawnmower", 90.0, False), ("lawnmower", 0.0, True), ("cross", 0.0, False)]
-    for height, (shape, azimuth, turns), nose in product(asked.heights_m, shapes, NOSES):
+    for height, (shape, azimuth, turns), nose in product(plan.heights_m, shapes, NOSES):
         if turns and nose != "along":
             continue
         pattern = Pattern(shape=shape, azimuth_deg=azimuth, height_m=height, nose=nose, turns=turns)  # type: ignore[arg-type]
         try:
-            route = _raised(route_of(pattern, area, asked.speed_mps, 60.0 * asked.minutes), site)
+            route = _raised(route_of(pattern, area, plan.speed_mps, 60.0 * plan.minutes), site)
         except UsageError:
             continue
-        if not _leaves(route, area):
+        if not _leaves_area(route, area):
             out.append((route, pattern, ""))
     return out
 
 
-def _given(asked: PlanAsked, area: Any, site: Site) -> list[Candidate]:
+def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     """Routes of files, flown at the speed of the plan; why one may not be flown."""
     out: list[Candidate] = []
-    for path in asked.routes:
-        targets = find_targets(path, site, Asked(heights_m=asked.heights_m))
+    for path in plan.routes:
+        targets = find_targets(path, site, TargetOptions(heights_m=plan.heights_m))
         if targets.kind == "grid" or len(targets) < 2:
             raise InputError("no route", expected="a .plan, KML, CSV or log with two points or more", path=path)
         good = targets.known
@@ -284,10 +284,10 @@ def _given(asked: PlanAsked, area: Any, site: Site) -> list[Candidate]:
             Waypoint(east_m=float(p[0]), north_m=float(p[1]), height_m=float(p[2]) - ground, yaw_deg=float(y))
             for p, y in zip(targets.position_m[good], targets.yaw_deg[good], strict=True)
         ]
-        route = _raised(flown(path.name, _corners(points), asked.speed_mps), site)
-        refused = "leaves the allowed area" if _leaves(route, area) else ""
-        if route.duration_s > 60.0 * asked.minutes + 1.0:
-            refused = f"takes {route.duration_s / 60.0:.1f} min of {asked.minutes:g} min"
+        route = _raised(flown(path.name, _corners(points), plan.speed_mps), site)
+        refused = "leaves the allowed area" if _leaves_area(route, area) else ""
+        if route.duration_s > 60.0 * plan.minutes + 1.0:
+            refused = f"takes {route.duration_s / 60.0:.1f} min of {plan.minutes:g} min"
         out.append((route, None, refused))
     return out
 
@@ -295,13 +295,13 @@ def _given(asked: PlanAsked, area: Any, site: Site) -> list[Candidate]:
 def _corners(points: Sequence[Waypoint]) -> list[Waypoint]:
     """Waypoints without those that lie straight between their neighbours and keep the yaw."""
     place = np.array([(w.east_m, w.north_m, w.height_m) for w in points])
-    kept = [points[0]]
+    corners = [points[0]]
     for i in range(1, len(points) - 1):
-        one, two = place[i] - place[i - 1], place[i + 1] - place[i]
-        straight = float(one @ two) > 0.9998 * float(np.linalg.norm(one) * np.linalg.norm(two))
-        if not straight or abs(points[i].yaw_deg - kept[-1].yaw_deg) > 2.0:
-            kept.append(points[i])
-    return [*kept, points[-1]]
+        before, after = place[i] - place[i - 1], place[i + 1] - place[i]
+        straight = float(before @ after) > 0.9998 * float(np.linalg.norm(before) * np.linalg.norm(after))
+        if not straight or abs(points[i].yaw_deg - corners[-1].yaw_deg) > 2.0:
+            corners.append(points[i])
+    return [*corners, points[-1]]
 
 
 def _raised(route: Route, site: Site) -> Route:
@@ -309,7 +309,7 @@ def _raised(route: Route, site: Site) -> Route:
     return replace(route, position_m=route.position_m + np.array([0.0, 0.0, site.datum.takeoff_ground_m]))
 
 
-def _leaves(route: Route, area: Any) -> bool:
+def _leaves_area(route: Route, area: Any) -> bool:
     line = shapely.LineString(route.position_m[:, :2])
     return not bool(shapely.covers(shapely.buffer(area, ALLOWED_OUTSIDE_M + 3.0), line))
 
@@ -339,10 +339,10 @@ def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, s
 
 def _check_near(what: str, place: Any, area: Any, which: str) -> None:
     """UsageError where a shape lies farther than :data:`FARTHEST_M` outside the area."""
-    away = shapely.distance(area, place)
-    if away > FARTHEST_M:
+    distance_m = shapely.distance(area, place)
+    if distance_m > FARTHEST_M:
         raise UsageError(
-            f"the {what} lies {away:.0f} m outside the area {which}",
+            f"the {what} lies {distance_m:.0f} m outside the area {which}",
             expected=f"a {what} within {FARTHEST_M:g} m of it",
             cause="another site, or exchanged coordinates",
         )
@@ -364,14 +364,14 @@ def _even_directions(count: int) -> FloatArray:
     return np.asarray(np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1), dtype=np.float64)
 
 
-def _known(series: Sequence[LinkSamples]) -> Known:
+def _flown_knowledge(series: Sequence[LinkSamples]) -> Known:
     """Strengths and residual field by the flights that were flown; the model's own without any."""
-    model, left = GainModel(), None
+    model, residual_field = GainModel(), None
     if series:
         model = learned_antennas(series).model
         correction = choose(series, {"learned": lambda train: learned_antennas(train).predict})
-        left = correction.model if correction.on else None
-    return Known(series=series, model=model, field=left)
+        residual_field = correction.model if correction.on else None
+    return Known(series=series, model=model, field=residual_field)
 
 
 def _thinned(samples: LinkSamples, most: int) -> LinkSamples:
@@ -381,7 +381,7 @@ def _thinned(samples: LinkSamples, most: int) -> LinkSamples:
     return samples.part(np.arange(0, len(samples), step))
 
 
-def _over(sd_db: Mapping[str, FloatArray]) -> FloatArray:
+def _rms_of_antennas(sd_db: Mapping[str, FloatArray]) -> FloatArray:
     return np.asarray(np.sqrt(np.mean([sd**2 for sd in sd_db.values()], axis=0)))
 
 
@@ -390,14 +390,14 @@ CURVE_OF = 3
 
 
 def _curve(
-    ranked: Sequence[Ranked], leaves_db: Callable[[Route], float], site: Site, area: Any, asked: PlanAsked
+    ranked: Sequence[Ranked], leaves_db: Callable[[Route], float], site: Site, area: Any, plan: PlanOptions
 ) -> list[dict[str, float]]:
     """Standard deviations that shorter and longer flights of the best candidates leave; of files, shorter ones."""
     out: list[dict[str, float]] = []
     best = [r for r in ranked if not r.refused][:CURVE_OF]
     for share in SHARES:
         tried = []
-        for route in filter(None, (_of_length(item, share, area, asked) for item in best)):
+        for route in filter(None, (_of_length(item, share, area, plan) for item in best)):
             raised = _raised(route, site)
             sd = leaves_db(raised)
             tried.append({"minutes": raised.duration_s / 60.0, "length_m": raised.length_m, "sd_db": sd})
@@ -407,15 +407,15 @@ def _curve(
     return out
 
 
-def _of_length(one: Ranked, share: float, area: Any, asked: PlanAsked) -> Route | None:
+def _of_length(candidate: Ranked, share: float, area: Any, plan: PlanOptions) -> Route | None:
     """A candidate that takes this share of the battery; None of a file for more than it has."""
-    if one.pattern is not None:
-        return route_of(one.pattern, area, asked.speed_mps, 60.0 * share * asked.minutes)
-    whole = flown(one.route.name, one.route.waypoints, asked.speed_mps)
-    return cut(whole, share * whole.duration_s, asked.speed_mps) if share <= 1.0 else None
+    if candidate.pattern is not None:
+        return route_of(candidate.pattern, area, plan.speed_mps, 60.0 * share * plan.minutes)
+    full = flown(candidate.route.name, candidate.route.waypoints, plan.speed_mps)
+    return cut(full, share * full.duration_s, plan.speed_mps) if share <= 1.0 else None
 
 
-def run_plan(target: str, flights: Sequence[Path], asked: PlanAsked, options: RunOptions = DEFAULT) -> JobOutcome:
+def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: RunOptions = DEFAULT) -> JobOutcome:
     """Rank flights and write ``plan.html``, the chosen route, ``sd_map.csv``, ``metrics.json`` and figures.
 
     Parameters
@@ -423,7 +423,7 @@ def run_plan(target: str, flights: Sequence[Path], asked: PlanAsked, options: Ru
     target : str
         As for :func:`.next_flight.plan_flight`.
     flights : sequence of Path
-    asked : PlanAsked
+    plan : PlanOptions
     options : RunOptions
         ``out`` is ``reports/plan-TARGET`` by default.
 
@@ -436,13 +436,13 @@ def run_plan(target: str, flights: Sequence[Path], asked: PlanAsked, options: Ru
     UsageError, InputError
         With what was found, expected, and the likely cause.
     """
-    inputs = [p for p in (Path(target), asked.fence, *asked.avoid, *asked.routes) if p is not None and p.is_file()]
+    inputs = [p for p in (Path(target), plan.fence, *plan.avoid, *plan.routes) if p is not None and p.is_file()]
     known = named_flights(flights)
     inputs += files_of(known, options.logs_root)
     stages = Stages(options.progress)
     folder = options.out or Path("reports") / f"plan-{safe_name(Path(target).stem)}"
     with OutputFolder(folder, job="plan", inputs=inputs, force=options.force) as output:
-        record = plan_flight(target, known, asked, logs_root=options.logs_root, stages=stages)
+        record = plan_flight(target, known, plan, logs_root=options.logs_root, stages=stages)
         with output.filling() as place:
             options.progress("page")
             written = write_plan(record, place)

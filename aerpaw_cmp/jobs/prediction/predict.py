@@ -49,7 +49,7 @@ from .sources import (
     sources_of,
     track_m,
 )
-from .where import Asked, Targets, find_targets, flight_of, is_settings
+from .where import TargetOptions, Targets, find_targets, flight_of, is_settings
 
 # Directions of the nose that count alike where it is not known.
 HEADINGS = 8
@@ -96,7 +96,7 @@ class Prediction:
 def predict(
     where: Path,
     flights: Sequence[NamedFlight],
-    asked: Asked | None = None,
+    options: TargetOptions | None = None,
     *,
     threshold_db: float | None = None,
     logs_root: Path | None = None,
@@ -110,7 +110,7 @@ def predict(
         See :func:`.where.find_targets`.
     flights : sequence of NamedFlight
         To learn from; without any the memory of the site is the source.
-    asked : Asked, optional
+    options : TargetOptions, optional
     threshold_db : float, optional
         P(level > threshold) is given for it, in the unit of the logs.
     logs_root : Path, optional
@@ -126,21 +126,21 @@ def predict(
     UsageError, InputError
         No source that shares a tower and band, no place to predict.
     """
-    stages, asked = stages or Stages(), asked or Asked()
+    stages, options = stages or Stages(), options or TargetOptions()
     with stages("read"):
-        known, said = counted_once([flight.load(logs_root) for flight in flights])
-        site, place = site_of(where, flights, known, asked.site)
+        known, remarks = counted_once([flight.load(logs_root) for flight in flights])
+        site, place = site_of(where, flights, known, options.site)
         memory = None if known else memory_of(place, site)
         if memory is not None:
             sources = memory.sources()
         else:
             observed, warnings = observe(known)
             sources = sources_of(known, observed)
-            said += [text for text in warnings if "scored" not in text]
+            remarks += [text for text in warnings if "scored" not in text]
         _check_shared(where, sources, site, "the flights heard" if known else "the site remembers")
-        targets = find_targets(where, site, asked, logs_root)
+        targets = find_targets(where, site, options, logs_root)
     with stages("choose"):
-        model = memory or _chosen(targets, sources, known, place, said)
+        model = memory or _best_model(targets, sources, known, place, remarks)
     with stages("predict"):
         receivers = _receivers(known, place, site)
         table = _table(targets, site, (sources, model, receivers), threshold_db, stages.progress)
@@ -150,22 +150,22 @@ def predict(
         table=table,
         units={f"{s.tower} {s.channel}": s.unit for s in sources.values()},
         shape=None if targets.grid is None else targets.grid.shape,
-        flown={f"{s.flight} {s.antenna}": track_m(s).T for one in sources.values() for s in one.samples},
+        flown={f"{s.flight} {s.antenna}": track_m(s).T for source in sources.values() for s in source.samples},
         threshold_db=threshold_db,
-        warnings=(*said, *targets.remarks),
+        warnings=(*remarks, *targets.remarks),
         stages_s=stages.seconds,
-        **_about(model, known, [receiver.trained_on for receiver, _, _ in receivers.values()], table),
+        **_model_fields(model, known, [receiver.trained_on for receiver, _, _ in receivers.values()], table),
     )
     return Prediction(page=page, targets=targets, model=model, sources=sources)
 
 
-def _about(
+def _model_fields(
     model: Flown | Memory, known: Sequence[FlightData], used: Iterable[Sequence[str]], table: pd.DataFrame
 ) -> dict[str, Any]:
     """Fields of the page that tell of the model and what it learned from; ``used``: logs of the receivers."""
     guess = outside_share(table)
     if isinstance(model, Memory):
-        entries = {one.entry.command: one.entry for one in model.known.values()}.values()
+        entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
         return {
             "verdict": memory_words([(m.entry, m.series, m.level.sd_db) for m in model.known.values()], guess),
             "flights": [name for entry in entries for name in entry.flights],
@@ -254,24 +254,26 @@ def _check_shared(where: Path, sources: Mapping[str, Source], site: Site, who: s
     """UsageError where the sources share no tower with the site, or none with the planned flight and its band."""
     planned = flight_of(where)
     towers, bands = {s.tower for s in sources.values()}, {s.link.carrier_hz for s in sources.values()}
-    wanted = {log.node for log in planned.logs if log.node} if planned is not None else set(site.towers) | towers
+    planned_towers = (
+        {log.node for log in planned.logs if log.node} if planned is not None else set(site.towers) | towers
+    )
     links = [planned.link.rss, *planned.link.channels.values()] if planned is not None else []
     carriers = {link.carrier_hz for link in links if "carrier_hz" in link.model_fields_set}
     near = not carriers or any(abs(a / b - 1.0) <= CARRIER_BAND for a in carriers for b in bands)
-    if (not wanted or wanted & towers) and near:
+    if (not planned_towers or planned_towers & towers) and near:
         return
     raise UsageError(
         f"{who} {', '.join(sorted(towers))} at {', '.join(f'{b / 1e9:g} GHz' for b in sorted(bands))}; "
-        f"{where.name} asks for {', '.join(sorted(wanted)) or 'any tower'}"
+        f"{where.name} asks for {', '.join(sorted(planned_towers)) or 'any tower'}"
         + (f" at {', '.join(f'{c / 1e9:g} GHz' for c in sorted(carriers))}" if carriers else ""),
         expected="--with a flight that shares a tower and the band",
     )
 
 
-def _chosen(
-    targets: Targets, sources: Mapping[str, Source], known: Sequence[FlightData], place: str | Path, said: list[str]
+def _best_model(
+    targets: Targets, sources: Mapping[str, Source], known: Sequence[FlightData], place: str | Path, remarks: list[str]
 ) -> Flown:
-    """The model that predicts the named flights best; ``said`` receives a remark on the choice.
+    """The model that predicts the named flights best; ``remarks`` receives a remark on the choice.
 
     Parameters
     ----------
@@ -280,7 +282,7 @@ def _chosen(
     known : sequence of FlightData
     place : str or Path
         Of the site.
-    said : list of str
+    remarks : list of str
 
     Returns
     -------
@@ -290,7 +292,7 @@ def _chosen(
     bases, logs = _bases(sources, known, place)
     beyond = bool(np.mean(outside(targets.position_m[targets.known], samples)) > 0.5)
     if beyond:
-        said.append("Most points lie outside the flown places: models that remember places are left out.")
+        remarks.append("Most points lie outside the flown places: models that remember places are left out.")
         bases.pop("none")
     correction = choose(samples, bases, STATED_FIELDS if beyond else ())
     return Flown(correction, sources, logs.get(correction.base, ()))
@@ -314,21 +316,21 @@ def _bases(
     }
     patterns = [p for s in sources.values() for p in learned_patterns(s.link.build([s.tower], s.folder))]
     near = {
-        name: one
-        for name, one in remembered(place).items()
-        if name in sources and abs(one.series.carrier_hz / sources[name].link.carrier_hz - 1.0) <= CARRIER_BAND
+        name: memory
+        for name, memory in remembered(place).items()
+        if name in sources and abs(memory.series.carrier_hz / sources[name].link.carrier_hz - 1.0) <= CARRIER_BAND
     }
     logs: dict[str, list[Sequence[str]]] = {
         "replay": [*(p.trained_on for p in patterns), *(data.settings.trained_on for data in known)],
-        "memory": [one.entry.trained_on for one in near.values()],
+        "memory": [memory.entry.trained_on for memory in near.values()],
     }
-    own = union(*map(flight_logs, known))
-    if not common(own, logs["replay"]):
+    flown_logs = union(*map(flight_logs, known))
+    if not common(flown_logs, logs["replay"]):
         bases["replay"] = each(lambda source, s: source.replayed_db(s))
     every = ((s, (near[name].tower, near[name].uav)) for data in known for s in data.rss
              if (name := f"{s.tower}.{s.channel}") in near)  # fmt: skip
-    seen = common(own, logs["memory"]) or any(learned_of(s, tables) for s, tables in every)
-    if len(near) == len(sources) and not seen:
+    learned_here = common(flown_logs, logs["memory"]) or any(learned_of(s, tables) for s, tables in every)
+    if len(near) == len(sources) and not learned_here:
         bases["memory"] = lambda _: by_degree(lambda s: near[s.antenna].gain_db(s))
     if len({s.flight for source in sources.values() for s in source.samples}) < 2:
         bases = {"free space": bases.pop("free space"), **bases}
@@ -378,8 +380,8 @@ def _table(
                 **dict(zip(("east_m", "north_m", "height_m"), targets.position_m[index].T, strict=True)),
                 "yaw_deg": targets.yaw_deg[index],
                 **{
-                    column: pd.Categorical.from_codes(np.full(len(flag), kind.categories.get_loc(one)), dtype=kind)
-                    for column, (one, kind) in names.items()
+                    column: pd.Categorical.from_codes(np.full(len(flag), kind.categories.get_loc(text)), dtype=kind)
+                    for column, (text, kind) in names.items()
                 },
                 **{name: np.asarray(value, dtype=np.float32) for name, value in values.items()},
                 "flag": pd.Categorical.from_codes(flag, dtype=kinds),
@@ -453,13 +455,13 @@ def _serving(level: AnyArray, slow: AnyArray, channels: Sequence[str]) -> AnyArr
     out: AnyArray = np.where(np.isfinite(level), np.float32(1.0), np.float32(np.nan))
     filled, sd = np.nan_to_num(level, nan=-1e9), np.nan_to_num(slow, nan=1.0)
     for k, channel in enumerate(channels):
-        others = [j for j, name in enumerate(channels) if name == channel and j != k]
-        if not others:
+        rivals = [j for j, name in enumerate(channels) if name == channel and j != k]
+        if not rivals:
             continue
         total = np.zeros(level.shape[1])
         for node, w in zip(nodes, weight / weight.sum(), strict=True):
             at = filled[k] + node * sd[k]
-            total += w * np.prod([ndtr((at - filled[j]) / sd[j]) for j in others], axis=0)
+            total += w * np.prod([ndtr((at - filled[j]) / sd[j]) for j in rivals], axis=0)
         out[k] *= total
     return out
 
@@ -472,16 +474,16 @@ def _receivers(known: Sequence[FlightData], place: str | Path, site: Site) -> Re
     out: dict[str, tuple[FittedReceiver, LinkSettings, Path]] = {}
     for data in known:
         if data.settings.rank.receiver is not None:
-            for tower, one in read_receiver(data.folder / data.settings.rank.receiver).items():
-                out.setdefault(tower, (one, data.settings.link.rank, data.folder))
+            for tower, fitted in read_receiver(data.folder / data.settings.rank.receiver).items():
+                out.setdefault(tower, (fitted, data.settings.link.rank, data.folder))
     link, folder = LinksSettings().rank, Path()
     if known:
         link, folder = known[0].settings.link.rank, known[0].folder
     for entry in read_learned(place).entries.values():
         for file in dict.fromkeys(receiver.file for receiver in entry.receivers):
-            for tower, one in read_receiver(folder_of(place) / file).items():
-                out.setdefault(tower, (one, link, folder))
-    return {tower: one for tower, one in out.items() if tower in site.towers}
+            for tower, fitted in read_receiver(folder_of(place) / file).items():
+                out.setdefault(tower, (fitted, link, folder))
+    return {tower: fitted for tower, fitted in out.items() if tower in site.towers}
 
 
 def _ranks(
@@ -515,11 +517,11 @@ def _ranks(
             progress(f"predict rank {tower}", len(each) / len(_turns(yaw)))
         p = np.mean(each, axis=0)
         if len(some) < len(rows):
-            p = p[cKDTree(_seen(targets, some)).query(_seen(targets, rows))[1]]
+            p = p[cKDTree(_place_and_nose(targets, some)).query(_place_and_nose(targets, rows))[1]]
         yield tower, rows, p
 
 
-def _seen(targets: Targets, rows: IntArray) -> FloatArray:
+def _place_and_nose(targets: Targets, rows: IntArray) -> FloatArray:
     """Place and nose (n, 5) in units [m] in which ranks differ alike."""
     yaw = np.radians(np.nan_to_num(targets.yaw_deg[rows]))
     return np.column_stack([targets.position_m[rows], NOSE_M * np.sin(yaw), NOSE_M * np.cos(yaw)])
@@ -528,7 +530,7 @@ def _seen(targets: Targets, rows: IntArray) -> FloatArray:
 def run_predict(
     where: Path,
     flights: Sequence[Path],
-    asked: Asked,
+    targets: TargetOptions,
     options: RunOptions = DEFAULT,
     *,
     threshold_db: float | None = None,
@@ -541,7 +543,7 @@ def run_predict(
         See :func:`.where.find_targets`.
     flights : sequence of Path
         Flight files, or calibration.yaml files that list some; none: the memory of the site.
-    asked : Asked
+    targets : TargetOptions
     options : RunOptions
         ``out`` is ``reports/prediction-NAME`` by default.
     threshold_db : float, optional
@@ -559,14 +561,16 @@ def run_predict(
     inputs = [*([where] if where.is_file() else []), *files_of(known, options.logs_root)]
     folder, stages = options.out or Path("reports") / f"prediction-{where.stem}", Stages(options.progress)
     with OutputFolder(folder, job="predict", inputs=inputs, force=options.force) as output:
-        prediction = predict(where, known, asked, threshold_db=threshold_db, logs_root=options.logs_root, stages=stages)
+        prediction = predict(
+            where, known, targets, threshold_db=threshold_db, logs_root=options.logs_root, stages=stages
+        )
         with output.filling() as place:
             options.progress("page")
-            written, said = write_prediction(prediction.page, place)
+            written, remarks = write_prediction(prediction.page, place)
             if prediction.targets.grid is not None:
                 more, missing = write_maps(prediction, prediction.targets.grid, place)
-                written, said = [*written, *more], [*said, *missing]
-        for text in said:
+                written, remarks = [*written, *more], [*remarks, *missing]
+        for text in remarks:
             options.progress(text)
     files = tuple(folder / path.relative_to(place) for path in written)
     return JobOutcome(folder=folder, metrics=prediction_metrics(prediction.page), files=files)
@@ -604,11 +608,11 @@ def write_maps(prediction: Prediction, grid: Grid, folder: Path) -> tuple[list[P
                 layers.append(Layer(at, part[name].to_numpy(np.float64).round(2), of, title))
     towers = {name: tower.position_m.tolist() for name, tower in prediction.page.site.towers.items()}
     maps = export.MapLayers(grid=grid, frame=prediction.page.site.frame, layers=layers, towers_m=towers)
-    written, said = [], []
+    written, remarks = [], []
     if n <= MOST_CELLS:
         written.append(export.write_kmz(folder / "prediction.kmz", maps, title=prediction.targets.name))
     try:
         written.append(export.write_geotiff(folder / "prediction.tif", maps))
     except UsageError as missing:
-        said.append(str(missing))
-    return written, said
+        remarks.append(str(missing))
+    return written, remarks

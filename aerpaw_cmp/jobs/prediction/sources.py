@@ -56,7 +56,7 @@ def named_flights(paths: Sequence[Path]) -> list[NamedFlight]:
         text = path.read_text(encoding="utf-8", errors="replace") if is_settings(path) and path.is_file() else ""
         listed = text.startswith("calibration:") or "\ncalibration:" in text
         each = [path.parent / name for name in load_calibration(path).flights] if listed else [path]
-        out += [NamedFlight(one, load_flight(one)) for one in each]
+        out += [NamedFlight(file, load_flight(file)) for file in each]
     return out
 
 
@@ -95,12 +95,12 @@ class Source:
     @classmethod
     def of(cls, data: FlightData, series: RssSeries, samples: Sequence[LinkSamples]) -> Source:
         """As a flight has it; ``samples`` are those of all flights."""
-        own = tuple(s for s in samples if (s.tower, s.channel) == (series.tower, series.channel))
+        of_series = tuple(s for s in samples if (s.tower, s.channel) == (series.tower, series.channel))
         return cls(
             **named(series, "tower channel unit link"),
             **named(data, "site folder"),
             **named(data.settings, "rt rss"),
-            samples=own,
+            samples=of_series,
         )
 
     @property
@@ -147,11 +147,11 @@ def track_m(samples: LinkSamples) -> FloatArray:
 
 def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
     """Towers that stand still and their channels that a flight heard, by antenna."""
-    heard = [o.samples for o in observed if np.isfinite(o.samples.residual_db).any()]
+    measured = [o.samples for o in observed if np.isfinite(o.samples.residual_db).any()]
     out: dict[str, Source] = {}
     for data in known:
         for series in data.rss:
-            source = Source.of(data, series, heard)
+            source = Source.of(data, series, measured)
             if source.samples and series.tower not in data.nodes and series.unit != "dB":
                 out.setdefault(source.antenna, source)
     if not out:
@@ -178,10 +178,10 @@ class Flown:
     logs: Sequence[Sequence[str]] = ()
     """SHA-256 of what its base knows besides the named flights."""
 
-    def levels(self, each: Sequence[LinkSamples], whole: int) -> Levels:
-        """Levels at targets as seen with each of some headings, which count alike; ``whole``: targets of the run."""
+    def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:
+        """Levels at targets as seen with each of some headings, which count alike; ``run_targets``: how many the run has."""
         antenna = each[0].antenna
-        level, slow = self.correction.over_headings(each, all_targets=whole)
+        level, slow = self.correction.over_headings(each, all_targets=run_targets)
         guess = outside(each[0].position_m, self.sources[antenna].samples)
         beyond = between_blocks_db(self.correction.channels[antenna])
         return level, np.where(guess, np.hypot(slow, beyond), slow), guess
@@ -212,17 +212,17 @@ class Memory:
         self.known, self._site = known, site
         self._gain_db: Predictor = by_degree(lambda samples: known[samples.antenna].gain_db(samples))
 
-    def levels(self, each: Sequence[LinkSamples], whole: int) -> Levels:  # noqa: ARG002
+    def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:  # noqa: ARG002
         """As :meth:`Flown.levels`; a guess where flights taught less than half of the variance, or off the site."""
-        one = self.known[each[0].antenna]
+        memory = self.known[each[0].antenna]
         gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
-        level, spread, gain_variance = one.level, one.spread, (sds**2).mean(axis=0)
-        rest = spread.own_sd_db**2 + spread.noise_sd_db**2 + level.sd_db**2
+        level, spread, gain_variance = memory.level, memory.spread, (sds**2).mean(axis=0)
+        variance_db2 = spread.own_sd_db**2 + spread.noise_sd_db**2 + level.sd_db**2
         west, east, south, north = self._site.area_m
         off = np.any(np.abs(each[0].position_m[:, :2] - (0.5 * (west + east), 0.5 * (south + north)))
                      > (0.5 * (east - west), 0.5 * (north - south)), axis=1)  # fmt: skip
-        guess = off | (gain_variance > 0.5 * one.prior_variance_db2)
-        return gains.mean(axis=0) + level.offset_db, np.sqrt(gain_variance + gains.var(axis=0) + rest), guess
+        guess = off | (gain_variance > 0.5 * memory.prior_variance_db2)
+        return gains.mean(axis=0) + level.offset_db, np.sqrt(gain_variance + gains.var(axis=0) + variance_db2), guess
 
     def fading(self, antenna: str) -> Spread:
         """As :meth:`Flown.fading`."""
@@ -235,8 +235,8 @@ class Memory:
     def sources(self) -> dict[str, Source]:
         """Links by antenna, with isotropic ends."""
         out = {}
-        for antenna, one in self.known.items():
-            series, level = one.series, one.level
+        for antenna, memory in self.known.items():
+            series, level = memory.series, memory.level
             link = LinkSettings(carrier_hz=series.carrier_hz, transmit_power_dbm=level.transmit_power_dbm)
             out[antenna] = Source(
                 tower=series.tower,
@@ -258,7 +258,9 @@ def memory_of(place: str | Path, site: Site) -> Memory:
         Nothing that a level can be predicted from.
     """
     every = remembered(place)
-    known = {name: one for name, one in every.items() if one.series.level and one.series.tower in site.towers}
+    known = {
+        name: memory for name, memory in every.items() if memory.series.level and memory.series.tower in site.towers
+    }
     if known:
         return Memory(known, site)
     raise UsageError(

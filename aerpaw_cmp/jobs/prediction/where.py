@@ -68,7 +68,7 @@ class Targets:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
+class TargetOptions:
     """Options of ``predict`` that say where.
 
     Parameters
@@ -137,7 +137,7 @@ def flight_of(where: Path) -> FlightFile | None:
     return load_flight(where) if re.search(r"^flight\s*:", text, re.MULTILINE) else None
 
 
-def find_targets(where: Path, site: Site, asked: Asked, logs_root: Path | None = None) -> Targets:
+def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Path | None = None) -> Targets:
     """Points that WHERE names.
 
     Parameters
@@ -145,7 +145,7 @@ def find_targets(where: Path, site: Site, asked: Asked, logs_root: Path | None =
     where : Path
         site.yaml or a packaged site (a grid), flight.yaml (its plan, else its track), a route, or a CSV of points.
     site : Site
-    asked : Asked
+    options : TargetOptions
     logs_root : Path, optional
         Where the logs of a flight file resolve.
 
@@ -162,11 +162,11 @@ def find_targets(where: Path, site: Site, asked: Asked, logs_root: Path | None =
     if flight is not None:
         targets = _planned(flight, site) if flight.flight.plan is not None else _flown(flight, where, logs_root)
     elif is_settings(where) or not where.exists():
-        targets = _grid(site, asked)
+        targets = _grid(site, options)
     elif (local := _local_points(where)) is not None:
         targets = local
     else:
-        targets = _route(where, site, asked)
+        targets = _route(where, site, options)
     if len(targets) > MOST_POINTS:
         raise UsageError(f"{len(targets)} points", expected=f"at most {MOST_POINTS}", cause="too fine a spacing")
     if not targets.known.any():
@@ -175,12 +175,12 @@ def find_targets(where: Path, site: Site, asked: Asked, logs_root: Path | None =
     return targets
 
 
-def _grid(site: Site, asked: Asked) -> Targets:
-    grid = Grid.over_area(site.area_m, asked.spacing_m)
-    position = np.concatenate([grid.positions_m(h) for h in asked.heights_m])
+def _grid(site: Site, options: TargetOptions) -> Targets:
+    grid = Grid.over_area(site.area_m, options.spacing_m)
+    position = np.concatenate([grid.positions_m(h) for h in options.heights_m])
     if site.dem is not None:
         position[:, 2] += site.dem.ground_m(position[:, 0], position[:, 1])
-    heading = np.nan if asked.heading_deg is None else asked.heading_deg
+    heading = np.nan if options.heading_deg is None else options.heading_deg
     return Targets(
         kind="grid",
         name=site.name,
@@ -188,7 +188,7 @@ def _grid(site: Site, asked: Asked) -> Targets:
         yaw_deg=np.full(len(position), heading),
         time_s=np.zeros(len(position)),
         grid=grid,
-        heights_m=asked.heights_m,
+        heights_m=options.heights_m,
     )
 
 
@@ -240,8 +240,8 @@ def _local_points(path: Path) -> Targets | None:
     )
 
 
-def _route(where: Path, site: Site, asked: Asked) -> Targets:
-    table = read_route(where, height_m=asked.heights_m[0])
+def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
+    table = read_route(where, height_m=options.heights_m[0])
     east, north = site.frame.to_local(table["latitude_deg"].to_numpy(), table["longitude_deg"].to_numpy())
     up = np.maximum(table["altitude_m"].to_numpy(np.float64) + site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
     position, yaw = np.column_stack([east, north, up]), table["yaw_deg"].to_numpy(np.float64)

@@ -55,7 +55,7 @@ class _Account:
     count: dict[str, int] = field(default_factory=dict)
     worst: dict[str, tuple[float, str]] = field(default_factory=dict)
     failed: dict[str, int] = field(default_factory=dict)
-    beside: list[str] = field(default_factory=list)
+    broken: list[str] = field(default_factory=list)
     not_covered: list[str] = field(default_factory=list)
 
     def add(self, kind: str, difference: float, where: str, spare: float = 0.0) -> None:
@@ -89,7 +89,7 @@ class _Account:
             raw_attitude_max_rad=most["rotation"],
             raw_measured_max_db=most["measured level"],
             raw_level_max_db=most["simulated level"],
-            failures=(*failures, *self.beside),
+            failures=(*failures, *self.broken),
             not_covered=tuple(f"from raw bytes: {text}" for text in self.not_covered),
         )
 
@@ -121,9 +121,9 @@ def raw_checked(
     if path is not None:
         _track_checked(data, path, account)
     each = max(3, SAMPLES // max(len(data.rss), 1))
-    for series, replayed, one in zip(data.rss, replays, expected, strict=False):
+    for series, replayed, expectation in zip(data.rss, replays, expected, strict=False):
         rows = _spread(replayed, path, series, each)
-        reference = _reference(data, replayed, one, towers, series.tower, account)
+        reference = _reference(data, replayed, expectation, towers, series.tower, account)
         check = _Series(data=data, series=series, replayed=replayed, path=path, reference=reference, account=account)
         check.readings(logs, rows)
         check.poses_and_levels(rows)
@@ -226,17 +226,19 @@ def _towers_checked(data: FlightData, account: _Account) -> dict[str, Tower]:
             account.leave(f"tower {name} (heights of another reference)")
             continue
         known = tower.get("positions")
-        wanted = choice.coordinates or content.get("coordinates") or next(iter(known or {}), "")
-        place = known[wanted] if known else tower
+        coordinates = choice.coordinates or content.get("coordinates") or next(iter(known or {}), "")
+        place = known[coordinates] if known else tower
         east, north = east_north_m(place["latitude_deg"], place["longitude_deg"], center)
         height = tower.get("antenna_height_m") or place.get("antenna_height_m") or 10.0
         ground = float(tower.get("ground_offset_m") or 0.0) if offsets else 0.0
         height = float(choice.antenna_height_m or height)
-        found = data.site.towers[name]
-        away = float(np.linalg.norm(found.position_m - np.array([east, north, ground + height])))
+        ours = data.site.towers[name]
+        distance_m = float(np.linalg.norm(ours.position_m - np.array([east, north, ground + height])))
         spare = 1e-6 * math.hypot(east, north)
-        account.add("tower", away, f"tower {name}", spare=spare if math.hypot(east, north) < FURTHEST_M else math.inf)
-        out[name] = replace(found, east_m=east, north_m=north, ground_m=ground, antenna_height_m=height)
+        account.add(
+            "tower", distance_m, f"tower {name}", spare=spare if math.hypot(east, north) < FURTHEST_M else math.inf
+        )
+        out[name] = replace(ours, east_m=east, north_m=north, ground_m=ground, antenna_height_m=height)
     return out
 
 
@@ -274,9 +276,9 @@ def _track_checked(data: FlightData, path: RawPath, account: _Account) -> None:
 
 
 def _pose_checked(pose: Pose, place: FloatArray, turn: FloatArray | None, where: str, account: _Account) -> None:
-    away = math.hypot(*pose.place_m[:2])
-    if away < FURTHEST_M:
-        account.add("position", math.dist(pose.place_m, place.tolist()), where, spare=1e-6 * away)
+    horizontal_m = math.hypot(*pose.place_m[:2])
+    if horizontal_m < FURTHEST_M:
+        account.add("position", math.dist(pose.place_m, place.tolist()), where, spare=1e-6 * horizontal_m)
     if turn is not None and pose.turn is not None:
         account.add("rotation", float(np.abs(np.array(pose.turn) - turn).max()), where)
 
@@ -332,7 +334,7 @@ class _Series:
                 account.leave(f"readings of {self.name} (no column of {settings.path} is known to be its level)")
                 return
             if settings.node is not None and settings.node != series.tower and not settings.cells:
-                account.beside.append(f"from raw bytes: {settings.path} is of {settings.node}, not of {series.tower}")
+                account.broken.append(f"from raw bytes: {settings.path} is of {settings.node}, not of {series.tower}")
             stamp = int(series.time[row].astype("datetime64[us]").astype(np.int64))
             account.add("time", abs(stamp - reading.time_us) * 1e-6, where)
             measured = float(series.measured_db[row])
@@ -393,15 +395,15 @@ class _Series:
         link = reference.link
         coherent = float((np.abs(h) ** 2).mean())
         for ours, value in ((replay.rss_dbm, coherent), (replay.rss_power_dbm, power)):
-            found = float(ours[at, 0])
+            ours_dbm = float(ours[at, 0])
             expected = 10 * math.log10(value) + link.transmit_power_dbm if value > 0 else -math.inf
             if abs(expected - link.noise_floor_dbm) < 0.1:
                 continue
             if expected < link.noise_floor_dbm:
-                self.account.add("simulated level", math.inf if math.isfinite(found) else 0.0, where)
+                self.account.add("simulated level", math.inf if math.isfinite(ours_dbm) else 0.0, where)
                 continue
             spare = 20 * math.log10(1 + 0.01 * math.sqrt(power / value)) if value < power else 0.0
-            self.account.add("simulated level", abs(found - expected), where, spare=spare)
+            self.account.add("simulated level", abs(ours_dbm - expected), where, spare=spare)
 
     def clock_sign(self) -> None:
         """The measurement follows direct and ground path better at the clock taken off than at its opposite."""
@@ -418,7 +420,7 @@ class _Series:
             error = [self._residual_db(reference, row, sign * ahead) for row in rows.tolist()]
             spreads.append(float(np.nanstd(error)) if np.isfinite(error).sum() > CLOCK_SAMPLES // 2 else math.nan)
         if spreads[1] < WRONG_SIGN * spreads[0]:
-            self.account.beside.append(
+            self.account.broken.append(
                 f"from raw bytes: the radio clock of {self.name}, {ahead:+.2f} s, has the wrong sign: the level varies "
                 f"by {spreads[0]:.1f} dB about the prediction with it, by {spreads[1]:.1f} dB with its opposite"
             )
@@ -503,14 +505,14 @@ def _rank_checked(
             if reading is None:
                 account.add("time", math.inf, where)
                 continue
-            written, found = reading.values.get(names[0], math.nan), float(series.rank[row])
-            account.add("rank", 0.0 if math.isnan(found) and not written >= 1 else abs(found - written), where)
+            written, ours = reading.values.get(names[0], math.nan), float(series.rank[row])
+            account.add("rank", 0.0 if math.isnan(ours) and not written >= 1 else abs(ours - written), where)
             if series.position_m is not None and path is not None and "latitude" in reading.values:
                 place = (reading.values["latitude"], reading.values["longitude"])
                 east, north = east_north_m(*place, path.origin_deg)
                 up = path.ground_m + max(reading.values["altitude"], LOWEST_M)
-                away = math.dist((east, north, up), series.position_m[row].tolist())
-                account.add("position", away, where, spare=1e-6 * math.hypot(east, north))
+                distance_m = math.dist((east, north, up), series.position_m[row].tolist())
+                account.add("position", distance_m, where, spare=1e-6 * math.hypot(east, north))
 
 
 def _names(log: Log | None) -> set[str]:

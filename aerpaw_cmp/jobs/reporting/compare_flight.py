@@ -92,23 +92,23 @@ def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> Ser
     Compared are the cells that the flight file gives to towers, at the moments when one of them served. Levels are as
     simulated: cells of one network send alike, and an offset fitted per cell would hide which one is stronger.
     """
-    cells = [(one, result) for one, result in zip(series, results, strict=True) if one.serving is not None]
-    if len(cells) < 2 or not any(np.nansum(one.serving) for one, _ in cells if one.serving is not None):
+    cells = [(cell, result) for cell, result in zip(series, results, strict=True) if cell.serving is not None]
+    if len(cells) < 2 or not any(np.nansum(cell.serving) for cell, _ in cells if cell.serving is not None):
         return None
-    start = min(one.time.min() for one, _ in cells if len(one.time))
+    start = min(cell.time.min() for cell, _ in cells if len(cell.time))
     times, served = [], []
-    for i, (one, _) in enumerate(cells):
-        assert one.serving is not None
-        mine = (one.time - start)[one.serving == 1] / np.timedelta64(1, "s")
+    for i, (cell, _) in enumerate(cells):
+        assert cell.serving is not None
+        mine = (cell.time - start)[cell.serving == 1] / np.timedelta64(1, "s")
         times.append(mine)
         served.append(np.full(len(mine), i))
     at = np.concatenate(times)
     predicted = np.full((len(at), len(cells)), np.nan)
-    for j, (one, result) in enumerate(cells):
-        order = np.argsort(one.time, kind="stable")
-        seconds = ((one.time - start) / np.timedelta64(1, "s"))[order]
+    for j, (cell, result) in enumerate(cells):
+        order = np.argsort(cell.time, kind="stable")
+        seconds = ((cell.time - start) / np.timedelta64(1, "s"))[order]
         predicted[:, j] = at_times(at, seconds, result.simulated_dbm[order], within_s=SERVING_WITHIN_S)
-    return compare_serving(np.concatenate(served), predicted, [f"{one.tower} {one.channel}" for one, _ in cells])
+    return compare_serving(np.concatenate(served), predicted, [f"{cell.tower} {cell.channel}" for cell, _ in cells])
 
 
 # --- RSS -----------------------------------------------------------------------------------------------------------
@@ -256,8 +256,8 @@ def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score:
     """RMSE after an own offset where some samples do not count."""
     if not wild.any():
         return score.rmse_db
-    kept = np.where(wild, np.nan, levels.measured_db)
-    return offsets.grid_offset(kept, levels.simulated_db, **settings.offsets).rmse_db
+    inliers_db = np.where(wild, np.nan, levels.measured_db)
+    return offsets.grid_offset(inliers_db, levels.simulated_db, **settings.offsets).rmse_db
 
 
 def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
@@ -313,10 +313,10 @@ def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> di
     }
 
 
-def _paired(levels: Levels, others: Mapping[str, FloatArray]) -> dict[str, statistics.PairedDifference]:
+def _paired(levels: Levels, models: Mapping[str, FloatArray]) -> dict[str, statistics.PairedDifference]:
     """The replay against each other model on the samples that both have, each with its own offset."""
     error_db = levels.measured_db - levels.simulated_db
-    return {name: statistics.paired_difference(error_db, levels.measured_db - level) for name, level in others.items()}
+    return {name: statistics.paired_difference(error_db, levels.measured_db - level) for name, level in models.items()}
 
 
 def _averaged(
@@ -428,21 +428,21 @@ def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
     for channel, other_channel in combinations(results, 2):
         if channel.tower != other_channel.tower:
             continue
-        here, there = _same_instants(channel.time, other_channel.time)
-        if not len(here):
+        rows, other_rows = _same_instants(channel.time, other_channel.time)
+        if not len(rows):
             continue
-        first, second = channel.calibrated_db[here], other_channel.calibrated_db[there]
-        position = channel.position_m[here]
-        context = {"height_m": position[:, 2], "elevation_deg": channel.geometry["elevation_deg"][here]}
+        first, second = channel.calibrated_db[rows], other_channel.calibrated_db[other_rows]
+        position = channel.position_m[rows]
+        context = {"height_m": position[:, 2], "elevation_deg": channel.geometry["elevation_deg"][rows]}
         if "heading_deg" in channel.geometry:
-            context["heading_deg"] = channel.geometry["heading_deg"][here]
+            context["heading_deg"] = channel.geometry["heading_deg"][rows]
         out.append(
             PairResult(
                 tower=channel.tower,
                 first=channel.channel,
                 second=other_channel.channel,
-                time=channel.time[here],
-                score=rss.channel_difference(channel.time[here], first, second, position_m=position, context=context),
+                time=channel.time[rows],
+                score=rss.channel_difference(channel.time[rows], first, second, position_m=position, context=context),
             )
         )
     return out
@@ -460,8 +460,8 @@ def _same_instants(first: Any, second: Any) -> tuple[IntArray, IntArray]:
     nearer = np.abs(second[order[before]] - first) < np.abs(second[order[ahead]] - first)
     nearest = order[np.where(nearer, before, ahead)]
     limit = 0.5 * np.median(np.abs(np.diff(first)))
-    here = np.flatnonzero(np.abs(second[nearest] - first) <= limit)
-    return here, nearest[here]
+    rows = np.flatnonzero(np.abs(second[nearest] - first) <= limit)
+    return rows, nearest[rows]
 
 
 def _has_direct(replayed: Replayed) -> BoolArray:
@@ -496,19 +496,19 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
         NaN where no pose is known.
     """
     link = replayed.link
-    seen = rss.link_geometry(
+    directions = rss.link_geometry(
         replayed.source_m(site),
         replayed.poses.position_m,
         replayed.poses.rotation,
         tower_mount=link.tower_arrays[tower].mount,
         uav_mount=link.uav_array.mount,
     )
-    seen["azimuth_deg"] = seen["tower_azimuth_deg"]  # residuals are drawn in the frame of the antenna
+    directions["azimuth_deg"] = directions["tower_azimuth_deg"]  # residuals are drawn in the frame of the antenna
     out = {"altitude_m": replayed.spread(replayed.poses.position_m[:, 2])}
     for name in (
         "distance_m", "elevation_deg", "azimuth_deg", "tower_elevation_deg", "uav_azimuth_deg", "uav_elevation_deg",
     ):  # fmt: skip
-        out[name] = replayed.spread(seen[name])
+        out[name] = replayed.spread(directions[name])
     if replayed.track is not None:
         out["heading_deg"] = replayed.spread(replayed.track.heading_deg)
     if len(site.trees) and rt.foliage != "none":
@@ -548,8 +548,8 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
     if settings.minimum_height_m is not None:
         with np.errstate(invalid="ignore"):
             keep &= position[:, 2] >= settings.minimum_height_m
-    rows, kept = np.flatnonzero(keep), np.flatnonzero(keep[replayed.valid])
-    h = replayed.replay.h[kept, 0]
+    rows, poses = np.flatnonzero(keep), np.flatnonzero(keep[replayed.valid])
+    h = replayed.replay.h[poses, 0]
     sinr_db = series.sinr_db[rows] if np.isfinite(series.sinr_db[rows]).any() else None
     score = ranks.compare_rank(
         series.rank[rows],
@@ -571,7 +571,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         measured=series.rank[rows],
         sinr_db=sinr_db,
         sigma=sigma,
-        level_dbm=replayed.replay.rss_dbm[kept, 0],
+        level_dbm=replayed.replay.rss_dbm[poses, 0],
         rank={k: ranks.rank_from_singular_values(sigma, k) for k in score.simulated},
         score=score,
         further=RankFurther(
@@ -603,12 +603,12 @@ def _receiver_forecast(
             path=data.folder / named,
         )
     samples, receiver = rank_samples(data, series), receivers[series.tower]
-    probability, said = receiver.forecast(samples)
+    probability, decided = receiver.forecast(samples)
     if receiver.knows(samples):  # nothing is scored where it was fitted
         return probability, None, samples.logs
     constant = receiver.mixture.members[0].constant
     replicates = max(data.settings.rank.advanced.bootstrap, 2)
-    return probability, score_forecast(samples.rank, probability, said, constant, replicates=replicates), ()
+    return probability, score_forecast(samples.rank, probability, decided, constant, replicates=replicates), ()
 
 
 def _repeated_rank(

@@ -115,7 +115,7 @@ def run_explain(
     link, pose, notes, instant = _pose(data, series, at, progress)
     if tower in data.nodes:  # as it stood at that moment
         place, known = data.tower_at(tower, instant)
-        _known(known, series, at)
+        _check_pose(known, series, at)
         data = dataclasses.replace(data, site=site_with_tower_at(data.site, tower, place[0]))
     rt = settings.rt.model_copy(update={"engine": "sionna"}) if engine == "sionna" else settings.rt
     replayed = replay_poses(data.site, rt, link, pose, engine=engine or rt.engine, progress=progress)
@@ -153,11 +153,11 @@ def _series(data: FlightData, tower: str, channel: str | None) -> RssSeries | Ra
     towers = list(dict.fromkeys(series.tower for series in every))
     mine = {series.channel: series for series in reversed(every) if series.tower == tower}
     if not mine:
-        there = tower in data.site.towers
+        at_site = tower in data.site.towers
         raise UsageError(
             f"no log of tower {tower!r}",
             expected="one of " + ", ".join(towers),
-            cause="the site has it, the flight has not measured there" if there else "a typing error",
+            cause="the site has it, the flight has not measured there" if at_site else "a typing error",
         )
     if channel is None:
         return mine[list(mine)[-1]]
@@ -170,16 +170,16 @@ def _sample(series: RssSeries | RankSeries, time: str, zone: str | None) -> tupl
     """Number of the sample nearest to an instant, and its seconds after the first."""
     first, last = series.time.min(), series.time.max()
     span = float((last - first) / np.timedelta64(1, "s"))
-    wanted = _instant(time, first, zone)
+    instant = _instant(time, first, zone)
     step = span / max(len(series.time) - 1, 1)
-    away = float((wanted - first) / np.timedelta64(1, "s"))
-    if not -max(step, 1.0) <= away <= span + max(step, 1.0):
+    after_s = float((instant - first) / np.timedelta64(1, "s"))
+    if not -max(step, 1.0) <= after_s <= span + max(step, 1.0):
         raise UsageError(
-            f"--time {time} is {abs(away) if away < 0 else away - span:.1f} s "
-            f"{'before the first' if away < 0 else 'after the last'} sample of {series.tower}",
+            f"--time {time} is {abs(after_s) if after_s < 0 else after_s - span:.1f} s "
+            f"{'before the first' if after_s < 0 else 'after the last'} sample of {series.tower}",
             expected=f"0 to {span:.1f} s, or {_iso(first)} to {_iso(last)}",
         )
-    at = int(np.argmin(np.abs(series.time - wanted)))
+    at = int(np.argmin(np.abs(series.time - instant)))
     return at, float((series.time[at] - first) / np.timedelta64(1, "s"))
 
 
@@ -221,11 +221,11 @@ def _pose(
             if clock is not None and clock.applied_s[at]:
                 notes.append(f"{clock.applied_s[at]:.3f} s are taken off the radio's clock")
         track = data.poses_at(time[at : at + 1])
-        _known(track.valid, series, at)
+        _check_pose(track.valid, series, at)
         return series.link.build([series.tower], data.folder), valid_poses(track, rt.attitude), notes, time[at : at + 1]
     link = data.settings.link.rank.build([series.tower], data.folder)
     position, valid = rank_positions(series, data.track)
-    _known(valid[at : at + 1], series, at)
+    _check_pose(valid[at : at + 1], series, at)
     rotation: FloatArray = np.eye(3)[None]
     if data.track is not None:
         track = data.poses_at(series.time[at : at + 1])
@@ -234,7 +234,7 @@ def _pose(
     return link, Poses(position[at : at + 1], np.ascontiguousarray(rotation)), notes, series.time[at : at + 1]
 
 
-def _known(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
+def _check_pose(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
     if not valid[0]:
         raise UsageError(
             f"no pose is known at {_iso(series.time[at])}",
@@ -265,13 +265,16 @@ def _paths(
 
 
 def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterator[tuple[str, str]]:
-    there = {tuple(row[row >= 0].tolist()) for row in replayed.paths.faces}
+    traced = {tuple(row[row >= 0].tolist()) for row in replayed.paths.faces}
     for words, sequence in simple_paths(replayed):
-        if tuple(sequence.tolist()) not in there:
-            yield words, why_not(replayed.faces, source, target, sequence, replayed.surfaces) or _elsewhere(replayed)
+        if tuple(sequence.tolist()) not in traced:
+            yield (
+                words,
+                why_not(replayed.faces, source, target, sequence, replayed.surfaces) or _reason_unknown(replayed),
+            )
 
 
-def _elsewhere(replayed: Replay) -> str:
+def _reason_unknown(replayed: Replay) -> str:
     if replayed.engine == "sionna":
         return f"nothing is in its way: not found with {replayed.samples} samples per tower"
     stopped = "stopped by the terrain, or the ground of another tower"

@@ -148,9 +148,9 @@ def flight_ladder(data: FlightData, replays: FlightReplay) -> FlightLadder | Non
 
 def _sampled(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: RssSettings) -> _Series:
     levels = levels_of(rss[index], replayed, rules)
-    wanted = np.flatnonzero(levels.posed & np.isfinite(levels.measured_db))
-    step = max(1, -(-len(wanted) // MOST_SAMPLES))
-    rows = wanted[::step]
+    comparable = np.flatnonzero(levels.posed & np.isfinite(levels.measured_db))
+    step = max(1, -(-len(comparable) // MOST_SAMPLES))
+    rows = comparable[::step]
     pose_of = np.cumsum(replayed.valid) - 1
     seconds = (rss[index].time - rss[0].time[:1]) / np.timedelta64(1, "s")
     return _Series(replayed=replayed, levels=levels, rows=rows, picked=pose_of[rows], step=step, time_s=seconds[rows])
@@ -165,8 +165,8 @@ class _Climber:
         self._traced: dict[tuple[int, bool], tuple[Replay, float]] = {}
         patterns = [p for s in series for a in _arrays(s.replayed.link) for p in a.patterns]
         self._offer = offered(data) if all(p.name == "iso" for p in patterns) else None
-        own = [s.replayed.link for s in series]
-        self._links = own if self._offer is None else [_link_of(self._offer, data, s) for s in data.rss]
+        links = [s.replayed.link for s in series]
+        self._links = links if self._offer is None else [_link_of(self._offer, data, s) for s in data.rss]
 
     def climb(self) -> FlightLadder:
         """All stages."""
@@ -184,13 +184,13 @@ class _Climber:
         models.append(None)
         rungs.append(self._as_set())
         names = tuple((s.tower, s.channel) for s in self._data.rss)
-        found = FlightLadder(
+        climbed = FlightLadder(
             ladder=self._scored(rungs),
             models=tuple(models),
             names=names,
             offered={} if self._offer is None else self._offer.antennas,
         )
-        return self._by_flights_left_out(found)
+        return self._by_flights_left_out(climbed)
 
     def _by_flights_left_out(self, climbed: FlightLadder) -> FlightLadder:
         """The learned model, as it was calibrated, where flights left out say that it beats free space."""
@@ -262,8 +262,8 @@ class _Climber:
 
     def _lines(self) -> list[Rung]:
         zeros = tuple(np.zeros(len(s.rows)) for s in self._series)
-        away = tuple(s.replayed.poses.position_m[s.picked] - self._sources(s) for s in self._series)
-        range_db = tuple(10.0 * np.log10(np.maximum(np.linalg.norm(a, axis=1), 0.1)) for a in away)
+        ray_m = tuple(s.replayed.poses.position_m[s.picked] - self._sources(s) for s in self._series)
+        range_db = tuple(10.0 * np.log10(np.maximum(np.linalg.norm(a, axis=1), 0.1)) for a in ray_m)
         return [
             Rung(model=name, level_db=zeros, seconds=0.0, regressor_db=x)
             for name, x in zip(LINES, (zeros, range_db), strict=True)
@@ -280,9 +280,9 @@ class _Climber:
     def _of_flight(self, seconds: Sequence[float]) -> float:
         """Seconds of a flight from those of its series: channels that share a replay cost it once."""
         shared: dict[tuple[str, str], float] = {}
-        for series, one in zip(self._data.rss, seconds, strict=True):
+        for series, cost_s in zip(self._data.rss, seconds, strict=True):
             key = series.tower, series.settings_key
-            shared[key] = max(one, shared.get(key, 0.0))
+            shared[key] = max(cost_s, shared.get(key, 0.0))
         return sum(shared.values())
 
     @cached_property
@@ -310,11 +310,11 @@ class _Climber:
         if model.antennas == "isotropic":
             link = _isotropic_link(link)
         paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
-        wanted = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
-        loss = path_loss(self._data.site, wanted, link.carrier_hz)
+        changed = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
+        loss = path_loss(self._data.site, changed, link.carrier_hz)
         pair = pair_db(link, poses, self._sources(series))
         if model.diffraction:
-            search = Search(max_depth=wanted.max_depth, diffraction="edges")
+            search = Search(max_depth=changed.max_depth, diffraction="edges")
             bent = replay(self._data.site, link, poses, search, Field(loss), Run(cache_dir=""))
             level = bent.rss_power_dbm if model.ground == "power sum" else bent.rss_dbm
             return level[:, 0] + pair, series.step * bent.seconds
@@ -343,9 +343,9 @@ class _Climber:
         return places if series.replayed.tower_m is None else places[series.picked]
 
     def _poses(self, series: _Series, attitude: str) -> Poses:
-        whole, track = series.replayed.poses, series.replayed.track
-        turn = whole.rotation if track is None else attitude_rotation(track, attitude)
-        return Poses(whole.position_m[series.picked], np.ascontiguousarray(turn[series.picked]))
+        poses, track = series.replayed.poses, series.replayed.track
+        turn = poses.rotation if track is None else attitude_rotation(track, attitude)
+        return Poses(poses.position_m[series.picked], np.ascontiguousarray(turn[series.picked]))
 
 
 def _root_mean_square(values: Sequence[float]) -> float:
@@ -410,7 +410,7 @@ def recommended_settings(
         for name in [key for key in ("rss",) if key in link]:
             link[name] = _isotropic(link[name])
         if "channels" in link:
-            link["channels"] = {name: _isotropic(one) for name, one in link["channels"].items()}
+            link["channels"] = {name: _isotropic(channel) for name, channel in link["channels"].items()}
         if link:
             result["link"] = link
     return result

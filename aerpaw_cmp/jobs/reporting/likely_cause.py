@@ -42,10 +42,10 @@ def cause_of(
     """
     if replayed.tower_m is not None:
         return Cause(name="none")
-    here = _seen(replayed, replayed.source_m(site), replayed.poses.rotation)
+    directions = _link_geometry(replayed, replayed.source_m(site), replayed.poses.rotation)
     order = np.argsort(time_s, kind="stable")
     names = ("uav_azimuth_deg", "uav_elevation_deg", "azimuth_deg")
-    spread = {name: replayed.spread(here[name])[order] for name in names}
+    spread = {name: replayed.spread(directions[name])[order] for name in names}
     evidence = LevelEvidence(
         time_s=time_s[order],
         measured_db=levels.measured_db[order],
@@ -53,34 +53,36 @@ def cause_of(
         uav_azimuth_deg=spread["uav_azimuth_deg"],
         uav_elevation_deg=spread["uav_elevation_deg"],
         tower_azimuth_deg=spread["azimuth_deg"],
-        turned_db={angle: replayed.spread(change)[order] for angle, change in _turned(site, replayed, here).items()},
+        turned_db={
+            angle: replayed.spread(change)[order] for angle, change in _turned(site, replayed, directions).items()
+        },
         other_towers_db={
             name: (levels.simulated_db - free_space + level)[order]
-            for name, level in _others(site, tower, replayed, _gain_db(replayed, here)).items()
+            for name, level in _other_towers(site, tower, replayed, _gain_db(replayed, directions)).items()
         },
         clock_confirmed=replayed.clock is not None and replayed.clock.result.verdict == "ok",
     )
     return likely_cause(evidence)
 
 
-def _seen(replayed: Replayed, place_m: FloatArray, rotation: FloatArray) -> dict[str, FloatArray]:
+def _link_geometry(replayed: Replayed, place_m: FloatArray, rotation: FloatArray) -> dict[str, FloatArray]:
     """Directions between a place and the UAV at the poses."""
     return rss.link_geometry(place_m, replayed.poses.position_m, rotation, uav_mount=replayed.link.uav_array.mount)
 
 
-def _others(site: Site, tower: str, replayed: Replayed, gain_db: FloatArray) -> dict[str, FloatArray]:
+def _other_towers(site: Site, tower: str, replayed: Replayed, gain_db: FloatArray) -> dict[str, FloatArray]:
     """Free space from each other tower, with the UAV's gain towards it less that towards its own, at the samples."""
-    link, found = replayed.link, {}
-    for name, other in site.towers.items():
+    link, levels = replayed.link, {}
+    for name, neighbour in site.towers.items():
         if name != tower:
-            place = other.position_m[None, :]
+            place = neighbour.position_m[None, :]
             level = free_space_dbm(place, replayed.poses.position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0]
-            level += _gain_db(replayed, _seen(replayed, place, replayed.poses.rotation)) - gain_db
-            found[name] = replayed.spread(level)
-    return found
+            level += _gain_db(replayed, _link_geometry(replayed, place, replayed.poses.rotation)) - gain_db
+            levels[name] = replayed.spread(level)
+    return levels
 
 
-def _turned(site: Site, replayed: Replayed, here: Mapping[str, FloatArray]) -> dict[float, FloatArray]:
+def _turned(site: Site, replayed: Replayed, directions: Mapping[str, FloatArray]) -> dict[float, FloatArray]:
     """Change of the direct path's gain [dB] at the poses where the heading is greater; none for isotropic antennas."""
     array = replayed.link.uav_array
     if all(isinstance(pattern, Isotropic) for pattern in array.patterns):
@@ -91,14 +93,14 @@ def _turned(site: Site, replayed: Replayed, here: Mapping[str, FloatArray]) -> d
         rotation = np.array(
             [[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]]
         )
-        there = _seen(replayed, replayed.source_m(site), rotation @ replayed.poses.rotation)
-        changes[angle] = _gain_db(replayed, there) - _gain_db(replayed, here)
+        turned = _link_geometry(replayed, replayed.source_m(site), rotation @ replayed.poses.rotation)
+        changes[angle] = _gain_db(replayed, turned) - _gain_db(replayed, directions)
     return changes
 
 
-def _gain_db(replayed: Replayed, seen: Mapping[str, FloatArray]) -> FloatArray:
+def _gain_db(replayed: Replayed, directions: Mapping[str, FloatArray]) -> FloatArray:
     """Mean gain of the UAV's elements towards the tower [dB]."""
-    theta, phi = np.radians(90.0 - seen["uav_elevation_deg"]), np.radians(seen["uav_azimuth_deg"])
+    theta, phi = np.radians(90.0 - directions["uav_elevation_deg"]), np.radians(directions["uav_azimuth_deg"])
     power = np.zeros(len(theta))
     for pattern in replayed.link.uav_array.patterns:
         e_theta, e_phi = pattern.field(theta, phi)

@@ -43,13 +43,13 @@ def _lines(replayed: Replayed, pose: int, tower_m: FloatArray) -> Iterator[tuple
         kinds.append((replay.through.paths, PASSING))
     for paths, kind in kinds:
         start, stop = np.searchsorted(paths.pose, [pose, pose + 1])
-        found = [
+        lines = [
             np.concatenate([tower_m[None], paths.vertices_m[row, : paths.depth[row]], target_m[None]])
             for row in range(start, stop)
         ]
         if kind is not None:
-            found = sorted(found, key=lambda line: float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))[
+            lines = sorted(lines, key=lambda line: float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))[
                 :SHORTEST
             ]
-        for line in found:
+        for line in lines:
             yield line, len(line) - 2 if kind is None else kind

@@ -199,8 +199,8 @@ def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: o
     digest = hashlib.sha256()
     digest.update("\n".join([str(LAYOUT), code_digest(), *map(str, more)]).encode())
     digest.update(settings.model_dump_json(exclude=_WITHOUT_EFFECT).encode())
-    for one in inputs:
-        digest.update(f"{one['role']} {one['sha256']}\n".encode())
+    for entry in inputs:
+        digest.update(f"{entry['role']} {entry['sha256']}\n".encode())
     return digest.hexdigest()
 
 

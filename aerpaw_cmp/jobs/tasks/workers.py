@@ -35,7 +35,7 @@ from .outcomes import code_digest
 Task = Callable[[Any], Any]
 
 # Gets the number of an item and the result of its task, or :class:`Lost`.
-Done = Callable[[int, Any], None]
+OnResult = Callable[[int, Any], None]
 
 # A task in work when a worker is lost is tried again; after so many tries once more, alone.
 TRIES = 2
@@ -48,7 +48,7 @@ NO_WORKER_S = 30.0
 
 
 # How often workers are counted.
-LOOK_S = 2.0
+COUNT_EVERY_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,18 +68,18 @@ class Workers(Protocol):
     def count(self) -> int:
         """Tasks at a time."""
 
-    def run(self, function: Task, items: Sequence[Any], done: Done) -> None:
-        """``function`` of every item, in any order; ``done`` gets number and result as they come."""
+    def run(self, function: Task, items: Sequence[Any], on_result: OnResult) -> None:
+        """``function`` of every item, in any order; ``on_result`` gets number and result as they come."""
 
 
-class Here:
+class InProcess:
     """One after the other, in this process."""
 
     count = 1
 
-    def run(self, function: Task, items: Sequence[Any], done: Done) -> None:  # noqa: D102
+    def run(self, function: Task, items: Sequence[Any], on_result: OnResult) -> None:  # noqa: D102
         for number, item in enumerate(items):
-            done(number, function(item))
+            on_result(number, function(item))
 
 
 # --- processes of this machine --------------------------------------------------------------------------------------
@@ -91,18 +91,18 @@ class Processes:
     def __init__(self, count: int) -> None:
         self.count = count
 
-    def run(self, function: Task, items: Sequence[Any], done: Done) -> None:  # noqa: D102
+    def run(self, function: Task, items: Sequence[Any], on_result: OnResult) -> None:  # noqa: D102
         with contextlib.ExitStack() as stack:
             crew = [stack.enter_context(_Worker(function)) for _ in range(min(self.count, len(items)))]
             tries: Counter[int] = Counter()
-            killed = _through(crew, items, deque(range(len(items))), tries, done)
+            killed = _through(crew, items, deque(range(len(items))), tries, on_result)
             for number in killed:  # a last time, so that none pays for its neighbour
-                if _through(crew[:1], items, deque([number]), tries, done):
-                    done(number, ENDED)
+                if _through(crew[:1], items, deque([number]), tries, on_result):
+                    on_result(number, ENDED)
 
 
 def _through(
-    crew: Sequence[_Worker], items: Sequence[Any], waiting: deque[int], tries: Counter[int], done: Done
+    crew: Sequence[_Worker], items: Sequence[Any], waiting: deque[int], tries: Counter[int], on_result: OnResult
 ) -> list[int]:
     """Run some tasks; gives those that lost their worker too often."""
     killed: list[int] = []
@@ -122,7 +122,7 @@ def _through(
                 tries[number] += 1
                 (waiting if tries[number] < TRIES else killed).append(number)
             else:
-                done(number, content if succeeded else Lost(f"its worker process ended: {content}"))
+                on_result(number, content if succeeded else Lost(f"its worker process ended: {content}"))
     return killed
 
 
@@ -136,10 +136,10 @@ class _Worker:
     def _start(self) -> None:
         # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
         context = get_context("spawn")
-        self.pipe, there = context.Pipe()
-        self._process = context.Process(target=_serve, args=(there, self._function), daemon=True)  # type: ignore[attr-defined]
+        self.pipe, child_end = context.Pipe()
+        self._process = context.Process(target=_serve, args=(child_end, self._function), daemon=True)  # type: ignore[attr-defined]
         self._process.start()
-        there.close()
+        child_end.close()
 
     def send(self, item: Any) -> None:
         with contextlib.suppress(OSError):  # one that has ended is seen where its answer is awaited
@@ -202,20 +202,20 @@ class Cluster:
 
     def __init__(self, client: Any, progress: Progress = silent) -> None:
         self._client, self._progress = client, progress
-        self._looked_s = self._seen_s = time.monotonic()
+        self._counted_s = self._staffed_s = time.monotonic()
 
     @property
     def count(self) -> int:
         """Threads of all workers that are there now."""
         return max(1, int(sum(self._client.nthreads().values())))
 
-    def run(self, function: Task, items: Sequence[Any], done: Done) -> None:  # noqa: D102
-        killed = self._through(function, items, range(len(items)), done)
+    def run(self, function: Task, items: Sequence[Any], on_result: OnResult) -> None:  # noqa: D102
+        killed = self._through(function, items, range(len(items)), on_result)
         for number in killed:  # a last time, so that none pays for its neighbour
-            if self._through(function, items, [number], done):
-                done(number, ENDED)
+            if self._through(function, items, [number], on_result):
+                on_result(number, ENDED)
 
-    def _through(self, function: Task, items: Sequence[Any], numbers: Iterable[int], done: Done) -> list[int]:
+    def _through(self, function: Task, items: Sequence[Any], numbers: Iterable[int], on_result: OnResult) -> list[int]:
         """Run some; gives those that lost their worker too often, as Dask counts."""
         killed: list[int] = []
         active = {self._client.submit(function, items[number], pure=False): number for number in numbers}
@@ -229,7 +229,7 @@ class Cluster:
                 if result is None:
                     killed.append(number)
                 else:
-                    done(number, result[0])
+                    on_result(number, result[0])
                 future.release()
         return killed
 
@@ -249,14 +249,14 @@ class Cluster:
         if self._client.status != "running":
             raise self._gone()
         now = time.monotonic()
-        if now - self._looked_s < LOOK_S:
+        if now - self._counted_s < COUNT_EVERY_S:
             return
-        self._looked_s = now
+        self._counted_s = now
         if self._client.nthreads():
-            self._seen_s = now
-        elif now - self._seen_s > NO_WORKER_S:
+            self._staffed_s = now
+        elif now - self._staffed_s > NO_WORKER_S:
             self._progress(f"the scheduler has had no worker for {NO_WORKER_S:.0f} s; finished tasks are kept")
-            self._seen_s = now
+            self._staffed_s = now
 
     def _gone(self) -> InputError:
         return InputError(
@@ -300,7 +300,7 @@ def open_workers(
         with _scheduler(scheduler, paths, progress) as cluster:
             yield cluster
     elif workers <= 1:
-        yield Here()
+        yield InProcess()
     else:
         yield Processes(workers)
 
@@ -340,8 +340,8 @@ def _scheduler(address: str, paths: Sequence[Path], progress: Progress) -> Itera
     cluster = Cluster(client, progress)
     try:
         check_workers(client, paths)
-        there = client.scheduler_info().get("services", {}).get("dashboard")
-        page = f"; dashboard {client.dashboard_link}" if there else ""
+        dashboard = client.scheduler_info().get("services", {}).get("dashboard")
+        page = f"; dashboard {client.dashboard_link}" if dashboard else ""
         progress(f"{len(client.nthreads())} workers, {cluster.count} tasks at a time{page}")
         yield cluster
     finally:
@@ -382,8 +382,8 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
         Naming worker, host and what is wrong.
     """
     answers = client.run(worker_facts, [str(path.absolute()) for path in paths], on_error="return")
-    here = worker_facts([])
-    wrong = [f"{worker}: {text}" for worker, facts in answers.items() if (text := _trouble(facts, here))]
+    ours = worker_facts([])
+    wrong = [f"{worker}: {text}" for worker, facts in answers.items() if (text := _trouble(facts, ours))]
     if wrong:
         more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""
         raise UsageError(
@@ -393,12 +393,14 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
         )
 
 
-def _trouble(facts: Any, here: WorkerFacts) -> str:
+def _trouble(facts: Any, ours: WorkerFacts) -> str:
     if isinstance(facts, BaseException):
         return f"aerpaw-cmp cannot be loaded there ({type(facts).__name__}: {facts})"
-    if facts.code != here.code:
-        other = f"aerpaw-cmp {facts.version}, here {here.version}" if facts.version != here.version else "another state"
-        return f"{facts.host} runs other code ({other} of the program or of NumPy, SciPy, Sionna RT)"
+    if facts.code != ours.code:
+        difference = (
+            f"aerpaw-cmp {facts.version}, here {ours.version}" if facts.version != ours.version else "another state"
+        )
+        return f"{facts.host} runs other code ({difference} of the program or of NumPy, SciPy, Sionna RT)"
     if facts.missing:
         more = f" and {len(facts.missing) - 1} more" if len(facts.missing) > 1 else ""
         return f"{facts.host} does not see {facts.missing[0]}{more}"

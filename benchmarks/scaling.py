@@ -169,7 +169,7 @@ def flights(count: int, workers: int = 1) -> dict[str, float]:
             place = folder / f"f{number}"
             place.mkdir()
             (place / "flight.yaml").write_text(yaml.safe_dump(short_flight(number)), encoding="utf-8")
-            run_simulate(place / "flight.yaml", out=place / "flown")
+            run_simulate(place / "flight.yaml", RunOptions(out=place / "flown"))
         content = {
             "campaign": "scaling",
             "flights": [f"f{n}/flown/flight.yaml" for n in range(count)],

@@ -120,9 +120,11 @@ def test_json_of_the_commands_that_only_write_files(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from aerpaw_cmp.jobs import run
+    from aerpaw_cmp.jobs.options import JobOutcome
 
+    written = JobOutcome(folder=Path(), files=(Path("a.txt"), Path("b.txt")))
     for name, line in (("run_site_show", ["site", "show"]), ("run_simulate", ["simulate", "plan.yaml"])):
-        monkeypatch.setattr(run, name, lambda *_, **__: [Path("a.txt"), Path("b.txt")])
+        monkeypatch.setattr(run, name, lambda *_, **__: written)
         assert main([*line, "--json"]) == 0
         assert json.loads(capsys.readouterr().out) == {"schema": 1, "files": ["a.txt", "b.txt"]}
         assert main(line) == 0

@@ -250,7 +250,8 @@ def simulate(
     """Forward-simulate a planned flight into logs of the real formats."""
     from ..jobs import run
 
-    print_files(run.run_simulate(flight, out=out, force=force, progress=say), as_json)
+    options = RunOptions(out=out, force=force, progress=say)
+    print_files(run.run_simulate(flight, options).files, as_json)
 
 
 @command(

@@ -96,7 +96,7 @@ def site_export(
     """Write a site for Sionna."""
     from ..jobs.mapping.site_scene import run_site_export
 
-    files = run_site_export(site, out, trees=trees, force=force)
+    files = run_site_export(site, out, trees=trees, force=force).files
     print_files(files if as_json else files[:1], as_json)
 
 
@@ -124,13 +124,14 @@ def site_show(
     """Look at a site."""
     from ..jobs import run
 
-    shown = run.run_site_show(site, out, flight=flight, logs_root=logs_root, export=export, force=force)
+    options = RunOptions(out=out, logs_root=logs_root, force=force)
+    shown = run.run_site_show(site, options, flight=flight, export=export)
     if not as_json and flight is None:
         from ..site.learned import memory_lines
 
         for line in memory_lines(site or "lake_wheeler"):
             say(line)
-    print_files(shown, as_json)
+    print_files(shown.files, as_json)
 
 
 @command(

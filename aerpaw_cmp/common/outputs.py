@@ -376,6 +376,11 @@ class OutputFolder:
                 self._written = True
         self._made = []
 
+    def placed(self, written: Iterable[Path]) -> tuple[Path, ...]:
+        """Final names of files that were written into the folder of :meth:`filling`."""
+        assert self._place is not None, "used as a context"
+        return tuple(self.named / path.relative_to(self._place.part) for path in written)
+
     def _commit(self, place: _Place) -> None:
         files = [file for file in files_below(place.part) if file.name != _UNFINISHED]
         results = sorted(file.relative_to(place.part).as_posix() for file in files)

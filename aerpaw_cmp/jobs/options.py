@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ class JobOutcome:
     ----------
     folder : Path
     metrics : dict
-        Its metrics.json.
+        Its metrics.json; empty of a job that measures nothing.
     files : tuple of Path
         What was written, the page first.
     failed_checks : tuple of str
@@ -56,6 +56,6 @@ class JobOutcome:
     """
 
     folder: Path
-    metrics: dict[str, Any]
+    metrics: dict[str, Any] = field(default_factory=dict)
     files: tuple[Path, ...] = ()
     failed_checks: tuple[str, ...] = ()

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..common.errors import AerpawCmpError, InputError, UsageError, noting_interrupts
+from ..common.errors import InputError, UsageError, noting_interrupts
 from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
-from ..common.stages import Progress, Stages, silent
+from ..common.stages import Stages
 from .options import DEFAULT, JobOutcome, RunOptions
 
 _KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
@@ -89,14 +89,15 @@ def run_ingest(
 
     if out is not None and draft is not None and os.path.realpath(out) == os.path.realpath(draft):
         raise UsageError("-o and --draft name the same file", expected="two names", path=draft)
+    inputs = [*paths, *([] if site is None else [Path(site)])]
     with ExitStack() as outputs:  # a wrong name is told before the logs are read
         target = None
         if out is not None:
-            target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=paths, force=force))
+            target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=inputs, force=force))
         if draft is not None:
             from ..flight.draft import SITE, drafts
 
-            drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=paths, force=force))
+            drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=inputs, force=force))
         files = ingest(paths, options=ReadOptions(**options), reader=reader)
         account = summary(files)
         if draft is not None:
@@ -111,7 +112,7 @@ def run_ingest(
                 draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(flight_drafts) + 1)
             )
             places = [draft, *numbered]
-            further = [OutputFile(place, own=is_sealed, inputs=paths, force=force) for place in places[1:]]
+            further = [OutputFile(place, own=is_sealed, inputs=inputs, force=force) for place in places[1:]]
             for file, flight_draft in zip([drafted, *map(outputs.enter_context, further)], flight_drafts, strict=True):
                 file.write(sealed(flight_draft.text))
             account["draft"] = [
@@ -125,25 +126,19 @@ def run_ingest(
     return account
 
 
-def run_simulate(
-    flight: Path, *, out: Path | None = None, force: bool = False, progress: Progress = silent
-) -> list[Path]:
+def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
     """Write a folder with the logs that ``flight.plan`` describes, the flight file and what was planted.
 
     Parameters
     ----------
     flight : Path
         flight.yaml with ``flight.plan``.
-    out : Path, optional
-        The folder; by default ``simulated/NAME``, after the flight.
-    force : bool
-    progress : Progress
-        Gets the name of each log.
+    options : RunOptions
+        ``out`` is ``simulated/NAME`` by default, after the flight.
 
     Returns
     -------
-    list of Path
-        Files written.
+    JobOutcome
 
     Raises
     ------
@@ -153,13 +148,15 @@ def run_simulate(
     from ..flight.data import choose_site
     from ..flight.settings import load_flight
     from ..flight.simulate import FlightSimulator
+    from .tasks.manifest import inputs_of_flight
 
     settings = load_flight(flight)
     site = choose_site(settings.site, flight.parent)
     simulator = FlightSimulator(settings, site, flight.parent)
-    inputs = [flight, flight.parent / settings.site.file]
-    out = out or Path("simulated") / settings.flight.name
-    return simulator.run(out, inputs=inputs, force=force, progress=progress)
+    inputs = inputs_of_flight(settings.model_copy(update={"logs": []}), flight)  # the logs are its outputs
+    folder = options.out or Path("simulated") / settings.flight.name
+    files = simulator.run(folder, inputs=inputs, force=options.force, progress=options.progress)
+    return JobOutcome(folder=folder, files=tuple(files))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -275,10 +272,11 @@ def run_report(flight: Path, chosen: ReportOptions = AS_IT_COMES, options: RunOp
 def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:
     """Settings with what the command line says instead, files that they name, folder of the results."""
     from ..flight.settings import load_flight
+    from .tasks.manifest import inputs_of_flight
 
     learned = None if chosen.learned is None else Path(chosen.learned)
     settings = _overridden(load_flight(flight, learned), chosen.engine, chosen.audit)
-    inputs = [*input_files(settings, flight, options.logs_root), *([] if learned is None else [learned])]
+    inputs = [*inputs_of_flight(settings, flight, options.logs_root), *([] if learned is None else [learned])]
     return settings, inputs, options.out or Path("reports") / settings.flight.name
 
 
@@ -387,14 +385,8 @@ def run_site_import(
 
 
 def run_site_show(
-    site: str | None,
-    out: Path | None = None,
-    *,
-    flight: Path | None = None,
-    logs_root: Path | None = None,
-    export: bool = False,
-    force: bool = False,
-) -> list[Path]:
+    site: str | None, options: RunOptions = DEFAULT, *, flight: Path | None = None, export: bool = False
+) -> JobOutcome:
     """Plan view and a page of the scene in 3-D; with a flight its track.
 
     Without a site the flight's own is shown; with neither, the packaged one.
@@ -403,26 +395,22 @@ def run_site_show(
     ----------
     site : str, optional
         site.yaml, or the name of a packaged site.
-    out : Path
-        Folder of the pictures.
+    options : RunOptions
+        ``out`` is ``reports/site-SITE`` by default.
     flight : Path, optional
         flight.yaml whose track is drawn.
-    logs_root : Path, optional
-        Folder against which its logs resolve.
     export : bool
         Also the scene as PLY and Mitsuba XML.
-    force : bool
-        Replace files that this tool did not write.
 
     Returns
     -------
-    list of Path
-        Files written.
+    JobOutcome
     """
     from ..report.site_view import write_site_view
     from ..site.siteyaml import load_site
+    from .tasks.manifest import inputs_of_flight, inputs_of_site
 
-    settings, inputs = None, [Path(site)] if site is not None else []
+    settings, inputs, logs_root = None, inputs_of_site(site or "lake_wheeler"), options.logs_root
     if flight is not None:
         from ..flight.settings import load_flight
 
@@ -430,11 +418,10 @@ def run_site_show(
         if site is not None:
             file = str(Path(site).resolve()) if Path(site).is_file() else site
             settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
-        inputs += input_files(settings, flight, logs_root)
-    track = None
-    if out is None:
-        out = Path("reports") / f"site-{Path(site or (settings.site.file if settings else 'lake_wheeler')).stem}"
-    with OutputFolder(out, job="site show", inputs=inputs, force=force) as output:
+        inputs = inputs_of_flight(settings, flight, logs_root)
+    track, shown = None, site or (settings.site.file if settings else "lake_wheeler")
+    out = options.out or Path("reports") / f"site-{Path(shown).stem}"
+    with OutputFolder(out, job="site show", inputs=inputs, force=options.force) as output:
         if flight is None or settings is None:
             place = load_site(site or "lake_wheeler")
         else:
@@ -449,7 +436,7 @@ def run_site_show(
                 from ..site.export import export_scene
 
                 written += export_scene(place, folder / "scene")
-    return [out / path.relative_to(folder) for path in written]
+        return JobOutcome(folder=out, files=output.placed(written))
 
 
 def run_map(
@@ -497,8 +484,8 @@ def run_map(
     place, progress, stages = load_site(site), options.progress, Stages(options.progress)
     if (flights or remembered) and settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m)):
         raise UsageError("flights and a map in tiles", expected="fewer receivers, or a map without --with")
-    folder = options.out or _map_folder(site)
-    inputs = [Path(site), *([] if flight is None else [flight]), *files_of(known, options.logs_root)]
+    inputs, folder = _map_inputs(site, flight, options)
+    inputs += files_of(known, options.logs_root)
     with OutputFolder(folder, job="map", inputs=inputs, force=options.force) as output:
         file = [Path(site).absolute()] if Path(site).is_file() else []
         with open_workers(options.workers, options.scheduler, paths=file, progress=progress) as crew:
@@ -526,12 +513,15 @@ def run_map(
             if record.paper:
                 written.append(part / "paper.md")
                 written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
-    results = tuple(folder / path.relative_to(part) for path in (*written, *files))
-    return JobOutcome(folder=folder, metrics=maps_metrics(record), files=results)
+        return JobOutcome(folder=folder, metrics=maps_metrics(record), files=output.placed([*written, *files]))
 
 
-def _map_folder(site: str) -> Path:
-    return Path("reports") / f"map-{Path(site).stem}"
+def _map_inputs(site: str, flight: Path | None, options: RunOptions) -> tuple[list[Path], Path]:
+    """Files that a map is made from, and the folder of its results."""
+    from .tasks.manifest import inputs_of_flights, inputs_of_site
+
+    flown = inputs_of_flights([] if flight is None else [flight], options.logs_root)
+    return [*inputs_of_site(site), *flown], options.out or Path("reports") / f"map-{Path(site).stem}"
 
 
 def plan_map(site: str, settings: Any, options: RunOptions = DEFAULT, *, flight: Path | None = None) -> Any:
@@ -556,7 +546,7 @@ def plan_map(site: str, settings: Any, options: RunOptions = DEFAULT, *, flight:
     """
     from .plan import map_plan
 
-    inputs, folder = [Path(site), *([] if flight is None else [flight])], options.out or _map_folder(site)
+    inputs, folder = _map_inputs(site, flight, options)
     if flight is not None and not flight.is_file():
         raise InputError("no such file", cause="a misspelt path", path=flight)
     OutputFolder(folder, job="map", inputs=inputs, force=options.force).refuse()
@@ -616,21 +606,18 @@ def run_campaign(
     UsageError
         A campaign.yaml that is wrong; a flight that cannot be read is a row of the result instead.
     """
-    from ..flight.settings import load_flight
     from ..report.campaign.html import campaign_metrics, write_campaign
     from ..report.campaign.words import warnings
     from ..report.exports.formats import chosen_formats
     from .campaigns.campaign import load_campaign
     from .campaigns.campaign import run as run_all
     from .campaigns.season import find_reports, with_season
+    from .tasks.manifest import inputs_of_flights
 
     stages = Stages(options.progress)
     campaign = load_campaign(path)
     formats = chosen_formats(campaign.export, export)
-    inputs = input_files(campaign, path)
-    for entry in campaign.flights:
-        with suppress(AerpawCmpError):  # a flight file that cannot be read is a row of the result
-            inputs += input_files(load_flight(path.parent / entry), path.parent / entry, options.logs_root)
+    inputs = [path, *inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)]
     folder = options.out or Path("reports") / campaign.campaign
     store = None if fresh else campaign_keep(campaign, path, keep)
     note = f"finished tasks are kept in {store}, and the same command computes the rest" if store else "nothing is kept"
@@ -720,20 +707,19 @@ def run_calibrate(
     UsageError, InputError
         With what was found, expected, and the likely cause.
     """
-    from ..flight.settings import load_flight
     from ..site.learned import remember
     from .learning.calibrate import calibrate, load_calibration, read_flights
     from .learning.calibrate_rank import fit_rank
     from .learning.calibration_files import Calibrated, site_entries, write_files
+    from .tasks.manifest import inputs_of_flights, inputs_of_site
 
     settings = load_calibration(path)
     target = options.out or Path(f"{settings.calibration}.calibrated.yaml")
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError("the output is no YAML file", expected="-o NAME.yaml", path=target)
     inputs = input_files(settings, path, options.logs_root)
-    for name in settings.flights:
-        inputs += input_files(load_flight(path.parent / name), path.parent / name, options.logs_root)
-
+    inputs += inputs_of_flights([*(path.parent / name for name in settings.flights), *score], options.logs_root)
+    inputs += [] if into_site is None else inputs_of_site(into_site)
     stages, folder = Stages(options.progress), target.with_suffix("")
     with (
         OutputFile(target, own=is_sealed, inputs=inputs, force=options.force) as file,

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.outputs import SUMS, changed_files, read_sums
+from aerpaw_cmp.common.outputs import SUMS, changed_files, read_sums, sealed
 from aerpaw_cmp.flight.settings import load_flight
 from tests.geojson import collection, feature, polygon
 from tests.simulated import simulate
@@ -240,3 +240,50 @@ def test_a_map_that_fails_in_its_exports_leaves_the_old_one(tmp_path: Path, monk
         assert main(command) == 3
     assert digests(out) == before
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
+
+
+@pytest.fixture(scope="module")
+def own_folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of this tool that later commands read: ``scene`` of ``site.yaml``, ``flown`` with logs of ``away.yaml``."""
+    folder = tmp_path_factory.mktemp("own")
+    scene, site = folder / "scene", folder / "site.yaml"
+    assert main(["site", "export", "lake_wheeler", "-o", str(scene), "--no-trees"]) == 0
+    assert main(["site", "import", str(scene / "scene.xml"), "--base", "lake_wheeler", "-o", str(site)]) == 0
+    assert main(["simulate", str(SAMPLE / "flight.yaml"), "-o", str(folder / "flown")]) == 0
+    content = yaml.safe_load((SAMPLE / "flight.yaml").read_text())
+    for log in content["logs"]:
+        log["path"] = f"flown/{log['path']}"
+    (folder / "away.yaml").write_text(yaml.safe_dump(content))
+    content["site"] = "site.yaml"
+    (folder / "in_scene.yaml").write_bytes(sealed(yaml.safe_dump(content)))
+    (folder / "calibration.yaml").write_text("calibration: c\nflights: [away.yaml]\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "map lake_wheeler --flight away.yaml -o flown",
+        "map lake_wheeler --flight away.yaml --dry-run -o flown",
+        "predict away.yaml -o flown",
+        "calibrate calibration.yaml --score away.yaml -o flown.yaml",
+        "calibrate calibration.yaml --score in_scene.yaml -o in_scene.yaml",
+        "map site.yaml -o scene",
+        "site show site.yaml -o scene",
+        "site show --flight in_scene.yaml -o scene",
+        "site export site.yaml -o scene",
+        "report in_scene.yaml -o scene",
+        "simulate in_scene.yaml -o scene",
+        "predict site.yaml -o scene",
+        "predict lake_wheeler --site site.yaml -o scene",
+        "plan site.yaml -o scene",
+        "ingest flown/UAV --site site.yaml --timezone UTC --draft site.yaml",
+    ],
+)
+def test_what_a_site_or_a_flight_names_is_never_replaced(
+    own_folders: Path, words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Folders that an earlier command wrote are its own and may be replaced, but not by what is made from them."""
+    monkeypatch.chdir(own_folders)
+    capsys.readouterr()
+    assert "input" in refused(capsys, own_folders, *words.split())

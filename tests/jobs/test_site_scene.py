@@ -101,7 +101,7 @@ def test_maps_are_no_scenes(room: Path, tmp_path: Path) -> None:
 
 
 def test_a_site_of_prisms_can_be_written(tmp_path: Path) -> None:
-    files = run_site_export("lake_wheeler", tmp_path / "out", trees=False)
+    files = run_site_export("lake_wheeler", tmp_path / "out", trees=False).files
     assert files[0].name == "scene.xml"
     assert {f.stem for f in files[1:]} >= {"all_concrete", "all_medium_dry_ground"}
 

@@ -16,6 +16,8 @@ from ...site.footprints import site_yaml
 from ...site.mitsuba import TriangleScene
 from ...site.scenes import GROUND_SHARE, bounds, ground_share, placed_scene
 from ...site.siteyaml import SceneModel, SiteModel, build_site, load_site, site_model
+from ..options import JobOutcome
+from ..tasks.manifest import inputs_of_site
 
 LOCAL_NOTE = "this site has no georeference: latitude and longitude count from (0, 0), and no log of a flight fits it"
 
@@ -190,8 +192,8 @@ def _towers(towers: Sequence[str], frame: SiteFrame, low: Any, high: Any) -> dic
     return by_name
 
 
-def run_site_export(site: str, out: Path, *, trees: bool = True, force: bool = False) -> list[Path]:
-    """Write any site as ``scene.xml`` with PLY meshes, which ``sionna.rt.load_scene`` opens; the files written.
+def run_site_export(site: str, out: Path, *, trees: bool = True, force: bool = False) -> JobOutcome:
+    """Write any site as ``scene.xml`` with PLY meshes, which ``sionna.rt.load_scene`` opens.
 
     Parameters
     ----------
@@ -206,9 +208,10 @@ def run_site_export(site: str, out: Path, *, trees: bool = True, force: bool = F
 
     Returns
     -------
-    list of Path
-        Files written.
+    JobOutcome
+        ``scene.xml`` is the first of its ``files``.
     """
-    with OutputFolder(out, job="site export", inputs=[Path(site)], force=force) as output, output.filling() as folder:
-        written = export_scene(load_site(site), folder, trees=trees)
-        return [out / path.relative_to(folder) for path in written]
+    with OutputFolder(out, job="site export", inputs=inputs_of_site(site), force=force) as output:
+        with output.filling() as folder:
+            written = export_scene(load_site(site), folder, trees=trees)
+        return JobOutcome(folder=out, files=output.placed(written))

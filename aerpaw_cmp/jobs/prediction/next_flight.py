@@ -30,7 +30,7 @@ from ..learning.calibrate import learned_antennas, observe
 from ..options import DEFAULT, JobOutcome, RunOptions
 from .predict import site_of
 from .sources import NamedFlight, files_of, named_flights, sources_of
-from .where import TargetOptions, Targets, find_targets, level_samples
+from .where import TargetOptions, Targets, find_targets, level_samples, target_files
 
 # Target: all directions of the tower seen from the UAV, at all headings.
 SPHERE = "sphere"
@@ -436,7 +436,8 @@ def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: R
     UsageError, InputError
         With what was found, expected, and the likely cause.
     """
-    inputs = [p for p in (Path(target), plan.fence, *plan.avoid, *plan.routes) if p is not None and p.is_file()]
+    inputs = target_files(Path(target), plan.target.site, options.logs_root)
+    inputs += [path for path in (plan.fence, *plan.avoid, *plan.routes) if path is not None]
     known = named_flights(flights)
     inputs += files_of(known, options.logs_root)
     stages = Stages(options.progress)
@@ -446,5 +447,4 @@ def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: R
         with output.filling() as place:
             options.progress("page")
             written = write_plan(record, place)
-    files = tuple(folder / path.relative_to(place) for path in written)
-    return JobOutcome(folder=folder, metrics=plan_metrics(record), files=files)
+        return JobOutcome(folder=folder, metrics=plan_metrics(record), files=output.placed(written))

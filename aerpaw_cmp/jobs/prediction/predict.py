@@ -49,7 +49,7 @@ from .sources import (
     sources_of,
     track_m,
 )
-from .where import TargetOptions, Targets, find_targets, flight_of, is_settings
+from .where import TargetOptions, Targets, find_targets, flight_of, is_settings, target_files
 
 # Directions of the nose that count alike where it is not known.
 HEADINGS = 8
@@ -558,7 +558,7 @@ def run_predict(
         With what was found, expected, and the likely cause.
     """
     known = named_flights(flights)
-    inputs = [*([where] if where.is_file() else []), *files_of(known, options.logs_root)]
+    inputs = [*target_files(where, targets.site, options.logs_root), *files_of(known, options.logs_root)]
     folder, stages = options.out or Path("reports") / f"prediction-{where.stem}", Stages(options.progress)
     with OutputFolder(folder, job="predict", inputs=inputs, force=options.force) as output:
         prediction = predict(
@@ -572,8 +572,7 @@ def run_predict(
                 written, remarks = [*written, *more], [*remarks, *missing]
         for text in remarks:
             options.progress(text)
-    files = tuple(folder / path.relative_to(place) for path in written)
-    return JobOutcome(folder=folder, metrics=prediction_metrics(prediction.page), files=files)
+        return JobOutcome(folder=folder, metrics=prediction_metrics(prediction.page), files=output.placed(written))
 
 
 # Cells of a grid that is also written as pictures for Google Earth.

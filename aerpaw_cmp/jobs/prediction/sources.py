@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from ...common.errors import InputError, UsageError
-from ...common.inputs import input_files
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray
 from ...compare.direction_gain import LinkSamples
@@ -26,6 +25,7 @@ from ...propagation.arrays import Poses, rotation_from_aircraft
 from ...propagation.field.baselines import free_space_dbm
 from ...site.site import Site
 from ..learning.calibrate import load_calibration
+from ..tasks.manifest import inputs_of_flight
 from .where import is_settings, level_samples
 
 REPLAYED_AT_ONCE = 20_000
@@ -62,7 +62,7 @@ def named_flights(paths: Sequence[Path]) -> list[NamedFlight]:
 
 def files_of(flights: Sequence[NamedFlight], logs_root: Path | None) -> list[Path]:
     """Every file that the flights are read from."""
-    return [file for flight in flights for file in input_files(flight.settings, flight.path, logs_root)]
+    return [file for flight in flights for file in inputs_of_flight(flight.settings, flight.path, logs_root)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

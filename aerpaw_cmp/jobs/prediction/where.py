@@ -19,6 +19,7 @@ from ...logs.route import read_route
 from ...maps.grid import Grid
 from ...propagation.arrays import rotation_from_aircraft
 from ...site.site import Site
+from ..tasks.manifest import inputs_of_flight, inputs_of_site
 
 # Between points of a route that is given by its corners [m].
 STEP_M = 10.0
@@ -135,6 +136,16 @@ def flight_of(where: Path) -> FlightFile | None:
         return None
     text = where.read_text(encoding="utf-8", errors="replace")
     return load_flight(where) if re.search(r"^flight\s*:", text, re.MULTILINE) else None
+
+
+def target_files(where: Path, site: str | None, logs_root: Path | None) -> list[Path]:
+    """Files that WHERE and the site of ``--site`` are read from."""
+    files = [] if site is None else inputs_of_site(site)
+    if (flight := flight_of(where)) is not None:
+        return [*files, *inputs_of_flight(flight, where, logs_root)]
+    if is_settings(where) or not where.exists():
+        return [*files, *inputs_of_site(where)]
+    return [*files, where]
 
 
 def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Path | None = None) -> Targets:

@@ -6,17 +6,19 @@ Whatever text of the flight file or of the site file names a file is one (:mod:`
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from ...common.errors import AerpawCmpError
 from ...common.files import LARGEST_TABLE
-from ...common.inputs import named_files
+from ...common.inputs import input_files, named_files
 from ...common.outputs import file_digest
 from ...common.provenance import trained_on
-from ...flight.settings import FlightFile
+from ...flight.settings import FlightFile, load_flight
 from ...report.data import InputFile
 from ...site.learned import read_table
 
@@ -56,11 +58,39 @@ def other_inputs(
     return tuple(entries.values())
 
 
+def inputs_of_site(site: str | Path, folder: Path = Path()) -> list[Path]:
+    """The site file, as it is named in a folder, and what it names; none where it is wrong, which its reader says."""
+    with suppress(AerpawCmpError, OSError):
+        return [place for _, _, place in _site_files(str(site), folder)]
+    return []
+
+
+def inputs_of_flight(settings: FlightFile, flight: Path, logs_root: Path | None = None) -> list[Path]:
+    """Every file that a flight is read from, its site's too: no output may replace one."""
+    return [*input_files(settings, flight, logs_root), *inputs_of_site(settings.site.file, flight.parent)]
+
+
+def inputs_of_flights(flights: Iterable[Path], logs_root: Path | None = None) -> list[Path]:
+    """Inputs of several flight files; of one that is wrong the file alone."""
+    files: list[Path] = []
+    for flight in flights:
+        files.append(flight)
+        with suppress(AerpawCmpError, OSError):
+            files += inputs_of_flight(load_flight(flight), flight, logs_root)
+    return files
+
+
 def site_inputs(name: str, folder: Path) -> Iterator[tuple[InputFile, Path]]:
     """The site file, as it is named in a folder, and what it names."""
+    for text, role, place in _site_files(name, folder):
+        yield _entry(text, place, role), place
+
+
+def _site_files(name: str, folder: Path) -> Iterator[tuple[str, str, Path]]:
+    """Name, role and place of the site file and of what it names."""
     path = folder / name
     if path.is_file():
-        yield _entry(name, path, "site file"), path
+        yield name, "site file", path
         status = path.stat()
         model = _site_model(path, status.st_size, status.st_mtime_ns)
     else:
@@ -68,10 +98,10 @@ def site_inputs(name: str, folder: Path) -> Iterator[tuple[InputFile, Path]]:
         packaged = name.lower().replace("-", "_").replace(" ", "_") + ".yaml"
         with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / packaged) as file:
             if file.is_file():
-                yield _entry(f"aerpaw_cmp/site/data/{packaged}", file, "site file (packaged)"), file
+                yield f"aerpaw_cmp/site/data/{packaged}", "site file (packaged)", file
         return
     for key, text, place in named_files(model.model_dump(), [path.parent]):
-        yield _entry(text, place, f"site: {key}"), place
+        yield text, f"site: {key}", place
 
 
 @lru_cache(maxsize=16)

@@ -147,7 +147,7 @@ def block_errors(
     bench.manifest.tasks["block"] = Task(title="", split="blocks", train=list(known), test=[test])
     extra = [o.samples for o in samples_of(bench, antennas)]
     asked = list(questions(bench, "block", test))[::every]
-    found = [both([o.samples for o in q.train], [o.samples for o in q.asked], extra) for q in asked]
+    found = [both([o.samples for o in q.train], [o.samples for o in q.targets], extra) for q in asked]
     row = []
     for k in (1, 2):  # blocks of one series are one series again
         series = zip(*(one[k] for one in found), strict=True)
@@ -244,7 +244,7 @@ def folds(bench: Bench, names: Sequence[str]) -> Iterator[tuple[list[LinkSamples
         others = [other for other in names if other != name]
         bench.manifest.tasks["fold"] = Task(title="", split=split, train=others, test=[name])
         for one in questions(bench, "fold", name):
-            yield [o.samples for o in one.train], [o.samples for o in one.asked]
+            yield [o.samples for o in one.train], [o.samples for o in one.targets]
 
 
 def crps(bench: Bench, *, quick: bool) -> None:

@@ -179,7 +179,7 @@ class Flown:
     """SHA-256 of what its base knows besides the named flights."""
 
     def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:
-        """Levels at targets as seen with each of some headings, which count alike; ``run_targets``: how many the run has."""
+        """Levels at targets as seen with each of some headings, which count alike; ``run_targets``: their count."""
         antenna = each[0].antenna
         level, slow = self.correction.over_headings(each, all_targets=run_targets)
         guess = outside(each[0].position_m, self.sources[antenna].samples)

@@ -88,13 +88,13 @@ def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
         chunks: list[bytes] = []
-        held = 0
-        while size <= most and held <= most and (chunk := file.read(_CHUNK)):
+        total = 0
+        while size <= most and total <= most and (chunk := file.read(_CHUNK)):
             chunks.append(chunk)
-            held += len(chunk)
-    if max(size, held) > most:
-        found = f"the file has {size} bytes" if size > most else f"it has more than {most} bytes"
-        raise InputError(found, expected=f"{expected} of at most {most} bytes", path=path)
+            total += len(chunk)
+    if max(size, total) > most:
+        excess = f"the file has {size} bytes" if size > most else f"it has more than {most} bytes"
+        raise InputError(excess, expected=f"{expected} of at most {most} bytes", path=path)
     return b"".join(chunks)
 
 

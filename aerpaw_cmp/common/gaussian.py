@@ -10,7 +10,7 @@ import numpy as np
 from .units import FloatArray, IntArray
 
 
-def gaussian_kernel(one: FloatArray, other: FloatArray, length: float) -> FloatArray:
+def gaussian_kernel(first: FloatArray, second: FloatArray, length: float) -> FloatArray:
     """Gaussian kernel of unit variance between points (n, d) and (m, d): (n, m).
 
     Examples
@@ -20,7 +20,7 @@ def gaussian_kernel(one: FloatArray, other: FloatArray, length: float) -> FloatA
     """
     from scipy.spatial.distance import cdist
 
-    return np.asarray(np.exp(-cdist(one, other, "sqeuclidean") / (2.0 * length**2)))
+    return np.asarray(np.exp(-cdist(first, second, "sqeuclidean") / (2.0 * length**2)))
 
 
 def determining(
@@ -48,11 +48,11 @@ def determining(
     Pivoted Cholesky decomposition of the kernel: the point of largest variance left is taken next (Harbrecht, Peters
     and Schneider, Appl. Numer. Math. 62 (2012), doi:10.1016/j.apnum.2011.10.001).
     """
-    left, rows, taken = np.ones(len(points)), np.empty((min(most, len(points)), len(points))), list[int]()
-    while len(taken) < len(rows) and left.max() > share:
-        at, known = int(left.argmax()), rows[: len(taken)]
-        rows[len(taken)] = (kernel(points[at : at + 1], points)[0] - known[:, at] @ known) / math.sqrt(left[at])
-        left = np.maximum(left - rows[len(taken)] ** 2, 0.0)
-        left[at] = 0.0
-        taken.append(at)
-    return np.array(taken, dtype=np.int64)
+    remaining, rows, chosen = np.ones(len(points)), np.empty((min(most, len(points)), len(points))), list[int]()
+    while len(chosen) < len(rows) and remaining.max() > share:
+        at, known = int(remaining.argmax()), rows[: len(chosen)]
+        rows[len(chosen)] = (kernel(points[at : at + 1], points)[0] - known[:, at] @ known) / math.sqrt(remaining[at])
+        remaining = np.maximum(remaining - rows[len(chosen)] ** 2, 0.0)
+        remaining[at] = 0.0
+        chosen.append(at)
+    return np.array(chosen, dtype=np.int64)

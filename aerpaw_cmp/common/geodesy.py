@@ -71,8 +71,8 @@ def in_shape(transform: Callable[[Any, Any], Any], x: ArrayLike, y: ArrayLike) -
     """
     first, second = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
     if first.size == 1:
-        made = transform(float(first.reshape(-1)[0]), float(second.reshape(-1)[0]))
+        transformed = transform(float(first.reshape(-1)[0]), float(second.reshape(-1)[0]))
     else:
-        made = transform(first, second)
-    one, other = (np.asarray(values, dtype=np.float64).reshape(first.shape) for values in made)
-    return one, other
+        transformed = transform(first, second)
+    x_out, y_out = (np.asarray(values, dtype=np.float64).reshape(first.shape) for values in transformed)
+    return x_out, y_out

@@ -110,15 +110,15 @@ def held() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    seen: list[int] = []
+    signals: list[int] = []
     before = {number: signal.getsignal(number) for number in SIGNALS}
     ours = {number: handler for number, handler in before.items() if callable(handler)}
     for number in ours:
-        signal.signal(number, lambda number, _frame: seen.append(number))
+        signal.signal(number, lambda number, _frame: signals.append(number))
     try:
         yield
     finally:
         for number, handler in ours.items():
             signal.signal(number, handler)
-    if seen and callable(handler := ours[seen[0]]):
-        handler(seen[0], None)
+    if signals and callable(handler := ours[signals[0]]):
+        handler(signals[0], None)

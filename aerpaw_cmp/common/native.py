@@ -60,10 +60,10 @@ def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     code, out, err = _in_child(kind, data)
     if code == 0:
         return _unpacked(out)
-    said = err.decode("utf-8", "replace").strip().splitlines()
-    if code == _REFUSED and said:
-        raise InputError(**json.loads(said[-1]))
-    reason = said[-1] if said else f"its library ended with code {code}"
+    lines = err.decode("utf-8", "replace").strip().splitlines()
+    if code == _REFUSED and lines:
+        raise InputError(**json.loads(lines[-1]))
+    reason = lines[-1] if lines else f"its library ended with code {code}"
     raise InputError(f"no {_NAMES[kind]} file, or a damaged one ({reason})", cause="a cut download")
 
 
@@ -210,9 +210,9 @@ class _Items:
             self.data_sets[place] = item
 
 
-def _lies_elsewhere(found: str) -> InputError:
+def _lies_elsewhere(reason: str) -> InputError:
     return InputError(
-        found,
+        reason,
         expected="a file that holds its own data",
         cause="a file made to read other files of this machine, or a set in several files: make it one (h5repack)",
     )

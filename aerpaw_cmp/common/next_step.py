@@ -30,8 +30,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     command = " ".join(["aerpaw-cmp", *words[: 2 if words[:1] == ["site"] else 1]])
     place = None if error.path is None else Path(error.path)
     if place is not None and not _exists(place):  # as the flight file names it
-        beside = (Path(word).parent / place for word in arguments if word.endswith(_SETTINGS))
-        place = next(filter(_exists, beside), place)
+        candidates = (Path(word).parent / place for word in arguments if word.endswith(_SETTINGS))
+        place = next(filter(_exists, candidates), place)
     if isinstance(error, CheckError):
         return "read the page, or run without the check"
     if isinstance(error, OutputError) or re.search(r"after -o\b|a new name", error.expected or ""):

@@ -227,8 +227,8 @@ class OutputFile:
 def _say_kept(error: BaseException | None, named: Path) -> None:
     """Add to an interrupt what stands at the output's name."""
     if isinstance(error, KeyboardInterrupt) or (error is not None and interrupted()):
-        there = os.path.lexists(named)
-        add_note(error, f"{one_line(str(named))} {'is as it was before' if there else 'was not written'}")
+        exists = os.path.lexists(named)
+        add_note(error, f"{one_line(str(named))} {'is as it was before' if exists else 'was not written'}")
 
 
 def _replaces_input(named: Path, path: Path) -> UsageError:
@@ -324,8 +324,8 @@ class OutputFolder:
         if _taken(self.target) and not self.target.is_dir():
             raise UsageError("a file is in the way", expected="the name of a folder", path=self.named)
         if self.target.is_dir():
-            here = Path.cwd().resolve()
-            if self.target == here or self.target in here.parents or os.path.ismount(self.target):
+            working_folder = Path.cwd().resolve()
+            if self.target == working_folder or self.target in working_folder.parents or os.path.ismount(self.target):
                 raise UsageError(
                     "the folder is replaced as a whole, and that cannot be done to one that a command runs in or that "
                     "a file system is mounted on",
@@ -444,17 +444,17 @@ def _mounted_below(folder: Path) -> list[Path]:
     return [Path(point) for point in points if folder in Path(point).parents]
 
 
-def _make_folders(folder: Path, made: list[Path]) -> None:
-    """Make a folder and its parents; ``made`` gets those that were not there."""
+def _make_folders(folder: Path, created: list[Path]) -> None:
+    """Make a folder and its parents; ``created`` gets those that were not there."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     for place in reversed(missing):
         place.mkdir(exist_ok=True)
-        made.append(place)
+        created.append(place)
 
 
-def _remove_folders(made: list[Path]) -> None:
+def _remove_folders(created: list[Path]) -> None:
     """Remove folders made for a run that failed, where nothing is in them."""
-    for place in reversed(made):
+    for place in reversed(created):
         with contextlib.suppress(OSError):
             place.rmdir()
 
@@ -495,9 +495,9 @@ class _Place:
         """Clear what a killed run left; UsageError where something else is there."""
         with contextlib.suppress(OSError):
             _clear(self.part, keep=True)
-        if left := next(self.part.iterdir(), None):
+        if foreign := next(self.part.iterdir(), None):
             raise UsageError(
-                f"the hidden place {one_line(str(self.part))} holds what is not this tool's: {one_line(left.name)}",
+                f"the hidden place {one_line(str(self.part))} holds what is not this tool's: {one_line(foreign.name)}",
                 expected="a hidden place of this tool's alone: move that away",
                 path=self.named,
             )
@@ -603,7 +603,7 @@ def _clear(part: Path, *, keep: bool = False) -> None:
 
 def _exchange(part: Path, target: Path) -> None:
     """Two folders swap their names in one step; where the system cannot, in two that :func:`_restore` mends."""
-    if _renamed_both(part, target):
+    if _names_swapped(part, target):
         return
     old = hidden_name(target, "old")
     target.rename(old)
@@ -622,10 +622,10 @@ def _restore(target: Path) -> None:
         old.rename(target)
 
 
-def _renamed_both(one: Path, other: Path) -> bool:
+def _names_swapped(first: Path, second: Path) -> bool:
     """RENAME_EXCHANGE (Linux) or RENAME_SWAP (macOS); False where kernel, library or file system have it not."""
     library = ctypes.CDLL(None, use_errno=True)
-    names = os.fsencode(one), os.fsencode(other)
+    names = os.fsencode(first), os.fsencode(second)
     if sys.platform == "darwin":
         function, arguments = getattr(library, "renamex_np", None), (*names, 2)
     else:
@@ -637,7 +637,7 @@ def _renamed_both(one: Path, other: Path) -> bool:
     code = ctypes.get_errno()
     if code in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP):
         return False
-    raise OSError(code, os.strerror(code), str(other))
+    raise OSError(code, os.strerror(code), str(second))
 
 
 def _sync_tree(folder: Path) -> None:

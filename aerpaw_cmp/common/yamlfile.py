@@ -240,8 +240,8 @@ class _Builder:
                 self.document.value = self._value(root, ())
         return self.document
 
-    def _fail(self, event: Any, found: str) -> NoReturn:
-        raise UsageError(found, path=self.path, line=event.start_mark.line + 1)
+    def _fail(self, event: Any, problem: str) -> NoReturn:
+        raise UsageError(problem, path=self.path, line=event.start_mark.line + 1)
 
     def _count(self, nodes: int, event: Any) -> None:
         self.nodes += nodes
@@ -341,14 +341,15 @@ def _explain(
 ) -> UsageError:
     findings: list[tuple[int | None, str, str | None]] = []
     for item in error.errors(include_url=False):
-        found, cause = _finding(item, model)
-        findings.append((document.line(item["loc"]), found, cause))
+        problem, cause = _finding(item, model)
+        findings.append((document.line(item["loc"]), problem, cause))
     findings.sort(key=lambda finding: finding[0] or 0)
     if len(findings) == 1:
-        line, found, cause = findings[0]
-        return UsageError(found, cause=cause, path=path, line=line)
+        line, problem, cause = findings[0]
+        return UsageError(problem, cause=cause, path=path, line=line)
     lines = [
-        f"line {line}: {found}" + (f" ({cause})" if cause else "") if line else found for line, found, cause in findings
+        f"line {line}: {problem}" + (f" ({cause})" if cause else "") if line else problem
+        for line, problem, cause in findings
     ]
     shown = lines[:20] + ([f"and {len(lines) - 20} more"] if len(lines) > 20 else [])
     return UsageError(f"{len(findings)} problems\n  " + "\n  ".join(shown), path=path)
@@ -389,9 +390,9 @@ def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | Non
     if item["type"] in ("value_error", "assertion_error"):
         return (f"{where}: {message}" if where else message), None
     message = re.sub(r"<\w+\.\w+: ('[^']*')>", r"\1", message)  # members of an Enum, as they are written
-    found = repr(item["input"])
-    found = found if len(found) <= 60 else found[:57] + "..."
-    return f"{where}: found {found}; expected {message}", None
+    shown = repr(item["input"])
+    shown = shown if len(shown) <= 60 else shown[:57] + "..."
+    return f"{where}: found {shown}; expected {message}", None
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -405,13 +406,13 @@ def _field_names(*models: type[pydantic.BaseModel]) -> list[str]:
 
 def _models_at(model: type[pydantic.BaseModel], location: Location) -> list[type[pydantic.BaseModel]]:
     """Models that may stand at a location; parts that name no field are indices, keys or union members."""
-    here: list[type[pydantic.BaseModel]] = [model]
+    models: list[type[pydantic.BaseModel]] = [model]
     for part in location:
-        fields = [field for candidate in here for field in candidate.model_fields.items()]
+        fields = [field for candidate in models for field in candidate.model_fields.items()]
         inside = [model for name, info in fields if part in (name, info.alias) for model in _models_in(info.annotation)]
-        named = [candidate for candidate in here if candidate.__name__ == part]
-        here = inside or named or here
-    return here
+        named = [candidate for candidate in models if candidate.__name__ == part]
+        models = inside or named or models
+    return models
 
 
 def _models_in(annotation: Any) -> list[type[pydantic.BaseModel]]:

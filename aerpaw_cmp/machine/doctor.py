@@ -82,10 +82,10 @@ def ready(checks: Sequence[Check]) -> bool:
 
 def python_check(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
     """Python of 3.10 or newer."""
-    found = f"{'.'.join(map(str, version))} ({sys.executable})"
+    running = f"{'.'.join(map(str, version))} ({sys.executable})"
     if version < (3, 10):
-        return Check("Python", "fail", found, "install Python 3.10 or newer, then 'make clean setup'")
-    return Check("Python", "ok", found)
+        return Check("Python", "fail", running, "install Python 3.10 or newer, then 'make clean setup'")
+    return Check("Python", "ok", running)
 
 
 def package_checks() -> Iterator[Check]:
@@ -168,19 +168,19 @@ def memory_check(available: int | None = None) -> Check:
     available = available_memory_bytes() if available is None else available
     if available is None:
         return Check("Memory", "warn", "unknown on this system", "have 2 GiB free for a report")
-    found = f"{available / 1024**3:.1f} GiB free"
+    free = f"{available / 1024**3:.1f} GiB free"
     if available < MEMORY_NEEDED_BYTES:
-        return Check("Memory", "warn", found, "a report needs up to 2 GiB: close other programs")
-    return Check("Memory", "ok", found)
+        return Check("Memory", "warn", free, "a report needs up to 2 GiB: close other programs")
+    return Check("Memory", "ok", free)
 
 
 def disk_check(folder: Path) -> Check:
     """Enough room where reports are written."""
     free = shutil.disk_usage(folder).free
-    found = f"{free / 1024**3:.1f} GiB free in {folder}"
+    room = f"{free / 1024**3:.1f} GiB free in {folder}"
     if free < DISK_NEEDED_BYTES:
-        return Check("Disk", "warn", found, "free some space, or write reports elsewhere with '-o FOLDER'")
-    return Check("Disk", "ok", found)
+        return Check("Disk", "warn", room, "free some space, or write reports elsewhere with '-o FOLDER'")
+    return Check("Disk", "ok", room)
 
 
 def cache_check(folder: Path) -> Check:
@@ -219,8 +219,8 @@ def holders(device: str) -> list[str]:
 def serial_checks() -> Iterator[Check]:
     """Serial ports, whether this user may open them and who holds them; no port is opened."""
     if missing := [name for name in ("fcntl", "termios") if not _importable(name)]:
-        found = f"this system has no {' and no '.join(missing)}: 'tap' and 'modem-sim' need Linux, all else works"
-        yield Check("Serial", "warn", found, "run the tap on Linux")
+        lacking = f"this system has no {' and no '.join(missing)}: 'tap' and 'modem-sim' need Linux, all else works"
+        yield Check("Serial", "warn", lacking, "run the tap on Linux")
         return
     try:
         from serial.tools import list_ports
@@ -245,15 +245,15 @@ def _importable(name: str) -> bool:
 
 def serial_check(device: str, description: str = "") -> Check:
     """One port: present, allowed, free."""
-    found = f"{device} {description}".strip()
+    port = f"{device} {description}".strip()
     if not os.access(device, os.R_OK | os.W_OK):
         return Check(
-            "Serial", "warn", f"{found}: not allowed", f"sudo usermod -aG {_group(device)} $USER, then log in anew"
+            "Serial", "warn", f"{port}: not allowed", f"sudo usermod -aG {_group(device)} $USER, then log in anew"
         )
     if busy := holders(device):
         stop = "sudo systemctl stop ModemManager" if any("ModemManager" in name for name in busy) else "stop it"
-        return Check("Serial", "warn", f"{found}: held by {', '.join(busy)}", stop)
-    return Check("Serial", "ok", found)
+        return Check("Serial", "warn", f"{port}: held by {', '.join(busy)}", stop)
+    return Check("Serial", "ok", port)
 
 
 def _group(device: str) -> str:

@@ -187,7 +187,7 @@ def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
         paths = _system_paths()
     by_path: dict[Path, Library] = {}
     for library in filter(None, map(_library, paths)):  # one file under several names: the one that tells the release
-        by_path[library.path] = max(by_path.get(library.path, library), library, key=lambda one: one.version)
+        by_path[library.path] = max(by_path.get(library.path, library), library, key=lambda file: file.version)
     return sorted(by_path.values(), key=lambda library: (library.version, str(library.path)), reverse=True)
 
 
@@ -207,9 +207,9 @@ def _failure(child: subprocess.CompletedProcess[str]) -> str:
     if missing := _missing_library(child.stderr):
         return f"Dr.Jit cannot be loaded, the system has no {missing}"
     lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
-    said = next((line for line in lines if "LLVM ERROR" in line), lines[-1] if lines else "no message")
+    message = next((line for line in lines if "LLVM ERROR" in line), lines[-1] if lines else "no message")
     how = f"was ended by signal {-child.returncode}" if child.returncode < 0 else f"ended with {child.returncode}"
-    return f"the trial {how}: {said[:200]}"
+    return f"the trial {how}: {message[:200]}"
 
 
 def _run_trial(

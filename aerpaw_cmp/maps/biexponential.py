@@ -176,8 +176,8 @@ class _Projection:
 
     def _slopes(self, log_rates: FloatArray) -> FloatArray:
         """Central differences (n, 2) of the residuals over the logarithms of the rates, all at once."""
-        away = 1e-5 * np.eye(2)
-        ahead, behind = self.amplitudes(log_rates + np.stack([away, -away]))[1]
+        steps = 1e-5 * np.eye(2)
+        ahead, behind = self.amplitudes(log_rates + np.stack([steps, -steps]))[1]
         return np.asarray((ahead - behind).T / 2e-5)
 
     def single(self) -> float:

@@ -130,8 +130,8 @@ def write_geojson(path: str | Path, maps: MapLayers) -> Path:
     columns = {layer.name: json_safe(layer.values) for layer in maps.layers}
     features = []
     for i, corner in enumerate(corners):
-        here = {"kind": "cell", "index": i + 1, **{name: values[i] for name, values in columns.items()}}
-        features.append(_feature("Polygon", [corner.tolist()], here))
+        properties = {"kind": "cell", "index": i + 1, **{name: values[i] for name, values in columns.items()}}
+        features.append(_feature("Polygon", [corner.tolist()], properties))
     for name, place in maps.towers_m.items():
         features.append(_feature("Point", maps.lonlat([place])[0].tolist(), {"kind": "tower", "name": name}))
     for border in maps.borders:

@@ -125,12 +125,12 @@ def _not_a_knot_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
     right[..., 1:-1, :] = 3 * (h[..., 1:, :] * slope[..., :-1, :] + h[..., :-1, :] * slope[..., 1:, :])
     for end, a, b in ((0, 0, 1), (m - 1, -1, -2)):
         near, far = step[..., a], step[..., b]
-        both = near + far
+        span = near + far
         system[..., end, end] = far
-        system[..., end, 1 if end == 0 else m - 2] = both
+        system[..., end, 1 if end == 0 else m - 2] = span
         right[..., end, :] = (
-            (near + 2 * both)[..., None] * far[..., None] * slope[..., a, :] + near[..., None] ** 2 * slope[..., b, :]
-        ) / both[..., None]
+            (near + 2 * span)[..., None] * far[..., None] * slope[..., a, :] + near[..., None] ** 2 * slope[..., b, :]
+        ) / span[..., None]
     return np.asarray(np.linalg.solve(system, right))
 
 
@@ -211,12 +211,12 @@ class _Local:
 
     def _estimate(self, targets: FloatArray, *, leave_out: bool) -> tuple[FloatArray, FloatArray]:
         estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
-        for kept, columns in coverage_patterns(self.values_):
-            samples, values = self.points_m_[kept], self.values_[np.ix_(kept, columns)]
+        for covered, columns in coverage_patterns(self.values_):
+            samples, values = self.points_m_[covered], self.values_[np.ix_(covered, columns)]
             skip = None
             if leave_out:
-                skip = np.full(len(kept), -1, dtype=np.int64)
-                skip[kept] = np.arange(kept.sum())
+                skip = np.full(len(covered), -1, dtype=np.int64)
+                skip[covered] = np.arange(covered.sum())
             estimate[:, columns] = self._one_pattern(samples, values, targets, skip)
         estimate = estimate[:, 0] if self._one_field else estimate
         return estimate, np.full_like(estimate, np.nan)

@@ -83,11 +83,11 @@ def write_archive(path: Path, title: str, description: str, body: str, pictures:
     Path
         The file.
     """
-    said = f"<description>{xml_text(description)}</description>" if description else ""
+    described = f"<description>{xml_text(description)}</description>" if description else ""
     document = (
         '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2" '
         'xmlns:gx="http://www.google.com/kml/ext/2.2"><Document>'
-        f"<name>{xml_text(title)}</name><open>1</open>{said}{body}</Document></kml>\n"
+        f"<name>{xml_text(title)}</name><open>1</open>{described}{body}</Document></kml>\n"
     )
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in {"doc.kml": document.encode(), **pictures}.items():

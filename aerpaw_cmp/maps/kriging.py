@@ -190,8 +190,8 @@ class OrdinaryKriging:
 
     def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
         """Estimate and variance at every sample from the others; shapes as the values given to ``fit``."""
-        own = np.arange(len(self.points_m_))
-        estimate, variance = self._estimate(self.points_m_, own)
+        place = np.arange(len(self.points_m_))
+        estimate, variance = self._estimate(self.points_m_, place)
         return self._shaped(estimate[self.place_], variance[self.place_])
 
     def weights(self, targets_m: ArrayLike) -> Weights:
@@ -234,18 +234,18 @@ class OrdinaryKriging:
 
     # --- estimation ----------------------------------------------------------------------------------------------
 
-    def _estimate(self, targets: FloatArray, own: IntArray | None) -> tuple[FloatArray, FloatArray]:
-        """Estimate and variance (targets, fields); ``own`` is the place that each target must not use."""
+    def _estimate(self, targets: FloatArray, place: IntArray | None) -> tuple[FloatArray, FloatArray]:
+        """Estimate and variance (targets, fields); ``place`` is the one that each target must not use."""
         estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
         variance = np.full_like(estimate, np.nan)
-        for kept, columns in coverage_patterns(self.values_):
+        for covered, columns in coverage_patterns(self.values_):
             skip = None
-            if own is not None:
+            if place is not None:
                 new_number = np.full(len(self.points_m_), -1, dtype=np.int64)
-                new_number[kept] = np.arange(kept.sum())
-                skip = new_number[own]
-            rule = self._weights(self.points_m_[kept], targets, skip)
-            estimate[:, columns] = _apply(rule, self.values_[np.ix_(kept, columns)])
+                new_number[covered] = np.arange(covered.sum())
+                skip = new_number[place]
+            rule = self._weights(self.points_m_[covered], targets, skip)
+            estimate[:, columns] = _apply(rule, self.values_[np.ix_(covered, columns)])
             variance[:, columns] = rule.variance[:, None] * self.sill_[columns]
         return estimate, variance
 
@@ -440,9 +440,9 @@ def _solve_reduced(gamma: FloatArray, to_target: FloatArray) -> FloatArray:
     spread = _contrasts(gamma)
     right = basis @ (gamma.mean(axis=2) - to_target)[:, :, None]
     level, direction = np.linalg.eigh((spread + spread.transpose(0, 2, 1)) / 2)
-    kept = level > np.maximum(np.maximum(level[:, -1:], 1e-300) / CONDITION_LIMIT, -level[:, :1])
+    strong = level > np.maximum(np.maximum(level[:, -1:], 1e-300) / CONDITION_LIMIT, -level[:, :1])
     along = (direction.transpose(0, 2, 1) @ right)[:, :, 0]
-    along = np.where(kept, along / np.where(kept, level, 1.0), 0.0)
+    along = np.where(strong, along / np.where(strong, level, 1.0), 0.0)
     return np.asarray(1.0 / m + (direction @ along[:, :, None])[:, :, 0] @ basis)
 
 

@@ -75,13 +75,13 @@ def nearest(
         return chosen
     tree = cKDTree(samples_m)
     least = m + 1 + (skip is not None)
-    wanted = least
+    candidates = least
     order = in_strips(targets_m, CHUNK)
     for start in range(0, len(targets_m), CHUNK):
         part = order[start : start + CHUNK]
-        todo = _fill_nearest(tree, targets_m, part, radius_m, skip, wanted, chosen)
+        todo = _fill_nearest(tree, targets_m, part, radius_m, skip, candidates, chosen)
         # scattered samples have no ties; on the paper's grid a ring of equal distance holds up to 12 cells
-        wanted = m + 13 if len(todo) > len(part) // 4 else least
+        candidates = m + 13 if len(todo) > len(part) // 4 else least
         ask = m + 13
         while len(todo):
             todo = _fill_nearest(tree, targets_m, todo, radius_m, skip, ask, chosen)
@@ -104,33 +104,33 @@ def _fill_nearest(
     todo: IntArray,
     radius_m: float,
     skip: IntArray | None,
-    wanted: int,
+    candidates: int,
     chosen: Neighbours,
 ) -> IntArray:
-    """Fill the rows ``todo`` from ``wanted`` candidates; the rows for which a tie reaches the last candidate."""
+    """Fill the rows ``todo`` from so many ``candidates``; the rows for which a tie reaches the last candidate."""
     samples_m, m = tree.data, chosen.index.shape[1]
-    wanted = min(wanted, len(samples_m))
-    away, who = tree.query(targets_m[todo], k=np.arange(1, wanted + 1), distance_upper_bound=radius_m + TIE_M)
-    last = _in_micrometres(away[:, -1])
-    exhausted = (wanted == len(samples_m)) | ~np.isfinite(last)
+    candidates = min(candidates, len(samples_m))
+    distance, who = tree.query(targets_m[todo], k=np.arange(1, candidates + 1), distance_upper_bound=radius_m + TIE_M)
+    last = _in_micrometres(distance[:, -1])
+    exhausted = (candidates == len(samples_m)) | ~np.isfinite(last)
     if skip is not None:
-        own = who == skip[todo, None]
-        away[own] = np.inf
+        excluded = who == skip[todo, None]
+        distance[excluded] = np.inf
         # the sample left out goes to the end, the order of the others stays
-        order = np.argsort(own, axis=1, kind="stable")
-        away, who = np.take_along_axis(away, order, axis=1), np.take_along_axis(who, order, axis=1)
-    ring = _in_micrometres(away)
+        order = np.argsort(excluded, axis=1, kind="stable")
+        distance, who = np.take_along_axis(distance, order, axis=1), np.take_along_axis(who, order, axis=1)
+    ring = _in_micrometres(distance)
     tied = (ring[:, 1:] == ring[:, :-1]) & np.isfinite(ring[:, 1:])
     rows = np.flatnonzero(tied.any(axis=1))
     if len(rows):
-        here = np.where(np.isfinite(away[rows]), who[rows], 0)
-        order = _tie_order(away[rows], here, samples_m, targets_m[todo[rows]])
-        away[rows], who[rows] = (np.take_along_axis(a[rows], order, axis=1) for a in (away, who))
-    complete = exhausted | (_in_micrometres(away[:, m - 1]) < last) if wanted >= m else exhausted
-    width = min(m, wanted)
-    done = todo[complete]
-    chosen.index[done, :width] = np.where(np.isfinite(away[:, :width]), who[:, :width], -1)[complete]
-    chosen.distance_m[done, :width] = away[complete, :width]
+        numbers = np.where(np.isfinite(distance[rows]), who[rows], 0)
+        order = _tie_order(distance[rows], numbers, samples_m, targets_m[todo[rows]])
+        distance[rows], who[rows] = (np.take_along_axis(a[rows], order, axis=1) for a in (distance, who))
+    complete = exhausted | (_in_micrometres(distance[:, m - 1]) < last) if candidates >= m else exhausted
+    width = min(m, candidates)
+    filled = todo[complete]
+    chosen.index[filled, :width] = np.where(np.isfinite(distance[:, :width]), who[:, :width], -1)[complete]
+    chosen.distance_m[filled, :width] = distance[complete, :width]
     return todo[~complete]
 
 
@@ -193,7 +193,7 @@ def random_within(
         order = np.lexsort((draw, target))
         target, sample, far = target[order], sample[order], far[order]
         rank = np.arange(len(target)) - np.searchsorted(target, target)
-        taken = rank < m
-        index[start + target[taken], rank[taken]] = sample[taken]
-        distance[start + target[taken], rank[taken]] = far[taken]
+        drawn = rank < m
+        index[start + target[drawn], rank[drawn]] = sample[drawn]
+        distance[start + target[drawn], rank[drawn]] = far[drawn]
     return Neighbours(index, distance)

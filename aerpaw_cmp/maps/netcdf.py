@@ -88,8 +88,17 @@ def maps_dataset(
             variables[layer.name] = _PLANE, plane.astype(np.int8), _codes(codes, layer.title)
         else:
             unit = {"dBm": DBM, "dB": DB}.get(layer.unit, layer.unit)
-            said = {"long_name": layer.title, "units": unit, "comment": f"unit: {layer.unit}", "grid_mapping": "crs"}
-            variables[layer.name] = _PLANE, plane.astype(np.float32), {**said, "coordinates": "latitude longitude"}
+            attributes = {
+                "long_name": layer.title,
+                "units": unit,
+                "comment": f"unit: {layer.unit}",
+                "grid_mapping": "crs",
+            }
+            variables[layer.name] = (
+                _PLANE,
+                plane.astype(np.float32),
+                {**attributes, "coordinates": "latitude longitude"},
+            )
     return dataset(variables, about)
 
 
@@ -99,7 +108,7 @@ def _text(dimension: str, names: Mapping[str, Any] | Sequence[str], meaning: str
 
 def _places(maps: MapResult, frame: SiteFrame) -> dict[str, _Variable]:
     """Axes, towers, latitude and longitude, the tower that serves, the reference system."""
-    found: dict[str, _Variable] = {
+    variables: dict[str, _Variable] = {
         "k": (("k",), np.array(maps.ks), {"long_name": "singular-value ratio K of the rank", "units": "1"}),
         "tower_name": _text("tower", maps.tower_names, "name of the tower"),
     }
@@ -108,22 +117,22 @@ def _places(maps: MapResult, frame: SiteFrame) -> dict[str, _Variable]:
         ("height", maps.rss_altitudes_m, "levels"),
         ("height_of_rank", maps.rank_altitudes_m, "ranks"),
     ):
-        found[name] = (name,), np.array(heights), {**height, "long_name": f"height above ground of the {what}"}
+        variables[name] = (name,), np.array(heights), {**height, "long_name": f"height above ground of the {what}"}
     for name, axis, what in (("y", maps.grid.north_m, "north"), ("x", maps.grid.east_m, "east")):
         along = {"standard_name": f"projection_{name}_coordinate", "long_name": f"{what} of the site origin"}
-        found[name] = (name,), axis, {**along, "units": "m", "axis": name.upper()}
+        variables[name] = (name,), axis, {**along, "units": "m", "axis": name.upper()}
     for i, (name, what) in enumerate((("tower_x", "east"), ("tower_y", "north"), ("tower_height", "above the ground"))):
         meaning = f"array centre of the tower, {what} at the site origin"
-        found[name] = ("tower",), maps.towers_m[:, i], {"long_name": meaning, "units": "m"}
+        variables[name] = ("tower",), maps.towers_m[:, i], {"long_name": meaning, "units": "m"}
     latitude, longitude = frame.to_geographic(*maps.grid.points_m.T)
     for name, degrees, unit in (("latitude", latitude, "degrees_north"), ("longitude", longitude, "degrees_east")):
         attributes = {"standard_name": name, "long_name": f"WGS84 {name}", "units": unit}
-        found[name] = _PLANE, maps.grid.raster(degrees), attributes
+        variables[name] = _PLANE, maps.grid.raster(degrees), attributes
     crs = {name: value for name, value in site_crs(frame).to_cf().items() if value is not None}
-    found["crs"] = (), np.array(0, dtype=np.int32), {**crs, "long_name": "site frame"}
+    variables["crs"] = (), np.array(0, dtype=np.int32), {**crs, "long_name": "site frame"}
     serving = _codes(maps.tower_names, "nearest tower, which serves here")
-    found["serving_tower"] = _PLANE, maps.grid.raster(maps.serving).astype(np.int8), serving
-    return found
+    variables["serving_tower"] = _PLANE, maps.grid.raster(maps.serving).astype(np.int8), serving
+    return variables
 
 
 def _levels(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
@@ -139,27 +148,27 @@ def _levels(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
         "condition": (f"largest over last singular value, {limit}", "height_of_rank", DB, "dB",
                       lambda m: np.minimum(m.condition_db, RATIO_LIMIT_DB)),
     }  # fmt: skip
-    found = {}
+    variables = {}
     for name, (meaning, height, unit, shown, values_of) in kinds.items():
         by_tower = [np.moveaxis(values_of(item), 1, 0) for item in maps.values()]  # tower, height, n
         joint = [
-            values[one.serving, :, np.arange(len(one.grid))].T
-            for one, values in zip(maps.values(), by_tower, strict=True)
+            values[result.serving, :, np.arange(len(result.grid))].T
+            for result, values in zip(maps.values(), by_tower, strict=True)
         ]
-        said = {"long_name": meaning, "units": unit, "comment": f"unit: {shown}"}
-        found[name] = _stacked(maps, by_tower, ("tower", height), said)
-        found[f"{name}_joint"] = _stacked(maps, joint, (height,), said)
-    return found
+        attributes = {"long_name": meaning, "units": unit, "comment": f"unit: {shown}"}
+        variables[name] = _stacked(maps, by_tower, ("tower", height), attributes)
+        variables[f"{name}_joint"] = _stacked(maps, joint, (height,), attributes)
+    return variables
 
 
 def _ranks(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
-    said = _codes(("out_of_coverage", *(f"rank_{i}" for i in range(1, HIGHEST_RANK + 1))), "channel rank")
+    attributes = _codes(("out_of_coverage", *(f"rank_{i}" for i in range(1, HIGHEST_RANK + 1))), "channel rank")
     # (height, K, tower, n) to (tower, K, height, n)
     by_tower = [np.moveaxis(item.rank, (2, 1, 0), (0, 1, 2)) for item in maps.values()]
     joint = [np.moveaxis(item.ranks(), 1, 0) for item in maps.values()]
     return {
-        "rank": _stacked(maps, by_tower, ("tower", "k", "height_of_rank"), said),
-        "rank_joint": _stacked(maps, joint, ("k", "height_of_rank"), said),
+        "rank": _stacked(maps, by_tower, ("tower", "k", "height_of_rank"), attributes),
+        "rank_joint": _stacked(maps, joint, ("k", "height_of_rank"), attributes),
     }
 
 
@@ -183,15 +192,15 @@ def _stacked(
         Dimensions, values, attributes.
     """
     joint = "tower" not in between
-    planes = np.stack([_plane(one, part) for one, part in zip(maps.values(), values, strict=True)])
+    planes = np.stack([_plane(result, part) for result, part in zip(maps.values(), values, strict=True)])
     numbers = planes.astype(np.int8) if "flag_values" in attributes else np.round(planes, 2).astype(np.float32)
-    said = {
+    described = {
         **attributes,
         "long_name": str(attributes["long_name"]) + (", nearest tower" if joint else ""),
         "coordinates": _LABELS if joint else f"{_LABELS} tower_name",
         "grid_mapping": "crs",
     }
-    return ("foliage", *between, *_PLANE), numbers, said
+    return ("foliage", *between, *_PLANE), numbers, described
 
 
 def _plane(maps: MapResult, values: AnyArray) -> AnyArray:

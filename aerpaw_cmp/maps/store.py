@@ -175,8 +175,8 @@ class TileStore:
 
     def read(self, empty: Mapping[str, MapResult], step: int) -> dict[str, MapResult]:
         """Maps of every ``step``-th position each way, by foliage mode; ``empty`` as for :meth:`begin`."""
-        whole = self.tiling.grid
-        grid = Grid(whole.east_m[::step], whole.north_m[::step], whole.spacing_m * step)
+        full = self.tiling.grid
+        grid = Grid(full.east_m[::step], full.north_m[::step], full.spacing_m * step)
         maps = {}
         for number, (mode, like) in enumerate(empty.items()):
             values = {}

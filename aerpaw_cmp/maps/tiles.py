@@ -199,9 +199,9 @@ class Reach:
         far = 100.0 * np.abs(image[:, None] - tile).sum(axis=2).max(initial=0.0)
         reach = far / np.maximum(np.linalg.norm(ray, axis=2, keepdims=True), NEAR_M)
         beam = shapely.polygons(np.concatenate([image[:, None] + ray, (image[:, None] + ray * reach)[:, ::-1]], axis=1))
-        whole = shapely.polygons(tile)
+        area = shapely.polygons(tile)
         wide = height < 0.05 * length  # a far end of the beam would come near the wall
-        lit = np.where(wide, whole, shapely.intersection(beam, whole))
+        lit = np.where(wide, area, shapely.intersection(beam, area))
         return np.asarray(shapely.union(lit, shapely.linestrings(ends)))
 
 

@@ -116,16 +116,16 @@ def vector_correlation(
     present = np.isfinite(data)
     lacking = ~present.all(axis=1) if missing == "drop" else present.sum(axis=1) < MINIMUM_COMMON
     constant = ~lacking & _is_constant(data, present)
-    kept = ~(lacking | constant)
-    if missing == "drop" or present[kept].all():
-        unit = data[kept] - data[kept].mean(axis=1, keepdims=True)
+    varying = ~(lacking | constant)
+    if missing == "drop" or present[varying].all():
+        unit = data[varying] - data[varying].mean(axis=1, keepdims=True)
         unit /= np.sqrt((unit**2).sum(axis=1, keepdims=True))
         bins = _bin_pairs(
-            points[kept], lambda rows, columns: np.clip(unit[rows] @ unit[columns].T, -1.0, 1.0), width_m, maximum_m
+            points[varying], lambda rows, columns: np.clip(unit[rows] @ unit[columns].T, -1.0, 1.0), width_m, maximum_m
         )
     else:
-        bins = _bin_pairs(points[kept], _PairwisePearson(data[kept], MINIMUM_COMMON), width_m, maximum_m)
-    return BinnedCorrelation(*bins, int(kept.sum()), int(constant.sum()), int(lacking.sum()))
+        bins = _bin_pairs(points[varying], _PairwisePearson(data[varying], MINIMUM_COMMON), width_m, maximum_m)
+    return BinnedCorrelation(*bins, int(varying.sum()), int(constant.sum()), int(lacking.sum()))
 
 
 def field_correlation(
@@ -153,8 +153,8 @@ def field_correlation(
     present = np.isfinite(data)
     lacking = present.sum(axis=0) < 2
     constant = ~lacking & _is_constant(data.T, present.T)
-    kept = ~(lacking | constant)
-    data, present = data[:, kept], present[:, kept]
+    varying = ~(lacking | constant)
+    data, present = data[:, varying], present[:, varying]
     count = present.sum(axis=0)
     filled = np.where(present, data, 0.0)
     centred = np.where(present, data - filled.sum(axis=0) / np.maximum(count, 1), 0.0)

@@ -95,18 +95,18 @@ def switch() -> str:
 
 def source_hash() -> str:
     """Hash of the sources, of numba's version and of Python's."""
-    made = sha256(f"{version('numba')} {sys.version_info[:3]}".encode())
+    digest = sha256(f"{version('numba')} {sys.version_info[:3]}".encode())
     for name in SOURCES:
-        made.update((ROOM / name).read_bytes())
-    return made.hexdigest()[:16]
+        digest.update((ROOM / name).read_bytes())
+    return digest.hexdigest()[:16]
 
 
 @lru_cache(maxsize=1)
 def cache_folder() -> Path | None:
     """Folder of compiled code: ``NUMBA_CACHE_DIR``, beside this file or the user's cache; None if none is kept."""
-    given = os.environ.get("NUMBA_CACHE_DIR")
+    named = os.environ.get("NUMBA_CACHE_DIR")
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    for base in (Path(given),) if given else (ROOM / "__pycache__", home / "aerpaw-cmp" / "compiled"):
+    for base in (Path(named),) if named else (ROOM / "__pycache__", home / "aerpaw-cmp" / "compiled"):
         folder = base / f"kernels-{source_hash()}"
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -6,12 +6,12 @@ upright corners.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..common.units import AnyArray, FloatArray, IntArray
-from .paths import Faces, PathSet
+from ..common.units import FloatArray, IntArray
+from .paths import Faces, PathSet, Rows
 from .surfaces import Surfaces
 
 # An end nearer than this to an edge has no path over it: there is no far field.
@@ -168,12 +168,12 @@ class Edges:
         face, side = self.face.reshape(-1), np.tile([0, 1], len(self))
         edge = np.repeat(np.arange(len(self)), 2)
         order = np.argsort(face, kind="stable")
-        made: list[IntArray] = [np.zeros((0, 4), np.int64)]
+        pieces: list[IntArray] = [np.zeros((0, 4), np.int64)]
         for run in np.split(order, np.flatnonzero(np.diff(face[order])) + 1) if len(order) else []:
             first, second = (part.reshape(-1) for part in np.meshgrid(run, run, indexing="ij"))
             apart = edge[first] != edge[second]
-            made.append(np.column_stack([edge[first], edge[second], side[first], side[second]])[apart])
-        rows = np.concatenate(made)
+            pieces.append(np.column_stack([edge[first], edge[second], side[first], side[second]])[apart])
+        rows = np.concatenate(pieces)
         return rows[:, :2], rows[:, 2:]
 
 
@@ -227,7 +227,7 @@ def _corner(faces: Faces, wall: int, end: int) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class EdgePaths:
+class EdgePaths(Rows):
     """Paths over one or two edges, sorted by pose and tower.
 
     Parameters
@@ -272,7 +272,3 @@ class EdgePaths:
         vertices = np.take_along_axis(self.vertices_m, first[..., None], axis=1)
         nothing = np.full(self.vertices_m.shape[:2], -1, dtype=np.int64)
         return PathSet(self.pose, self.tower, used.sum(axis=1), nothing, vertices)
-
-    def select(self, rows: AnyArray | slice) -> EdgePaths:
-        """The paths of a mask, of indices or of a run."""
-        return EdgePaths(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})

@@ -112,7 +112,7 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
     """
     depth = search.max_depth
     links = scene.links_to(poses)
-    extent = None if run.whole is None else run.whole.extent_m
+    extent = None if run.job is None else run.job.extent_m
     if by_beams(scene, search, _links(scene, run)):
         from .search import beams as search_beams
         from .search import prisms  # compiled: loaded where there are many faces
@@ -151,7 +151,7 @@ def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:
 
 def _links(scene: Scene, run: Run) -> int:
     """Links of the whole job."""
-    return scene.excluded.size if run.whole is None else run.whole.links
+    return scene.excluded.size if run.job is None else run.job.links
 
 
 def _long_search(estimate: Estimate) -> None:

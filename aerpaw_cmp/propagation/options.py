@@ -115,7 +115,7 @@ class Field:
 
 
 @dataclass(frozen=True, slots=True)
-class Whole:
+class Job:
     """Properties of the whole replay that a part must know, so that it is the same as in one piece.
 
     Parameters
@@ -131,7 +131,7 @@ class Whole:
     pairs: int
 
     @classmethod
-    def of(cls, points_m: FloatArray, links: int, pairs: int) -> Whole:
+    def of(cls, points_m: FloatArray, links: int, pairs: int) -> Job:
         """The box of the points (n, 3) that are known."""
         known = points_m[np.isfinite(points_m).all(axis=1)]
         return cls(np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known, links, pairs)
@@ -146,11 +146,11 @@ class Run(SearchRun):
     cache_dir : path, optional
         Keep paths here, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for the
         ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
-    whole : Whole, optional
+    job : Job, optional
         What the poses are a part of.
     threads, progress, on_estimate
         As :class:`~aerpaw_cmp.propagation.search.effort.SearchRun` has them.
     """
 
     cache_dir: str | Path | None = None
-    whole: Whole | None = None
+    job: Job | None = None

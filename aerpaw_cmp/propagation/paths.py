@@ -1,14 +1,15 @@
 """One path record for every engine, as columns.
 
 A path is an ordered list of reflecting faces between the source (tower) and the target (UAV). Lengths, phases
-and fields are not stored: :mod:`aerpaw_cmp.propagation.channel` evaluates them in float64 from the faces.
+and fields are not stored: :mod:`aerpaw_cmp.propagation.field.sum` evaluates them in float64 from the faces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 from shapely.geometry import Polygon
@@ -113,8 +114,28 @@ def joined(first: Faces, second: Faces) -> Faces:
     return Faces(**columns)
 
 
+RowsT = TypeVar("RowsT", bound="Rows")
+
+
+class Rows:
+    """Columns of one length: the base of records that hold a path, or a path over edges, a row."""
+
+    __slots__ = ()
+    pose: IntArray
+
+    def select(self: RowsT, rows: AnyArray | slice) -> RowsT:
+        """The paths of a mask, of indices or of a slice."""
+        return type(self)(**{column.name: getattr(self, column.name)[rows] for column in fields(self)})  # type: ignore[arg-type]
+
+    @classmethod
+    def one_after_another(cls: type[RowsT], pieces: Sequence[RowsT]) -> RowsT:
+        """The paths of all pieces, one at least, as they come; nothing is sorted."""
+        names = [column.name for column in fields(cls)]  # type: ignore[arg-type]
+        return cls(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
+
+
 @dataclass(frozen=True, slots=True)
-class PathSet:
+class PathSet(Rows):
     """All paths of a replay, sorted by pose, tower, depth, faces.
 
     Parameters
@@ -155,10 +176,6 @@ class PathSet:
         """Paths (paths,) that bounce off a crown."""
         return np.asarray((self.tree >= 0).any(axis=1))
 
-    def select(self, rows: AnyArray | slice) -> PathSet:
-        """The paths of a mask, of indices or of a slice."""
-        return PathSet(**{column.name: getattr(self, column.name)[rows] for column in fields(self)})
-
     @classmethod
     def from_tower(cls, tower: int, pose: IntArray, faces: IntArray, vertices_m: FloatArray, max_depth: int) -> PathSet:
         """Paths of one tower over sequences (paths, depth), padded to ``max_depth``; -1 is no face.
@@ -186,16 +203,22 @@ class PathSet:
         return cls(pose, np.full(len(pose), tower), (sequence >= 0).sum(axis=1), sequence, points)
 
     @classmethod
-    def one_after_another(cls, pieces: Sequence[PathSet]) -> PathSet:
-        """The paths of all pieces, one at least, as they come; nothing is sorted."""
-        names = [column.name for column in fields(cls)]
-        return cls(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
-
-    @classmethod
     def empty(cls, max_depth: int) -> PathSet:
         """No path at all."""
         zero = np.zeros(0, dtype=np.int64)
         return cls(zero, zero, zero, np.zeros((0, max_depth), dtype=np.int64), np.zeros((0, max_depth, 3)))
+
+
+def legs(source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Starts and ends (paths, 3) of the legs of polylines, leg by leg.
+
+    A vertex (paths, vertices, 3) that is not used (NaN) is the point after it: a leg that begins there has no length.
+    """
+    points = [target_m]
+    for step in reversed(range(vertices_m.shape[1])):
+        vertex = vertices_m[:, step]
+        points.append(np.where(np.isfinite(vertex), vertex, points[-1]))
+    return pairwise([np.broadcast_to(source_m, target_m.shape), *reversed(points)])
 
 
 def path_lengths(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
@@ -210,10 +233,7 @@ def path_lengths(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -
     -------
     (paths,) [m]
     """
-    total, last = np.zeros(len(paths)), sources_m[paths.tower]
-    for step in range(paths.vertices_m.shape[1] + 1):
-        end = paths.vertices_m[:, step] if step < paths.vertices_m.shape[1] else targets_m[paths.pose]
-        used = np.asarray(np.isfinite(end).all(axis=1))
-        total[used] += np.linalg.norm(end[used] - last[used], axis=1)
-        last = np.where(used[:, None], end, last)
+    total = np.zeros(len(paths))
+    for start, end in legs(sources_m[paths.tower], paths.vertices_m, targets_m[paths.pose]):
+        total += np.linalg.norm(end - start, axis=1)
     return total

@@ -19,7 +19,7 @@ from .field.edges import edge_channels
 from .field.ridges import ridge_loss_db
 from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
 from .options import Field, Run, Search
-from .paths import Faces, PathSet
+from .paths import Faces, PathSet, legs
 from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
 from .search.edges import find_edge_paths
@@ -144,12 +144,7 @@ def require_xarray() -> Any:
 
 
 def replay(
-    site: Site,
-    link: Link,
-    poses: Poses,
-    search: Search = Search(),  # noqa: B008 - frozen
-    field: Field = Field(),  # noqa: B008
-    run: Run = Run(),  # noqa: B008
+    site: Site, link: Link, poses: Poses, search: Search = Search(), field: Field = Field(), run: Run = Run()
 ) -> Replay:
     """Replay a flight.
 
@@ -253,11 +248,11 @@ def _shaped_ground(
     """Scene with tangent planes of the terrain, paths that stay on level ground, paths over the planes, notes."""
     if site.dem is None or scene.surfaces is not None or not paths.faces.shape[1]:
         return scene, paths, paths.select(slice(0, 0)), []
-    found = on_terrain(site.dem, scene.faces, scene.links_to(poses), paths, wavelength_m(link.carrier_hz))
+    terrain = on_terrain(site.dem, scene.faces, scene.links_to(poses), paths, wavelength_m(link.carrier_hz))
     words = "links over ground that the elevation model does not know: level ground reflects there"
-    more = np.zeros((len(scene.usable), len(found.faces) - len(scene.faces)), dtype=np.bool_)
-    scene = replace(scene, faces=found.faces, usable=np.concatenate([scene.usable, more], axis=1))
-    return scene, found.level, found.shaped, [Omission(words, (found.unknown,))]
+    more = np.zeros((len(scene.usable), len(terrain.faces) - len(scene.faces)), dtype=np.bool_)
+    scene = replace(scene, faces=terrain.faces, usable=np.concatenate([scene.usable, more], axis=1))
+    return scene, terrain.level, terrain.shaped, [Omission(words, (terrain.unknown,))]
 
 
 def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:
@@ -275,13 +270,8 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
     clear = np.ones(len(paths), dtype=np.bool_)
     clear[straight] = site.dem.clear(source[straight], target[straight])
     rows = np.flatnonzero(~straight)
-    start = source[rows]
-    for step in range(paths.vertices_m.shape[1] + 1):
-        last = step == paths.vertices_m.shape[1]
-        corner = target[rows] if last else paths.vertices_m[rows, step]
-        end = np.where(np.isfinite(corner), corner, target[rows])
+    for start, end in legs(source[rows], paths.vertices_m[rows], target[rows]):
         clear[rows] &= site.dem.clear(start, end)
-        start = end
     return clear
 
 
@@ -359,7 +349,7 @@ def _evaluated(
 ) -> Replay:
     """Fields of the paths; times are the caller's."""
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
-    work = None if run.whole is None else run.whole.pairs
+    work = None if run.job is None else run.job.pairs
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=run.threads, work=work)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle

@@ -305,7 +305,7 @@ def test_two_renames_where_the_system_cannot_exchange(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
 ) -> None:
     """Killed before, between and after the two renames: the old set or the new one, at the next run at the latest."""
-    monkeypatch.setattr(outputs, "_renamed_both", lambda *_: False)
+    monkeypatch.setattr(outputs, "_names_swapped", lambda *_: False)
     target = tmp_path / "report"
     write_folder(target, {"a": "1"})
     rename, calls = Path.rename, []

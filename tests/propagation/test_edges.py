@@ -14,7 +14,7 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation.arrays import Array, Isotropic, Link, Poses, single_element
 from aerpaw_cmp.propagation.check.bent import _cotangent, _transition
-from aerpaw_cmp.propagation.check.explain import edge_path_lines
+from aerpaw_cmp.propagation.check.explain import further_path_lines
 from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
 from aerpaw_cmp.propagation.check.reference import element_wave, fresnel, permittivity, turned
 from aerpaw_cmp.propagation.edges import EdgePaths, Edges
@@ -671,7 +671,7 @@ def test_polylines_of_paths_over_edges_leave_out_what_is_not_used() -> None:
 def test_paths_over_edges_are_explained_by_their_levels() -> None:
     where = poses((70.0, 3.0, 2.0))
     result = trace(place(BARN), LINK, where, diffraction="edges")
-    lines = edge_path_lines(result, np.array([0.0, 0.0, 10.0]), where, LINK)
+    lines = further_path_lines(result, np.array([0.0, 0.0, 10.0]), where, LINK)
     assert result.edge_paths is not None
     assert len(lines) == len(result.edge_paths) == 2
     assert all("edge of barn wall" in line for line in lines)

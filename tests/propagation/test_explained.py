@@ -9,7 +9,7 @@ from shapely.geometry import Polygon, box
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import single_element
 from aerpaw_cmp.propagation.check import reference
-from aerpaw_cmp.propagation.check.explain import explain_paths, power_sum_dbm, simple_paths, wall_path_lines, why_not
+from aerpaw_cmp.propagation.check.explain import explain_paths, further_path_lines, power_sum_dbm, simple_paths, why_not
 from aerpaw_cmp.propagation.check.field_audit import Expected
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.options import Search
@@ -126,9 +126,9 @@ def test_a_bounce_straight_down_and_paths_through_walls_in_words(scenes):
     assert ground.level_dbm == pytest.approx(free + ground.bounces[0].te_db)
     assert ground.bounces[0].te_db == pytest.approx(ground.bounces[0].tm_db)
     there = scenes.poses([70.0, 3.0, 2.0])
-    assert wall_path_lines(found, np.array([0.0, 0, 10]), pose, link) == []
+    assert further_path_lines(found, np.array([0.0, 0, 10]), pose, link) == []
     lit = replay(site, link, there, Search(max_depth=1, refraction=True))
-    lines = wall_path_lines(lit, np.array([0.0, 0, 10]), there, link)
+    lines = further_path_lines(lit, np.array([0.0, 0, 10]), there, link)
     levels = [float(line.split()[1]) for line in lines]
     assert levels == sorted(levels, reverse=True)
     assert len(lines) == len(lit.through.paths) >= 2

@@ -69,11 +69,11 @@ def test_blocks_hold_each_pose_once_and_as_many_places_as_fit(monkeypatch, place
     blocks = list(moving._blocks(sources))
     assert sorted(np.concatenate([block.rows for block in blocks]).tolist()) == list(range(25))
     for block in blocks:
-        assert np.array_equal(block.places_m[block.own], sources[block.rows])
+        assert np.array_equal(block.places_m[block.place], sources[block.rows])
         assert len(block.places_m) == 1 or len(block.rows) * len(block.places_m) <= links
         assert len(block.places_m) <= places
     for block, after in itertools.pairwise(blocks):
-        more = int((after.own == 0).sum())
+        more = int((after.place == 0).sum())
         full = len(block.places_m) == places
         assert full or (len(block.rows) + more) * (len(block.places_m) + 1) > links
     first = np.concatenate([block.places_m for block in blocks])

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.propagation.field.ridges import Ridges, bullington_db, deygout_db, knife_edge_db, ridge_loss_db
+from aerpaw_cmp.propagation.field.ridges import (
+    Profile,
+    Ridges,
+    bullington_db,
+    deygout_db,
+    knife_edge_db,
+    ridge_loss_db,
+)
 from aerpaw_cmp.site.dem import Dem
 
 # ITU-R study group 3, validation examples for the delta-Bullington method, path 2 (132.3 km, heights above the sea):
@@ -31,7 +38,7 @@ def test_bullington_gives_the_losses_of_the_itu_examples(
     line = (height[0] + sent_m) * (1 - km / length) + (height[-1] + received_m) * km / length
     bulge = 500.0 / 8500.0 * km * (length - km)  # the examples take an Earth of 8500 km, and 3e8 m/s
     loss = bullington_db(
-        np.array([1000 * length]), (km / length)[:, None], (height + bulge - line)[:, None], 3e8 / (1e6 * mhz)
+        Profile(np.array([1000 * length]), (km / length)[:, None], (height + bulge - line)[:, None]), 3e8 / (1e6 * mhz)
     )
     assert loss[0] == pytest.approx(expected_db, abs=0.001)
 
@@ -49,7 +56,9 @@ def test_one_edge_is_a_knife_edge_whatever_the_method() -> None:
     for height in (0.0, 3.0, 40.0):
         intrusion = np.where(np.isclose(share, 0.25), height, -500.0)
         nu = height * np.sqrt(2 * 2000.0 / (0.1 * 500.0 * 1500.0))
-        assert deygout_db(np.array([2000.0]), share, intrusion, 0.1)[0] == pytest.approx(knife_edge_db(nu), abs=1e-9)
+        assert deygout_db(Profile(np.array([2000.0]), share, intrusion), 0.1)[0] == pytest.approx(
+            knife_edge_db(nu), abs=1e-9
+        )
     # P.526 eq. 31 against the Fresnel integral of the half-plane
     assert knife_edge_db(np.array([0.0, 1.0, 2.4])) == pytest.approx([6.02, 13.8, 20.5], abs=0.15)
     assert knife_edge_db(np.array([-0.78, -5.0, -np.inf])).tolist() == [0.0, 0.0, 0.0]
@@ -62,7 +71,7 @@ def test_two_grazed_edges_lose_what_the_exact_solution_says(first: float, second
     d1, d2, d3 = first, second - first, 1 - second
     exact = -20 * np.log10(0.5 - np.arctan(np.sqrt(d2 / (d1 * d3))) / (2 * np.pi))
     share, intrusion = grazed(first, second)
-    corrected = deygout_db(np.array([3000.0]), share, intrusion, 0.1)[0]
+    corrected = deygout_db(Profile(np.array([3000.0]), share, intrusion), 0.1)[0]
     assert corrected == pytest.approx(exact, abs=0.75)
     assert abs(corrected - exact) < abs(12.04 - exact), "without the correction two edges always lose 12 dB"
 
@@ -71,22 +80,22 @@ def test_three_edges_and_both_directions() -> None:
     # n edges in a line at equal distances pass 1 / (n + 1) (Lee, 1978); a hair decides which is the main one
     share, intrusion = grazed(0.25, 0.5, 0.75)
     intrusion[600] = 1e-3
-    assert deygout_db(np.array([3000.0]), share, intrusion, 0.1)[0] == pytest.approx(12.04, abs=1.1)
+    assert deygout_db(Profile(np.array([3000.0]), share, intrusion), 0.1)[0] == pytest.approx(12.04, abs=1.1)
     random = np.random.default_rng(3)
     heights = random.uniform(-60.0, 25.0, (1201, 20))
     length, share = random.uniform(500.0, 5000.0, 20), np.repeat(share, 20, axis=1)
     for law in (deygout_db, bullington_db):
-        there, back = law(length, share, heights, 0.1), law(length, share, heights[::-1], 0.1)
+        there, back = (law(Profile(length, share, heights[::step]), 0.1) for step in (1, -1))
         assert there == pytest.approx(back, abs=1e-6)
         assert (there > 0).all()
 
 
 def test_unknown_ground_is_no_edge() -> None:
-    share, intrusion = grazed(0.5)
+    (share, intrusion), length = grazed(0.5), np.array([900.0])
     for law in (deygout_db, bullington_db):
-        known = law(np.array([900.0]), share, intrusion, 0.1)
-        assert law(np.array([900.0]), share, np.where(share < 0.3, np.nan, intrusion), 0.1) == pytest.approx(known)
-        assert law(np.array([900.0]), share, np.full_like(share, np.nan), 0.1).tolist() == [0.0]
+        known = law(Profile(length, share, intrusion), 0.1)
+        assert law(Profile(length, share, np.where(share < 0.3, np.nan, intrusion)), 0.1) == pytest.approx(known)
+        assert law(Profile(length, share, np.full_like(share, np.nan)), 0.1).tolist() == [0.0]
 
 
 @pytest.mark.parametrize("method", ["deygout", "bullington"])

@@ -32,12 +32,12 @@ COSINE, PERMITTIVITY, LOSS, THICKNESS = (
 
 
 def through(cosine: Any, eta: Any, thickness: Any) -> tuple[Any, Any]:
-    te_re, te_im, tm_re, tm_im = transmission(cosine, np.real(eta), np.imag(eta), thickness)
+    te_re, te_im, tm_re, tm_im = transmission(cosine, (np.real(eta), np.imag(eta), thickness))
     return te_re + 1j * te_im, -(tm_re + 1j * tm_im)
 
 
 def back(cosine: Any, eta: Any, thickness: Any) -> tuple[Any, Any]:
-    te_re, te_im, tm_re, tm_im = coefficients(cosine, np.real(eta), np.imag(eta), thickness)
+    te_re, te_im, tm_re, tm_im = coefficients(cosine, (np.real(eta), np.imag(eta), thickness))
     return te_re + 1j * te_im, tm_re + 1j * tm_im
 
 

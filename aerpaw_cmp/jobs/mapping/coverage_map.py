@@ -45,7 +45,7 @@ from ...propagation.arrays import Link, Poses, linear_array, single_element
 from ...propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
 from ...propagation.field.stands import stand_loss_db
 from ...propagation.field.sum import channel_matrices, rss_dbm
-from ...propagation.options import Engine, Run, Search, Whole
+from ...propagation.options import Engine, Job, Run, Search
 from ...propagation.paths import PathSet
 from ...propagation.replay import Replay, replay
 from ...propagation.scene import Scene
@@ -265,7 +265,7 @@ class SiteChannels:
         poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (n, 3, 3)))
         search = Search(s.engine, max_depth=s.max_depth, samples=s.samples)
         links = n * len(self.site.towers)
-        run = Run(whole=Whole(self.reach.extent_m, links, links))
+        run = Run(job=Job(self.reach.extent_m, links, links))
         replayed = replay(self.site, self.siso, poses, search, run=run)
         self.paths += len(replayed.paths)
         siso, mimo = replayed.h, self._matrices(replayed, replayed.paths, poses, self.mimo, None)

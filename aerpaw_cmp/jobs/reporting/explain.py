@@ -23,11 +23,10 @@ from ...flight.settings import RtSettings, load_flight
 from ...propagation.arrays import Link, Poses
 from ...propagation.check.explain import (
     ExplainedPath,
-    edge_path_lines,
     explain_paths,
+    further_path_lines,
     power_sum_dbm,
     simple_paths,
-    wall_path_lines,
     why_not,
 )
 from ...propagation.drivers.moving import site_with_tower_at
@@ -125,8 +124,7 @@ def run_explain(
     paths = _paths(data.site, rt, replayed, link, pose, source)
     if isinstance(series, RssSeries) and settings.rss.field != "coherent":
         notes.append(f"rss.csv holds rss.field: {settings.rss.field}; the level here is the coherent sum")
-    notes += edge_path_lines(replayed, np.asarray(source), pose, link)
-    notes += wall_path_lines(replayed, np.asarray(source), pose, link)
+    notes += further_path_lines(replayed, np.asarray(source), pose, link)
     measured = float(series.measured_db[at]) if isinstance(series, RssSeries) else None
     return Explanation(
         flight=settings.flight.name,

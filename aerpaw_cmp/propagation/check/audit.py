@@ -123,9 +123,9 @@ def audit(
     link: Link,
     poses: Poses,
     replay: Replay,
-    search: Search = Search(),  # noqa: B008 - frozen
-    field: Field = Field(),  # noqa: B008
-    run: Run = Run(),  # noqa: B008
+    search: Search = Search(),
+    field: Field = Field(),
+    run: Run = Run(),
     second: Second = Second(),
 ) -> Audit:
     """Check a replay by another engine, on the whole scene (nothing left out).
@@ -147,28 +147,28 @@ def audit(
     """
     complete = second.complete
     chosen = _spread(poses, None if second.links is None else -(-second.links // max(1, len(replay.towers))))
-    other: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
-    search = replace(search, engine=other)
+    engine: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
+    search = replace(search, engine=engine)
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
     checked = run_replay(site, link, few, search, Field(field.loss), run)
     rays = checked.samples or (FIELD_SAMPLES if search.samples == "auto" else search.samples)
-    found, ks, expected = None, second.ks, second.expected
+    fields, ks, expected = None, second.ks, second.expected
     if expected is not None:
-        found = FieldAudit(not_covered=("the second implementation: it knows prisms, no scene of triangles",))
+        fields = FieldAudit(not_covered=("the second implementation: it knows prisms, no scene of triangles",))
         if site.scene is None:
             few_kinds = spread_over_paths(replay, chosen, second.reference_links)
-            found = against_reference(
+            fields = against_reference(
                 site, poses, replay, few_kinds, expected, ks=ks, max_depth=search.max_depth, complete=complete
             )
-        found += per_pair(site, link, poses, replay, chosen, replace(search, engine="image"), Field(field.loss), ks=ks)
+        fields += per_pair(site, link, poses, replay, chosen, replace(search, engine="image"), Field(field.loss), ks=ks)
         if site.scene is None:
-            found += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
+            fields += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
         rayed = replace(search, samples=min(rays, FIELD_SAMPLES))
-        found += against_sionna(site, link, poses, replay, chosen, expected, rayed, complete=complete)
+        fields += against_sionna(site, link, poses, replay, chosen, expected, rayed, complete=complete)
     return Audit(
-        field=found,
+        field=fields,
         engine=replay.engine,
-        reference=other,
+        reference=engine,
         links=len(chosen) * len(replay.towers),
         **asdict(compare(replay, checked, chosen, ks)),
         seconds=replay.seconds,
@@ -206,8 +206,8 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
     """
     ours, theirs = (keys.keys() for keys in _keys_of_both(replay, reference, chosen))
     level, level_reference = replay.rss_dbm[chosen], reference.rss_dbm
-    both = np.isfinite(level) & np.isfinite(level_reference)
-    error = np.abs(level[both] - level_reference[both])
+    covered = np.isfinite(level) & np.isfinite(level_reference)
+    error = np.abs(level[covered] - level_reference[covered])
     return Difference(
         missing_paths=len(theirs - ours),
         extra_paths=len(ours - theirs),

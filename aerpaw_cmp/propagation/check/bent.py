@@ -49,16 +49,16 @@ def corners_of(reference: Reference) -> Iterator[Corner]:
             wall, last = (b - a) / np.linalg.norm(b - a), (a - before) / np.linalg.norm(a - before)
             out, out_last = np.array([wall[1], -wall[0], 0.0]), np.array([last[1], -last[0], 0.0])
             up = np.array([0.0, 0.0, 1.0])
-            one = Corner(
+            rim = Corner(
                 start=np.append(a, top), end=np.append(b, top), out=out, out_n=up, into=-up, exterior=1.5,
                 material=building.material, solid=number,
             )  # fmt: skip
-            yield one
+            yield rim
             turn = math.atan2(last[0] * wall[1] - last[1] * wall[0], float(last @ wall))
             if turn > 1e-6:
                 foot = np.append(a, max(ground, min(building.base_m, 0.0) - 0.5))
                 into, exterior = np.append(-last, 0.0), 1 + turn / math.pi
-                yield replace(one, start=foot, end=one.start, out=out_last, out_n=out, into=into, exterior=exterior)
+                yield replace(rim, start=foot, end=rim.start, out=out_last, out_n=out, into=into, exterior=exterior)
 
 
 def bent_matrix(reference: Reference, target: Vector, turn: Matrix) -> tuple[int, ComplexArray, float] | None:
@@ -91,9 +91,9 @@ def bent_matrix(reference: Reference, target: Vector, turn: Matrix) -> tuple[int
             if verdict is None:
                 return None
             if verdict:
-                one = bend.field()
-                count, power = count + 1, power + float((np.abs(one) ** 2).mean())
-                h += one
+                field = bend.field()
+                count, power = count + 1, power + float((np.abs(field) ** 2).mean())
+                h += field
     return count, h, power
 
 
@@ -160,11 +160,11 @@ class _Bend:
         matrix = self._wedge(near, far, before, after, cosine, wavelength)
         bases = [np.array([edge - cosine * s, np.cross(edge, s)]) / math.sqrt(1 - cosine**2) for s in (before, after)]
         sent = [self._wave(tower, i, tower.mount, before, 0) for i in range(len(tower.positions_m))]
-        seen = [self._wave(uav, i, uav_turn, -after, 1) for i in range(len(uav.positions_m))]
+        received = [self._wave(uav, i, uav_turn, -after, 1) for i in range(len(uav.positions_m))]
         places = [self._places(a, t, side) for side, (a, t) in enumerate(((tower, tower.mount), (uav, uav_turn)))]
         amplitude = wavelength / (4 * math.pi) / math.sqrt(near * far)
-        h = np.zeros((len(seen), len(sent)), dtype=np.complex128)
-        for (u, s), (t, w) in itertools.product(enumerate(seen), enumerate(sent)):
+        h = np.zeros((len(received), len(sent)), dtype=np.complex128)
+        for (u, s), (t, w) in itertools.product(enumerate(received), enumerate(sent)):
             (x, r), (y, q) = places[1][u], places[0][t]
             total = math.hypot(r + q, x - y)
             coupling = complex((bases[1] @ s) @ (matrix @ (bases[0] @ w)))
@@ -209,7 +209,7 @@ class _Bend:
         first, last = (math.atan2(v @ c.out, v @ c.into) % (2 * math.pi) for v in (-before, after))
         kl = k * near * far * sine**2 / (near + far)
         less, more = last - first, last + first
-        both = _cotangent(less, 1, n, kl) + _cotangent(less, -1, n, kl)
+        shadow = _cotangent(less, 1, n, kl) + _cotangent(less, -1, n, kl)
         faces = _cotangent(more, 1, n, kl) + _cotangent(more, -1, n, kl)
         half = (math.pi - less) / 2
         flat = math.sin(first / n) * math.sin(last / n) * math.sin(half)
@@ -222,7 +222,7 @@ class _Bend:
         a, b = math.cos(half) / size, cosine * flat / size
         face = np.array([[te * a * a - tm * b * b, (te + tm) * a * b], [-(te + tm) * a * b, tm * a * a - te * b * b]])
         scale = -cmath.exp(-0.25j * math.pi) / (2 * n * math.sqrt(2 * math.pi * k) * sine)
-        return np.asarray(scale * (both * np.eye(2) + faces * face))
+        return np.asarray(scale * (shadow * np.eye(2) + faces * face))
 
 
 def _transition(x: float) -> complex:
@@ -230,8 +230,8 @@ def _transition(x: float) -> complex:
     if x > 40.0:
         return 1 + 1j / (2 * x) - 3 / (4 * x**2) - 15j / (8 * x**3) + 75 / (16 * x**4)
     sine, cosine = fresnel_integrals(math.sqrt(2 * x / math.pi))
-    rest = complex(0.5 - float(cosine), float(sine) - 0.5)
-    return 2j * math.sqrt(x) * cmath.exp(1j * x) * math.sqrt(math.pi / 2) * rest
+    tail = complex(0.5 - float(cosine), float(sine) - 0.5)
+    return 2j * math.sqrt(x) * cmath.exp(1j * x) * math.sqrt(math.pi / 2) * tail
 
 
 def _cotangent(angle: float, sign: int, n: float, kl: float) -> complex:

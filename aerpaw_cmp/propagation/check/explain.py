@@ -118,18 +118,20 @@ def explain_paths(
     table = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
     explained = []
     for row in range(len(paths)):
-        seen: list[tuple[str, AnyArray]] = []
-        one = paths.select(np.array([row]))
-        columns = geometry(replace(one, tower=np.zeros(1, np.int64)), faces, table, source_m[None], poses, link)
+        recorded: list[tuple[str, AnyArray]] = []
+        single = paths.select(np.array([row]))
+        columns = geometry(replace(single, tower=np.zeros(1, np.int64)), faces, table, source_m[None], poses, link)
         ends = pattern_ends(columns, elements, link)
-        field = amplitudes(columns, elements, ends, wavelength, lambda *step: seen.append(step))  # noqa: B023
+        field = amplitudes(columns, elements, ends, wavelength, lambda *step: recorded.append(step))  # noqa: B023
         further = {name: float(loss[row]) for name, loss in further_db.items()}
-        explained.append(_explained(one, faces, source_m, poses.position_m[0], link, seen, field[0], further))
+        explained.append(_explained(single, faces, source_m, poses.position_m[0], link, recorded, field[0], further))
     return tuple(sorted(explained, key=lambda path: -path.level_dbm))
 
 
-def edge_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Link) -> list[str]:
-    """Paths over edges of a replay of one link in words, strongest first, with their levels before foliage.
+def further_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Link) -> list[str]:
+    """Paths over edges, then those through walls, of a replay of one link in words.
+
+    Strongest first, with their levels before foliage.
 
     Parameters
     ----------
@@ -144,51 +146,31 @@ def edge_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Li
     -------
     list of str
     """
-    paths, lines = replay.edge_paths, []
-    if paths is None or not len(paths):
-        return []
-    edges = edges_of(replay)
-    field = edge_amplitudes(paths, Tables.of(edges, replay.faces, source_m[None], poses, link), link)
-    level = link.transmit_power_dbm + db_from_power((np.abs(field) ** 2).mean(axis=(1, 2)))
-    for row in np.argsort(-level, kind="stable"):
-        steps = [
-            f"edge of {replay.faces.label[edges.face[edge, 0]]} and {replay.faces.label[edges.face[edge, 1]]} at "
-            + ", ".join(f"{x:.1f}" for x in paths.vertices_m[row, 1 + k]) + " m"
-            for k, edge in enumerate(paths.edge[row])
-            if edge >= 0
-        ]  # fmt: skip
-        before, after = ([replay.faces.label[face]] if face >= 0 else [] for face in paths.ground[row])
-        lines.append(f"diffracted path {level[row]:.2f} dBm: {', '.join([*before, *steps, *after])}")
+    bent, through, lines = replay.edge_paths, replay.through, list[str]()
+    if bent is not None and len(bent):
+        edges, label = edges_of(replay), replay.faces.label
+        field = edge_amplitudes(bent, Tables.of(edges, replay.faces, source_m[None], poses, link), link)
+        words = []
+        for row in range(len(bent)):
+            steps = [
+                f"edge of {label[edges.face[edge, 0]]} and {label[edges.face[edge, 1]]} at "
+                + ", ".join(f"{x:.1f}" for x in bent.vertices_m[row, 1 + k]) + " m"
+                for k, edge in enumerate(bent.edge[row])
+                if edge >= 0
+            ]  # fmt: skip
+            before, after = ([label[face]] if face >= 0 else [] for face in bent.ground[row])
+            words.append([*before, *steps, *after])
+        lines += _strongest_first("diffracted path", (np.abs(field) ** 2).mean(axis=(1, 2)), words, link)
+    if through is not None and len(through.paths):
+        power = channel_matrices(through.paths, through.faces, source_m[None], poses, link).path_power
+        words = [[through.faces.label[face] for face in row if face >= 0] for row in through.paths.faces]
+        lines += _strongest_first("path", power, words, link)
     return lines
 
 
-def wall_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Link) -> list[str]:
-    """Paths through walls of a replay of one link in words, strongest first, with their levels before foliage.
-
-    Parameters
-    ----------
-    replay : Replay
-    source_m : (3,)
-    poses : Poses
-        The pose.
-    link : Link
-        With that tower alone.
-
-    Returns
-    -------
-    list of str
-    """
-    through = replay.through
-    if through is None or not len(through.paths):
-        return []
-    paths, label = through.paths, through.faces.label
-    level = link.transmit_power_dbm + db_from_power(
-        channel_matrices(paths, through.faces, source_m[None], poses, link).path_power
-    )
-    return [
-        f"path {level[row]:.2f} dBm: {', '.join(label[face] for face in paths.faces[row] if face >= 0)}"
-        for row in np.argsort(-level, kind="stable")
-    ]
+def _strongest_first(kind: str, power: FloatArray, words: list[list[str]], link: Link) -> list[str]:
+    level = link.transmit_power_dbm + db_from_power(power)
+    return [f"{kind} {level[row]:.2f} dBm: {', '.join(words[row])}" for row in np.argsort(-level, kind="stable")]
 
 
 def _explained(
@@ -197,13 +179,13 @@ def _explained(
     source_m: FloatArray,
     target_m: FloatArray,
     link: Link,
-    seen: list[tuple[str, AnyArray]],
+    recorded: list[tuple[str, AnyArray]],
     field: AnyArray,
     further_db: dict[str, float],
 ) -> ExplainedPath:
-    waves = [value for name, value in seen if name == "wave"]
-    spreading = next(value for name, value in seen if name == "spreading") ** 2
-    uav = next(value for name, value in seen if name == "uav")
+    waves = [value for name, value in recorded if name == "wave"]
+    spreading = next(value for name, value in recorded if name == "spreading") ** 2
+    uav = next(value for name, value in recorded if name == "uav")
     powers = [*waves, waves[-1] * spreading, waves[-1] * spreading * uav, (field**2).sum(axis=1)]
     mean = np.array([1.0, *(float(power.mean()) for power in powers)])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -222,7 +204,7 @@ def _explained(
     corners = np.concatenate([source_m[None], path.vertices_m[0, :depth], target_m[None]])
     legs = np.diff(corners, axis=0)
     lengths = np.linalg.norm(legs, axis=1)
-    away, back = legs[0], -legs[-1]
+    departure, arrival = legs[0], -legs[-1]
     bounces = tuple(
         _bounce(faces, int(path.faces[0, i]), corners[i + 1], legs[i], link, terms[f"reflection {i + 1}"])
         for i in range(depth)
@@ -233,10 +215,10 @@ def _explained(
         segments_m=tuple(lengths.tolist()),
         length_m=float(lengths.sum()),
         delay_ns=1e9 * float(lengths.sum()) / SPEED_OF_LIGHT_MPS,
-        departure_azimuth_deg=_azimuth_deg(away),
-        departure_elevation_deg=_elevation_deg(away),
-        arrival_azimuth_deg=_azimuth_deg(back),
-        arrival_elevation_deg=_elevation_deg(back),
+        departure_azimuth_deg=_azimuth_deg(departure),
+        departure_elevation_deg=_elevation_deg(departure),
+        arrival_azimuth_deg=_azimuth_deg(arrival),
+        arrival_elevation_deg=_elevation_deg(arrival),
         terms_db=terms,
         level_dbm=link.transmit_power_dbm + sum(terms.values()),
         phase_deg=float(np.degrees(np.arctan2(field[0, 1], field[0, 0]))),
@@ -304,8 +286,8 @@ def why_not(
     sequence = sequence[sequence >= 0]
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
     images = images_of(faces, sequence[None], source_m[None])
-    whole = Faces(faces.normal, faces.offset_m, faces.material, faces.label)  # every face a whole plane
-    points, ahead = trace_back(whole, sequence[None], images, target_m[None], tolerance)
+    planes = Faces(faces.normal, faces.offset_m, faces.material, faces.label)  # every face a whole plane
+    points, ahead = trace_back(planes, sequence[None], images, target_m[None], tolerance)
     if not ahead[0]:
         return "an end or an image lies behind a face: it has no reflection point"
     for step, face in enumerate(sequence):

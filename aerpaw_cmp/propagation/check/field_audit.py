@@ -373,20 +373,20 @@ def spread_over_paths(replay: Replay, chosen: IntArray, count: int) -> IntArray:
     """Poses of ``chosen`` that together meet as many kinds of paths as possible: faces, and crowns."""
     if len(chosen) <= count:
         return chosen
-    seen: dict[int, set[tuple[int, ...]]] = {int(row): set() for row in chosen}
+    kinds: dict[int, set[tuple[int, ...]]] = {int(row): set() for row in chosen}
     for pose, tower, faces in zip(
         replay.paths.pose.tolist(), replay.paths.tower.tolist(), replay.paths.faces.tolist(), strict=True
     ):
-        if pose in seen:
-            seen[pose].add((tower, *faces))
+        if pose in kinds:
+            kinds[pose].add((tower, *faces))
     picked: list[int] = []
     met: set[tuple[int, ...]] = set()
-    rest = list(seen)
+    candidates = list(kinds)
     while len(picked) < count:
-        best = max(rest, key=lambda row: (len(seen[row] - met), len(seen[row])))
+        best = max(candidates, key=lambda row: (len(kinds[row] - met), len(kinds[row])))
         picked.append(best)
-        met |= seen[best]
-        rest.remove(best)
+        met |= kinds[best]
+        candidates.remove(best)
     return np.array(sorted(picked), dtype=np.int64)
 
 
@@ -442,10 +442,10 @@ def against_sionna(
     place[chosen] = np.arange(len(chosen))
     rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~replay.paths.off_crown & ~_over_terrain(replay))
     ours = replace(replay.paths.select(rows), pose=place[replay.paths.pose[rows]])
-    mine, other = _matched(ours, replay.faces, theirs.paths, scene.faces)
-    total = _paths_against_sionna(ours.select(mine), replay, scene, few, probe, theirs, other)
+    mine, matches = _matched(ours, replay.faces, theirs.paths, scene.faces)
+    total = _paths_against_sionna(ours.select(mine), replay, scene, few, probe, theirs, matches)
     if complete and site.dem is None and site.scene is None:
-        lacking = np.setdiff1d(np.arange(len(theirs.paths)), other)
+        lacking = np.setdiff1d(np.arange(len(theirs.paths)), matches)
         total += _lacking(site, replay, theirs.paths, scene.faces, lacking, few, expected)
     return replace(total, not_covered=covered)
 
@@ -457,7 +457,7 @@ def per_pair(
     replay: Replay,
     chosen: IntArray,
     search: Search,
-    field: Field = Field(),  # noqa: B008 - frozen
+    field: Field = Field(),
     *,
     ks: Sequence[float],
 ) -> FieldAudit:
@@ -486,10 +486,10 @@ def per_pair(
     change = np.abs(pairs.rss_dbm - replay.rss_dbm[chosen])
     ranks = [channel_rank(pairs.h, k) != channel_rank(replay.h[chosen], k) for k in ks]
     size = np.abs(pairs.h).max(axis=(2, 3)) + np.abs(replay.h[chosen]).max(axis=(2, 3))
-    other = np.abs(pairs.h - replay.h[chosen]).max(axis=(2, 3)) > 1e-9 * size
+    differs = np.abs(pairs.h - replay.h[chosen]).max(axis=(2, 3)) > 1e-9 * size
     audit = FieldAudit(
-        pairs_links=other.size,
-        pairs_differ=int(other.sum()),
+        pairs_links=differs.size,
+        pairs_differ=int(differs.sum()),
         pairs_rss_max_db=float(np.nanmax(change, initial=0.0)),
         pairs_rank_differs=int(np.any(ranks, axis=0).sum()),
     )
@@ -511,8 +511,8 @@ def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
 
     arrays = list(link.tower_arrays.values())
     names = {pattern.name for array in (*arrays, link.uav_array) for pattern in array.patterns}
-    away = [np.linalg.norm(few.position_m - site.towers[t].position_m, axis=1) for t in link.tower_arrays]
-    gap = np.min(away, axis=0)
+    distances = [np.linalg.norm(few.position_m - site.towers[t].position_m, axis=1) for t in link.tower_arrays]
+    gap = np.min(distances, axis=0)
     near = np.argsort(gap)[:EXPLICIT_POSES]
     near = near[gap[near] < EXPLICIT_RANGE_M]
     alike = all(np.array_equal(a.positions_m, arrays[0].positions_m) for a in arrays)
@@ -536,19 +536,19 @@ def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
 
 def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
     """The link with two crossed elements in each array's centre, with the pattern and slant of its first element."""
-    left: list[str] = []
+    unasked: list[str] = []
 
     def centre(array: Array) -> Array:
         first = array.patterns[0]
         if first.name not in SIONNA_PATTERNS:
-            left.append(f"the antenna pattern '{first.name}' (Sionna is asked with isotropic elements)")
+            unasked.append(f"the antenna pattern '{first.name}' (Sionna is asked with isotropic elements)")
             first = Isotropic()
         slants = array.slant_rad[0] + np.array([0.0, np.pi / 2])
         return Array(np.zeros((2, 3)), slants, (first,), array.mount)
 
     towers = {name: centre(array) for name, array in link.tower_arrays.items()}
     return replace(link, tower_arrays=towers, uav_array=centre(link.uav_array), uav_transmits=False), tuple(
-        dict.fromkeys(left)
+        dict.fromkeys(unasked)
     )
 
 
@@ -559,12 +559,12 @@ def _matched(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Face
     plane = planes_of(joined(our_faces, their_faces))
     known = {key: index for index, key in enumerate(plane_keys(theirs, plane[len(our_faces) :]))}
     pairs = [(i, known[key]) for i, key in enumerate(plane_keys(ours, plane[: len(our_faces)])) if key in known]
-    both = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    return both[:, 0], both[:, 1]
+    rows = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    return rows[:, 0], rows[:, 1]
 
 
 def _paths_against_sionna(
-    ours: PathSet, replay: Replay, scene: Scene, few: Poses, probe: Link, theirs: Any, other: IntArray
+    ours: PathSet, replay: Replay, scene: Scene, few: Poses, probe: Link, theirs: Any, matches: IntArray
 ) -> FieldAudit:
     count = len(ours)
     if not count:
@@ -573,7 +573,7 @@ def _paths_against_sionna(
     alone = replace(ours, pose=np.arange(count))
     spots = Poses(few.position_m[ours.pose], few.rotation[ours.pose])
     h = channel_matrices(alone, replay.faces, scene.sources_m, spots, probe).h[np.arange(count), ours.tower]
-    reference = theirs.gain[other]
+    reference = theirs.gain[matches]
     size = np.abs(reference).max(axis=(1, 2))
     strong = np.abs(reference) > size[:, None, None] * 10 ** (-WEAK_DB / 20)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -582,7 +582,7 @@ def _paths_against_sionna(
         weak = 20 * np.log10(1 + np.abs(h - reference * np.exp(1j * np.angle(h / reference))) / size[:, None, None])
         power = np.where(strong, power, np.nan_to_num(weak)).max(axis=(1, 2))
         phase = np.where(strong, np.abs(np.angle(h / reference)), 0.0).max(axis=(1, 2))
-    near = theirs.length_m[other] < PHASE_RANGE_M
+    near = theirs.length_m[matches] < PHASE_RANGE_M
     failures = []
     bad = int((~(power <= POWER_TOLERANCE_DB)).sum())
     if bad:

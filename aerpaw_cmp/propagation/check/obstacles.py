@@ -73,11 +73,11 @@ def _hits(surfaces: Surfaces, a: FloatArray, b: FloatArray) -> tuple[IntArray, F
     across = np.cross(b - a, other_edge)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1.0 / np.einsum("ti,ti->t", edge, across)
-        away = a - corner[:, 0]
-        u = np.einsum("ti,ti->t", away, across) * inverse
-        other = np.cross(away, edge)
-        v = np.einsum("i,ti->t", b - a, other) * inverse
-        share = np.einsum("ti,ti->t", other_edge, other) * inverse
+        offset = a - corner[:, 0]
+        u = np.einsum("ti,ti->t", offset, across) * inverse
+        cross = np.cross(offset, edge)
+        v = np.einsum("i,ti->t", b - a, cross) * inverse
+        share = np.einsum("ti,ti->t", other_edge, cross) * inverse
         hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & (share > 0.0) & (share < 1.0)
     rows = np.flatnonzero(hit)
     return surfaces.face[rows], share[rows]

@@ -110,10 +110,10 @@ def _od_lines(text: str, zone: str) -> dict[int, Reading]:
     """``[stamp] octal value`` of od through ts; no value on a line ``*``, which stands for repeated samples."""
     out = {}
     for number, line in enumerate(text.split("\n"), start=1):
-        found = re.match(r"\[([^\]]+)\] (?:\*|[0-7]+ +(\S+))\s*$", line)
-        if found and _STAMP.fullmatch(found[1]):
+        match = re.match(r"\[([^\]]+)\] (?:\*|[0-7]+ +(\S+))\s*$", line)
+        if match and _STAMP.fullmatch(match[1]):
             try:
-                out[number] = Reading(utc_us(found[1], zone), {"": float(found[2])} if found[2] else {})
+                out[number] = Reading(utc_us(match[1], zone), {"": float(match[2])} if match[2] else {})
             except ValueError:
                 continue
     return out
@@ -246,12 +246,12 @@ def body_quaternion(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Quater
 def between(first: Quaternion, second: Quaternion, share: float) -> Quaternion:
     """The turn after a share of the way from one to another, at constant rate by the shorter way."""
     dot = sum(a * b for a, b in zip(first, second, strict=True))
-    other = tuple(-b for b in second) if dot < 0 else second
+    nearer = tuple(-b for b in second) if dot < 0 else second
     angle = math.acos(min(1.0, abs(dot)))
     if angle < 1e-9:
         return first
     weights = math.sin((1 - share) * angle) / math.sin(angle), math.sin(share * angle) / math.sin(angle)
-    return tuple(weights[0] * a + weights[1] * b for a, b in zip(first, other, strict=True))  # type: ignore[return-value]
+    return tuple(weights[0] * a + weights[1] * b for a, b in zip(first, nearer, strict=True))  # type: ignore[return-value]
 
 
 def matrix(q: Quaternion) -> Matrix:
@@ -314,14 +314,14 @@ class RawPath:
         if not times or not times[0] <= time_us <= times[-1]:
             return None
         after = min(max(bisect.bisect_left(times, time_us), 1), len(times) - 1)
-        one, two = self.rows[max(after - 1, 0)], self.rows[after]
-        gap = two.time_us - one.time_us
-        share = (time_us - one.time_us) / gap if gap else 0.0
-        ends = [east_north_m(row.latitude_deg, row.longitude_deg, self.origin_deg) for row in (one, two)]
+        earlier, later = self.rows[max(after - 1, 0)], self.rows[after]
+        gap = later.time_us - earlier.time_us
+        share = (time_us - earlier.time_us) / gap if gap else 0.0
+        ends = [east_north_m(row.latitude_deg, row.longitude_deg, self.origin_deg) for row in (earlier, later)]
         east, north = ((1 - share) * a + share * b for a, b in zip(*ends, strict=True))
-        up = self.ground_m + (1 - share) * one.altitude_m + share * two.altitude_m
+        up = self.ground_m + (1 - share) * earlier.altitude_m + share * later.altitude_m
         turn = None
-        known = [row.angles_deg for row in (one, two) if row.angles_deg is not None and any(row.angles_deg)]
+        known = [row.angles_deg for row in (earlier, later) if row.angles_deg is not None and any(row.angles_deg)]
         if len(known) == 2 and all(math.isfinite(angle) for angles in known for angle in angles):
             turn = matrix(between(body_quaternion(*known[0]), body_quaternion(*known[1]), share))
         return Pose((east, north, max(up, self.ground_m + LOWEST_M)), turn)

@@ -303,8 +303,8 @@ def mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
     mirrors = [Mirror((0.0, 0.0, 1.0), tower.ground_m, site.ground_material)]
     for number, building in enumerate(site.buildings):
         foot, top = min(building.base_m, 0.0) - 0.5, building.base_m + building.height_m
-        whole = building.footprint if building.footprint.is_valid else shapely.make_valid(building.footprint)
-        for part in shapely.get_parts(whole):
+        footprint = building.footprint if building.footprint.is_valid else shapely.make_valid(building.footprint)
+        for part in shapely.get_parts(footprint):
             if part.geom_type != "Polygon" or part.area <= 0:
                 continue
             for a, b in _edges(part):
@@ -497,9 +497,9 @@ class Reference:
         wave = element_wave(tower, tx, tower.mount, rays[0])
         for mirror, ray, onward in zip(sequence, rays[:-1], rays[1:], strict=True):
             wave = self._reflected(mirror, wave, ray, onward)
-        seen = element_wave(uav, rx, uav_turn, (-rays[-1][0], -rays[-1][1], -rays[-1][2]))
+        received = element_wave(uav, rx, uav_turn, (-rays[-1][0], -rays[-1][1], -rays[-1][2]))
         wavelength = C_MPS / self.link.carrier_hz
-        coupling = sum(a * b for a, b in zip(seen, wave, strict=True))
+        coupling = sum(a * b for a, b in zip(received, wave, strict=True))
         spreading = min(1.0, wavelength / (4 * math.pi * length))
         return coupling * spreading * cmath.exp(-2j * math.pi * math.fmod(length / wavelength, 1.0))
 
@@ -534,8 +534,8 @@ class Reference:
             return None
         depth = trunks = 0.0
         for step, (a, b) in enumerate(itertools.pairwise(points)):
-            own = {bounced[k] for k in (step - 1, step) if 0 <= k < len(bounced)}
-            depth += crown_depth_m(self.site.trees, a, b, own)
+            reflecting = {bounced[k] for k in (step - 1, step) if 0 <= k < len(bounced)}
+            depth += crown_depth_m(self.site.trees, a, b, reflecting)
             if self.loss.model == "opaque":
                 trunks += crown_depth_m(self.site.trees, a, b, set(), trunks=True)
         if self.loss.model == "opaque":
@@ -567,11 +567,11 @@ class Reference:
         power = 0.0
         for sequence, loss in paths:
             factor = 0.0 if math.isinf(loss) else 10 ** (-loss / 20)
-            one = np.array(
+            amplitudes = np.array(
                 [[factor * self.pair(sequence, t, u, target, turn) for t in range(tower)] for u in range(uav)]
             )
-            h += one
-            power += float((np.abs(one) ** 2).mean())
+            h += amplitudes
+            power += float((np.abs(amplitudes) ** 2).mean())
         return h, power
 
 

@@ -17,7 +17,7 @@ from ...common.errors import UsageError
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...site.site import Site, Tower
 from ..arrays import Link, Poses
-from ..options import Field, Loss, Run, Search, Whole
+from ..options import Field, Job, Loss, Run, Search
 from ..paths import PathSet
 from ..replay import PER_LINK, Replay, replay
 from .parts import in_turn
@@ -34,11 +34,11 @@ WORK_PER_POSE = 200
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Poses (rows of the flight) and their places: ``own`` (rows,) indexes ``places_m`` (places, 3)."""
+    """Poses (rows of the flight) and their places: ``place`` (rows,) indexes ``places_m`` (places, 3)."""
 
     rows: IntArray
     places_m: FloatArray
-    own: IntArray
+    place: IntArray
 
 
 def _blocks(sources_m: FloatArray) -> Iterator[_Block]:
@@ -90,9 +90,9 @@ def replay_moving(
     link: Link,
     poses: Poses,
     sources_m: FloatArray,
-    search: Search = Search(),  # noqa: B008 - frozen
-    field: Field = Field(),  # noqa: B008
-    run: Run = Run(),  # noqa: B008
+    search: Search = Search(),
+    field: Field = Field(),
+    run: Run = Run(),
 ) -> Replay:
     """Replay a flight against one tower that has a place of its own at every pose.
 
@@ -137,20 +137,20 @@ def replay_moving(
     if not blocks:
         return replay(site, link, poses, search, field, run)
     if len(blocks) > 1:
-        run = replace(run, whole=_shared_by_blocks(link, poses, sources_m))
+        run = replace(run, job=_shared_by_blocks(link, poses, sources_m))
 
     def of(block: _Block) -> Replay:
-        here, several, some, links = _scene_of(site, link, name, poses, block)
-        return _of_one_tower(replay(here, several, some, replace(search, links=links), field, run), name, block)
+        moved_site, several, some, links = _scene_of(site, link, name, poses, block)
+        return _of_one_tower(replay(moved_site, several, some, replace(search, links=links), field, run), name, block)
 
     return in_turn([block.rows for block in blocks], map(of, blocks), progress)
 
 
-def _shared_by_blocks(link: Link, poses: Poses, sources_m: FloatArray) -> Whole:
+def _shared_by_blocks(link: Link, poses: Poses, sources_m: FloatArray) -> Job:
     """Properties of all blocks that each must know: one tolerance, and whether compiled code is worth loading."""
     pairs = len(poses) * len(link.uav_array) * sum(map(len, link.tower_arrays.values()))
     points = np.concatenate([poses.position_m, sources_m])
-    return Whole.of(points, 0, pairs * WORK_PER_POSE)  # each place has few faces in reach: mirror images
+    return Job.of(points, 0, pairs * WORK_PER_POSE)  # each place has few faces in reach: mirror images
 
 
 def _scene_of(
@@ -159,10 +159,15 @@ def _scene_of(
     """Site, link and poses of a block, each place a tower; which links count."""
     names = [name] if len(block.places_m) == 1 else [f"{name}@{i}" for i in range(len(block.places_m))]
     towers = {n: _moved(site, site.towers[name], n, at) for n, at in zip(names, block.places_m, strict=True)}
-    here = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
+    moved_site = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
     several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
     some = Poses(poses.position_m[block.rows], poses.rotation[block.rows])
-    return here, several, some, None if len(names) == 1 else np.arange(len(names))[:, None] == block.own[None, :]
+    return (
+        moved_site,
+        several,
+        some,
+        None if len(names) == 1 else np.arange(len(names))[:, None] == block.place[None, :],
+    )
 
 
 def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
@@ -171,10 +176,10 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     if through is not None:
         through = replace(through, paths=replace(through.paths, tower=np.zeros_like(through.paths.tower)))
 
-    def own(values: AnyArray) -> AnyArray:
-        return np.ascontiguousarray(values[row, block.own][:, None])
+    def at_place(values: AnyArray) -> AnyArray:
+        return np.ascontiguousarray(values[row, block.place][:, None])
 
-    columns: dict[str, Any] = {name: own(getattr(replayed, name)) for name in PER_LINK}
+    columns: dict[str, Any] = {name: at_place(getattr(replayed, name)) for name in PER_LINK}
     return replace(
         replayed,
         **columns,

@@ -35,12 +35,7 @@ class PairChannels:
 
 
 def replay_pairs(
-    site: Site,
-    link: Link,
-    poses: Poses,
-    search: Search = Search(),  # noqa: B008 - frozen
-    field: Field = Field(),  # noqa: B008
-    run: Run = Run(),  # noqa: B008
+    site: Site, link: Link, poses: Poses, search: Search = Search(), field: Field = Field(), run: Run = Run()
 ) -> PairChannels:
     """Replay with paths of each element pair; as many searches as the UAV has elements.
 

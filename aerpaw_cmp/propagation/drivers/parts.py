@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import fields, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,11 @@ import numpy as np
 from ...common.units import IntArray
 from ...site.site import Site
 from ..arrays import Link, Poses
-from ..edges import EdgePaths
-from ..options import Field, Run, Search, Whole
-from ..paths import Faces, PathSet, joined
+from ..options import Field, Job, Run, Search
+from ..paths import Faces, PathSet, RowsT, joined
 from ..replay import PER_LINK, Replay, replay
 from ..scene import Omission
 from ..search.effort import Progress
-from ..search.walls import ThroughWalls
 
 
 def replay_in_parts(
@@ -42,7 +40,7 @@ def replay_in_parts(
         return replay(site, link, poses, search, field, run)
     links = len(poses) * len(link.tower_arrays)
     pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
-    progress, run = run.progress, replace(run, progress=None, whole=Whole.of(poses.position_m, links, pairs))
+    progress, run = run.progress, replace(run, progress=None, job=Job.of(poses.position_m, links, pairs))
 
     def of(at: IntArray) -> Replay:
         return replay(site, link, Poses(poses.position_m[at], poses.rotation[at]), search, field, run)
@@ -52,14 +50,14 @@ def replay_in_parts(
 
 def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | None) -> Replay:
     """One replay of parts that are made as they are asked for; ``rows`` are their poses."""
-    made: list[Replay] = []
-    done, count = 0, max(1, sum(map(len, rows)))
+    replays: list[Replay] = []
+    finished, count = 0, max(1, sum(map(len, rows)))
     for at, part in zip(rows, parts, strict=True):
-        made.append(part)
-        done += len(at)
+        replays.append(part)
+        finished += len(at)
         if progress is not None:
-            progress(done / count)
-    return _put_together(made, rows)
+            progress(finished / count)
+    return _put_together(replays, rows)
 
 
 def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
@@ -67,14 +65,15 @@ def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
     first, count = parts[0], sum(map(len, rows))
     # faces of crowns and terrain are numbered as they are met: other blocks have others
     faces, shifted = _joined_faces(parts)
-    bent = [part.edge_paths for part in parts]
-    rest: dict[str, Any] = {
+    bent = [part.edge_paths for part in parts if part.edge_paths is not None]
+    through = [part.through for part in parts if part.through is not None]
+    further: dict[str, Any] = {
         "faces": faces,
         "seconds": sum(part.seconds for part in parts),
         "search_seconds": sum(part.search_seconds for part in parts),
         "omitted": _added(parts),
-        "through": _through([part.through for part in parts if part.through is not None], rows),
-        "edge_paths": None if first.edge_paths is None else _edge_paths([b for b in bent if b is not None], rows),
+        "through": replace(through[0], paths=_in_flight([t.paths for t in through], rows)) if through else None,
+        "edge_paths": _in_flight(bent, rows) if bent else None,
     }
     columns = {name: [getattr(part, name) for part in parts] for name in PER_LINK}
     parts.clear()
@@ -84,26 +83,14 @@ def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
         arrays[name] = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
         for at, value in zip(rows, values, strict=True):
             arrays[name][at] = value
-    in_flight = [replace(paths, pose=at[paths.pose]) for at, paths in zip(rows, shifted, strict=True)]
-    paths = PathSet.one_after_another(in_flight)
-    if (np.diff(paths.pose) < 0).any():
-        paths = paths.select(np.argsort(paths.pose, kind="stable"))
-    return replace(first, **arrays, **rest, paths=paths)
+    return replace(first, **arrays, **further, paths=_in_flight(shifted, rows))
 
 
-def _edge_paths(parts: list[EdgePaths], rows: list[IntArray]) -> EdgePaths:
-    moved = [replace(part, pose=at[part.pose]) for at, part in zip(rows, parts, strict=True)]
-    whole = EdgePaths(**{f.name: np.concatenate([getattr(p, f.name) for p in moved]) for f in fields(EdgePaths)})
-    return whole.select(np.argsort(whole.pose, kind="stable"))
-
-
-def _through(parts: list[ThroughWalls], rows: list[IntArray]) -> ThroughWalls | None:
-    """Paths through walls of all blocks, whose buildings are the same."""
-    if not parts:
-        return None
-    moved = [replace(part.paths, pose=at[part.paths.pose]) for at, part in zip(rows, parts, strict=True)]
-    paths = PathSet.one_after_another(moved)
-    return replace(parts[0], paths=paths.select(np.argsort(paths.pose, kind="stable")))
+def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
+    """Paths of all parts as one set: their poses are numbered as in the flight, and in order."""
+    numbered = [replace(part, pose=at[part.pose]) for at, part in zip(rows, parts, strict=True)]  # type: ignore[type-var]
+    paths = numbered[0].one_after_another(numbered)
+    return paths.select(np.argsort(paths.pose, kind="stable")) if (np.diff(paths.pose) < 0).any() else paths
 
 
 def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
@@ -114,16 +101,19 @@ def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
     faces, out = parts[0].faces.select(np.arange(common)), []
     for part in parts:
         shift = len(faces) - common
-        own = part.paths.faces
-        out.append(replace(part.paths, faces=np.where(own >= common, own + shift, own)))
+        numbers = part.paths.faces
+        out.append(replace(part.paths, faces=np.where(numbers >= common, numbers + shift, numbers)))
         faces = joined(faces, part.faces.select(np.arange(common, len(part.faces))))
     return faces, out
 
 
-def _shared(one: Faces, other: Faces) -> int:
+def _shared(first: Faces, second: Faces) -> int:
     """Number of faces, from the first on, that are the same in both."""
-    count = min(len(one), len(other))
-    same = (one.normal[:count] == other.normal[:count]).all(axis=1) & (one.offset_m[:count] == other.offset_m[:count])
+    count = min(len(first), len(second))
+    same = (first.normal[:count] == second.normal[:count]).all(axis=1)
+    same &= first.offset_m[:count] == second.offset_m[:count]
+    # the bottoms of two crowns lie in one plane, and are two faces
+    same &= np.array([a == b for a, b in zip(first.label, second.label, strict=False)], dtype=np.bool_)
     return count if same.all() else int(np.argmin(same))
 
 

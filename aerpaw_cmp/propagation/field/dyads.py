@@ -114,10 +114,10 @@ def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector
     x, y, z, length
         Zero where the two meet.
     """
-    here, there = turned_back(frame, tower_m), turned_back(axes, uav_m)
-    x = place_m[0] + there[0] - (image_m[0] + here[0])
-    y = place_m[1] + there[1] - (image_m[1] + here[1])
-    z = place_m[2] + there[2] - (image_m[2] + here[2])
+    tower_offset, uav_offset = turned_back(frame, tower_m), turned_back(axes, uav_m)
+    x = place_m[0] + uav_offset[0] - (image_m[0] + tower_offset[0])
+    y = place_m[1] + uav_offset[1] - (image_m[1] + tower_offset[1])
+    z = place_m[2] + uav_offset[2] - (image_m[2] + tower_offset[2])
     length = np.sqrt(x * x + y * y + z * z)
     scale = select(length > 0.0, 1.0 / larger(length, 1e-300), 0.0)
     return x * scale, y * scale, z * scale, length

@@ -195,8 +195,8 @@ def _over_pairs(w: FloatArray, t: Tables, r: Rows, first: int, many: int) -> Non
         put(w, _WAYS + p, before)
         put(w, _WAYS + 3 * LANES + p, after)
         w[_COSINES + p], w[_COSINES + LANES + p] = cosines
-        for k, one in enumerate(joined):
-            w[_JOINED + 2 * k * LANES + p], w[_JOINED + (2 * k + 1) * LANES + p] = one.real, one.imag
+        for k, entry in enumerate(joined):
+            w[_JOINED + 2 * k * LANES + p], w[_JOINED + (2 * k + 1) * LANES + p] = entry.real, entry.imag
         for k, number in enumerate(turn):
             w[_TURN + k * LANES + p] = number
 
@@ -219,14 +219,14 @@ def _unit_fields(w: FloatArray, at: int, side: int) -> None:
 
 
 @kernel
-def _elements(w: FloatArray, at: int, array: Any, index: IntArray, span: tuple[int, int], made: FloatArray) -> None:
+def _elements(w: FloatArray, at: int, array: Any, index: IntArray, span: tuple[int, int], out: FloatArray) -> None:
     """Fields and places of all elements of an end."""
     places, slants, fields, side = array
     parts, edge, (first, many) = _PARTS + 8 * side * LANES, _LAST if side else _EDGE, span
     w[_ELEMENT + 5 * LANES : _ELEMENT + 9 * LANES] = 0.0
     w[_ELEMENT + 5 * LANES : _ELEMENT + 6 * LANES] = 1.0
     for i in range(places.shape[2]):
-        row = made[i * EACH : (i + 1) * EACH]
+        row = out[i * EACH : (i + 1) * EACH]
         for p in range(many):
             q = 0 if side else index[first + p]
             put(w, _ELEMENT + p, (places[q, 0, i], places[q, 1, i], places[q, 2, i]))
@@ -252,10 +252,10 @@ def _pairs(w: FloatArray, turns: float, sent: FloatArray, caught: FloatArray, ou
     w[_POWER : _POWER + LANES] = 0.0
     ports = len(sent) // EACH
     for j in range(len(caught) // EACH):
-        there = caught[j * EACH : (j + 1) * EACH]
+        target = caught[j * EACH : (j + 1) * EACH]
         for p in range(LANES):
-            b_re, b_im, p_re, p_im = _four(there, p)
-            along, radius, lost = there[4 * LANES + p], there[5 * LANES + p], w[_LOST + p]
+            b_re, b_im, p_re, p_im = _four(target, p)
+            along, radius, lost = target[4 * LANES + p], target[5 * LANES + p], w[_LOST + p]
             bb_re, bb_im, bp_re, bp_im = _four(w, _JOINED + p)
             pb_re, pb_im, pp_re, pp_im = _four(w, _JOINED + 4 * LANES + p)
             w[_MIDDLE + p] = (b_re * bb_re - b_im * bb_im + p_re * pb_re - p_im * pb_im) * lost
@@ -266,14 +266,14 @@ def _pairs(w: FloatArray, turns: float, sent: FloatArray, caught: FloatArray, ou
             w[_MIDDLE + 4 * LANES + p] = u[0] + u[1] * along + u[2] * radius
             w[_MIDDLE + 5 * LANES + p] = v[0] + v[1] * along + v[2] * radius
         for i in range(ports):
-            here, k = sent[i * EACH : (i + 1) * EACH], 2 * (j * ports + i) * LANES
+            source, k = sent[i * EACH : (i + 1) * EACH], 2 * (j * ports + i) * LANES
             row = out[k : k + 2 * LANES]
             for p in range(LANES):
                 b_re, b_im, c_re, c_im = _four(w, _MIDDLE + p)
-                s_re, s_im, t_re, t_im = _four(here, p)
+                s_re, s_im, t_re, t_im = _four(source, p)
                 x, y = (
-                    w[_MIDDLE + 4 * LANES + p] - here[4 * LANES + p],
-                    w[_MIDDLE + 5 * LANES + p] + here[5 * LANES + p],
+                    w[_MIDDLE + 4 * LANES + p] - source[4 * LANES + p],
+                    w[_MIDDLE + 5 * LANES + p] + source[5 * LANES + p],
                 )
                 total = np.sqrt(x * x + y * y)
                 sine, cosine = dyads.sine_cosine(total * turns)

@@ -163,37 +163,37 @@ def amplitudes(paths: EdgePaths, tables: Tables, link: Link) -> ComplexArray:
     """
     out = np.empty((len(paths), tables.uav_m.shape[2], tables.tower_m.shape[2]), dtype=np.complex128)
     fields = pattern_ends(paths, tables, link)
-    for two in (False, True):
-        rows = np.flatnonzero((paths.edge[:, 1] >= 0) == two)
+    for double in (False, True):
+        rows = np.flatnonzero((paths.edge[:, 1] >= 0) == double)
         if len(rows):
-            out[rows] = _alike(paths.select(rows), tables, [None if f is None else f[rows] for f in fields], two)
+            out[rows] = _alike(paths.select(rows), tables, [None if f is None else f[rows] for f in fields], double)
     return out
 
 
-def _alike(paths: EdgePaths, t: Tables, fields: list[FloatArray | None], two: bool) -> ComplexArray:
+def _alike(paths: EdgePaths, t: Tables, fields: list[FloatArray | None], double: bool) -> ComplexArray:
     """Amplitudes of paths that all cross one edge, or all two."""
-    first, last = paths.edge[:, 0], paths.edge[:, 1 if two else 0]
-    here, there = (_end(paths, t, side) for side in (0, 1))
+    first, last = paths.edge[:, 0], paths.edge[:, 1 if double else 0]
+    source, target = (_end(paths, t, side) for side in (0, 1))
     edge_1, edge_2 = (_edge(t, e) for e in (first, last))
-    if two:
+    if double:
         before, after, cosines, joined, turn = over_two(
-            here[0], there[0], edge_1, edge_2, parts_of(paths.vertices_m[:, 1]), parts_of(paths.vertices_m[:, 2]),
+            source[0], target[0], edge_1, edge_2, parts_of(paths.vertices_m[:, 1]), parts_of(paths.vertices_m[:, 2]),
             (paths.shared[:, 0, None], paths.shared[:, 1, None]), t.wave_number,
         )  # fmt: skip
     else:
-        before, after, cosines, distance, spread, angles = over_one(here[0], there[0], edge_1, t.wave_number)
+        before, after, cosines, distance, spread, angles = over_one(source[0], target[0], edge_1, t.wave_number)
         bb, bp, pp = wedge(angles[0], angles[1], cosines[0], edge_1[5], distance, edge_1[6], edge_1[7])
         joined, turn = (bb * spread, bp * spread, -bp * spread, pp * spread), STRAIGHT
     parts = []
-    for side, (end, edge, way) in enumerate(((here, edge_1, before), (there, edge_2, after))):
-        mirrors = coefficients(dyads.incidence(way, end[2]), *parts_of(t.mirror[paths.ground[:, side], 4:]))
+    for side, (end, edge, way) in enumerate(((source, edge_1, before), (target, edge_2, after))):
+        mirrors = coefficients(dyads.incidence(way, end[2]), parts_of(t.mirror[paths.ground[:, side], 4:]))
         mirror = end[2], (paths.ground[:, side] >= 0)[:, None], mirrors
-        given = (1.0, 0.0, 0.0, 0.0) if fields[side] is None else tuple(fields[side].swapaxes(0, 1))  # type: ignore[union-attr]
+        pattern = (1.0, 0.0, 0.0, 0.0) if fields[side] is None else tuple(fields[side].swapaxes(0, 1))  # type: ignore[union-attr]
         units = end_parts(end[1], (way, 1.0 - 2.0 * side), mirror, edge[1], cosines[side])
-        b_re, b_im, p_re, p_im = element_parts(units, given, (end[4][..., 0, :], end[4][..., 1, :]))
+        b_re, b_im, p_re, p_im = element_parts(units, pattern, (end[4][..., 0, :], end[4][..., 1, :]))
         parts.append((b_re + 1j * b_im, p_re + 1j * p_im))
-    u_s, v_s = _in_edge(here, edge_1)
-    along, radius = _in_edge(there, edge_2)
+    u_s, v_s = _in_edge(source, edge_1)
+    along, radius = _in_edge(target, edge_2)
     u_t, v_t = turn[0] + turn[1] * along + turn[2] * radius, turn[3] + turn[4] * along + turn[5] * radius
     total = np.hypot(u_t[:, :, None] - u_s[:, None, :], v_t[:, :, None] + v_s[:, None, :])
     cycles = total * (t.wave_number / (2.0 * np.pi))
@@ -248,13 +248,13 @@ def pattern_ends(paths: EdgePaths, t: Tables, link: Link) -> list[FloatArray | N
             continue
         centre, axes, *_ = _end(paths, t, side)
         way = unit(centre, parts_of(corner))
-        made = np.empty((len(paths), 4, len(uav if side else arrays[0])))
+        columns = np.empty((len(paths), 4, len(uav if side else arrays[0])))
         for tower, array in enumerate((uav,) if side else arrays):
             rows = slice(None) if side else np.flatnonzero(paths.tower == tower)
             turned = tuple(tuple(part[rows] for part in axis) for axis in axes)
             spread = tuple(np.repeat(part[rows], len(array), axis=1) for part in way)
-            made[rows] = pattern_fields(array, np.arange(len(array)), turned, spread)  # type: ignore[arg-type]
-        fields[side] = made
+            columns[rows] = pattern_fields(array, np.arange(len(array)), turned, spread)  # type: ignore[arg-type]
+        fields[side] = columns
     return fields
 
 
@@ -396,18 +396,21 @@ def over_one(source: Vector, target: Vector, edge: Any, wave_number: float) -> A
     angles : (Number, Number)
         Of source and target round the edge [rad].
     """
-    here, there = round_edge(source, edge), round_edge(target, edge)
-    near, far = np.sqrt(here[1] ** 2 + here[2] ** 2), np.sqrt(there[1] ** 2 + there[2] ** 2)
-    rise = there[0] - here[0]
+    source_place, target_place = round_edge(source, edge), round_edge(target, edge)
+    near, far = (
+        np.sqrt(source_place[1] ** 2 + source_place[2] ** 2),
+        np.sqrt(target_place[1] ** 2 + target_place[2] ** 2),
+    )
+    rise = target_place[0] - source_place[0]
     total = np.sqrt((near + far) ** 2 + rise * rise)
     sine, cosine = (near + far) / total, rise / total
-    at, start, along = here[0] + rise * near / (near + far), edge[0], edge[1]
+    at, start, along = source_place[0] + rise * near / (near + far), edge[0], edge[1]
     point = start[0] + at * along[0], start[1] + at * along[1], start[2] + at * along[2]
     # lambda / (4 pi) = 1 / 2k; the legs are near / sine and far / sine long, both bases lack a factor 1 / sine
     spread = 1.0 / (2.0 * wave_number * sine * np.sqrt(wave_number * near * far))
     return (
         unit(source, point), unit(point, target), (cosine, cosine), wave_number * near * far / total, spread,
-        (angle_round(here), angle_round(there)),
+        (angle_round(source_place), angle_round(target_place)),
     )  # fmt: skip
 
 
@@ -454,8 +457,11 @@ def over_two(
     """
     way, (shared_1, shared_2) = unit(point_1, point_2), shared
     gap = distance(point_1, point_2)
-    here, there = round_edge(source, edge_1), round_edge(target, edge_2)
-    near, far = np.sqrt(here[1] ** 2 + here[2] ** 2), np.sqrt(there[1] ** 2 + there[2] ** 2)
+    source_place, target_place = round_edge(source, edge_1), round_edge(target, edge_2)
+    near, far = (
+        np.sqrt(source_place[1] ** 2 + source_place[2] ** 2),
+        np.sqrt(target_place[1] ** 2 + target_place[2] ** 2),
+    )
     cos_1, cos_2 = dot(way, edge_1[1]), dot(way, edge_2[1])
     sin_1, sin_2 = np.sqrt(1.0 - cos_1 * cos_1), np.sqrt(1.0 - cos_2 * cos_2)
     first, last = near / sin_1, far / sin_2
@@ -464,12 +470,12 @@ def over_two(
         dyads.select(on_n, edge_1[7][0], edge_1[6][0]), dyads.select(on_n, edge_1[7][1], edge_1[6][1]),
         dyads.select(on_n, edge_1[7][2], edge_1[6][2]),
     )  # fmt: skip
-    one = at_face(
-        np.abs(shared_1 * np.pi * edge_1[5] - angle_round(here)), edge_1[5],
+    wedge_1 = at_face(
+        np.abs(shared_1 * np.pi * edge_1[5] - angle_round(source_place)), edge_1[5],
         wave_number * first * gap * sin_1 * sin_1 / (first + gap), sin_1, first / distance(source, point_2), material,
     )  # fmt: skip
-    two = at_face(
-        np.abs(shared_2 * np.pi * edge_2[5] - angle_round(there)), edge_2[5],
+    wedge_2 = at_face(
+        np.abs(shared_2 * np.pi * edge_2[5] - angle_round(target_place)), edge_2[5],
         wave_number * last * gap * sin_2 * sin_2 / (last + gap), sin_2, last / distance(point_1, target), material,
     )  # fmt: skip
     # matrices lack one factor 1 / sine each, bases another, and the height of a ray over the face gains one
@@ -477,9 +483,9 @@ def over_two(
     # the bases of both edges lie in the face and across it: they differ by a sign
     spread = dyads.select(dot(edge_1[1], edge_2[1]) - cos_1 * cos_2 < 0.0, -spread, spread) / (2j * wave_number * gap)
     te, tm = along_face(wave_number * gap, material)
-    coupling, whole = np.sqrt(first * last / ((first + gap) * (gap + last))), 4j * wave_number * gap
-    soft, (mixed_te, hard_te), (mixed_tm, hard_tm) = coupled(one, two, coupling)
-    soft_te, soft_tm = 1.0 - te * te / whole, 1.0 - tm * tm / whole
+    coupling, conductor = np.sqrt(first * last / ((first + gap) * (gap + last))), 4j * wave_number * gap
+    soft, (mixed_te, hard_te), (mixed_tm, hard_tm) = coupled(wedge_1, wedge_2, coupling)
+    soft_te, soft_tm = 1.0 - te * te / conductor, 1.0 - tm * tm / conductor
     beta = spread * (soft_te * (soft_te * soft + te * mixed_te) + te * te * hard_te)
     phi = spread * (soft_tm * (soft_tm * soft + tm * mixed_tm) + tm * tm * hard_tm)
     joined = beta, 0.0 * beta, 0.0 * phi, phi

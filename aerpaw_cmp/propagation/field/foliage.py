@@ -19,6 +19,7 @@ import numpy as np
 from ...common.errors import UsageError
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...site.site import Trees
+from ..paths import legs
 
 # Form of a crown between its base and the tree's top; the paper's is the cone.
 Shape = Literal["cone", "ellipsoid", "cylinder"]
@@ -273,14 +274,13 @@ def foliage_depth_m(
     vertices = np.asarray(vertices_m, dtype=np.float64)
     index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
     depth = np.zeros(len(source))
-    end = target
     last = vertices.shape[1] - 1
-    for k in range(last, -2, -1):  # from the target back; an unused vertex is the next one
-        start = source if k < 0 else np.where(np.isnan(vertices[:, k]), end, vertices[:, k])
+    # from the target back, as lengths were always added: another order moves their last digit
+    for k, (start, end) in reversed([*enumerate(legs(source, vertices, target), start=-1)]):
         moved = (start != end).any(axis=1)
-        own = None if bounced is None else bounced[moved][:, max(k, 0) : min(k, last - 1) + 2].max(axis=1, initial=-1)
-        depth[moved] += index.chords_m(start[moved], end[moved], own)
-        end = start
+        adjacent = slice(max(k, 0), min(k, last - 1) + 2)
+        bouncing = None if bounced is None else bounced[moved][:, adjacent].max(axis=1, initial=-1)
+        depth[moved] += index.chords_m(start[moved], end[moved], bouncing)
     depth[~(np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1))] = np.nan
     return depth
 
@@ -290,16 +290,16 @@ _last_index: list[CrownIndex] = []
 
 def crown_index(trees: Trees) -> CrownIndex:
     """The index of cones of these trees; the last one is kept: a flight asks many times, the next has its site."""
-    kept = next((item for item in _last_index if item.trees is trees or _same(item.trees, trees)), None)
-    if kept is None:
-        kept = CrownIndex(trees)
-        _last_index[:] = [kept]
-    return kept
+    index = next((item for item in _last_index if item.trees is trees or _same(item.trees, trees)), None)
+    if index is None:
+        index = CrownIndex(trees)
+        _last_index[:] = [index]
+    return index
 
 
-def _same(one: Trees, other: Trees) -> bool:
+def _same(first: Trees, second: Trees) -> bool:
     """Check whether two sets of trees are equal to the last digit."""
-    return all(np.array_equal(getattr(one, of.name), getattr(other, of.name)) for of in fields(Trees))
+    return all(np.array_equal(getattr(first, of.name), getattr(second, of.name)) for of in fields(Trees))
 
 
 class CrownIndex:
@@ -324,11 +324,11 @@ class CrownIndex:
     def trunks(self) -> CrownIndex:
         """The trunks of the same trees, as cylinders from the ground to the crown."""
         if self._trunks is None:
-            other = CrownIndex.__new__(CrownIndex)
-            other.trees, other.shape, other._trunks = self.trees, "cylinder", None
+            index = CrownIndex.__new__(CrownIndex)
+            index.trees, index.shape, index._trunks = self.trees, "cylinder", None
             ground = self.trees.ground_m
-            other._set(ground, ground + self.trees.crown_base_m, self.trees.trunk_diameter_m / 2)
-            self._trunks = other
+            index._set(ground, ground + self.trees.crown_base_m, self.trees.trunk_diameter_m / 2)
+            self._trunks = index
         return self._trunks
 
     def _set(self, base_m: FloatArray, top_m: FloatArray, radius_m: FloatArray) -> None:
@@ -382,15 +382,15 @@ class CrownIndex:
         along = np.hypot(end_m[:, 0] - start_m[:, 0], end_m[:, 1] - start_m[:, 1])
         live = np.flatnonzero(last >= first)  # NaN compares false
         pieces = np.ceil((last - first)[live] * along[live] / _PIECE_M).clip(1).astype(np.int64)
-        done = np.cumsum(pieces)
+        ends = np.cumsum(pieces)
         at_once = max(_PAIRS_AT_ONCE // max(int(np.diff(self._row).max()), 1), 1)
         begin = 0
         while begin < len(live):
-            used = done[begin - 1] if begin else 0
-            stop = max(begin + 1, int(np.searchsorted(done, used + at_once, side="right")))
+            used = ends[begin - 1] if begin else 0
+            stop = max(begin + 1, int(np.searchsorted(ends, used + at_once, side="right")))
             some = live[begin:stop]
-            own = None if without is None else without[some]
-            total[some] = self._sum(start_m[some], end_m[some], first[some], last[some], pieces[begin:stop], own)
+            excepted = None if without is None else without[some]
+            total[some] = self._sum(start_m[some], end_m[some], first[some], last[some], pieces[begin:stop], excepted)
             begin = stop
         return total
 

@@ -89,17 +89,12 @@ def returned(thickness: Any, root_re: Any, root_im: Any) -> tuple[Any, Any]:
     return select(finite, e_re, 0.0), select(finite, e_im, 0.0)
 
 
-def reflection(cosine: Any, eta_re: Any, eta_im: Any, thickness: Any) -> tuple[Any, Any, Any, Any]:
-    """TE and TM coefficients of slabs and, of infinite thickness, of half-spaces: :func:`coefficients` of a mirror.
+def reflection(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
+    """TE and TM coefficients (re, im each) of slabs and, of infinite thickness, of half-spaces.
 
-    Parameters
-    ----------
-    cosine, eta_re, eta_im, thickness : float or (...)
-
-    Returns
-    -------
-    te_re, te_im, tm_re, tm_im : float or (...)
+    ``material`` is the permittivity (re, im) and the thickness in wavelengths, as in all laws of a face.
     """
+    eta_re, eta_im, thickness = material
     te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
     e_re, e_im = returned(thickness, root_re, root_im)
     te_re, te_im = slab(te_re, te_im, e_re, e_im)
@@ -135,19 +130,12 @@ def passing(r_re: Any, r_im: Any, e_re: Any, e_im: Any, c_re: Any, c_im: Any) ->
     return (n_re * d_re + n_im * d_im) * scale, (n_im * d_re - n_re * d_im) * scale
 
 
-def transmission(cosine: Any, eta_re: Any, eta_im: Any, thickness: Any) -> tuple[Any, Any, Any, Any]:
-    """TE and negative TM coefficients of slabs that a ray passes, thickness in wavelengths.
+def transmission(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
+    """TE and negative TM coefficients of slabs that a ray passes.
 
     With the sign of a mirror's: a wave that goes on has its TM part where a mirror would turn it.
-
-    Parameters
-    ----------
-    cosine, eta_re, eta_im, thickness : float or (...)
-
-    Returns
-    -------
-    te_re, te_im, tm_re, tm_im : float or (...)
     """
+    eta_re, eta_im, thickness = material
     te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
     e_re, e_im = echo(0.5 * thickness, root_re, root_im)
     sine, free = sine_cosine(thickness * cosine)
@@ -156,26 +144,19 @@ def transmission(cosine: Any, eta_re: Any, eta_im: Any, thickness: Any) -> tuple
     return te_re, te_im, -tm_re, -tm_im
 
 
-def coefficients(cosine: Any, eta_re: Any, eta_im: Any, thickness: Any) -> tuple[Any, Any, Any, Any]:
-    """TE and TM coefficients of faces, thickness in wavelengths; infinite for a half-space, which returns no echo.
+def coefficients(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
+    """TE and TM coefficients (re, im each) of faces: the Fresnel coefficients that NumPy's field takes.
 
     A negative thickness is that of a slab which the ray passes: :func:`transmission`.
-
-    Parameters
-    ----------
-    cosine, eta_re, eta_im, thickness : (...)
-
-    Returns
-    -------
-    te_re, te_im, tm_re, tm_im : (...)
     """
+    eta_re, eta_im, thickness = material
     passes = thickness < 0.0
     if np.any(passes):
-        other = coefficients(cosine, eta_re, eta_im, np.where(passes, np.inf, thickness))
-        through = transmission(cosine, eta_re, eta_im, np.where(passes, -thickness, 0.0))
-        return tuple(np.where(passes, a, b) for a, b in zip(through, other, strict=True))  # type: ignore[return-value]
+        reflecting = coefficients(cosine, (eta_re, eta_im, np.where(passes, np.inf, thickness)))
+        through = transmission(cosine, (eta_re, eta_im, np.where(passes, -thickness, 0.0)))
+        return tuple(np.where(passes, a, b) for a, b in zip(through, reflecting, strict=True))  # type: ignore[return-value]
     if np.any(np.isfinite(thickness)):
-        return reflection(cosine, eta_re, eta_im, thickness)
+        return reflection(cosine, material)
     return half_space(cosine, eta_re, eta_im)[:4]
 
 
@@ -209,7 +190,7 @@ def reflection_coefficients(
     ((-0.333333+0j), (0.333333+0j))
     """
     eta, thickness = np.asarray(permittivity), np.asarray(thickness_m) / wavelength
-    te_re, te_im, tm_re, tm_im = coefficients(np.asarray(cos_theta), eta.real, eta.imag, thickness)
+    te_re, te_im, tm_re, tm_im = coefficients(np.asarray(cos_theta), (eta.real, eta.imag, thickness))
     return np.asarray(te_re + 1j * te_im), np.asarray(tm_re + 1j * tm_im)
 
 
@@ -228,10 +209,11 @@ class FaceMaterials:
     def of(cls, faces: Faces, carrier_hz: float) -> FaceMaterials:
         """Those of all faces at a carrier."""
         known = {name: face_material(name.removeprefix(THROUGH)) for name in set(faces.material)}
-        eta = {name: one.relative_permittivity(carrier_hz) for name, one in known.items()}
+        eta = {name: material.relative_permittivity(carrier_hz) for name, material in known.items()}
         thick = {
-            name: (-1.0 if name.startswith(THROUGH) else 1.0) * (np.inf if one.thickness_m is None else one.thickness_m)
-            for name, one in known.items()
+            name: (-1.0 if name.startswith(THROUGH) else 1.0)
+            * (np.inf if material.thickness_m is None else material.thickness_m)
+            for name, material in known.items()
         }
         return cls(
             np.array([*(eta[name] for name in faces.material), 2.0 + 0j], dtype=np.complex128),

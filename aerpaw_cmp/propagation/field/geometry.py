@@ -128,11 +128,11 @@ def parts_of(vector: AnyArray) -> dyads.Vector:
 def directions(g: Geometry, elements: Elements) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Unit vectors and lengths (paths, pairs) from the towers' images to the UAV."""
     tower_m = elements.tower_m[g.tower]
-    found = dyads.direction(
+    ways = dyads.direction(
         parts_of(g.image_m), rows_of(g.frame), (tower_m[:, 0], tower_m[:, 1], tower_m[:, 2]),
         parts_of(g.place_m), rows_of(g.axes), tuple(elements.uav_m),  # type: ignore[arg-type]
     )  # fmt: skip
-    return found  # type: ignore[no-any-return]
+    return ways  # type: ignore[no-any-return]
 
 
 def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: dyads.Vector) -> FloatArray:

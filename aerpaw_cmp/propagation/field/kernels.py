@@ -104,7 +104,7 @@ def _reflect(w: FloatArray, pairs: int, normal: Any, eta_re: float, eta_im: floa
     if thickness < 0.0:
         for p in range(pairs):
             cosine = dyads.incidence(taken(w, _X + p), normal)
-            te_re, te_im, tm_re, tm_im = fresnel.transmission(cosine, eta_re, eta_im, -thickness)
+            te_re, te_im, tm_re, tm_im = fresnel.transmission(cosine, (eta_re, eta_im, -thickness))
             w[_TE + p], w[_TE + LANES + p], w[_TM + p], w[_TM + LANES + p] = te_re, te_im, tm_re, tm_im
     elif math.isfinite(thickness):
         for p in range(pairs):
@@ -129,12 +129,15 @@ def _fill(
     for path in range(len(out)):
         image, place, tower = vector(g.image_m[path]), vector(g.place_m[path]), g.tower[path]
         frame, axes = _rotation(g.frame[path]), _rotation(g.axes[path])
-        here, there = elements.tower_m[tower], elements.uav_m
+        tower_places, uav_places = elements.tower_m[tower], elements.uav_m
         for first in range(0, total, LANES):
             pairs = min(LANES, total - first)
             for p in range(pairs):
                 q = first + p
-                tower_m, uav_m = (here[0, q], here[1, q], here[2, q]), (there[0, q], there[1, q], there[2, q])
+                tower_m, uav_m = (
+                    (tower_places[0, q], tower_places[1, q], tower_places[2, q]),
+                    (uav_places[0, q], uav_places[1, q], uav_places[2, q]),
+                )
                 x, y, z, length = dyads.direction(image, frame, tower_m, place, axes, uav_m)
                 put(w, _X + p, (x, y, z))
                 w[_LENGTH + p] = length

@@ -1,12 +1,8 @@
-"""Loss over ridges of the terrain: knife edges across the straight line between the ends.
-
-A profile is a column of samples: ``share`` (samples, links) of the way and ``intrusion_m``, the height of the ground
-above the line (:func:`aerpaw_cmp.site.dem.above_line`), NaN where it is unknown.
-"""
+"""Loss over ridges of the terrain: knife edges across the straight line between the ends."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -17,6 +13,25 @@ Ridges = Literal["deygout", "bullington"]
 
 # Ground that rises less over its chord is a plane.
 _PLANE_M = 1e-6
+
+
+class Profile(NamedTuple):
+    """Ground under straight lines, a column of samples each.
+
+    ``length_m`` (links,) is that of the lines, ``share`` (samples, links) the part of the way to each sample,
+    ``intrusion_m`` the height of the ground above the line there (:func:`aerpaw_cmp.site.dem.above_line`), NaN where it
+    is unknown.
+    """
+
+    length_m: FloatArray
+    share: FloatArray
+    intrusion_m: FloatArray
+
+    def parameter(self, wavelength_m: float) -> FloatArray:
+        """Parameter nu (samples, links) of each sample as the one edge of its line."""
+        return _parameter(
+            self.intrusion_m, self.share * self.length_m, (1.0 - self.share) * self.length_m, wavelength_m
+        )
 
 
 def ridge_loss_db(
@@ -40,18 +55,16 @@ def ridge_loss_db(
     loss, law = np.zeros(len(source_m)), deygout_db if method == "deygout" else bullington_db
     length = np.linalg.norm(target_m - source_m, axis=1)
     for some, share, ground in dem.profiles(source_m, target_m):
-        intrusion = above_line(source_m[some], target_m[some], share, ground)
-        edge = _edge_share(length[some], share, ground, intrusion, wavelength_m)
-        loss[some] = law(length[some], share, intrusion, wavelength_m) * edge
+        profile = Profile(length[some], share, above_line(source_m[some], target_m[some], share, ground))
+        loss[some] = law(profile, wavelength_m) * _edge_share(profile, ground, wavelength_m)
     return loss
 
 
-def _edge_share(
-    length_m: FloatArray, share: FloatArray, ground_m: FloatArray, intrusion_m: FloatArray, wavelength_m: float
-) -> FloatArray:
+def _edge_share(profile: Profile, ground_m: FloatArray, wavelength_m: float) -> FloatArray:
     """Share of an edge that the ground nearest to each line (links,) is: 1 where it blocks the line, 0 on a plane."""
-    main = _parameter(intrusion_m, share * length_m, (1.0 - share) * length_m, wavelength_m).argmax(axis=0)
-    at, over, ground = (np.take_along_axis(a, main[None], axis=0)[0] for a in (share, intrusion_m, ground_m))
+    main = profile.parameter(wavelength_m).argmax(axis=0)
+    columns = profile.share, profile.intrusion_m, ground_m
+    at, over, ground = (np.take_along_axis(column, main[None], axis=0)[0] for column in columns)
     rise = ground - (1.0 - at) * ground_m[0] - at * ground_m[-1]
     ridge = (over <= 0.0) & (rise > _PLANE_M)
     return np.where(over > 0.0, 1.0, np.where(ridge, rise / np.where(ridge, rise - over, 1.0), 0.0))
@@ -69,27 +82,16 @@ def knife_edge_db(nu: FloatArray) -> FloatArray:
 def _parameter(height_m: FloatArray, before_m: FloatArray, after_m: FloatArray, wavelength_m: float) -> FloatArray:
     """Parameter nu of edges; -inf at the ends of a line and where the height is unknown."""
     inner = (before_m > 0.0) & (after_m > 0.0) & np.isfinite(height_m)
-    both = np.where(inner, before_m * after_m, 1.0)
-    nu = np.where(inner, height_m, 0.0) * np.sqrt(2.0 * np.abs(before_m + after_m) / (wavelength_m * both))
+    product = np.where(inner, before_m * after_m, 1.0)
+    nu = np.where(inner, height_m, 0.0) * np.sqrt(2.0 * np.abs(before_m + after_m) / (wavelength_m * product))
     return np.where(inner, nu, -np.inf)
 
 
-def deygout_db(length_m: FloatArray, share: FloatArray, intrusion_m: FloatArray, wavelength_m: float) -> FloatArray:
-    """Loss of up to three edges by Deygout's construction with Causebrook's correction.
+def deygout_db(profile: Profile, wavelength_m: float) -> FloatArray:
+    """Loss (links,) [dB] of up to three edges by Deygout's construction with Causebrook's correction.
 
     Sources: Deygout, IEEE Trans. Antennas Propag. 14 (1966) 480, doi 10.1109/TAP.1966.1138719; Causebrook and Davis,
     BBC Research Department report 1971/43, eq. 13 to 15.
-
-    Parameters
-    ----------
-    length_m : (links,)
-    share, intrusion_m : (samples, links)
-    wavelength_m : float
-
-    Returns
-    -------
-    (links,)
-        [dB]
 
     Notes
     -----
@@ -97,7 +99,7 @@ def deygout_db(length_m: FloatArray, share: FloatArray, intrusion_m: FloatArray,
     ``C = (6 - A + A_e) cos(alpha)``, with A_e the loss of the side's edge alone on the direct line and
     ``cos(alpha)^2 = d_1 d_34 / (d_12 d_234)``; neither term is negative.
     """
-    nu = _parameter(intrusion_m, share * length_m, (1.0 - share) * length_m, wavelength_m)
+    (length_m, share, intrusion_m), nu = profile, profile.parameter(wavelength_m)
     main, link = nu.argmax(axis=0), np.arange(len(length_m))
     total = first = knife_edge_db(nu[main, link])
     known = np.isfinite(nu[main, link])
@@ -113,24 +115,13 @@ def deygout_db(length_m: FloatArray, share: FloatArray, intrusion_m: FloatArray,
     return np.asarray(total)
 
 
-def bullington_db(length_m: FloatArray, share: FloatArray, intrusion_m: FloatArray, wavelength_m: float) -> FloatArray:
-    """Loss of the one edge where the horizons of both ends meet.
+def bullington_db(profile: Profile, wavelength_m: float) -> FloatArray:
+    """Loss (links,) [dB] of the one edge where the horizons of both ends meet.
 
     Source: ITU-R P.526-15 section 4.5.1.
-
-    Parameters
-    ----------
-    length_m : (links,)
-    share, intrusion_m : (samples, links)
-    wavelength_m : float
-
-    Returns
-    -------
-    (links,)
-        [dB]
     """
+    (length_m, share, intrusion_m), nu = profile, profile.parameter(wavelength_m).max(axis=0)
     before, after = share * length_m, (1.0 - share) * length_m
-    nu = _parameter(intrusion_m, before, after, wavelength_m).max(axis=0)
     inner = (before > 0.0) & (after > 0.0) & np.isfinite(intrusion_m)
     rise, fall = (
         np.where(inner, intrusion_m / np.where(inner, way, 1.0), -np.inf).max(axis=0) for way in (before, after)

@@ -16,8 +16,9 @@ import shapely
 
 from ...common.units import FloatArray, IntArray
 from ...site.site import Forest, Site
+from ..paths import legs
 from .foliage import FoliageModel, NoFoliage, Opaque
-from .ridges import deygout_db
+from .ridges import Profile, deygout_db
 
 # Loss per metre between trunks over that in crowns: assumed.
 TRUNKS = 0.3
@@ -61,11 +62,7 @@ def stand_loss_db(
     if not stands or isinstance(model, NoFoliage):
         return loss
     tree = shapely.STRtree([stand.area for stand in stands])
-    start = source_m
-    for step in range(vertices_m.shape[1] + 1):
-        end = target_m
-        if step < vertices_m.shape[1]:
-            end = np.where(np.isnan(vertices_m[:, step]), target_m, vertices_m[:, step])
+    for start, end in legs(source_m, vertices_m, target_m):
         moved = np.flatnonzero(
             np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1) & (start != end).any(axis=1)
         )
@@ -73,7 +70,6 @@ def stand_loss_db(
             rows = moved[first : first + _SEGMENTS_AT_ONCE]
             for some, db in _of_segments(site, stands, tree, start[rows], end[rows], model, wavelength_m):
                 loss[rows[some]] += db
-        start = end
     return loss
 
 
@@ -88,8 +84,8 @@ def _of_segments(
     segment, stand = tree.query(lines, predicate="intersects")
     for number in np.unique(stand):
         mine = segment[stand == number]
-        one = stands[number]
-        parts, owner = shapely.get_parts(shapely.intersection(lines[mine], one.area), return_index=True)
+        forest = stands[number]
+        parts, owner = shapely.get_parts(shapely.intersection(lines[mine], forest.area), return_index=True)
         line = shapely.get_type_id(parts) == 1
         row, parts = mine[owner[line]], parts[line]
         ends = [shapely.get_coordinates(shapely.get_point(parts, at)) for at in (0, -1)]
@@ -97,7 +93,7 @@ def _of_segments(
         share = np.sort(
             np.stack([((e - start[row, :2]) * way).sum(axis=1) / (way**2).sum(axis=1) for e in ends], axis=1), axis=1
         )
-        yield _loss(site, one, start, end, row, share, model, wavelength_m)
+        yield _loss(site, forest, start, end, row, share, model, wavelength_m)
 
 
 def _loss(
@@ -115,20 +111,20 @@ def _loss(
     np.minimum.at(enter, place, share[:, 0])
     np.maximum.at(leave, place, share[:, 1])
     np.maximum.at(top, place, stand.height_m + ground)
-    here, there, lower = start[some], end[some], np.zeros(len(some))
-    outside = ((enter > 1e-9) | (here[:, 2] > top)) & ((leave < 1.0 - 1e-9) | (there[:, 2] > top))
-    ways = [] if isinstance(model, Opaque) else list(_detours(stand, here, there, enter, leave, top))
+    source, target, lower = start[some], end[some], np.zeros(len(some))
+    outside = ((enter > 1e-9) | (source[:, 2] > top)) & ((leave < 1.0 - 1e-9) | (target[:, 2] > top))
+    ways = [] if isinstance(model, Opaque) else list(_detours(stand, source, target, enter, leave, top))
     if ways:
-        length, at, over = ways[0]
-        zone = CLEAR * np.sqrt(wavelength_m * length * at * (1.0 - at))
-        lower = np.where(outside, np.maximum((zone - over).min(axis=0), 0.0), 0.0)
+        top_way = ways[0]
+        zone = CLEAR * np.sqrt(wavelength_m * top_way.length_m * top_way.share * (1.0 - top_way.share))
+        lower = np.where(outside, np.maximum((zone - top_way.intrusion_m).min(axis=0), 0.0), 0.0)
     up, rise = start[row, 2] - ground - lower[place], (end - start)[row, 2]
     base, way = stand.height_m * stand.crown_base_fraction, np.linalg.norm((end - start)[row], axis=1)
     depth = _between(share, up, rise, base, stand.height_m) + TRUNKS * _between(share, up, rise, 0.0, base)
     through = model.loss_db(np.bincount(place, depth * way, len(some)).astype(np.float64))
     if not ways:
         return some, through
-    power = sum(10.0 ** (-deygout_db(*detour, wavelength_m) / 10.0) for detour in ways)
+    power = sum(10.0 ** (-deygout_db(detour, wavelength_m) / 10.0) for detour in ways)
     blocked = (1.0 - 10.0 ** (-through / 10.0)) * (1.0 - np.where(outside, np.minimum(power, 1.0), 0.0))
     return some, -10.0 * np.log10(1.0 - blocked)
 
@@ -146,11 +142,11 @@ def _between(share: FloatArray, up: FloatArray, rise: FloatArray, low: float, hi
 
 def _detours(
     stand: Forest, start: FloatArray, end: FloatArray, enter: FloatArray, leave: FloatArray, top: FloatArray
-) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Profiles (length, share, intrusion) of the ways over a stand and around both sides of it."""
+) -> Iterator[Profile]:
+    """Profiles of the ways over a stand and around both sides of it."""
     length = np.linalg.norm(end - start, axis=1)
     share = np.stack([enter, leave])
-    yield length, share, top - start[:, 2] - share * (end - start)[:, 2]
+    yield Profile(length, share, top - start[:, 2] - share * (end - start)[:, 2])
     corner = shapely.get_coordinates(stand.area.convex_hull)[:, None]
     way = (end - start)[:, :2]
     flat = np.maximum(np.hypot(*way.T), _UPRIGHT_M)
@@ -158,4 +154,4 @@ def _detours(
     along = (off * way).sum(axis=2) / flat**2
     across = (way[:, 0] * off[..., 1] - way[:, 1] * off[..., 0]) / flat
     for side in (1.0, -1.0):
-        yield length, along, side * across
+        yield Profile(length, along, side * across)

@@ -183,7 +183,7 @@ def _of_one_depth(
         if record is not None:
             record("wave", _power(re, im))
         normal, face = parts_of(g.normal[:, step]), parts_of(g.face[:, step])
-        re, im = dyads.reflected(re, im, toward, normal, *coefficients(dyads.incidence(toward, normal), *face))
+        re, im = dyads.reflected(re, im, toward, normal, *coefficients(dyads.incidence(toward, normal), face))
     uav = _vectors(rows_of(g.axes), (-x, -y, -z), ends[1], *elements.uav_slant)
     cycles = length / wavelength
     with np.errstate(divide="ignore"):
@@ -224,8 +224,8 @@ def pattern_ends(g: Geometry, elements: Elements, link: Link) -> Ends:
         for number, array in enumerate(arrays):
             rows = np.flatnonzero(g.tower == number)
             towers[rows] = pattern_fields(array, pair % ports, rows_of(g.frame[rows]), (x[rows], y[rows], z[rows]))
-    away = (-x, -y, -z)
-    return towers, None if plain_uav else pattern_fields(uav, pair // ports, rows_of(g.axes), away)
+    toward_tower = (-x, -y, -z)
+    return towers, None if plain_uav else pattern_fields(uav, pair // ports, rows_of(g.axes), toward_tower)
 
 
 def _check_patterns(arrays: Sequence[Array]) -> None:

@@ -127,8 +127,8 @@ def quadrant(a: Number, b: Number, coupling: Number, passed: Any) -> Any:
     complex
     """
     slant = np.sqrt(1.0 - coupling * coupling)
-    one, other = sector(a, (b + coupling * a) / slant, passed[0]), sector(b, (a + coupling * b) / slant, passed[1])
-    return -1j / slant * (one + other)
+    first, second = sector(a, (b + coupling * a) / slant, passed[0]), sector(b, (a + coupling * b) / slant, passed[1])
+    return -1j / slant * (first + second)
 
 
 def wedge(
@@ -171,7 +171,7 @@ def wedge(
     sine = np.abs(upright) * np.sqrt(1.0 - cos_beta * cos_beta)
     bb_re, bb_im, bp_re, bp_im, pp_re, pp_im = matrix(
         tuple(part for term in terms for part in term[:2]), (upright, across, cos_beta, exterior),
-        coefficients(sine, *face_0), coefficients(sine, *face_n),
+        coefficients(sine, face_0), coefficients(sine, face_n),
     )  # fmt: skip
     return bb_re + 1j * bb_im, bp_re + 1j * bp_im, pp_re + 1j * pp_im
 
@@ -231,9 +231,9 @@ def matrix(terms: Any, angles: Any, face_0: Any, face_n: Any) -> Any:
     te_im = n_re * face_n[1] + n_im * face_n[0] + o_re * face_0[1] + o_im * face_0[0]
     tm_re = n_re * face_n[2] - n_im * face_n[3] + o_re * face_0[2] - o_im * face_0[3]
     tm_im = n_re * face_n[3] + n_im * face_n[2] + o_re * face_0[3] + o_im * face_0[2]
-    both_re, both_im, rest = up_re + down_re, up_im + down_im, askew * askew * weight
-    bb_re, bb_im = both_re + te_re * along - tm_re * rest, both_im + te_im * along - tm_im * rest
-    pp_re, pp_im = both_re + tm_re * along - te_re * rest, both_im + tm_im * along - te_im * rest
+    both_re, both_im, sideways = up_re + down_re, up_im + down_im, askew * askew * weight
+    bb_re, bb_im = both_re + te_re * along - tm_re * sideways, both_im + te_im * along - tm_im * sideways
+    pp_re, pp_im = both_re + tm_re * along - te_re * sideways, both_im + tm_im * along - te_im * sideways
     bp_re, bp_im = (te_re + tm_re) * mixed, (te_im + tm_im) * mixed
     # -e^{-j pi/4} / (2 sqrt(2 pi)) = (j - 1) / (4 sqrt(pi))
     scale = 0.25 / np.sqrt(np.pi) / (exterior * np.sqrt(1.0 - cos_beta * cos_beta))
@@ -243,14 +243,14 @@ def matrix(terms: Any, angles: Any, face_0: Any, face_n: Any) -> Any:
     )  # fmt: skip
 
 
-def at_face(away: Number, exterior: Number, distance: Number, sine: Number, nearer: Number, face: Any) -> Any:
+def at_face(angle: Number, exterior: Number, distance: Number, sine: Number, nearer: Number, face: Any) -> Any:
     """A wedge from an end to one of its faces: what passes where waves add up, and how it grows where they cancel.
 
     Each is the sum of a far part and of a near part, which jumps where the end comes into the plane of the face.
 
     Parameters
     ----------
-    away : Number
+    angle : Number
         Angle between end and face [rad].
     exterior : Number
     distance : Number
@@ -276,19 +276,19 @@ def at_face(away: Number, exterior: Number, distance: Number, sine: Number, near
         what comes from there holds the wave along the face by the face's reflection, so that is a factor here.
     """
     scale = -np.exp(-0.25j * np.pi) / (2.0 * np.sqrt(2.0 * np.pi)) / exterior
-    root, sharp, cosine, _ = pole(np.pi - away, exterior, distance)
-    far_root, far_sharp, far_cosine, _ = pole(np.pi + away, exterior, distance)
+    root, sharp, cosine, _ = pole(np.pi - angle, exterior, distance)
+    far_root, far_sharp, far_cosine, _ = pole(np.pi + angle, exterior, distance)
     (re, im), (far_re, far_im) = transition(root), transition(far_root)
     passed = far_re + 1j * far_im
     far, bent = scale * far_cosine * far_sharp * passed, 2j * scale / (exterior * sine)
     far_slope, slope = bent * far_sharp * far_sharp * (1.0 - far_root * passed), -bent * sharp * sharp
-    lit, hard = away <= np.pi, scale * cosine * sharp
-    te_re, te_im, tm_re, tm_im = reflection(select(lit, nearer * sine * np.sin(away), 0.0), face[0], face[1], face[2])
+    lit, hard = angle <= np.pi, scale * cosine * sharp
+    te_re, te_im, tm_re, tm_im = reflection(select(lit, nearer * sine * np.sin(angle), 0.0), face)
     te, tm = select(lit, te_re + 1j * te_im, 1.0 + 0j), select(lit, tm_re + 1j * tm_im, 1.0 + 0j)
     return root, re + 1j * im, far, slope, far_slope, hard * te, hard * tm
 
 
-def coupled(one: Any, two: Any, coupling: Number) -> Any:
+def coupled(wedge_1: Any, wedge_2: Any, coupling: Number) -> Any:
     """Products of two parts that :func:`at_face` returns, where the transition of one edge reaches the other.
 
     The near parts stand under one integral (:func:`quadrant`) for a face where waves add up (hard), where they cancel
@@ -296,7 +296,7 @@ def coupled(one: Any, two: Any, coupling: Number) -> Any:
 
     Parameters
     ----------
-    one, two : tuple
+    wedge_1, wedge_2 : tuple
     coupling : Number
 
     Returns
@@ -306,26 +306,34 @@ def coupled(one: Any, two: Any, coupling: Number) -> Any:
     te, tm : tuple of 2 complex
         Slope times hard and hard times slope; hard times hard.
     """
-    a, b = larger(one[0], 1e-9), larger(two[0], 1e-9)  # at 0 alone their ratio is lost
-    passed, opposite = (one[1], two[1]), 1.0 / (1.0 - coupling * coupling)
+    a, b = larger(wedge_1[0], 1e-9), larger(wedge_2[0], 1e-9)  # at 0 alone their ratio is lost
+    passed, opposite = (wedge_1[1], wedge_2[1]), 1.0 / (1.0 - coupling * coupling)
     plus, minus = quadrant(a, b, coupling, passed), quadrant(a, b, -coupling, passed)
-    near_1, near_2 = one[3] * (1.0 - a * one[1]), two[3] * (1.0 - b * two[1])
-    soft = one[4] * (two[4] + near_2) + near_1 * two[4] + 1j * one[3] * two[3] * (plus - minus) / coupling
-    rise_1 = one[3] * opposite * (two[1] - coupling * one[1] + 4.0 * (a - coupling * b) * minus)
-    rise_2 = two[3] * opposite * (one[1] - coupling * two[1] + 4.0 * (b - coupling * a) * minus)
-    both = near_1, near_2, rise_1, rise_2, plus + minus
-    return soft, of_wave(one, two, one[5], two[5], both), of_wave(one, two, one[6], two[6], both)
+    near_1, near_2 = wedge_1[3] * (1.0 - a * wedge_1[1]), wedge_2[3] * (1.0 - b * wedge_2[1])
+    soft = (
+        wedge_1[4] * (wedge_2[4] + near_2)
+        + near_1 * wedge_2[4]
+        + 1j * wedge_1[3] * wedge_2[3] * (plus - minus) / coupling
+    )
+    rise_1 = wedge_1[3] * opposite * (wedge_2[1] - coupling * wedge_1[1] + 4.0 * (a - coupling * b) * minus)
+    rise_2 = wedge_2[3] * opposite * (wedge_1[1] - coupling * wedge_2[1] + 4.0 * (b - coupling * a) * minus)
+    common = near_1, near_2, rise_1, rise_2, plus + minus
+    return (
+        soft,
+        of_wave(wedge_1, wedge_2, wedge_1[5], wedge_2[5], common),
+        of_wave(wedge_1, wedge_2, wedge_1[6], wedge_2[6], common),
+    )
 
 
-def of_wave(one: Any, two: Any, hard_1: Any, hard_2: Any, both: Any) -> tuple[Any, Any]:
+def of_wave(wedge_1: Any, wedge_2: Any, hard_1: Any, hard_2: Any, common: Any) -> tuple[Any, Any]:
     """The products of :func:`coupled` that depend on the polarisation.
 
     Parameters
     ----------
-    one, two : tuple
+    wedge_1, wedge_2 : tuple
     hard_1, hard_2 : complex
         Near hard parts of both edges.
-    both : tuple of 5 complex
+    common : tuple of 5 complex
         Near slopes of both edges, the same times the other's near hard part under one integral, and the sum of
         quadrants of both signs.
 
@@ -333,10 +341,17 @@ def of_wave(one: Any, two: Any, hard_1: Any, hard_2: Any, both: Any) -> tuple[An
     -------
     mixed, hard : complex
     """
-    near_1, near_2, rise_1, rise_2, added = both
-    sum_1, sum_2 = one[2] + hard_1 * one[1], two[2] + hard_2 * two[1]
-    mixed = one[4] * sum_2 + near_1 * two[2] + rise_1 * hard_2 + sum_1 * two[4] + one[2] * near_2 + rise_2 * hard_1
-    return mixed, one[2] * sum_2 + hard_1 * one[1] * two[2] - 2.0 * hard_1 * hard_2 * added
+    near_1, near_2, rise_1, rise_2, added = common
+    sum_1, sum_2 = wedge_1[2] + hard_1 * wedge_1[1], wedge_2[2] + hard_2 * wedge_2[1]
+    mixed = (
+        wedge_1[4] * sum_2
+        + near_1 * wedge_2[2]
+        + rise_1 * hard_2
+        + sum_1 * wedge_2[4]
+        + wedge_1[2] * near_2
+        + rise_2 * hard_1
+    )
+    return mixed, wedge_1[2] * sum_2 + hard_1 * wedge_1[1] * wedge_2[2] - 2.0 * hard_1 * hard_2 * added
 
 
 def along_face(gap: Number, face: Any) -> tuple[Any, Any]:

@@ -86,7 +86,7 @@ class Rules(NamedTuple):
 def grow_paths(
     surfaces: Surfaces,
     links: Links,
-    run: SearchRun = SearchRun(),  # noqa: B008 - frozen
+    run: SearchRun = SearchRun(),
     *,
     max_depth: int = 2,
     beams: bool = True,
@@ -129,9 +129,9 @@ def grow_paths(
                 on_estimate(search.estimate(first, threads).times(towers - tower))
                 on_estimate = None
 
-            def share(done: float, tower: int = tower) -> None:
+            def share(fraction: float, tower: int = tower) -> None:
                 if run.progress:
-                    run.progress((tower + done) / towers)
+                    run.progress((tower + fraction) / towers)
 
             levels += search.run(first, threads, share)
         pieces += [PathSet.from_tower(tower, poses[pose], faces, at, max_depth) for pose, faces, at in levels]
@@ -281,11 +281,11 @@ class _Search:
     def run(self, first: IntArray, threads: int, share: Progress) -> list[_Level]:
         """Follow all sequences that begin with the faces ``first``."""
         levels: list[_Level] = []
-        done = 0
+        followed = 0
         for some, size in _chunks(first, threads):
             levels += [(pose, faces, points) for pose, faces, points, _ in in_threads(self.follow, some, threads)]
-            done += size
-            share(done / len(first))
+            followed += size
+            share(followed / len(first))
         return levels
 
 
@@ -314,7 +314,7 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
     order = np.lexsort((paths.depth, paths.tower, paths.pose))
     link = np.column_stack([paths.pose, paths.tower, paths.depth])[order]
     starts = np.flatnonzero(np.append(True, (link[1:] != link[:-1]).any(axis=1)))
-    gone = np.zeros(len(paths), dtype=np.bool_)
+    repeated = np.zeros(len(paths), dtype=np.bool_)
     for rows in np.split(order, starts[1:]):
         depth = int(paths.depth[rows[0]])
         if len(rows) < 2 or not depth:
@@ -325,9 +325,9 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
         alike = (np.abs(np.einsum("akc,bkc->abk", normal, normal)) > 0.999).all(axis=2)
         first, second = np.nonzero(np.triu((apart < COINCIDENT_M) & alike, 1))
         for i, j in zip(first, second, strict=True):
-            if not gone[rows[i]]:
-                gone[rows[j]] = True
-    return paths.select(~gone)
+            if not repeated[rows[i]]:
+                repeated[rows[j]] = True
+    return paths.select(~repeated)
 
 
 def reflection_points(
@@ -396,14 +396,14 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
 
 
 @kernel
-def _face_at(mirrors, f, beside, point, edge):  # type: ignore[no-untyped-def]
-    """The face ``f`` where a point lies in it, else the first of those ``beside`` it in its plane; -1 in none."""
+def _face_at(mirrors, f, coplanar, point, edge):  # type: ignore[no-untyped-def]
+    """The face ``f`` where a point lies in it, else the first of those ``coplanar`` with it; -1 in none."""
     _, _, along, across, _, _, _, _, _, first, flat = mirrors
     if in_face(first, flat, along, across, f, point, edge):
         return f
-    for other in beside:
-        if in_face(first, flat, along, across, other, point, edge):
-            return other
+    for neighbour in coplanar:
+        if in_face(first, flat, along, across, neighbour, point, edge):
+            return neighbour
     return -1
 
 
@@ -771,8 +771,8 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
             continue
         f = next_faces[level, turn[level]]
         turn[level] += 1
-        here = images[level]
-        height = _height(normal, offset, f, here)
+        place = images[level]
+        height = _height(normal, offset, f, place)
         flatwise = abs(height) <= side
         before = chain[level - 1]
         if level > 0:
@@ -786,17 +786,17 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
         if level > 0 and beams:
             if not _ahead(normal, offset, f, sign, window[before], side):
                 continue
-            asked = rules.shadows and level + 1 < depth  # of a last face it would cost more than it saves
+            worthwhile = rules.shadows and level + 1 < depth  # of a last face it would cost more than it saves
             last = signs[level - 1]
-            if asked and _wholly_hidden(mirrors, face_tree, here, f, before, last, rules, stack):
+            if worthwhile and _wholly_hidden(mirrors, face_tree, place, f, before, last, rules, stack):
                 continue
         followed += 1
         chain[level], signs[level] = f, sign
         n0, n1, n2 = normal[f, 0], normal[f, 1], normal[f, 2]
         image = images[level + 1]
-        image[0] = here[0] - 2.0 * height * n0
-        image[1] = here[1] - 2.0 * height * n1
-        image[2] = here[2] - 2.0 * height * n2
+        image[0] = place[0] - 2.0 * height * n0
+        image[1] = place[1] - 2.0 * height * n1
+        image[2] = place[2] - 2.0 * height * n2
         # planes of the beam: before this face, what earlier faces leave of it, mirrored; and its own sides
         mine, number = planes[level], 1
         mine[0, 0], mine[0, 1], mine[0, 2] = sign * n0, sign * n1, sign * n2

@@ -184,8 +184,8 @@ class Crowns:
             return paths, faces
         sequence = paths.faces.copy()
         sequence[crown] = len(faces) + position
-        both = joined(faces, self._faces(used, int(faces.solid.max(initial=-1)) + 1))
-        return merge([replace(paths, faces=sequence)], max_depth, both), both
+        extended = joined(faces, self._faces(used, int(faces.solid.max(initial=-1)) + 1))
+        return merge([replace(paths, faces=sequence)], max_depth, extended), extended
 
     def _faces(self, number: IntArray, solids: int) -> Faces:
         """Columns of the facets ``number``; their solids count on from ``solids`` by tree."""
@@ -281,8 +281,8 @@ class _Search:
         points, good = [point_m], np.ones(len(point_m), dtype=np.bool_)
         if self.ground >= 0:
             good = self._height(point_m) > self.hiding.tolerance_m
-        for wanted, place, end in ((self.before, 0, source_m), (self.after, len(points) + 1, target_m)):
-            if wanted:
+        for mirrored, place, end in ((self.before, 0, source_m), (self.after, len(points) + 1, target_m)):
+            if mirrored:
                 end = np.broadcast_to(end, point_m.shape)
                 below, above = self._height(end), self._height(point_m)
                 with np.errstate(divide="ignore", invalid="ignore"):
@@ -299,8 +299,8 @@ class _Search:
         free = ~(self._inside(source, tree) | self._inside(target_m, tree))
         for step, (start, end) in enumerate(pairwise(points)):
             rows = np.flatnonzero(free)
-            own = tree[rows] if step in (crown, crown + 1) else None
-            free[rows] = self.crowns.index.chords_m(start[rows], end[rows], own) == 0.0
+            bouncing = tree[rows] if step in (crown, crown + 1) else None
+            free[rows] = self.crowns.index.chords_m(start[rows], end[rows], bouncing) == 0.0
             rows = np.flatnonzero(free)
             free[rows] = self.crowns.index.trunks().chords_m(start[rows], end[rows]) == 0.0
             rows = np.flatnonzero(free)
@@ -317,8 +317,8 @@ class _Search:
         t = self.crowns.trees
         top, base = (t.ground_m + t.height_m)[tree], (t.ground_m + t.crown_base_m)[tree]
         width = t.crown_diameter_m[tree] / 2 * (top - point_m[:, 2]) / (top - base)
-        away = np.hypot(point_m[:, 0] - t.east_m[tree], point_m[:, 1] - t.north_m[tree])
-        return np.asarray((point_m[:, 2] > base) & (away < width))
+        distance = np.hypot(point_m[:, 0] - t.east_m[tree], point_m[:, 1] - t.north_m[tree])
+        return np.asarray((point_m[:, 2] > base) & (distance < width))
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,7 +63,7 @@ class Mirrors(NamedTuple):
 class Bends(NamedTuple):
     """Edges, pairs of edges of one face, and which faces may bend which legs.
 
-    ``options`` lists faces (-1 first), ``both`` (ways, 2) which of them may bend the legs before and after an edge
+    ``options`` lists faces (-1 first), ``ways`` (ways, 2) which of them may bend the legs before and after an edge
     together; ``ground_t`` (towers,) and ``ground_p`` (poses,) are the grounds of the ends, -2
     for that of the tower; ``wall`` (faces,) are those that bend one leg alone. ``pair`` and ``shared`` (pairs, 2) are
     edges and which of their faces is the common one, ``turn`` (pairs, 6) as in the field.
@@ -78,7 +78,7 @@ class Bends(NamedTuple):
     exterior: FloatArray
     face: IntArray
     options: IntArray
-    both: IntArray
+    ways: IntArray
     ground_t: IntArray
     ground_p: IntArray
     wall: BoolArray
@@ -138,8 +138,8 @@ def _bounce(m, f, image, end, corner):  # type: ignore[no-untyped-def]
 
 
 @part
-def _pieces_cut(s, work, a, b, own):  # type: ignore[no-untyped-def]
-    """Check whether the segment runs inside a convex piece but ``own``, deeper than the tolerance."""
+def _pieces_cut(s, work, a, b, wedge):  # type: ignore[no-untyped-def]
+    """Check whether the segment runs inside a convex piece but ``wedge``, deeper than the tolerance."""
     lower, upper, child, start, _, _ = s.tree
     inverse = (
         1.0 / (b[0] - a[0]) if b[0] != a[0] else 1e300,
@@ -160,8 +160,8 @@ def _pieces_cut(s, work, a, b, own):  # type: ignore[no-untyped-def]
         for k in range(LEAF):
             met += _box_met(s.boxes, s.block[node], k, a, inverse) << k
         piece = start[node]
-        if piece <= own < piece + LEAF:
-            met &= ~(1 << (own - piece))
+        if piece <= wedge < piece + LEAF:
+            met &= ~(1 << (wedge - piece))
         while met > 0:
             if met & 1 and _piece_cut(s, piece, a, b):
                 return True
@@ -210,13 +210,13 @@ def _piece_cut(s, piece, a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _own(s, b, own):  # type: ignore[no-untyped-def]
-    """A piece that both faces of each edge bound, or -1, into ``own``: no leg from outside the wedge enters it."""
-    own[:] = -1
+def _wedge_pieces(s, b, pieces):  # type: ignore[no-untyped-def]
+    """A piece that both faces of each edge bound, or -1, into ``pieces``: no leg from outside the wedge enters it."""
+    pieces[:] = -1
     if s.triangles:
         return
     hits = np.empty(len(s.first), np.int64)
-    for e in range(len(own)):
+    for e in range(len(pieces)):
         middle = b.start[e] + 0.5 * b.length[e] * b.along[e]
         for k in range(overlapping(s.tree, middle, middle, hits)):
             bounds = 0
@@ -226,7 +226,7 @@ def _own(s, b, own):  # type: ignore[no-untyped-def]
                     for face, out in ((1, b.out[e]), (2, b.out_n[e])):
                         bounds |= face if n[0] * out[0] + n[1] * out[1] + n[2] * out[2] > 1.0 - 1e-12 else 0
             if bounds == 3:
-                own[e] = hits[k]
+                pieces[e] = hits[k]
 
 
 @kernel
@@ -237,11 +237,11 @@ def _triangles_cut(s, m, a, b, f, g):  # type: ignore[no-untyped-def]
 
 
 @part
-def _cut(s, m, work, a, b, f, g, own):  # type: ignore[no-untyped-def]
+def _cut(s, m, work, a, b, f, g, wedge):  # type: ignore[no-untyped-def]
     """Check whether a segment is cut; ``f`` and ``g`` are the mirrors at its ends or -1."""
     if s.triangles:
         return _triangles_cut(s, m, a, b, f, g)
-    return _pieces_cut(s, work, a, b, own)
+    return _pieces_cut(s, work, a, b, wedge)
 
 
 @kernel
@@ -312,19 +312,19 @@ def search(b, m, s, sources, targets, excluded, poses):  # type: ignore[no-untyp
     for tower in range(towers):
         for i in range(options):
             _round(b, _mirrored(m, b.options[i], _vector(sources, tower)), a_s[tower, i], r_s[tower, i])
-    own, seen, work = np.empty(edges, np.int64), np.empty(edges, np.bool_), np.empty(DEEPEST, np.int64)
-    _own(s, b, own)
+    wedges, crossed, work = np.empty(edges, np.int64), np.empty(edges, np.bool_), np.empty(DEEPEST, np.int64)
+    _wedge_pieces(s, b, wedges)
     room, total = max(ROWS, 2 * (edges + len(b.pair))), 0
     index, vertices = np.empty((room, 8), np.int64), np.empty((room, 4, 3))
     for pose in poses:
         for j in range(options):
             _round(b, _mirrored(m, b.options[j], _vector(targets, pose)), a_t[j], r_t[j])
         link = 0
-        while link < towers * len(b.both):
+        while link < towers * len(b.ways):
             if len(index) - total < edges + len(b.pair):
                 index, vertices = _doubled(index, vertices)
             link, total = _links(
-                (b, m, s), ends, (a_s, r_s, a_t, r_t), (own, seen, work), (index, vertices, total), pose, link
+                (b, m, s), ends, (a_s, r_s, a_t, r_t), (wedges, crossed, work), (index, vertices, total), pose, link
             )
     return index[:total], vertices[:total]
 
@@ -333,21 +333,21 @@ def search(b, m, s, sources, targets, excluded, poses):  # type: ignore[no-untyp
 def _links(scene, ends, places, space, rows, pose, first):  # type: ignore[no-untyped-def]
     """Paths of the links of a pose from ``first`` on while there is room; the next link, and the rows in use."""
     (b, m, _), (sources, targets, excluded), (a_s, r_s, a_t, r_t) = scene, ends, places
-    (own, seen, _), (index, vertices, total) = space, rows
-    edges, ways, target = len(own), len(b.both), _vector(targets, pose)
+    (wedges, crossed, _), (index, vertices, total) = space, rows
+    edges, ways, target = len(wedges), len(b.ways), _vector(targets, pose)
     for link in range(first, len(sources) * ways):
         if len(index) - total < edges + len(b.pair):
             return link, total
-        tower, i, j = link // ways, b.both[link % ways, 0], b.both[link % ways, 1]
+        tower, i, j = link // ways, b.ways[link % ways, 0], b.ways[link % ways, 1]
         f, g, source = b.options[i], b.options[j], _vector(sources, tower)
         if excluded[tower, pose] or not _allowed(b, f, g, tower, pose):
             continue
         bent = (source, _mirrored(m, f, source), f), (target, _mirrored(m, g, target), g)
         at = a_s[tower, i], r_s[tower, i], a_t[j], r_t[j]
-        _on_edges(b.length, at, seen)
+        _on_edges(b.length, at, crossed)
         walled = (f >= 0 and b.wall[f]) or (g >= 0 and b.wall[g])
         for k in range(edges if walled else edges + len(b.pair)):
-            if (k >= edges or seen[k]) and _free(scene, space, bent, k, at, vertices[total]):
+            if (k >= edges or crossed[k]) and _free(scene, space, bent, k, at, vertices[total]):
                 _write(b, k, index[total], (pose, tower, f, g))
                 total += 1
     return len(sources) * ways, total
@@ -359,13 +359,13 @@ def _vector(points, k):  # type: ignore[no-untyped-def]
 
 
 @part
-def _on_edges(length, places, seen):  # type: ignore[no-untyped-def]
-    """Edges whose diffraction point lies on them, into ``seen``."""
+def _on_edges(length, places, crossed):  # type: ignore[no-untyped-def]
+    """Edges whose diffraction point lies on them, into ``crossed``."""
     a_s, r_s, a_t, r_t = places
-    for e in range(len(seen)):
+    for e in range(len(crossed)):
         close, far = r_s[e], r_t[e]
         share = a_s[e] * far + a_t[e] * close
-        seen[e] = (close >= 0.0) & (far >= 0.0) & (share >= 0.0) & (share <= length[e] * (close + far))
+        crossed[e] = (close >= 0.0) & (far >= 0.0) & (share >= 0.0) & (share <= length[e] * (close + far))
 
 
 @part
@@ -376,14 +376,14 @@ def _point(b, e, at):  # type: ignore[no-untyped-def]
 @part
 def _free(scene, space, ends, k, places, vertices):  # type: ignore[no-untyped-def]
     """Check whether a candidate meets its edges and mirrors and its legs are free; its points into ``vertices``."""
-    (b, m, s), (own, _, work), (a_s, r_s, a_t, r_t) = scene, space, places
-    two = k - len(own)
-    first, last = (k, k) if two < 0 else (b.pair[two, 0], b.pair[two, 1])
+    (b, m, s), (wedges, _, work), (a_s, r_s, a_t, r_t) = scene, space, places
+    pair = k - len(wedges)
+    first, last = (k, k) if pair < 0 else (b.pair[pair, 0], b.pair[pair, 1])
     vertices[:] = np.nan
-    if two < 0:
+    if pair < 0:
         u = w = (a_s[k] * r_t[k] + a_t[k] * r_s[k]) / (r_s[k] + r_t[k])
     else:
-        on, u, w = _over_pair(b, two, a_s[first], r_s[first], a_t[last], r_t[last])
+        on, u, w = _over_pair(b, pair, a_s[first], r_s[first], a_t[last], r_t[last])
         if r_s[first] < 0.0 or r_t[last] < 0.0 or not on:
             return False
     corners = _point(b, first, u), _point(b, last, w)
@@ -391,19 +391,19 @@ def _free(scene, space, ends, k, places, vertices):  # type: ignore[no-untyped-d
         end, image, f = ends[side]
         e, corner = last if side else first, corners[side]
         met, bounce = _bounce(m, f, image, end, corner)
-        if not met or _cut(s, m, work, bounce, corner, f, -1, own[e]):
+        if not met or _cut(s, m, work, bounce, corner, f, -1, wedges[e]):
             return False
         if f >= 0:
             if _cut(s, m, work, end, bounce, -1, f, -1):
                 return False
             vertices[3 * side, 0], vertices[3 * side, 1], vertices[3 * side, 2] = bounce
-        if side == 0 or two >= 0:
+        if side == 0 or pair >= 0:
             vertices[1 + side, 0], vertices[1 + side, 1], vertices[1 + side, 2] = corner
             if s.triangles and _covered(s, m, b, e, corner):
                 return False
-    if two < 0:
+    if pair < 0:
         return True
-    (x, y, z), (x2, y2, z2), common = corners[0], corners[1], b.face[first, b.shared[two, 0]]
+    (x, y, z), (x2, y2, z2), common = corners[0], corners[1], b.face[first, b.shared[pair, 0]]
     apart = (x2 - x) ** 2 + (y2 - y) ** 2 + (z2 - z) ** 2 > NEAREST_M**2
     return apart and not _cut(s, m, work, corners[0], corners[1], common, common, -1)
 
@@ -419,11 +419,11 @@ def _doubled(index, vertices):  # type: ignore[no-untyped-def]
 @part
 def _write(b, k, row, link):  # type: ignore[no-untyped-def]
     """Write pose, tower, edges, shared faces and mirrors of a path into its row."""
-    two = k - len(b.start)
+    pair = k - len(b.start)
     row[0], row[1], row[6], row[7] = link
     row[2], row[3], row[4], row[5] = k, -1, 0, 0
-    if two >= 0:
-        row[2], row[3], row[4], row[5] = b.pair[two, 0], b.pair[two, 1], b.shared[two, 0], b.shared[two, 1]
+    if pair >= 0:
+        row[2], row[3], row[4], row[5] = b.pair[pair, 0], b.pair[pair, 1], b.shared[pair, 0], b.shared[pair, 1]
 
 
 def try_out() -> None:

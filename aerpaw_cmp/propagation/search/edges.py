@@ -21,7 +21,7 @@ from ...common.units import BoolArray, FloatArray, IntArray
 from .. import compiled
 from ..edges import NEAREST_M, EdgePaths, Edges
 from ..faces import inside
-from ..paths import Faces
+from ..paths import Faces, legs
 from ..surfaces import Surfaces
 from .mirror import scene_tolerance_m
 from .occlusion import Occlusion
@@ -96,11 +96,10 @@ def find_edge_paths(
 
 def _sorted(pieces: list[EdgePaths]) -> EdgePaths:
     """Pieces as one, by pose, tower, edges and mirrors."""
-    columns = {name: np.concatenate([getattr(p, name) for p in pieces]) for name in EdgePaths.__slots__}
-    before, after = columns["ground"].T
-    last, first = columns["edge"].T[::-1]
-    order = np.lexsort((after, before, first, last, columns["tower"], columns["pose"]))
-    return EdgePaths(**{name: column[order] for name, column in columns.items()})
+    paths = EdgePaths.one_after_another(pieces)
+    before, after = paths.ground.T
+    last, first = paths.edge.T[::-1]
+    return paths.select(np.lexsort((after, before, first, last, paths.tower, paths.pose)))
 
 
 def _compiled(
@@ -152,7 +151,7 @@ def _beyond_bounds(
     if any(any(pieces) for pieces in hiding.abutting):
         rows = np.flatnonzero(good)
         sources, targets = ends
-        for start, end in _legs(sources[paths.tower[rows]], paths.vertices_m[rows], targets[paths.pose[rows]]):
+        for start, end in legs(sources[paths.tower[rows]], paths.vertices_m[rows], targets[paths.pose[rows]]):
             good[rows] &= ~hiding.segments(start, end)
     return good
 
@@ -193,7 +192,7 @@ def _bends(
         exterior=edges.exterior,
         face=np.ascontiguousarray(edges.face),
         options=options,
-        both=np.argwhere(~((options[:, None] >= 0) & (options >= 0) & (wall[options][:, None] | wall[options]))),
+        ways=np.argwhere(~((options[:, None] >= 0) & (options >= 0) & (wall[options][:, None] | wall[options]))),
         ground_t=ground_t,
         ground_p=ground_p,
         wall=wall,
@@ -263,7 +262,7 @@ def _solids(kernels: ModuleType, hiding: Occlusion | None, surfaces: Surfaces | 
 
 def _below(surfaces: Surfaces, points_m: FloatArray) -> IntArray:
     """Face of the first triangle below each point; -1 where there is none."""
-    corners, found = surfaces.corners_m, np.full(len(points_m), -1, dtype=np.int64)
+    corners, ground = surfaces.corners_m, np.full(len(points_m), -1, dtype=np.int64)
     side, last = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = side[:, 0] * last[:, 1] - side[:, 1] * last[:, 0]
     rows = np.flatnonzero(np.abs(area) > 1e-9)
@@ -276,16 +275,16 @@ def _below(surfaces: Surfaces, points_m: FloatArray) -> IntArray:
         height = corner[:, 2] + u * side[:, 2] + v * last[:, 2]
         under = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & (height < point[2])
         if under.any():
-            found[number] = face[np.flatnonzero(under)[height[under].argmax()]]
-    return found
+            ground[number] = face[np.flatnonzero(under)[height[under].argmax()]]
+    return ground
 
 
 class _Exposed:
     """Test of whether both faces of an edge are in the air at a point: another building may touch one of them."""
 
     def __init__(self, faces: Faces, edges: Edges, hiding: Occlusion) -> None:
-        own = np.unique(faces.solid[faces.solid >= 0])
-        solid = np.searchsorted(own, faces.solid[edges.face[:, 0]])
+        numbers = np.unique(faces.solid[faces.solid >= 0])
+        solid = np.searchsorted(numbers, faces.solid[edges.face[:, 0]])
         low = np.minimum(edges.start_m, edges.end_m) - 2.0 * PROBE_M
         high = np.maximum(edges.start_m, edges.end_m) + 2.0 * PROBE_M
         touch = (hiding.low[None] <= high[:, None]) & (hiding.high[None] >= low[:, None])
@@ -293,7 +292,7 @@ class _Exposed:
         near[np.arange(len(edges)), solid] = False
         self.doubtful = np.asarray(near.any(axis=1))
         axis_n = np.cross(edges.along, edges.normal_n)
-        self.beside = np.stack([edges.face_axis + 0.1 * edges.normal, axis_n + 0.1 * edges.normal_n], axis=1)
+        self.sides = np.stack([edges.face_axis + 0.1 * edges.normal, axis_n + 0.1 * edges.normal_n], axis=1)
         self.hiding = hiding
 
     def at(self, edge: IntArray, points_m: FloatArray) -> BoolArray:
@@ -301,7 +300,7 @@ class _Exposed:
         good = np.ones(len(edge), dtype=np.bool_)
         rows = np.flatnonzero(self.doubtful[edge])
         for side in (0, 1):
-            step = PROBE_M * self.beside[edge[rows], side]
+            step = PROBE_M * self.sides[edge[rows], side]
             good[rows] &= ~self.hiding.segments(points_m[rows] + 0.5 * step, points_m[rows] + step)
         return good
 
@@ -342,21 +341,12 @@ def _over_edges(
                 rows = np.flatnonzero(good)
                 good[rows] = inside(faces, np.full(len(rows), index), spot[rows], 0.0)
         good[good] &= exposed.at(edge[good], point[good])
-        for leg in _legs(source_m, vertices, targets_m[pose]):
+        for leg in legs(source_m, vertices, targets_m[pose]):
             good[good] &= ~exposed.hiding.segments(leg[0][good], leg[1][good])
         rows = np.zeros((int(good.sum()), 8), dtype=np.int64)
         rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 6:] = pose[good], tower, edge[good], -1, ground
         pieces.append(EdgePaths.of(rows, vertices[good]))
     return pieces
-
-
-def _legs(source_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Straight pieces of the paths; a point that is not used is the one before it."""
-    points = [np.broadcast_to(source_m, targets_m.shape)]
-    for corner in range(vertices_m.shape[1]):
-        used = np.isfinite(vertices_m[:, corner, :1])
-        points.append(np.where(used, vertices_m[:, corner], points[-1]))
-    return list(itertools.pairwise([*points, targets_m]))
 
 
 def _round_edges(edges: Edges, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:

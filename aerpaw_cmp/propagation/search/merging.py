@@ -104,11 +104,11 @@ def merged(scene: TriangleScene, merge_m: float = MERGE_M) -> Surfaces:
 
 def _labels(shapes: tuple[str, ...], of_face: IntArray) -> tuple[str, ...]:
     """``shape face 3``: faces counted within their shape."""
-    seen: dict[int, int] = {}
+    counts: dict[int, int] = {}
     labels = []
     for shape in of_face.tolist():
-        seen[shape] = seen.get(shape, 0) + 1
-        labels.append(f"{shapes[shape]} face {seen[shape]}")
+        counts[shape] = counts.get(shape, 0) + 1
+        labels.append(f"{shapes[shape]} face {counts[shape]}")
     return tuple(labels)
 
 
@@ -173,14 +173,14 @@ def _merge_neighbours(order, corners, normal, offset, neighbours, merge_m):  # t
 
 
 @kernel
-def _joining(here, number, face, todo, corners, plane, neighbours, merge_m):  # type: ignore[no-untyped-def]
+def _joining(triangle, number, face, todo, corners, plane, neighbours, merge_m):  # type: ignore[no-untyped-def]
     """Neighbours of a triangle that lie in the plane of its face join that, and wait in ``todo``; how many."""
     edges, triangle_of, start = neighbours
     many = 0
-    for edge in edges[here]:
-        for other in triangle_of[start[edge] : start[edge + 1]]:
-            if face[other] < 0 and _lie_in(corners, other, other + 1, plane, merge_m):
-                face[other], todo[many] = number, other
+    for edge in edges[triangle]:
+        for neighbour in triangle_of[start[edge] : start[edge + 1]]:
+            if face[neighbour] < 0 and _lie_in(corners, neighbour, neighbour + 1, plane, merge_m):
+                face[neighbour], todo[many] = number, neighbour
                 many += 1
     return many
 
@@ -204,10 +204,10 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
     for f in np.argsort(-area):
         many = overlapping(tree, low[f] - merge_m, high[f] + merge_m, near)
         best = -1
-        for other in near[:many]:
-            if area[other] < area[f] or (area[other] == area[f] and other >= f):
+        for neighbour in near[:many]:
+            if area[neighbour] < area[f] or (area[neighbour] == area[f] and neighbour >= f):
                 continue
-            lead = plane[other]
+            lead = plane[neighbour]
             if abs(np.dot(normal[lead], normal[f])) < 0.7:
                 continue
             if not _lie_in(corners, first[f], first[f + 1], (normal[lead], offset[lead]), merge_m):

@@ -16,7 +16,7 @@ from shapely.geometry import Polygon
 
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..faces import corners
-from ..paths import Faces
+from ..paths import Faces, legs
 
 # Segment-solid pairs looked at at once.
 CELLS_PER_CHUNK = 1_000_000
@@ -67,12 +67,9 @@ class Occlusion:
     def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
         """Check whether polylines source - vertices (paths, depth, 3) - target are cut (paths,)."""
         cut = np.zeros(len(sources_m), dtype=np.bool_)
-        start = sources_m
-        for step in range(vertices_m.shape[1] + 1):
-            end = vertices_m[:, step] if step < vertices_m.shape[1] else targets_m
+        for start, end in legs(sources_m, vertices_m, targets_m):
             rows = np.flatnonzero(~cut)
             cut[rows] = self.segments(start[rows], end[rows])
-            start = end
         return cut
 
     def segments(self, start: FloatArray, end: FloatArray) -> BoolArray:

@@ -30,7 +30,7 @@ OVERLAP_M = 1e-3
 def find_paths(
     faces: Faces,
     links: Links,
-    run: SearchRun = SearchRun(),  # noqa: B008 - frozen
+    run: SearchRun = SearchRun(),
     *,
     max_depth: int = 2,
     extent_m: FloatArray | None = None,

@@ -1,7 +1,7 @@
 """Sionna RT as a path finder; the only file that imports sionna, mitsuba and drjit.
 
 Sionna computes in float32 and finds paths by sampling. Only *which faces a path meets* is taken from it; reflection
-points come from the image method in float64 and fields from :mod:`aerpaw_cmp.propagation.channel`.
+points come from the image method in float64 and fields from :mod:`aerpaw_cmp.propagation.field.sum`.
 
 Guards against what Sionna RT 2.2.0 does silently:
 
@@ -135,14 +135,14 @@ def _leave_for_later() -> None:
         return
     for name, kind in _LATER.items():
         later = sys.modules[f"sionna.rt.{name}"] = ModuleType(f"sionna.rt.{name}")
-        vars(later)[kind] = partial(_made, later, kind)
+        vars(later)[kind] = partial(_loaded, later, kind)
 
 
-def _made(later: ModuleType, kind: str, *given: Any, **named: Any) -> Any:
+def _loaded(later: ModuleType, kind: str, *arguments: Any, **named: Any) -> Any:
     """Load a class in place of the module that stood for its own, and make an object of it."""
     if sys.modules.get(later.__name__) is later:
         del sys.modules[later.__name__]
-    return getattr(import_module(later.__name__), kind)(*given, **named)
+    return getattr(import_module(later.__name__), kind)(*arguments, **named)
 
 
 def free_memory() -> None:
@@ -211,8 +211,8 @@ class _Builder:
             owners.append(owner[rows])
         scene.add(objects)
         # read when a kernel runs: literals would be compiled anew for each carrier
-        made = scene.radio_materials.values()
-        dr.make_opaque(scene.frequency, *((m.relative_permittivity, m.conductivity) for m in made))
+        materials = scene.radio_materials.values()
+        dr.make_opaque(scene.frequency, *((m.relative_permittivity, m.conductivity) for m in materials))
         return _Scene(scene, {int(o.object_id): f for o, f in zip(objects, owners, strict=True)})
 
     def _mesh(self, name: str, vertices: FloatArray, triangle: IntArray) -> Any:
@@ -259,8 +259,8 @@ def _slots(built: _Scene, targets: int) -> int:
     Of n candidates some ``2 n^2 / slots`` are lost: less than one in two hundred batches.
     """
     mirrors = sum(len(np.unique(faces)) for faces in built.face_of.values())
-    wanted = 400.0 * (targets * max(mirrors, 1) ** 2) ** 2
-    return int(np.clip(2 ** np.ceil(np.log2(wanted)), FEWEST_SLOTS, SPECULAR_TABLE_SLOTS))
+    slots = 400.0 * (targets * max(mirrors, 1) ** 2) ** 2
+    return int(np.clip(2 ** np.ceil(np.log2(slots)), FEWEST_SLOTS, SPECULAR_TABLE_SLOTS))
 
 
 def _points(values: FloatArray) -> Any:
@@ -370,8 +370,8 @@ class _Finder:
         place = list(inspect.signature(inner).parameters).index("paths_counter_per_source")
 
         def watched(*arguments: Any, **named: Any) -> Any:
-            given = arguments[place] if len(arguments) > place else None
-            self.candidates = named.get("paths_counter_per_source", given)
+            counter = arguments[place] if len(arguments) > place else None
+            self.candidates = named.get("paths_counter_per_source", counter)
             return inner(*arguments, **named)
 
         generator._shoot_and_bounce = watched
@@ -575,7 +575,7 @@ def _refined(
     def make(towers: IntArray, chosen: IntArray) -> _Finder:
         return _Finder(builder.scene(chosen), _Ends.points(sources_m[towers]), _CENTRE, batch)
 
-    groups, alive, done = list(_groups(faces, sources_m, links.usable)), searched_links(links), 0
+    groups, alive, traced = list(_groups(faces, sources_m, links.usable)), searched_links(links), 0
     count = sum(int(alive[towers].any(axis=0).sum()) for towers, _ in groups)
     for finder, towers, some in _each_batch(make, groups, alive):
         raw = finder.searched(targets_m[some], rays.max_depth, rays.samples)
@@ -583,9 +583,9 @@ def _refined(
         pose, tower, sequence = _sequences(raw, finder.built.face_of, some, towers, rays.max_depth)
         del raw  # may be memory of the device, which the next batch needs
         yield _refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m, surfaces)
-        done += len(some)
+        traced += len(some)
         if progress:
-            progress(done / count)
+            progress(traced / count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -788,8 +788,8 @@ def _sequences(
         primitive = raw["primitive"][step, receiver, tower, path]
         good &= (kind == 0) | (kind == 1)
         for number, owner in face_of.items():
-            here = (kind == 1) & (shape == number)
-            sequence[here, step] = owner[primitive[here]]
+            hit = (kind == 1) & (shape == number)
+            sequence[hit, step] = owner[primitive[hit]]
         good &= (kind != 1) | (sequence[:, step] >= 0)
     return poses[receiver[good]], towers[tower[good]], sequence[good]
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...site.dem import Dem
-from ..paths import Faces, Links, PathSet, joined
+from ..paths import Faces, Links, PathSet, joined, legs
 from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, images_of, trace_back
 from .occlusion import Occlusion
 
@@ -87,14 +87,14 @@ def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_
     at, face = np.nonzero(usable & ground[:-1])
     plane[at] = face
     sequence[: len(bare), 0], sequence[len(bare) :] = plane[tower[bare]], paths.faces[several]
-    own = np.full(unknown.shape, -1, dtype=np.int64)
+    row_of = np.full(unknown.shape, -1, dtype=np.int64)
     alone = np.flatnonzero(once & (paths.depth == 1))
-    own[paths.pose[alone], paths.tower[alone]] = alone
+    row_of[paths.pose[alone], paths.tower[alone]] = alone
     candidates = _Candidates(
         pose=np.append(pose[bare], paths.pose[several]),
         tower=np.append(tower[bare], paths.tower[several]),
         sequence=sequence,
-        row=np.append(own[pose[bare], tower[bare]], several),
+        row=np.append(row_of[pose[bare], tower[bare]], several),
         plane=plane,
     )
     same, shaped, more = candidates.followed(dem, faces, links, wavelength_m)
@@ -132,7 +132,7 @@ class _Candidates:
         offset = (normal * place).sum(axis=1)
         mine = self.plane[self.tower[where]]
         level = (normal[:, 2] == 1.0) & (offset == faces.offset_m[mine]) & (part == 1.0)
-        kept = self.row[where[level]]
+        rows = self.row[where[level]]
         where, normal, offset, mine = where[~level], normal[~level], offset[~level], mine[~level]
         plain = Faces(
             normal=normal,
@@ -146,9 +146,9 @@ class _Candidates:
         sequence[np.arange(len(where)), slot[where]] = len(faces) + np.arange(len(where))
         paths = self._traced(every, where, sequence, links, -20.0 * np.log10(part[~level]))
         hiding = Occlusion(faces, RELATIVE_TOLERANCE * 1e4)
-        cut = hiding.any_segment(links.sources_m[paths.tower], _filled(paths, links), links.targets_m[paths.pose])
+        cut = hiding.any_segment(links.sources_m[paths.tower], paths.vertices_m, links.targets_m[paths.pose])
         paths = paths.select(~cut)
-        return kept[kept >= 0], paths.select(_clear(dem, every, links, paths, wavelength_m)), every
+        return rows[rows >= 0], paths.select(_clear(dem, every, links, paths, wavelength_m)), every
 
     def _traced(self, faces: Faces, where: IntArray, sequence: IntArray, links: Links, loss_db: FloatArray) -> PathSet:
         """Paths over the planes in order, sorted by pose and tower; whether something stops them is not asked."""
@@ -177,12 +177,6 @@ def _ends_seen_from(
     return source, target
 
 
-def _filled(paths: PathSet, links: Links) -> FloatArray:
-    """Reflection points (paths, depth, 3), unused ones at the target."""
-    used = np.arange(paths.vertices_m.shape[1]) < paths.depth[:, None]
-    return np.where(used[..., None], paths.vertices_m, links.targets_m[paths.pose][:, None])
-
-
 def _clear(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: float) -> BoolArray:
     """Paths with one reflection off the ground of which the terrain stops no leg.
 
@@ -190,7 +184,7 @@ def _clear(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: f
     Fresnel zone, is roughness and stops nothing.
     """
     source, target = links.sources_m[paths.tower], links.targets_m[paths.pose]
-    points, row = _filled(paths, links), np.arange(len(paths))
+    points, row = paths.vertices_m, np.arange(len(paths))
     slot = (np.append(faces.solid, 0)[paths.faces] < 0).argmax(axis=1)
     bounce, before = points[row, slot], np.where((slot > 0)[:, None], points[row, slot - 1], source)
     ray = bounce - before
@@ -198,12 +192,10 @@ def _clear(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: f
     sine = np.abs((ray * faces.normal[paths.faces[row, slot]]).sum(axis=1)) / np.maximum(length, MINIMUM_LENGTH_M)
     way = np.linalg.norm(bounce - target, axis=1) + length
     tolerance = np.minimum(wavelength_m / (8.0 * np.maximum(sine, 1e-9)), np.sqrt(wavelength_m * way) / 2.0)
-    free, start = np.ones(len(paths), dtype=np.bool_), source
-    for step in range(points.shape[1] + 1):
-        end = points[:, step] if step < points.shape[1] else target
+    free = np.ones(len(paths), dtype=np.bool_)
+    for start, end in legs(source, points, target):
         rows = np.flatnonzero(free & (start != end).any(axis=1))
         free[rows] = dem.clear(start[rows], end[rows], tolerance_m=tolerance[rows])
-        start = end
     return free
 
 
@@ -250,9 +242,9 @@ def _stationary(
 
         def growth(d: FloatArray, z: FloatArray) -> FloatArray:
             """Growth of the way over the ground along the profile."""
-            here, there = np.hypot(d, z - up[0]), np.hypot(d - length, z - up[1])
-            before = (d + slope * (z - up[0])) / np.maximum(here, 1e-12)
-            after = (d - length + slope * (z - up[1])) / np.maximum(there, 1e-12)
+            from_source, from_target = np.hypot(d, z - up[0]), np.hypot(d - length, z - up[1])
+            before = (d + slope * (z - up[0])) / np.maximum(from_source, 1e-12)
+            after = (d - length + slope * (z - up[1])) / np.maximum(from_target, 1e-12)
             return np.asarray(before + after)
 
         ends = [growth(along[:-1], ground[:-1]), growth(along[1:], ground[1:])]
@@ -264,8 +256,8 @@ def _stationary(
     d, total = along[piece + 1, column], length[column]
     over = [up[0][column] - z0 + m * d0, up[1][column] - z0 - m * (total - d0)]
     foot = [over[0] * m / (1.0 + m * m), total + over[1] * m / (1.0 + m * m)]
-    both = over[0] + over[1]
-    inner = foot[0] + (foot[1] - foot[0]) * over[0] / np.where(both > 0.0, both, 1.0)
+    height_sum = over[0] + over[1]
+    inner = foot[0] + (foot[1] - foot[0]) * over[0] / np.where(height_sum > 0.0, height_sum, 1.0)
     d = np.where(crease, d, inner)
     z = np.where(crease, ground[piece + 1, column], z0 + m * (d - d0))
     way = np.hypot(d, z - up[0][column]) + np.hypot(d - total, z - up[1][column])
@@ -278,9 +270,9 @@ def _stationary(
     at, heights = along[:, column], (source[column, 2], target[column, 2])
     total = length[column]
     # the slope at which the way is stationary: that of the piece, or between those of both sides of a crease
-    here, there = np.hypot(d, z - heights[0]), np.hypot(d - total, z - heights[1])
-    steep = (z - heights[0]) / np.maximum(here, 1e-12) + (z - heights[1]) / np.maximum(there, 1e-12)
-    lean = -(d / np.maximum(here, 1e-12) + (d - total) / np.maximum(there, 1e-12)) / np.where(
+    to_source, to_target = np.hypot(d, z - heights[0]), np.hypot(d - total, z - heights[1])
+    steep = (z - heights[0]) / np.maximum(to_source, 1e-12) + (z - heights[1]) / np.maximum(to_target, 1e-12)
+    lean = -(d / np.maximum(to_source, 1e-12) + (d - total) / np.maximum(to_target, 1e-12)) / np.where(
         steep < 0.0, steep, -1e-12
     )
     widths = [
@@ -331,8 +323,8 @@ def _settled(
         over = [end[:, 2] - up - (slope * (end[:, :2] - spot)).sum(axis=1) for end in (source, target)]
         turn = slope / (1.0 + (slope**2).sum(axis=1))[:, None]
         feet = [end[:, :2] + h[:, None] * turn for end, h in zip((source, target), over, strict=True)]
-        both = np.where(over[0] + over[1] > 0.0, over[0] + over[1], np.inf)
-        moved = feet[0] + (feet[1] - feet[0]) * (over[0] / both)[:, None] - spot
+        height_sum = np.where(over[0] + over[1] > 0.0, over[0] + over[1], np.inf)
+        moved = feet[0] + (feet[1] - feet[0]) * (over[0] / height_sum)[:, None] - spot
         moved = np.where(crease[:, None], moved - (moved * way).sum(axis=1)[:, None] * way, moved)
         spot = begin + np.clip(spot + moved - begin, -dem.cell_m, dem.cell_m)
     place = np.column_stack([spot, dem.ground_m(*spot.T)])

@@ -101,7 +101,7 @@ def _crossings(faces: Faces, links: Links, paths: PathSet) -> tuple[IntArray, In
     points = np.where(used[..., None], paths.vertices_m, target[:, None])
     corners = np.concatenate([links.sources_m[paths.tower][:, None], points, target[:, None]], axis=1)
     # a crossing is a row: path, its place along the path (leg + share), face, point
-    found: list[tuple[IntArray, FloatArray, IntArray, FloatArray]] = []
+    pieces: list[tuple[IntArray, FloatArray, IntArray, FloatArray]] = []
     for leg in range(corners.shape[1] - 1):
         for first in range(0, len(paths), LEGS_AT_ONCE):
             start, end = (corners[first : first + LEGS_AT_ONCE, leg + k] for k in (0, 1))
@@ -111,8 +111,8 @@ def _crossings(faces: Faces, links: Links, paths: PathSet) -> tuple[IntArray, In
             share = before[row, wall] / (before[row, wall] - after[row, wall])
             point = start[row] + share[:, None] * (end - start)[row]
             good = inside(faces, walls[wall], point, 0.0)
-            found.append((first + row[good], leg + share[good], walls[wall[good]], point[good]))
-    path, place, face, point = (np.concatenate(x) for x in zip(*found, strict=True))
+            pieces.append((first + row[good], leg + share[good], walls[wall[good]], point[good]))
+    path, place, face, point = (np.concatenate(x) for x in zip(*pieces, strict=True))
     # a shell is entered as often as it is left; a ray through an edge of it is none that counts
     solids, solid = np.unique(faces.solid[face], return_inverse=True)
     times = np.zeros((len(paths), max(len(solids), 1)), dtype=np.int64)

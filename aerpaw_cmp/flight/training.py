@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ..common.provenance import union
-from ..common.units import AnyArray
+from ..common.units import AnyArray, FloatArray
 from ..propagation.arrays import Link
 from ..site.sphere_pattern import SpherePattern
 from .data import FlightData, RankSeries, RssSeries
@@ -48,36 +48,58 @@ def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, 
 # Readings of a run; marks that a learned file keeps of a log; marks that two logs share if one is of the other.
 RUN, MARKS, SHARED = 32, 32, 3
 
+# The same of ranks: in a run, and how many of them must differ. Of 4 000 random reports no two of 8 850 pairs share a
+# run; two real flights have 103 and 167 and share none, any half of one shares 8 and more of the 32 that are kept.
+HOLDS, DIFFERING = 12, 6
+
 # Runs that are hashed at a time: bounds the memory.
 AT_ONCE = 8192
 
 _WEIGHTS = np.array([pow(0x9E3779B97F4A7C15, j, 2**64) for j in range(1, RUN + 1)], dtype=np.uint64)
 
 
-def marks(series: RssSeries) -> AnyArray:
-    """Hashes of all runs of consecutive levels, sorted: a part of a log has those of the log, in any format or zone."""
-    level = np.concatenate([np.round(10.0 * series.measured_db), np.full(RUN, np.nan)])
-    every = np.lib.stride_tricks.sliding_window_view(level, RUN)
+def marks(series: RssSeries | RankSeries) -> AnyArray:
+    """Hashes of all runs of readings, sorted: a part of a log has those of the log, in any format or zone.
+
+    Readings are levels, or, of ranks, which mostly repeat, for how many reports each holds.
+    """
+    if isinstance(series, RssSeries):
+        return _hashes(np.round(10.0 * series.measured_db), RUN, RUN // 4 + 1)
+    rank = series.rank[np.isfinite(series.rank)]
+    return _hashes(np.diff(np.flatnonzero(np.diff(rank))).astype(np.float64), HOLDS, DIFFERING)
+
+
+def _hashes(readings: FloatArray, run: int, differing: int) -> AnyArray:
+    """Of runs of finite readings of which so many differ: levels at a floor would be alike in any flight."""
+    every = np.lib.stride_tricks.sliding_window_view(np.concatenate([readings, np.full(run, np.nan)]), run)
     out = []
     for start in range(0, len(every), AT_ONCE):
         runs = every[start : start + AT_ONCE]
         runs = runs[np.isfinite(runs).all(axis=1)]
-        telling = (np.diff(np.sort(runs, axis=1), axis=1) != 0).sum(axis=1) >= RUN // 4
-        out.append((runs[telling].astype(np.int64).view(np.uint64) * _WEIGHTS).sum(axis=1, dtype=np.uint64))
+        telling = (np.diff(np.sort(runs, axis=1), axis=1) != 0).sum(axis=1) >= differing - 1
+        out.append((runs[telling].astype(np.int64).view(np.uint64) * _WEIGHTS[:run]).sum(axis=1, dtype=np.uint64))
     return np.unique(np.concatenate(out))
+
+
+def marks_text(series: RssSeries | RankSeries, most: int | None = None) -> tuple[str, ...]:
+    """Marks as learned files write them; at most some, those of the smallest hashes."""
+    return tuple(f"{mark:016x}" for mark in marks(series)[:most])
 
 
 def marks_note(flights: Sequence[FlightData]) -> str:
     """Comment of an antenna table: marks of the logs that it was learned from, of all channels: they share a fit."""
-    every = [marks(s)[:MARKS] for data in flights for s in data.rss]
-    return "marks: " + " ".join(f"{mark:016x}" for ours in every for mark in ours)
+    return "marks: " + " ".join(mark for data in flights for s in data.rss for mark in marks_text(s, MARKS))
 
 
 def learned_of(series: RssSeries, patterns: Iterable[SpherePattern]) -> bool:
     """Check whether antennas were learned from the readings of a series, whatever its log is now."""
     lines = [line for p in patterns for line in p.notes.splitlines() if line.startswith("# marks:")]
-    known = np.array([int(mark, 16) for line in lines for mark in line.split()[2:]], dtype=np.uint64)
-    return bool(len(known)) and len(np.intersect1d(known, marks(series))) >= SHARED
+    return bool(lines) and shared((mark for line in lines for mark in line.split()[2:]), marks_text(series))
+
+
+def shared(learned: Iterable[str], readings: Iterable[str]) -> bool:
+    """Check whether the marks of some readings are those that something was learned from."""
+    return len({*learned} & {*readings}) >= SHARED
 
 
 def common(logs: Sequence[str], learned: Iterable[Iterable[str]]) -> tuple[str, ...]:
@@ -100,7 +122,7 @@ def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[
         again = {digest: home[digest] for digest in flight_logs(data) if digest in home}
         for digest, first in again.items():
             remarks.append(f"{name} holds the same log as {first} (SHA-256 {digest[:12]}...): it is counted once")
-        marked = [(s, logs_of(data, s), marks(s)) for s in data.rss]
+        marked = [(s, logs_of(data, s), marks(s)) for _, s in data.series]
         for _, logs, ours in marked:
             earlier = [flight for flight, earlier_marks in known if len(np.intersect1d(earlier_marks, ours)) >= SHARED]
             if earlier and not set(logs) & set(again):

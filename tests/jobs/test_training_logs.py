@@ -16,12 +16,14 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.provenance import trained_on
-from aerpaw_cmp.flight.data import load_data
+from aerpaw_cmp.flight.data import FlightData, RankSeries, load_data
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.flight.training import counted_once, flight_logs
+from aerpaw_cmp.flight.training import MARKS, counted_once, flight_logs, marks, marks_text, shared
 from aerpaw_cmp.jobs.diff_reports import run_diff
-from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankSamples
+from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankSamples, rank_samples, read_receiver
+from aerpaw_cmp.site.learned import folder_of
 from tests.jobs.calibrated import calibrated, past_sector_antenna, settings
+from tests.real_logs import REAL
 from tests.simulated import write_yaml
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -230,3 +232,53 @@ def test_a_receiver_knows_its_reports_by_content() -> None:
     assert by_content.knows(one("b", "2" * 64, "1" * 64))
     assert not by_content.knows(one("a", "2" * 64))
     assert receiver().knows(one("a", "2" * 64))  # of 0.3: the name is all there is
+
+
+def ranks_of(rank: np.ndarray) -> RankSeries:
+    empty = np.zeros(len(rank))
+    return RankSeries(tower="LW1", time=empty.astype("datetime64[ns]"), rank=rank, sinr_db=empty, position_m=None)
+
+
+def held(seed: int, often: float) -> np.ndarray:
+    """Reports of a modem that goes to another of four ranks now and then."""
+    generator = np.random.default_rng(seed)
+    steps = np.where(generator.random(2000) < often, generator.integers(1, 4, 2000), 0)
+    return 1.0 + np.cumsum(steps) % 4
+
+
+@pytest.mark.parametrize("often", [0.05, 0.1, 0.3])
+def test_half_of_a_rank_log_is_known_by_how_long_its_ranks_hold(often: float) -> None:
+    """Rows without CSI and another base of the indicator change nothing; another flight of the modem is another."""
+    whole, other = held(1, often), held(2, often)
+    known = marks_text(ranks_of(whole), MARKS)
+    assert len(known) == MARKS
+    for half in (whole[:1000], whole[1000:], whole[500:1500] - 1.0):
+        gaps = np.insert(half, np.arange(0, len(half), 7), np.nan)
+        assert shared(known, marks_text(ranks_of(gaps)))
+    assert not set(marks_text(ranks_of(whole))) & set(marks_text(ranks_of(other)))
+
+
+def test_ranks_that_any_modem_reports_carry_no_marks() -> None:
+    """Nothing is told from one rank throughout, a strict alternation, a jump now and then, or none at all."""
+    alternating = np.tile([1.0, 1.0, 1.0, 2.0, 2.0], 400)
+    for rank in (np.full(2000, 2.0), alternating, np.repeat([1.0, 3.0, 2.0], 100), np.full(9, np.nan), np.zeros(0)):
+        assert not len(marks(ranks_of(rank)))
+
+
+@pytest.mark.field
+def test_half_of_an_nr_flight_is_not_scored_by_the_receiver_that_learned_from_it(tmp_path: Path) -> None:
+    """The packaged receiver was fitted on NR flights 1 and 3; a half of flight 3 has another digest."""
+    rows = (REAL / "nr_rank" / "july2_2024_flight3_nemo_nr.csv").read_text().splitlines()
+    content = yaml.safe_load((Path(__file__).parents[1] / "field" / "nr_rank_flight3.yaml").read_text())
+    flights: list[FlightData] = []
+    for name, part in {"whole": rows[1:], "half": rows[len(rows) // 2 :]}.items():
+        (tmp_path / f"{name}.csv").write_text("\n".join([rows[0], *part]) + "\n")
+        content |= {"flight": {"name": name}, "logs": [{"path": f"{name}.csv", "node": "LW1"}]}
+        flights.append(load_data(load_flight(write_yaml(tmp_path / f"{name}.yaml", content)), tmp_path))
+    receiver = read_receiver(folder_of("lake_wheeler") / "nr_rank.receiver.json.gz")["LW1"]
+    for data in flights:
+        assert set(receiver.trained_on).isdisjoint(flight_logs(data))  # other line ends
+        assert receiver.knows(rank_samples(data, data.rank[0]))
+    kept, said = counted_once(flights)
+    assert [data.settings.flight.name for data in kept] == ["whole"]
+    assert said == ["half holds readings of whole in another log: they are counted once"]

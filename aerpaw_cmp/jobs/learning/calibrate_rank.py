@@ -27,7 +27,7 @@ from ...compare.forecast import ForecastScore, constant_forecast, score_forecast
 from ...compare.rss import seconds
 from ...flight.data import FlightData, RankSeries, rank_positions
 from ...flight.replay import attitude_rotation
-from ...flight.training import logs_of
+from ...flight.training import MARKS, logs_of, marks_text, shared
 from ...propagation.arrays import Link, Poses
 from ...propagation.drivers.geometries import Geometry, every_geometry, singular_values_of
 from ...site.learned import read_table
@@ -81,6 +81,8 @@ class RankSamples:
     time_s: FloatArray
     logs: tuple[str, ...] = ()
     """SHA-256 of the logs that hold the reports."""
+    marks: tuple[str, ...] = ()
+    """Of these reports, whatever their log is: :func:`~aerpaw_cmp.flight.training.marks`."""
 
     def part(self, rows: Any) -> RankSamples:
         """Some of the samples."""
@@ -111,14 +113,16 @@ class FittedReceiver:
     """Names of those that it was fitted on."""
     trained_on: tuple[str, ...] = ()
     """SHA-256 of their logs: no score there is worth anything; receivers of 0.3 have none."""
+    marks: tuple[str, ...] = ()
+    """Some of their reports; receivers of 0.7 and before have none."""
     mixture: receiver.ReceiverMixture
     timing: Timing = Timing()
 
     def knows(self, samples: RankSamples) -> bool:
-        """Check whether it was fitted on these reports: by the content of their logs, or, in 0.3, the flight's name."""
+        """Check whether it was fitted on these reports: by their logs or readings, or, in 0.3, the flight's name."""
         if not self.trained_on:
             return samples.flight in self.flights
-        return not set(self.trained_on).isdisjoint(samples.logs)
+        return not set(self.trained_on).isdisjoint(samples.logs) or shared(self.marks, samples.marks)
 
     def forecast(self, samples: RankSamples) -> tuple[FloatArray, IntArray]:
         """Probability (n, 4) of each rank, and the one that is said."""
@@ -132,6 +136,7 @@ class FittedReceiver:
             "tied": self.tied,
             "flights": list(self.flights),
             KEY: list(self.trained_on),
+            "marks": list(self.marks),
             "members": json_safe(self.mixture.members),
             "decision_weight": self.mixture.decision_weight.tolist(),
             "shift_s": self.timing.shift_s,
@@ -147,6 +152,7 @@ class FittedReceiver:
             tied=int(content["tied"]),
             flights=tuple(str(name) for name in content["flights"]),
             trained_on=tuple(str(digest) for digest in content.get(KEY, ())),
+            marks=tuple(str(mark) for mark in content.get("marks", ())),
             mixture=receiver.ReceiverMixture(
                 members=tuple(receiver.Receiver.from_dict(m) for m in content["members"]),
                 decision_weight=np.asarray(content["decision_weight"], dtype=np.float64),
@@ -233,6 +239,7 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
         link=link,
         time_s=seconds(series.time[keep]),
         logs=logs_of(data, series),
+        marks=marks_text(series),
     )
 
 
@@ -364,6 +371,7 @@ class Tried:
             tied=len(choice.tied),
             flights=tuple(item.flight for item in train),
             trained_on=union(*(item.logs for item in train)),
+            marks=union(*(item.marks[:MARKS] for item in train)),
             mixture=mixture,
             timing=timing,
         )

@@ -203,7 +203,8 @@ def _fit(track: LevelTrack, places: FloatArray, shadow: FloatArray, noise: float
         if not track.below.any() or np.abs(latent - before).max() < _SETTLED_DB:
             break
     value, _, weight = _likelihood(track, latent, noise)
-    precision = eye + terms.swapaxes(1, 2) @ (weight[:, :, None] * terms)
+    if track.below.any():  # else the weight is that of the noise wherever the levels lie
+        precision = eye + terms.swapaxes(1, 2) @ (weight[:, :, None] * terms)
     evidence = value - 0.5 * (coefficient**2).sum(axis=1) - 0.5 * np.linalg.slogdet(precision)[1]
     slope_sd = SLOPE_SD * np.sqrt(np.linalg.inv(precision)[:, 1, 1])
     return evidence, SLOPE + SLOPE_SD * coefficient[:, 1], slope_sd

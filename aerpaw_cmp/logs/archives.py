@@ -91,11 +91,11 @@ def members(data: bytes, path: str | Path) -> dict[str, Member]:
         If the archive is damaged, or holds or unpacks to more than a data set can; also from a member's ``read``.
     """
     try:
-        found = list(_zip(data, path) if data.startswith(_ZIP) else _tar(data, path))
+        entries = list(_zip(data, path) if data.startswith(_ZIP) else _tar(data, path))
     except (*_DAMAGE, tarfile.TarError) as error:
         raise InputError(f"a damaged archive ({error})", cause="a cut download", path=path) from error
-    _check(found, len(data), path)
-    return {member.name: member for member in sorted(found, key=lambda member: member.name)}
+    _check(entries, len(data), path)
+    return {member.name: member for member in sorted(entries, key=lambda member: member.name)}
 
 
 def _hidden(name: str) -> bool:
@@ -156,10 +156,10 @@ def most_bytes(size: int) -> int:
     return min(MOST_IN_ALL, MOST_RATIO * size + _FREE_BYTES)
 
 
-def _check(found: list[Member], size: int, path: str | Path) -> None:
-    total = sum(member.size for member in found)
-    if len(found) > MOST_MEMBERS:
-        raise InputError(f"the archive holds {len(found)} files", expected=f"at most {MOST_MEMBERS}", path=path)
+def _check(entries: list[Member], size: int, path: str | Path) -> None:
+    total = sum(member.size for member in entries)
+    if len(entries) > MOST_MEMBERS:
+        raise InputError(f"the archive holds {len(entries)} files", expected=f"at most {MOST_MEMBERS}", path=path)
     if total > most_bytes(size):
         raise InputError(
             f"the archive of {size} bytes unpacks to {total} bytes",

@@ -35,19 +35,19 @@ def whole_lines(chunks: Iterable[bytes]) -> Iterator[bytes]:
     >>> list(whole_lines([b"a\nb", b"c", b"d\n", b"e"]))
     [b'a\n', b'bcd\n', b'e']
     """
-    kept: list[bytes] = []
-    begun = False
+    pending: list[bytes] = []
+    started = False
     for chunk in chunks:
         cut = chunk.rfind(b"\n") + 1
         if not cut:
-            kept.append(chunk)
+            pending.append(chunk)
             continue
-        piece = b"".join([*kept, chunk[:cut]])
-        yield piece if begun else piece.removeprefix(b"\xef\xbb\xbf")
-        begun, kept = True, [chunk[cut:]] if cut < len(chunk) else []
-    if kept:
-        piece = b"".join(kept)
-        yield piece if begun else piece.removeprefix(b"\xef\xbb\xbf")
+        piece = b"".join([*pending, chunk[:cut]])
+        yield piece if started else piece.removeprefix(b"\xef\xbb\xbf")
+        started, pending = True, [chunk[cut:]] if cut < len(chunk) else []
+    if pending:
+        piece = b"".join(pending)
+        yield piece if started else piece.removeprefix(b"\xef\xbb\xbf")
 
 
 def _chunks(place: Path) -> Iterator[bytes]:

@@ -268,9 +268,9 @@ def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolAr
         tails = np.ascontiguousarray(tail).view(f"S{width - end}").ravel()
         for text in set(tails.tolist()):  # one entry per distinct offset
             seconds = _zone_s(text)
-            here = rows[tails == text]
-            valid[here] &= seconds is not None
-            offset[here], zoned[here] = seconds or 0, bool(text) and seconds is not None
+            of_tail = rows[tails == text]
+            valid[of_tail] &= seconds is not None
+            offset[of_tail], zoned[of_tail] = seconds or 0, bool(text) and seconds is not None
     wall[~valid] = 0
     return wall, valid, offset, zoned
 
@@ -278,11 +278,11 @@ def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolAr
 def _zone_s(text: bytes) -> int | None:
     if text in (b"", b"Z"):
         return 0
-    found = re.fullmatch(rb"([+-])(\d\d):?(\d\d)", text)
-    if not found:
+    match = re.fullmatch(rb"([+-])(\d\d):?(\d\d)", text)
+    if not match:
         return None
-    seconds = int(found[2]) * 3600 + int(found[3]) * 60
-    return -seconds if found[1] == b"-" else seconds
+    seconds = int(match[2]) * 3600 + int(match[3]) * 60
+    return -seconds if match[1] == b"-" else seconds
 
 
 def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> tuple[Instants, BoolArray]:

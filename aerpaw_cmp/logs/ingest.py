@@ -127,30 +127,30 @@ def ingest(
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
-        inside, left = _below(Path(path), options, chosen)
+        inside, skipped_below = _below(Path(path), options, chosen)
         files += inside
-        skipped += left
+        skipped += skipped_below
     return Ingested(files, skipped)
 
 
 def _below(place: Path, options: OptionsFor | None, chosen: Reader | None) -> tuple[list[IngestedFile], list[Skipped]]:
     """Logs of a file, a folder, an archive or a flight file, and the files that are none."""
     if (is_folder := _is_folder(place)) or _is_archive(place):
-        inside, left = (_folder if is_folder else _archive)(place, options, chosen)
+        inside, skipped = (_folder if is_folder else _archive)(place, options, chosen)
     elif _head(place).startswith(_HDF5):
         return [replace(_of_kind(item, chosen, place), holder=str(place)) for item in read_flight(place)], []
     else:
         return [read_file(place, options=options, reader=chosen)], []
     if not inside:
         known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
-        looked = "1 file" if len(left) == 1 else f"{len(left)} files"
-        first = f"; {one_line(Path(left[0].path).name)}: {left[0].reason}" if left else ""
+        looked = "1 file" if len(skipped) == 1 else f"{len(skipped)} files"
+        first = f"; {one_line(Path(skipped[0].path).name)}: {skipped[0].reason}" if skipped else ""
         raise InputError(
             f"the {'folder' if is_folder else 'archive'} holds no log that {known} ({looked} looked at){first}",
             expected="one of the formats of 'aerpaw-cmp formats'",
             path=place,
         )
-    return join(inside), left
+    return join(inside), skipped
 
 
 def as_utf8(data: bytes) -> bytes:
@@ -269,11 +269,11 @@ def _refuse_other_kind(path: Path, reader: Reader) -> None:
     """A log whose content another reader recognises, and the named one does not, is the wrong file."""
     if reader.name == "generic_csv":
         return  # its columns were named: no other reader knows better
-    others = sniffers_of(path)
-    if not others or reader.name in others:
+    claimed_by = sniffers_of(path)
+    if not claimed_by or reader.name in claimed_by:
         return
     raise InputError(
-        f"the content is that of {' or '.join(others)}",
+        f"the content is that of {' or '.join(claimed_by)}",
         expected=f"a log of reader {reader.name!r}, as flight.yaml says",
         cause="the wrong file, or the wrong 'reader:'",
         path=path,
@@ -328,11 +328,11 @@ def _member(
     if archives.is_archive(data[:HEAD_BYTES]):
         raise InputError("an archive inside an archive: unpack it", path=path)
 
-    def beside(other: str) -> bytes | None:
-        neighbour = content.get(f"{member.name.rpartition('/')[0]}/{other}".lstrip("/"))
-        return None if neighbour is None else neighbour.read(None)
+    def neighbour(name: str) -> bytes | None:
+        file = content.get(f"{member.name.rpartition('/')[0]}/{name}".lstrip("/"))
+        return None if file is None else file.read(None)
 
-    return _read(path, data, digest, chosen or identify(data, path=str(path)), options, beside)
+    return _read(path, data, digest, chosen or identify(data, path=str(path)), options, neighbour)
 
 
 def _samples_of(name: str, names: Collection[str]) -> str | None:
@@ -425,23 +425,23 @@ def _in_pieces(place: Path, reader: Reader, options: OptionsFor | None) -> Inges
     if reader.read_pieces is None or _raw(place, 2) in _UTF_16:
         return None
     digest = hashlib.sha256()
-    given = _options(place, options, _neighbour_reader(place))
+    chosen = _options(place, options, _neighbour_reader(place))
     read_pieces = reader.read_pieces
-    result = _checked(place, reader, given, lambda: read_pieces(chunks.file_pieces(place, digest), given))
+    result = _checked(place, reader, chosen, lambda: read_pieces(chunks.file_pieces(place, digest), chosen))
     return IngestedFile(str(place), digest.hexdigest(), result)
 
 
-def _options(path: Path, options: OptionsFor | None, beside: Callable[[str], bytes | None]) -> ReadOptions:
-    given = options(path) if callable(options) else options or ReadOptions()
-    return replace(given, file_name=path.name, beside=beside)
+def _options(path: Path, options: OptionsFor | None, neighbour: Callable[[str], bytes | None]) -> ReadOptions:
+    chosen = options(path) if callable(options) else options or ReadOptions()
+    return replace(chosen, file_name=path.name, neighbour=neighbour)
 
 
 def _neighbour_reader(path: Path) -> Callable[[str], bytes | None]:
     """Reads another file of a log's folder."""
 
     def read(name: str) -> bytes | None:
-        other = path.parent / Path(name).name
-        return read_bytes(other)[0] if other.is_file() else None
+        neighbour = path.parent / Path(name).name
+        return read_bytes(neighbour)[0] if neighbour.is_file() else None
 
     return read
 
@@ -452,10 +452,10 @@ def _read(
     digest: str,
     reader: Reader,
     options: OptionsFor | None,
-    beside: Callable[[str], bytes | None] | None = None,
+    neighbour: Callable[[str], bytes | None] | None = None,
 ) -> IngestedFile:
-    given = _options(path, options, beside or _neighbour_reader(path))
-    return IngestedFile(str(path), digest, _checked(path, reader, given, lambda: reader.read(data, given)))
+    chosen = _options(path, options, neighbour or _neighbour_reader(path))
+    return IngestedFile(str(path), digest, _checked(path, reader, chosen, lambda: reader.read(data, chosen)))
 
 
 def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[], ReadResult]) -> ReadResult:
@@ -492,8 +492,8 @@ def _folder(
             continue
         try:
             if _is_archive(place):
-                inside, left = _archive(place, options, chosen)
-                files, skipped = files + inside, skipped + left
+                inside, skipped_inside = _archive(place, options, chosen)
+                files, skipped = files + inside, skipped + skipped_inside
             else:
                 files.append(read_file(place, options=options, reader=chosen))
         except InputError as error:
@@ -580,8 +580,8 @@ def _start_and_length(streams: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
         return "-", "-"
     first = min(np.datetime64(stream["start"].rstrip("Z")) for stream in streams)
     last = max(np.datetime64(stream["end"].rstrip("Z")) for stream in streams)
-    whole = str(first.astype("datetime64[s]")).replace("T", " ")
-    return whole if has_wall_clock(first) else "relative", f"{(last - first) / np.timedelta64(1, 's'):.1f}"
+    start = str(first.astype("datetime64[s]")).replace("T", " ")
+    return start if has_wall_clock(first) else "relative", f"{(last - first) / np.timedelta64(1, 's'):.1f}"
 
 
 def account_notes(account: Mapping[str, Any]) -> list[str]:
@@ -596,4 +596,4 @@ def account_notes(account: Mapping[str, Any]) -> list[str]:
         if more:
             lines = "line" if more == 1 else "lines"
             notes.append(f"{path}: and {more} more rejected {lines}, all in the flight file (-o)")
-    return notes + [f"{one_line(left['path'])}: skipped: {left['reason']}" for left in account["skipped"]]
+    return notes + [f"{one_line(skip['path'])}: skipped: {skip['reason']}" for skip in account["skipped"]]

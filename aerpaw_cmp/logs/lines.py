@@ -97,16 +97,16 @@ class Lines:
 SLICE = 1 << 17
 
 
-def places(buffer: AnyArray, one: int, other: int | None = None) -> IntArray:
+def places(buffer: AnyArray, byte: int, alternative: int | None = None) -> IntArray:
     """Places where one of two bytes stands, shape (n,)."""
-    found = []
+    parts = []
     for first in range(0, len(buffer), SLICE):
         piece = buffer[first : first + SLICE]
-        mask = piece == one
-        if other is not None:
-            mask |= piece == other
-        found.append(np.flatnonzero(mask) + first)
-    return np.concatenate(found).astype(np.int64, copy=False) if found else np.zeros(0, dtype=np.int64)
+        mask = piece == byte
+        if alternative is not None:
+            mask |= piece == alternative
+        parts.append(np.flatnonzero(mask) + first)
+    return np.concatenate(parts).astype(np.int64, copy=False) if parts else np.zeros(0, dtype=np.int64)
 
 
 def split(data: bytes) -> Lines:
@@ -151,17 +151,17 @@ def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tupl
         return _each(lines, pattern, range(len(lines)))
     positions: list[int] = []
     groups: list[tuple[bytes, ...]] = []
-    for found in pattern.finditer(lines.data):
-        positions.append(found.start())
-        groups.append(found.groups(b""))
+    for hit in pattern.finditer(lines.data):
+        positions.append(hit.start())
+        groups.append(hit.groups(b""))
     return np.searchsorted(lines.starts, np.array(positions, dtype=np.int64)), groups
 
 
 def _each(lines: Lines, pattern: re.Pattern[bytes], numbers: Iterable[int]) -> tuple[IntArray, list[tuple[bytes, ...]]]:
     """Of some lines those that the pattern describes, one by one, and its groups."""
-    found = [(i, pattern.match(lines.raw(i))) for i in numbers]
-    kept = [(i, one.groups(b"")) for i, one in found if one is not None]
-    return np.array([i for i, _ in kept], dtype=np.int64), [groups for _, groups in kept]
+    tried = [(i, pattern.match(lines.raw(i))) for i in numbers]
+    hits = [(i, hit.groups(b"")) for i, hit in tried if hit is not None]
+    return np.array([i for i, _ in hits], dtype=np.int64), [groups for _, groups in hits]
 
 
 class Rejects:
@@ -194,8 +194,8 @@ class Rejects:
 
     def result(self) -> tuple[tuple[RejectedLine, ...], tuple[RejectedReason, ...]]:
         """The first of them in the order of the file, and the reasons."""
-        kept = sorted(self._kept, key=lambda line: line.number)[:KEPT_REJECTED]
-        return tuple(kept), tuple(sorted(self._reasons.values(), key=lambda one: one.first))
+        ordered = sorted(self._kept, key=lambda line: line.number)[:KEPT_REJECTED]
+        return tuple(ordered), tuple(sorted(self._reasons.values(), key=lambda item: item.first))
 
 
 def remainder(
@@ -218,16 +218,16 @@ def remainder(
     blank : int
     rejected : list of RejectedLine
     """
-    left = np.ones(len(lines), dtype=bool)
-    left[accepted] = False
-    if not left.any() and blank is None:
+    unaccounted = np.ones(len(lines), dtype=bool)
+    unaccounted[accepted] = False
+    if not unaccounted.any() and blank is None:
         return 0, []
-    known = lines.blank & left
+    known = lines.blank & unaccounted
     if blank is not None:
         known[blank] = True
     count = int(known.sum())
     rejected: list[RejectedLine] = []
-    for i in np.flatnonzero(left & ~known):
+    for i in np.flatnonzero(unaccounted & ~known):
         why = reason(lines.raw(int(i)))
         if why is None:
             count += 1

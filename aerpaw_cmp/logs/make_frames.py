@@ -57,14 +57,14 @@ def frame(
     for name, column in values.items():
         if name not in content:
             content[name] = np.array(column)
-    made: pd.DataFrame = pd.DataFrame(content, copy=False)
-    return made
+    columns: pd.DataFrame = pd.DataFrame(content, copy=False)
+    return columns
 
 
 def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Attribute]:
     """Attributes from the options, then those of the reader; what is unknown is left out."""
-    found: dict[str, Attribute | None] = {**named(options, "node channel frequency_hz timezone"), **extra}
-    return {name: value for name, value in found.items() if value is not None}
+    merged: dict[str, Attribute | None] = {**named(options, "node channel frequency_hz timezone"), **extra}
+    return {name: value for name, value in merged.items() if value is not None}
 
 
 def steps_back(records: pd.DataFrame) -> list[str]:

@@ -80,17 +80,17 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
         raise _damaged("no byte order")
-    found: dict[str, AnyArray] = {}
-    left = FREE_BYTES + MOST_RATIO * len(data)
+    arrays: dict[str, AnyArray] = {}
+    allowance = FREE_BYTES + MOST_RATIO * len(data)
     for element in _elements(data, 128, order, padded=False):
-        one = _inflated(element, order, min(left, MOST_BYTES)) if element.kind == _COMPRESSED else element
-        left -= len(one.body) if element.kind == _COMPRESSED else 0
-        if one.kind != _MATRIX:
-            raise _damaged(f"element of type {one.kind} where a variable was expected")
-        name, array = _variable(one.body, order, wanted)
+        variable = _inflated(element, order, min(allowance, MOST_BYTES)) if element.kind == _COMPRESSED else element
+        allowance -= len(variable.body) if element.kind == _COMPRESSED else 0
+        if variable.kind != _MATRIX:
+            raise _damaged(f"element of type {variable.kind} where a variable was expected")
+        name, array = _variable(variable.body, order, wanted)
         if array is not None:
-            found[name] = array
-    return found
+            arrays[name] = array
+    return arrays
 
 
 def _read_hdf5(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArray]:
@@ -98,9 +98,11 @@ def _read_hdf5(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArra
     from ..common.native import read
 
     variables, notes = read("matlab", data)
-    kept = {name: values.T for name, values in variables.items() if wanted is None or name in wanted}
-    text = {name for name, kind in notes["classes"].items() if kind == "char" and name in kept and kept[name].ndim == 2}
-    return {name: _letters(values) if name in text else values for name, values in kept.items()}
+    chosen = {name: values.T for name, values in variables.items() if wanted is None or name in wanted}
+    text = {
+        name for name, kind in notes["classes"].items() if kind == "char" and name in chosen and chosen[name].ndim == 2
+    }
+    return {name: _letters(values) if name in text else values for name, values in chosen.items()}
 
 
 def _letters(codes: AnyArray) -> AnyArray:
@@ -183,9 +185,9 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
     if imaginary is None:
         raise _damaged(f"complex variable {title!r} without imaginary part")
     with np.errstate(all="ignore"):
-        both = real.astype(np.complex128)
-        both.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would be no number
-    return title, both
+        array = real.astype(np.complex128)
+        array.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would be no number
+    return title, array
 
 
 def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) -> AnyArray:

@@ -29,15 +29,15 @@ def stated(result: ReadResult, reader: Reader, options: ReadOptions) -> ReadResu
 
 def _origins(stream: Stream, reader: Reader, options: ReadOptions) -> dict[str, Attribute]:
     about = stream.attributes
-    made: dict[str, Attribute] = {}
+    attributes: dict[str, Attribute] = {}
     if "clock_from" not in about:
-        made |= _split("clock", _clock(stream, reader, options))
+        attributes |= _split("clock", _clock(stream, reader, options))
     if "height_from" not in about and _has_heights(stream):
-        made |= _split("height", reader.height_from)
+        attributes |= _split("height", reader.height_from)
     if stream.kind in ("rss", "rank") and "identity_from" not in about:
         named = any(key in about for key in ("node", "pci", "rnti")) or options.node is not None
-        made["identity_from"] = "written" if named else "assumed"
-    return made
+        attributes["identity_from"] = "written" if named else "assumed"
+    return attributes
 
 
 def _clock(stream: Stream, reader: Reader, options: ReadOptions) -> str:

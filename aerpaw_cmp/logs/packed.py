@@ -87,32 +87,32 @@ def pieces(chunks: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
         If it is damaged or cut, or unpacks to more than a log can.
     """
     chunks = iter(chunks)
-    rest = next(chunks, b"")
-    name = form(rest) or "bzip2"
+    unread = next(chunks, b"")
+    name = form(unread) or "bzip2"
     make, machine = _machine(name, path), None
-    taken, given = len(rest), 0
+    bytes_in, bytes_out = len(unread), 0
     while True:
-        rest = rest if machine is not None else rest.lstrip(b"\0")  # padding between streams
-        if not rest and (machine is None or machine.needs_input):
-            rest = next(chunks, b"")
-            taken += len(rest)
-            if not rest:
+        unread = unread if machine is not None else unread.lstrip(b"\0")  # padding between streams
+        if not unread and (machine is None or machine.needs_input):
+            unread = next(chunks, b"")
+            bytes_in += len(unread)
+            if not unread:
                 break
             continue
         machine = make() if machine is None else machine
         try:
-            piece = machine.decompress(rest, _PIECE)
+            piece = machine.decompress(unread, _PIECE)
         except MemoryError:
             raise
         except Exception as error:  # bz2 raises OSError and ValueError, lzma an exception of its own
             raise InputError(f"a damaged {name} file ({error})", cause="a cut download", path=path) from error
-        given += len(piece)
-        if given > _MOST_RATIO * taken + _PIECE:
+        bytes_out += len(piece)
+        if bytes_out > _MOST_RATIO * bytes_in + _PIECE:
             raise InputError(f"the {name} file unpacks to more than {_MOST_RATIO} times its size", cause="no log",
                              path=path)  # fmt: skip
         if piece:
             yield piece
-        rest = machine.unused_data if machine.eof else b""
+        unread = machine.unused_data if machine.eof else b""
         machine = None if machine.eof else machine
     if machine is not None:
         raise InputError(f"the {name} file ends too early", cause="a cut download", path=path)
@@ -120,26 +120,26 @@ def pieces(chunks: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
 
 def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
     """All of a packed file, never more than ``most`` bytes; see :func:`pieces`."""
-    made, size = [], 0
+    parts, size = [], 0
     for piece in pieces([raw], path):
-        made.append(piece)
+        parts.append(piece)
         size += len(piece)
         if size > most:
             raise InputError(f"the {form(raw)} file unpacks to more than {most} bytes", cause="no log", path=path)
-    return b"".join(made)
+    return b"".join(parts)
 
 
 def head_of(place: Path, count: int) -> bytes:
     """The first bytes of what a packed file holds, none where it is damaged: reading it says so."""
-    made = b""
+    head = b""
     try:
         for piece in pieces(_chunks(place), place):
-            made += piece
-            if len(made) >= count:
+            head += piece
+            if len(head) >= count:
                 break
     except InputError:
         return b""  # damaged further on than the beginning: refused alike when it is read
-    return made[:count]
+    return head[:count]
 
 
 def _chunks(place: Path) -> Iterator[bytes]:

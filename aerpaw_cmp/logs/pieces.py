@@ -31,8 +31,8 @@ def join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
         if len(group) > 1:
             joined |= {file.path: None for file in group[1:]}
             joined[group[0].path] = _joined(folder, group)
-    made = [joined.get(file.path, file) for file in files]
-    return [file for file in made if file is not None]
+    replaced = [joined.get(file.path, file) for file in files]
+    return [file for file in replaced if file is not None]
 
 
 def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:

@@ -53,7 +53,7 @@ class ReadOptions:
         RSS at or below this is out of coverage.
     file_name : str
         Of the log, without folders; set by ``ingest``. For formats whose content does not say what it is.
-    beside : callable, optional
+    neighbour : callable, optional
         Content of another file of the log's folder by its name, None where there is none; set by ``ingest``. For
         formats that keep their samples in a second file.
     """
@@ -70,7 +70,7 @@ class ReadOptions:
     unit: str | None = None
     floor_db: float = -200.0
     file_name: str = ""
-    beside: Callable[[str], bytes | None] | None = None
+    neighbour: Callable[[str], bytes | None] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -118,12 +118,12 @@ KEPT_REJECTED = 1000
 
 def reasons_of(rejected: Iterable[RejectedLine]) -> tuple[RejectedReason, ...]:
     """Rejected lines counted by reason, in the order of their first lines."""
-    found: dict[str, RejectedReason] = {}
+    by_reason: dict[str, RejectedReason] = {}
     for line in rejected:
-        old = found.get(line.reason, RejectedReason(line.reason, 0, line.number, line.number))
+        old = by_reason.get(line.reason, RejectedReason(line.reason, 0, line.number, line.number))
         first, last = min(old.first, line.number), max(old.last, line.number)
-        found[line.reason] = RejectedReason(line.reason, old.count + 1, first, last)
-    return tuple(sorted(found.values(), key=lambda one: one.first))
+        by_reason[line.reason] = RejectedReason(line.reason, old.count + 1, first, last)
+    return tuple(sorted(by_reason.values(), key=lambda entry: entry.first))
 
 
 @dataclass(frozen=True, slots=True)

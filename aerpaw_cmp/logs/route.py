@@ -110,13 +110,13 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
     bad = ~(table["latitude_deg"].between(-90, 90) & table["longitude_deg"].between(-180, 180))
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
-        found = f"point {first + 1} lies at {table['latitude_deg'][first]:g}, {table['longitude_deg'][first]:g}"
-        raise InputError(found, expected="latitude and longitude in degrees", cause="exchanged columns, or radians")
+        place = f"point {first + 1} lies at {table['latitude_deg'][first]:g}, {table['longitude_deg'][first]:g}"
+        raise InputError(place, expected="latitude and longitude in degrees", cause="exchanged columns, or radians")
     silent = table["altitude_m"].isna()
     if silent.any():
         if height_m is None:
-            found = f"{int(silent.sum())} of {len(table)} points have no height"
-            raise InputError(found, expected="heights above take-off in the file, or one height for all points")
+            place = f"{int(silent.sum())} of {len(table)} points have no height"
+            raise InputError(place, expected="heights above take-off in the file, or one height for all points")
         table["altitude_m"] = table["altitude_m"].fillna(height_m)
     if table["yaw_deg"].isna().any():
         route.remark("Points without a yaw face the next point.")
@@ -171,8 +171,8 @@ def _plan(data: bytes) -> _Route:
         home = _numbers(mission.get("plannedHomePosition") or ())
         items = list(_items(mission["items"]))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        found = f"a damaged QGroundControl plan ({type(error).__name__}: {error})"
-        raise InputError(found, expected="a mission with items") from error
+        damage = f"a damaged QGroundControl plan ({type(error).__name__}: {error})"
+        raise InputError(damage, expected="a mission with items") from error
     route = _Route()
     _fly(route, items, home, named_yaw=mission.get("firmwareType") != _ARDUPILOT)
     return route
@@ -229,7 +229,7 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
     named_yaw : bool
         Is the fourth parameter of a waypoint its yaw? ArduPilot ignores it.
     """
-    here = home[:2] if len(home) > 1 else (math.nan, math.nan)
+    place = home[:2] if len(home) > 1 else (math.nan, math.nan)
     for item in items:
         latitude, longitude, height = item.numbers[4:7]
         if item.command == _TURN and route.points:
@@ -237,10 +237,10 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
         if item.command == _RETURN:
             route.remark("The return to the take-off at the end is left out.")
         if not (latitude or longitude) or math.isnan(latitude):  # 0, 0 and null: where the aircraft is
-            latitude, longitude = here
+            latitude, longitude = place
         if item.command not in (*_WAYPOINTS, *_TAKEOFFS, *_LANDINGS) or math.isnan(latitude):
             continue
-        here = latitude, longitude
+        place = latitude, longitude
         yaw = item.numbers[3] if named_yaw else math.nan
         route.add(latitude, longitude, _height(route, item, height, home), yaw)
 
@@ -362,22 +362,24 @@ def _sheet(text: str) -> _Route:
     sign = max(",;\t", key=lines[0].count)
     rows = list(csv.reader(io.StringIO("\n".join(lines)), delimiter=sign, skipinitialspace=True))
     names = [re.sub(r"[^a-z0-9]+", " ", name.lower()).strip() for name in rows[0]]
-    found = {key: next((i for i, name in enumerate(names) if form.fullmatch(name)), -1) for key, form in _NAMES.items()}
+    columns = {
+        key: next((i for i, name in enumerate(names) if form.fullmatch(name)), -1) for key, form in _NAMES.items()
+    }
     first = 1
-    if found["latitude_deg"] < 0 or found["longitude_deg"] < 0:
+    if columns["latitude_deg"] < 0 or columns["longitude_deg"] < 0:
         if not all(_is_number(cell) for cell in rows[0]) or not 2 <= len(rows[0]) <= 4:
             raise InputError(f"no route: {lines[0][:60]!r}", expected=_EXPECTED)
-        found = {key: index if index < len(rows[0]) else -1 for index, key in enumerate(_NAMES)}
+        columns = {key: index if index < len(rows[0]) else -1 for index, key in enumerate(_NAMES)}
         first = 0
-    elif found["altitude_m"] < 0 and any(_SEA_LEVEL.search(name) for name in names):
+    elif columns["altitude_m"] < 0 and any(_SEA_LEVEL.search(name) for name in names):
         raise InputError("heights above sea level", expected="a column 'altitude_m' of heights above take-off")
     route = _Route()
     for number, row in enumerate(rows[first:], start=first + 1):
-        _add_row(route, row, found, names, number)
+        _add_row(route, row, columns, names, number)
     return route
 
 
-def _add_row(route: _Route, row: Sequence[str], found: Mapping[str, int], names: Sequence[str], number: int) -> None:
+def _add_row(route: _Route, row: Sequence[str], columns: Mapping[str, int], names: Sequence[str], number: int) -> None:
     """Add a row of a table.
 
     Parameters
@@ -385,19 +387,19 @@ def _add_row(route: _Route, row: Sequence[str], found: Mapping[str, int], names:
     route : _Route
     row : sequence of str
         Its cells.
-    found : mapping
+    columns : mapping
         Column of each quantity, -1 where there is none.
     names : sequence of str
         Plain names of the columns; they say feet and radians.
     number : int
         Of the row, for messages.
     """
-    cells = {key: row[index].strip() if 0 <= index < len(row) else "" for key, index in found.items()}
+    cells = {key: row[index].strip() if 0 <= index < len(row) else "" for key, index in columns.items()}
     try:
         values = {key: float(cell) if cell else math.nan for key, cell in cells.items()}
     except ValueError as error:
         raise InputError(f"row {number} holds what is no number ({error})", expected="latitude, longitude") from error
-    altitude, yaw = names[found["altitude_m"]], names[found["yaw_deg"]]
+    altitude, yaw = names[columns["altitude_m"]], names[columns["yaw_deg"]]
     if altitude.endswith((" ft", " feet")):
         values["altitude_m"] *= _FOOT_M
     if yaw.endswith(" rad"):

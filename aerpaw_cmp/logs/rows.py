@@ -91,8 +91,8 @@ class Rows:
 
     def decimal(self, name: str) -> FloatArray:
         """A column as numbers, what is none NaN."""
-        made = [float(cell) if _DECIMAL.fullmatch(cell) else np.nan for cell in self.columns[name].tolist()]
-        return np.array(made, dtype=np.float64)
+        values = [float(cell) if _DECIMAL.fullmatch(cell) else np.nan for cell in self.columns[name].tolist()]
+        return np.array(values, dtype=np.float64)
 
     def si(self, name: str) -> FloatArray:
         """A column of numbers with SI suffix: ``-4.3k`` is -4300."""
@@ -189,11 +189,11 @@ class Rows:
 
     def result(self, streams: Iterable[Stream | None]) -> ReadResult:
         """The streams that have rows, with the account."""
-        kept = tuple(stream for stream in streams if stream is not None)
-        back = [text for stream in kept[:1] for text in _frames.steps_back(stream.frame)]
+        present = tuple(stream for stream in streams if stream is not None)
+        back = [text for stream in present[:1] for text in _frames.steps_back(stream.frame)]
         return ReadResult(
             reader=self.reader,
-            streams=kept,
+            streams=present,
             lines=self.lines,
             accepted=len(self),
             blank=self.blank,
@@ -360,9 +360,9 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
     most = _FLIGHT_S if form == "relative" else _MOST_S
     valid = np.isfinite(value) & (np.abs(value) * _SCALE_NS[unit] <= most * 1e9)
     safe = np.where(valid, value, 0.0)
-    whole = np.floor(safe)  # the fraction apart: a float64 epoch in ns has no room for it
-    ns = whole.astype(np.int64) * int(_SCALE_NS[unit])
-    ns += np.round((safe - whole) * _SCALE_NS[unit]).astype(np.int64) + (origin or 0)
+    integer = np.floor(safe)  # the fraction apart: a float64 epoch in ns has no room for it
+    ns = integer.astype(np.int64) * int(_SCALE_NS[unit])
+    ns += np.round((safe - integer) * _SCALE_NS[unit]).astype(np.int64) + (origin or 0)
     if form == "epoch" and options.clock in ("local", "local_as_utc"):
         return False, _time.local_to_utc(ns, options.timezone, needed_by=reader), valid
     none = np.zeros(len(ns), dtype=bool)
@@ -399,7 +399,7 @@ def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = No
 def mean_rank(
     rows: Rows,
     ri: FloatArray,
-    beside: Mapping[str, FloatArray],
+    columns: Mapping[str, FloatArray],
     *,
     none: BoolArray,
     pick: IntArray | None = None,
@@ -412,7 +412,7 @@ def mean_rank(
     ----------
     rows : Rows
     ri : float array, shape (m,)
-    beside : mapping
+    columns : mapping
         Further columns.
     none : bool array, shape (m,)
         Where the number means that nothing was reported.
@@ -427,14 +427,14 @@ def mean_rank(
     flag = (rows.flag if pick is None else rows.flag[pick]).copy()
     absent = np.isnan(ri) | none
     good = (ri >= 1) & (ri <= 8) & ~absent
-    whole = good & (ri == np.round(ri))
+    integer = good & (ri == np.round(ri))
     _lines.add_flag(flag, absent, "no_csi")
     _lines.add_flag(flag, ~good & ~absent, "ri_out_of_range")
-    _lines.add_flag(flag, good & ~whole, "rank_is_a_mean")
+    _lines.add_flag(flag, good & ~integer, "rank_is_a_mean")
     values = {
-        "rank": np.where(whole, ri, np.nan),
+        "rank": np.where(integer, ri, np.nan),
         "ri_raw": ri,
-        **beside,
+        **columns,
         "rank_mean": np.where(good, ri, np.nan),
     }
     about = {"ri_base": "one", "source": "CSI report, mean over the period"}
@@ -473,14 +473,14 @@ def of_ues(
     pick, rnti = np.arange(len(rows)) if pick is None else pick, values["rnti"]
     rnti = _identity(rnti, _MOST_RNTI)
     parts: list[tuple[str, BoolArray, dict[str, Attribute | None]]] = [
-        (ue, mine, {"identity_from": "assumed"} if one is None else {"rnti": int(one)})
-        for ue, mine, one in _divided(name, np.ones(len(rnti), dtype=bool), rnti, "rnti{:04x}")
+        (ue, mine, {"identity_from": "assumed"} if number is None else {"rnti": int(number)})
+        for ue, mine, number in _divided(name, np.ones(len(rnti), dtype=bool), rnti, "rnti{:04x}")
     ]
     if "pci" in values:  # two cells may give one RNTI at one time
         parts = [
-            (cell, within, {**more, "pci": int(one)} if cell != ue and one is not None else more)
+            (cell, within, {**more, "pci": int(number)} if cell != ue and number is not None else more)
             for ue, mine, more in parts
-            for cell, within, one in _divided(ue, mine, _identity(values["pci"], _MOST_PCI), "pci{}")
+            for cell, within, number in _divided(ue, mine, _identity(values["pci"], _MOST_PCI), "pci{}")
         ]
     return [
         rows.stream(

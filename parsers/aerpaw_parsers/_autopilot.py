@@ -36,8 +36,8 @@ class Series:
             return np.full(len(time_s), np.nan)
         after = np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
         before = np.maximum(after - 1, 0)
-        left = np.abs(self.time_s[before] - time_s) <= np.abs(self.time_s[after] - time_s)
-        best = np.where(left, before, after)
+        before_is_nearer = np.abs(self.time_s[before] - time_s) <= np.abs(self.time_s[after] - time_s)
+        best = np.where(before_is_nearer, before, after)
         return np.where(np.abs(self.time_s[best] - time_s) <= NEAR_S, self.columns[name][best], np.nan)
 
 
@@ -97,9 +97,9 @@ def result(reader: str, options: ReadOptions, flight: Flight) -> ReadResult:
     if offset is not None:
         zero_ns = round(offset * 1e6) * 1000  # autopilots count microseconds
     time_s, number = flight.position.time_s, flight.position.number
-    kept = np.abs(time_s) < _MOST_S
-    rejected = [*flight.damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in number[~kept])]
-    time_s, number = time_s[kept], number[kept]
+    timed = np.abs(time_s) < _MOST_S
+    rejected = [*flight.damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in number[~timed])]
+    time_s, number = time_s[timed], number[timed]
     lines = flight.messages + len(flight.damaged)
     rows = _rows.Rows(
         reader=reader,
@@ -115,7 +115,7 @@ def result(reader: str, options: ReadOptions, flight: Flight) -> ReadResult:
     if not len(rows):
         return rows.result([])
     rows.warnings += ["no message carries UTC: " + _rows.RELATIVE] if rows.relative else []
-    values: dict[str, AnyArray] = {name: column[kept] for name, column in flight.position.columns.items()}
+    values: dict[str, AnyArray] = {name: column[timed] for name, column in flight.position.columns.items()}
     lost = (np.abs(values["latitude_deg"]) < 1e-6) & (np.abs(values["longitude_deg"]) < 1e-6)
     rows.mark(lost, "no_fix")
     for name in ("latitude_deg", "longitude_deg", "altitude_m"):

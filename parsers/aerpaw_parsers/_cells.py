@@ -14,7 +14,7 @@ from aerpaw_cmp.logs.records import Stream
 
 # Radio accesses; the first where a log does not say.
 RATS = ("", "lte", "nr")
-BESIDE = ("rsrq_db", "rssi_dbm", "sinr_db", "pathloss_db")
+QUALITIES = ("rsrq_db", "rssi_dbm", "sinr_db", "pathloss_db")
 # RSRP beyond these is a sentinel (2147483647, 0) or a mistake.
 RANGE_DBM = (-170.0, -1.0)
 
@@ -35,8 +35,8 @@ class Reading:
     rsrp_dbm : float
     serving : bool or None
         Does the log call it the serving cell?
-    beside : tuple of float
-        Values of :data:`BESIDE`.
+    qualities : tuple of float
+        Values of :data:`QUALITIES`.
     """
 
     row: int
@@ -45,7 +45,7 @@ class Reading:
     arfcn: float
     rsrp_dbm: float
     serving: bool | None
-    beside: tuple[float, ...] = (np.nan,) * len(BESIDE)
+    qualities: tuple[float, ...] = (np.nan,) * len(QUALITIES)
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Table:
         Index into :data:`RATS`.
     pci, arfcn, rsrp_dbm : float array, shape (n,)
     serving : bool array, shape (n,)
-    beside : float array, shape (4, n)
+    qualities : float array, shape (4, n)
     """
 
     row: IntArray
@@ -68,21 +68,23 @@ class Table:
     arfcn: FloatArray
     rsrp_dbm: FloatArray
     serving: BoolArray
-    beside: FloatArray
+    qualities: FloatArray
 
 
 def table(readings: Iterable[Reading]) -> Table:
     """Readings, one by one, as columns."""
-    found = list(readings)
-    pci, arfcn, rsrp = (np.array([getattr(item, name) for item in found], dtype=np.float64) for name in _NUMBERS)
+    listed = list(readings)
+    pci, arfcn, rsrp = (np.array([getattr(item, name) for item in listed], dtype=np.float64) for name in _NUMBERS)
     return Table(
-        row=np.array([item.row for item in found], dtype=np.int64),
-        rat=np.array([RATS.index(item.rat) for item in found], dtype=np.int8),
+        row=np.array([item.row for item in listed], dtype=np.int64),
+        rat=np.array([RATS.index(item.rat) for item in listed], dtype=np.int8),
         pci=pci,
         arfcn=arfcn,
         rsrp_dbm=rsrp,
-        serving=np.array([bool(item.serving) for item in found], dtype=bool),
-        beside=np.array([item.beside for item in found], dtype=np.float64).reshape(len(found), len(BESIDE)).T,
+        serving=np.array([bool(item.serving) for item in listed], dtype=bool),
+        qualities=np.array([item.qualities for item in listed], dtype=np.float64)
+        .reshape(len(listed), len(QUALITIES))
+        .T,
     )
 
 
@@ -110,16 +112,16 @@ def streams(rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: st
     readings : Table or iterable of Reading
     source : str
     """
-    found = readings if isinstance(readings, Table) else table(readings)
-    order = np.argsort(found.row, kind="stable")
-    order = order[np.isfinite(found.rsrp_dbm[order])]
-    rats, pci, arfcn = found.rat[order], found.pci[order], found.arfcn[order]
-    served = _serving(found, order)
+    columns = readings if isinstance(readings, Table) else table(readings)
+    order = np.argsort(columns.row, kind="stable")
+    order = order[np.isfinite(columns.rsrp_dbm[order])]
+    rats, pci, arfcn = columns.rat[order], columns.pci[order], columns.arfcn[order]
+    served = _serving(columns, order)
     pci = np.where(np.isfinite(pci) & (pci >= 0), pci, -1.0)
-    made: list[Stream] = []
+    per_cell: list[Stream] = []
     for rat in np.unique(rats).tolist():
-        for item in np.unique(pci[rats == rat]).tolist():
-            of_pci = np.flatnonzero((rats == rat) & (pci == item))
+        for identity in np.unique(pci[rats == rat]).tolist():
+            of_pci = np.flatnonzero((rats == rat) & (pci == identity))
             carriers = np.unique(arfcn[of_pci][np.isfinite(arfcn[of_pci])])
             if len(carriers) < 2:
                 parts = [(of_pci, float(carriers[0]) if len(carriers) else np.nan)]
@@ -127,9 +129,9 @@ def streams(rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: st
                 parts = [(of_pci[arfcn[of_pci] == carrier], carrier) for carrier in carriers.tolist()]
                 parts.append((of_pci[np.isnan(arfcn[of_pci])], np.nan))
             for pick, carrier in parts:
-                cell = Cell(RATS[rat], item, carrier, several=len(carriers) > 1)
-                made += [_stream(rows, found, order[pick], served[pick], cell, source)] if len(pick) else []
-    return made
+                cell = Cell(RATS[rat], identity, carrier, several=len(carriers) > 1)
+                per_cell += [_stream(rows, columns, order[pick], served[pick], cell, source)] if len(pick) else []
+    return per_cell
 
 
 @dataclass(frozen=True)
@@ -150,25 +152,25 @@ class Cell:
         return "_".join(part for part in parts if part)
 
 
-def _serving(found: Table, order: IntArray) -> FloatArray:
+def _serving(columns: Table, order: IntArray) -> FloatArray:
     """1 where the reading is of the cell that serves, 0 where another does, NaN where nothing is known."""
-    row, rats, serving = (column[order] for column in (found.row, found.rat, found.serving))
-    cell = np.stack([found.pci[order], np.nan_to_num(found.arfcn[order], nan=-1.0)])
+    row, rats, serving = (column[order] for column in (columns.row, columns.rat, columns.serving))
+    cell = np.stack([columns.pci[order], np.nan_to_num(columns.arfcn[order], nan=-1.0)])
     served = np.full(len(order), np.nan)
     for rat in np.unique(rats[serving]).tolist():
-        mine = np.flatnonzero(rats == rat)
-        named = mine[serving[mine]]
+        of_rat = np.flatnonzero(rats == rat)
+        named = of_rat[serving[of_rat]]
         # all readings of a row at once: the serving one may stand behind its neighbours
-        last = np.searchsorted(row[named], row[mine], side="right") - 1
-        known = last >= 0
-        mine = mine[known]
-        served[mine] = serving[mine] | (cell[:, mine] == cell[:, named[last[known]]]).all(axis=0)
+        last = np.searchsorted(row[named], row[of_rat], side="right") - 1
+        named_before = last >= 0
+        of_rat = of_rat[named_before]
+        served[of_rat] = serving[of_rat] | (cell[:, of_rat] == cell[:, named[last[named_before]]]).all(axis=0)
     return served
 
 
-def _stream(rows: _rows.Rows, found: Table, pick: IntArray, served: FloatArray, cell: Cell, source: str) -> Stream:
+def _stream(rows: _rows.Rows, columns: Table, pick: IntArray, served: FloatArray, cell: Cell, source: str) -> Stream:
     """Readings of one cell, in the order of the log."""
-    row, level = found.row[pick], found.rsrp_dbm[pick]
+    row, level = columns.row[pick], columns.rsrp_dbm[pick]
     flag = rows.flag[row]
     outside = ~((level >= RANGE_DBM[0]) & (level <= RANGE_DBM[1]))
     if 2 * outside.sum() > len(level):
@@ -180,16 +182,16 @@ def _stream(rows: _rows.Rows, found: Table, pick: IntArray, served: FloatArray, 
     _lines.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
     level[outside] = np.nan
     values: dict[str, FloatArray] = {"rss_db": level, "serving": served}
-    for name, column in zip(BESIDE, found.beside, strict=True):
-        mine = column[pick]
-        known = np.isfinite(mine)  # a ratio or loss written as 'inf' is none
-        if known.any():
-            values[name] = np.where(known, mine, np.nan)
-    made = rows.stream(
+    for name, column in zip(QUALITIES, columns.qualities, strict=True):
+        quality = column[pick]
+        finite = np.isfinite(quality)  # a ratio or loss written as 'inf' is none
+        if finite.any():
+            values[name] = np.where(finite, quality, np.nan)
+    stream = rows.stream(
         "rss", cell.name, values, pick=row, flag=flag, channel=rows.options.channel or cell.name,
         unit=rows.options.unit or "dBm", quantity="RSRP", rat=cell.rat or None,
         pci=int(cell.pci) if cell.pci >= 0 else None, arfcn=int(cell.arfcn) if np.isfinite(cell.arfcn) else None,
         source=source,
     )  # fmt: skip
-    assert made is not None
-    return made
+    assert stream is not None
+    return stream

@@ -30,7 +30,7 @@ class Objects:
     ----------
     row : int array, shape (n,)
         0-based line on which each begins.
-    found : list of dict, length n
+    values : list of dict, length n
     rejected : list of RejectedLine
         Lines that are no object.
     more : int array
@@ -38,7 +38,7 @@ class Objects:
     """
 
     row: IntArray
-    found: list[dict[str, Any]]
+    values: list[dict[str, Any]]
     rejected: list[RejectedLine]
     more: IntArray
 
@@ -50,7 +50,7 @@ def objects(lines: _lines.Lines) -> Objects:
     as nothing.
     """
     rows: list[int] = []
-    found: list[dict[str, Any]] = []
+    values: list[dict[str, Any]] = []
     rejected: list[RejectedLine] = []
     more: list[int] = []
     ends: dict[bytes, list[int]] | None = None
@@ -61,21 +61,21 @@ def objects(lines: _lines.Lines) -> Objects:
         text = _bare(lines.raw(i))
         if text in (b"[", b"]"):
             continue
-        one, goes_on = _loaded(text)
-        if goes_on and tried < _MOST_TRIED:
+        value, unclosed = _loaded(text)
+        if unclosed and tried < _MOST_TRIED:
             ends = _ends(lines) if ends is None else ends
             last = _end_of(lines, i, ends)
             if last >= 0:
                 several = _bare(lines.data[lines.starts[i] : lines.ends[last]])
-                one, _ = _loaded(several)
-                more += range(i + 1, last + 1) if isinstance(one, dict) else ()
-                tried += 0 if isinstance(one, dict) else len(several)
-        if isinstance(one, dict):
+                value, _ = _loaded(several)
+                more += range(i + 1, last + 1) if isinstance(value, dict) else ()
+                tried += 0 if isinstance(value, dict) else len(several)
+        if isinstance(value, dict):
             rows.append(i)
-            found.append(one)
+            values.append(value)
         else:
-            rejected.append(lines.reject(i, "no JSON object (torn line?)" if one is None else "no JSON object"))
-    return Objects(np.array(rows, dtype=np.int64), found, rejected, np.array(more, dtype=np.int64))
+            rejected.append(lines.reject(i, "no JSON object (torn line?)" if value is None else "no JSON object"))
+    return Objects(np.array(rows, dtype=np.int64), values, rejected, np.array(more, dtype=np.int64))
 
 
 def _bare(text: bytes) -> bytes:
@@ -98,11 +98,11 @@ def _indent(line: bytes) -> bytes:
 
 def _ends(lines: _lines.Lines) -> dict[bytes, list[int]]:
     """Lines that close an object and nothing else, by their indentation."""
-    found: dict[bytes, list[int]] = {}
+    closing: dict[bytes, list[int]] = {}
     for i in range(len(lines)):
         if lines.ends[i] - lines.starts[i] < 200 and lines.raw(i).strip().rstrip(b",") == b"}":
-            found.setdefault(_indent(lines.raw(i)), []).append(i)
-    return found
+            closing.setdefault(_indent(lines.raw(i)), []).append(i)
+    return closing
 
 
 def _end_of(lines: _lines.Lines, first: int, ends: dict[bytes, list[int]]) -> int:
@@ -118,14 +118,14 @@ def first(head: bytes) -> dict[str, Any] | None:
         text = line.strip().lstrip(b"\xef\xbb\xbf").lstrip(b"[").rstrip(b",")
         if not text:
             continue
-        one, _ = _loaded(text)
-        if one is None:  # perhaps one over several lines
+        value, _ = _loaded(text)
+        if value is None:  # perhaps one over several lines
             place = head.find(b"{")
             try:
-                one, _ = json.JSONDecoder().raw_decode(head[max(place, 0) :].decode("utf-8", "replace"))
+                value, _ = json.JSONDecoder().raw_decode(head[max(place, 0) :].decode("utf-8", "replace"))
             except (ValueError, RecursionError):
                 return None
-        return one if isinstance(one, dict) else None
+        return value if isinstance(value, dict) else None
     return None
 
 
@@ -134,26 +134,26 @@ def number(value: Any) -> float:
     if isinstance(value, bool) or value is None:
         return float("nan")
     try:
-        made = float(value)
+        converted = float(value)
     except (TypeError, ValueError, OverflowError):
         return float("nan")
-    return float("nan") if made in SENTINELS or abs(made) > 1e300 else made
+    return float("nan") if converted in SENTINELS or abs(converted) > 1e300 else converted
 
 
-def column(found: list[dict[str, Any]], *names: str) -> FloatArray:
+def column(entries: list[dict[str, Any]], *names: str) -> FloatArray:
     """A key of every object as numbers: of several names, the first that an object has."""
-    return np.array([number(next((entry[name] for name in names if name in entry), None)) for entry in found])
+    return np.array([number(next((entry[name] for name in names if name in entry), None)) for entry in entries])
 
 
-def inside(one: dict[str, Any], name: str) -> dict[str, Any]:
+def inside(entry: dict[str, Any], name: str) -> dict[str, Any]:
     """An object within an object, empty where there is none."""
-    value = one.get(name)
+    value = entry.get(name)
     return value if isinstance(value, dict) else {}
 
 
-def listed(one: dict[str, Any], name: str) -> list[dict[str, Any]]:
+def listed(entry: dict[str, Any], name: str) -> list[dict[str, Any]]:
     """A list of objects within an object."""
-    value = one.get(name)
+    value = entry.get(name)
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 

@@ -80,14 +80,14 @@ _CELLMAPPER = {r"signal": "rsrp", r"psc or pci": "pci"}
 
 def in_common_words(names: list[str]) -> list[str]:
     """Plain names, those that only one program uses in the words of all: G-NetTrack Pro's, srsUE's metrics file's."""
-    given = set(names)
+    present = set(names)
     programs = (
-        (_GNETTRACK, {"level", "qual"} <= given and not given.isdisjoint(OF_GNETTRACK)),
-        (_SRSUE, given >= SRSUE),
-        (_CELLMAPPER, {"signal", "psc or pci"} <= given),
-        (_BARE, "rank" in given and any(is_level(name) for name in names)),
+        (_GNETTRACK, {"level", "qual"} <= present and not present.isdisjoint(OF_GNETTRACK)),
+        (_SRSUE, present >= SRSUE),
+        (_CELLMAPPER, {"signal", "psc or pci"} <= present),
+        (_BARE, "rank" in present and any(is_level(name) for name in names)),
     )
-    for pattern, word in next((table for table, here in programs if here), {}).items():
+    for pattern, word in next((table for table, applies in programs if applies), {}).items():
         names = [re.sub(f"^{pattern}$", word, name) for name in names]
     return names
 

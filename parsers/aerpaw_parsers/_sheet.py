@@ -80,10 +80,10 @@ def header_of(lines: Sequence[bytes], is_header: IsHeader) -> tuple[int, str, li
 def starts(head: bytes, is_header: IsHeader) -> bool:
     """Check whether a file begins with such a header, title lines aside, and a row of its width soon follows."""
     lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
-    found = header_of(lines, is_header)
-    if found is None:
+    header = header_of(lines, is_header)
+    if header is None:
         return False
-    at, separator, names = found
+    at, separator, names = header
     below = [line for line in lines[at + 1 :] if line.strip()][:5]
     return not below or any(abs(len(_split(line, separator)) - len(names)) <= 1 for line in below)
 
@@ -145,8 +145,8 @@ class Sheet:
 
     def unit(self, column: int) -> str:
         """Unit in brackets at the end of a column's name, or the one that is known of it, or an empty text."""
-        found = _UNIT.search(self.names[column])
-        return found[1].strip().lower() if found else self.units.get(column, "")
+        written = _UNIT.search(self.names[column])
+        return written[1].strip().lower() if written else self.units.get(column, "")
 
     def unit_read(self, column: int) -> str:
         """Unit of :meth:`numbers`; empty where the brackets hold something else, such as ``(LTE scell0)``."""
@@ -161,17 +161,19 @@ class Sheet:
 
     def keep(self, where: BoolArray) -> None:
         """Leave the rows out that a mask does not hold."""
-        self.cells = [cells for cells, kept in zip(self.cells, where.tolist(), strict=True) if kept]
+        self.cells = [cells for cells, inside in zip(self.cells, where.tolist(), strict=True) if inside]
         self.row = self.row[where]
         self._silent = {column: mask[where] for column, mask in self._silent.items()}
         self._numbers = {}
 
     def texts(self, column: int) -> list[str]:
         """A column as text."""
-        made = [cells[column].strip() for cells in self.cells]
+        column_texts = [cells[column].strip() for cells in self.cells]
         if column in self._silent:
-            made = ["" if silent else text for text, silent in zip(made, self._silent[column].tolist(), strict=True)]
-        return made
+            column_texts = [
+                "" if silent else text for text, silent in zip(column_texts, self._silent[column].tolist(), strict=True)
+            ]
+        return column_texts
 
     def numbers(self, column: int) -> FloatArray:
         """A column as numbers in the unit of its name's brackets made SI or degrees; what is none is NaN. Read only."""
@@ -179,14 +181,14 @@ class Sheet:
             texts = self.texts(column)
             if self._has_points and _are_thousands(texts):
                 texts = [text.replace(",", "") for text in texts]
-            known = {text: _number(text) for text in set(texts)}  # tables repeat themselves
-            made = np.array([known[text] for text in texts], dtype=np.float64)
-            words = [text for text in texts if np.isnan(known[text]) and text.lower() not in _NONE]
+            parsed = {text: _number(text) for text in set(texts)}  # tables repeat themselves
+            values = np.array([parsed[text] for text in texts], dtype=np.float64)
+            words = [text for text in texts if np.isnan(parsed[text]) and text.lower() not in _NONE]
             if 2 * len(words) > sum(text.lower() not in _NONE for text in texts):
                 self._words[column] = len(words), words[0]
-            made *= _FACTORS.get(self.unit(column), ("", 1.0))[1]
-            made.flags.writeable = False  # the next who asks gets the same
-            self._numbers[column] = made
+            values *= _FACTORS.get(self.unit(column), ("", 1.0))[1]
+            values.flags.writeable = False  # the next who asks gets the same
+            self._numbers[column] = values
         return self._numbers[column]
 
     @cached_property
@@ -226,23 +228,23 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
 
 def read(data: bytes, is_header: IsHeader) -> Sheet | None:
     """The table of a file, None where none of its first lines is its header."""
-    found = header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
-    if found is None:
+    header = header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
+    if header is None:
         return None
-    at, separator, names = found
+    at, separator, names = header
     lines = _lines.split(data)
-    left = ~lines.blank
-    left[: at + 1] = False
+    below = ~lines.blank
+    below[: at + 1] = False
     row: list[int] = []
     cells: list[list[str]] = []
-    other: list[int] = [*range(at + 1)]
+    comments: list[int] = [*range(at + 1)]
     odd: list[tuple[int, int]] = []
-    for i in np.flatnonzero(left).tolist():
+    for i in np.flatnonzero(below).tolist():
         fields = _fitted(_split(lines.raw(i), separator), names)
         if len(fields) != len(names):
             odd.append((i, len(fields)))
         elif fields[0].strip() == names[0] and [text.strip() for text in fields] == names:
-            other.append(i)  # a header again: files joined by hand
+            comments.append(i)  # a header again: files joined by hand
         else:
             row.append(i)
             cells.append(fields)
@@ -255,7 +257,7 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
         names=names,
         row=np.array(row, dtype=np.int64),
         cells=cells,
-        blank_rows=np.array([*other, *foot], dtype=np.int64),
+        blank_rows=np.array([*comments, *foot], dtype=np.int64),
         rejected=[
             lines.reject(i, f"{count} fields where the header has {len(names)} (torn line?)")
             for i, count in odd
@@ -313,16 +315,16 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str]
     clock, cells, warnings = _stamps.read(texts, options, unit=count, european=_has_decimal_commas(sheet))
     if clock == "wall" and utc and not np.char.endswith(cells, b"Z").all():
         cells = np.array([cell if re.search(rb"(Z|[+-]\d\d:?\d\d)$", cell) else cell + b"Z" for cell in cells.tolist()])
-    made = _rows.built(
+    timed = _rows.built(
         sheet.lines, sheet.row, {"time": cells}, options, reader=reader, reason=lambda _line: None, clock=clock,
         extra=sheet.rejected, markup=sheet.blank_rows,
     )  # fmt: skip
-    made.warnings += warnings
-    if len(made.row) < len(sheet.row):
-        sheet.keep(np.isin(sheet.row, made.row))
+    timed.warnings += warnings
+    if len(timed.row) < len(sheet.row):
+        sheet.keep(np.isin(sheet.row, timed.row))
     if (counter := sheet.find("time millisecond")) not in (None, column):
-        _finer(made, sheet.numbers(counter))
-    return made
+        _finer(timed, sheet.numbers(counter))
+    return timed
 
 
 _DECIMAL_COMMA = re.compile(r"-?\d{1,4},\d{1,9}")
@@ -357,8 +359,8 @@ def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:
 def nothing(data: bytes, reader: str, reason: str) -> ReadResult:
     """The account of a file without such a table: every line rejected."""
     lines = _lines.split(data)
-    left = np.flatnonzero(~lines.blank)
-    rejected = tuple(lines.reject_all(left, reason))
+    filled = np.flatnonzero(~lines.blank)
+    rejected = tuple(lines.reject_all(filled, reason))
     return ReadResult(
-        reader=reader, streams=(), lines=len(lines), accepted=0, blank=len(lines) - len(left), rejected=rejected
+        reader=reader, streams=(), lines=len(lines), accepted=0, blank=len(lines) - len(filled), rejected=rejected
     )

@@ -45,8 +45,8 @@ def date_in_name(name: str) -> str | None:
     ('2024-02-09', '2022-06-10', None)
     """
     for pattern in _IN_NAME:
-        for found in pattern.finditer(name):
-            year, month, day = found.groups()
+        for match in pattern.finditer(name):
+            year, month, day = match.groups()
             year = year if len(year) == 4 else f"20{year}"
             number = int(month) if month.isdigit() else _month(month)
             if 1 <= number <= 12 and 1 <= int(day) <= 31:
@@ -64,32 +64,32 @@ def _written(year: str, month: int, day: str, clock: Sequence[str | None], zone:
     number = int(hour)
     if half:
         number = number % 12 + (12 if half.lower() == "pm" else 0)
-    whole, _, fraction = re.sub("[,:]", ".", second).partition(".")
-    text = f"{year}-{month:02d}-{int(day):02d} {number:02d}:{int(minute):02d}:{int(whole):02d}"
+    integer, _, fraction = re.sub("[,:]", ".", second).partition(".")
+    text = f"{year}-{month:02d}-{int(day):02d} {number:02d}:{int(minute):02d}:{int(integer):02d}"
     end = "Z" if zone in ("UTC", "GMT") else zone or ""
     return (text + (f".{fraction}" if fraction else "") + end).encode()
 
 
 def _dated(text: str, day_first: bool) -> bytes | None:
-    if found := _YEAR_FIRST.fullmatch(text) or _DIGITS.fullmatch(text):
-        return _written(found[1], int(found[2]), found[3], found.groups()[3:7], found[8])
-    if found := _YEAR_LAST.fullmatch(text):
-        day, month = (found[1], found[3]) if day_first else (found[3], found[1])
-        return _written(found[4], int(month), day, found.groups()[4:8], found[9])
-    if found := _WORD_MONTH.fullmatch(text):
-        year = found[3] if len(found[3]) == 4 else f"20{found[3]}"
-        return _written(year, _month(found[2]), found[1], found.groups()[3:7], found[8])
+    if match := _YEAR_FIRST.fullmatch(text) or _DIGITS.fullmatch(text):
+        return _written(match[1], int(match[2]), match[3], match.groups()[3:7], match[8])
+    if match := _YEAR_LAST.fullmatch(text):
+        day, month = (match[1], match[3]) if day_first else (match[3], match[1])
+        return _written(match[4], int(month), day, match.groups()[4:8], match[9])
+    if match := _WORD_MONTH.fullmatch(text):
+        year = match[3] if len(match[3]) == 4 else f"20{match[3]}"
+        return _written(year, _month(match[2]), match[1], match.groups()[3:7], match[8])
     return None
 
 
 def _day_first(texts: Iterable[str]) -> bool | None:
     """Check whether the day stands before the month; None where every date can be read both ways."""
-    dates = [found for text in texts if (found := _YEAR_LAST.fullmatch(text))]
-    if dates and all(found[2] == "." for found in dates):
+    dates = [match for text in texts if (match := _YEAR_LAST.fullmatch(text))]
+    if dates and all(match[2] == "." for match in dates):
         return True  # 02.03.2025: where points stand, the day comes first
-    if any(int(found[1]) > 12 for found in dates):
+    if any(int(match[1]) > 12 for match in dates):
         return True
-    if any(int(found[3]) > 12 for found in dates) or not dates:
+    if any(int(match[3]) > 12 for match in dates) or not dates:
         return False
     return None
 
@@ -123,26 +123,28 @@ def read(
     warnings : list of str
     """
     shown = [text.strip().strip('"').strip() for text in texts]
-    some = [text for text in shown if text]
-    refuse_rounded(some)
-    counts = sum(_NUMBER.fullmatch(text) is not None for text in some)
-    if counts * 2 > len(some) and not any(_DIGITS.fullmatch(text) for text in some[:3]):
+    filled = [text for text in shown if text]
+    refuse_rounded(filled)
+    counts = sum(_NUMBER.fullmatch(text) is not None for text in filled)
+    if counts * 2 > len(filled) and not any(_DIGITS.fullmatch(text) for text in filled[:3]):
         return _numbers(shown, unit, options)
-    if sum(_OF_DAY.fullmatch(text) is not None for text in some) * 2 > len(some):
+    if sum(_OF_DAY.fullmatch(text) is not None for text in filled) * 2 > len(filled):
         return _of_day(shown, options)
-    first = _day_first(some)
+    first = _day_first(filled)
     warnings = []
     if first is None:
-        first = _first_by_name(some, options.file_name)
+        first = _first_by_name(filled, options.file_name)
         reason = "as the date in the file name"
         if first is None:
             first, reason = european, "as where decimal commas are written" if european else "a guess"
         word = "day" if first else "month"
         warnings = [f"the dates can be read with the day or the month first: the {word} was taken, {reason}"]
-    if len(set(some)) < len(some) and 2 * sum(_NO_SECONDS.fullmatch(text) is not None for text in some) > len(some):
+    if len(set(filled)) < len(filled) and 2 * sum(_NO_SECONDS.fullmatch(text) is not None for text in filled) > len(
+        filled
+    ):
         warnings.append("the times have no seconds (a table saved by a spreadsheet?): rows of a minute share one time")
-    made = [text.encode() if _COMMON.fullmatch(text) else _dated(text, bool(first)) or b"-" for text in shown]
-    return "wall", np.array(made or [b"-"], dtype=np.bytes_)[: len(made)], warnings
+    cells = [text.encode() if _COMMON.fullmatch(text) else _dated(text, bool(first)) or b"-" for text in shown]
+    return "wall", np.array(cells or [b"-"], dtype=np.bytes_)[: len(cells)], warnings
 
 
 def refuse_rounded(texts: Sequence[str]) -> None:
@@ -202,10 +204,10 @@ _MILLISECONDS = "the times are whole numbers beyond a day of seconds: read as mi
 
 def _of_day(texts: Sequence[str], options: ReadOptions) -> tuple[str, AnyArray, list[str]]:
     """Times of the day: their date is that of ``time_origin``, of the file name, or nobody's."""
-    found = [_OF_DAY.fullmatch(text) for text in texts]
-    seconds = np.array([_seconds(item.groups()) if item else np.nan for item in found], dtype=np.float64)
+    matches = [_OF_DAY.fullmatch(text) for text in texts]
+    seconds = np.array([_seconds(item.groups()) if item else np.nan for item in matches], dtype=np.float64)
     seconds += 86_400.0 * np.cumsum(np.nan_to_num(np.diff(seconds, prepend=np.nan)) < -43_200)
-    marked = any(item[5] for item in found if item)
+    marked = any(item[5] for item in matches if item)
     hours = _hours_off(seconds, options.file_name)
     seconds -= 3600.0 * hours
     warnings = ["the times are marked as UTC but read as local, as the program's own names say"] if marked else []
@@ -220,10 +222,10 @@ _NEAR_S = 300.0
 
 def _hours_off(seconds: FloatArray, name: str) -> int:
     """Whole hours between the first time of the day [s] and the one in Nemo's file name; 0 where there is none."""
-    found, known = _NEMO_NAME.search(name), seconds[np.isfinite(seconds)][:1]
-    if found is None or not len(known):
+    written, first = _NEMO_NAME.search(name), seconds[np.isfinite(seconds)][:1]
+    if written is None or not len(first):
         return 0
-    apart = float(known[0]) - (int(found[1]) * 3600 + int(found[2]) * 60 + int(found[3]))
+    apart = float(first[0]) - (int(written[1]) * 3600 + int(written[2]) * 60 + int(written[3]))
     hours = round(apart / 3600)
     return hours if abs(apart - 3600 * hours) < _NEAR_S else 0
 

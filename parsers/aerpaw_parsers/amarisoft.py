@@ -41,7 +41,7 @@ def sniff(head: bytes) -> bool:
 def _table(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, dict[str, float]]], list[RejectedLine]]:
     """Line, time and values of each row."""
     places: dict[str, int] = {}
-    found, rejected = [], []
+    entries, rejected = [], []
     for i in range(len(lines)):
         line = lines.raw(i)
         if title := _TITLE.match(line):
@@ -56,10 +56,10 @@ def _table(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, dict[str, float]
             rejected.append(lines.reject(i, "a row that is shorter than its title (torn line?)"))
             continue
         texts = {name: cells[at].decode("ascii", "replace") for name, at in places.items()}
-        found.append(
+        entries.append(
             (i, written[1], {name: _number(texts[name], base) for name, base in _WANTED.items() if name in texts})
         )
-    return found, rejected
+    return entries, rejected
 
 
 def _number(text: str, base: int) -> float:
@@ -72,16 +72,16 @@ def _number(text: str, base: int) -> float:
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb`` with CQI and MCS; UsageError if no time zone is given."""
     lines = _lines.split(data)
-    found, rejected = _table(lines)
-    time = np.array([item[1] for item in found] or [b""], dtype=np.bytes_)[: len(found)]
-    row = np.array([item[0] for item in found], dtype=np.int64)
+    entries, rejected = _table(lines)
+    time = np.array([item[1] for item in entries] or [b""], dtype=np.bytes_)[: len(entries)]
+    row = np.array([item[0] for item in entries], dtype=np.int64)
     rows = _rows.built(
         lines, row, {"time": time}, options, reader="amarisoft", reason=lambda _line: None, extra=rejected
     )
-    kept = [found[i][2] for i in rows.at.tolist()]
-    value = {name: np.array([item.get(name, np.nan) for item in kept]) for name in _WANTED}
-    beside = {"cqi": value["cqi"], "mcs": value["mcs"], "rnti": value["RNTI"]}
-    return rows.result(_rows.mean_rank(rows, value["ri"], beside, none=value["ri"] == 0))
+    timed = [entries[i][2] for i in rows.at.tolist()]
+    value = {name: np.array([item.get(name, np.nan) for item in timed]) for name in _WANTED}
+    columns = {"cqi": value["cqi"], "mcs": value["mcs"], "rnti": value["RNTI"]}
+    return rows.result(_rows.mean_rank(rows, value["ri"], columns, none=value["ri"] == 0))
 
 
 def sniff_json(head: bytes) -> bool:
@@ -95,9 +95,9 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb``: a record per UE, cell and answer; one without the time that the others have is rejected."""
     lines = _lines.split(data)
     answers = _json.objects(lines)
-    found = answers.found
-    has_utc = any("utc" in item for item in found)
-    time = _json.column(found, "utc" if has_utc else "time")
+    replies = answers.values
+    has_utc = any("utc" in item for item in replies)
+    time = _json.column(replies, "utc" if has_utc else "time")
     rows = _rows.built(
         lines, answers.row, {"time": time}, options, reader="amarisoft_json", reason=_json.bracket,
         clock="epoch_s" if has_utc else "relative_s", extra=answers.rejected, markup=answers.more,
@@ -105,18 +105,18 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     pairs: list[tuple[int, dict[str, Any]]] = [
         (i, {**ue, **cell})
         for i, at in enumerate(rows.at.tolist())
-        for ue in _json.listed(found[at], "ue_list")
+        for ue in _json.listed(replies[at], "ue_list")
         for cell in _json.listed(ue, "cells")
     ]
     cells = [cell for _, cell in pairs]
-    beside = {
+    columns = {
         "cqi": _json.column(cells, "cqi"),
         "mcs": _json.column(cells, "dl_mcs"),
         "rnti": _json.column(cells, "rnti"),
     }
     ri = _json.column(cells, "ri")
     pick = np.array([i for i, _ in pairs], dtype=np.int64)
-    return rows.result(_rows.mean_rank(rows, ri, beside, none=ri == 0, pick=pick))
+    return rows.result(_rows.mean_rank(rows, ri, columns, none=ri == 0, pick=pick))
 
 
 READER = Reader(

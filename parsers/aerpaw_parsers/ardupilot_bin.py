@@ -63,7 +63,7 @@ _Rows = dict[str, dict[tuple[str, ...], list[tuple[int, tuple[float, ...]]]]]
 def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
     """Values of the wanted messages, the number of sound messages, and damaged stretches."""
     forms: dict[int, _Form] = {_FMT: _Form(89, "FMT", "BBnNZ", ["Type", "Length", "Name", "Format", "Columns"])}
-    found: _Rows = {name: {} for name in _WANTED}
+    by_name: _Rows = {name: {} for name in _WANTED}
     damaged: list[RejectedLine] = []
     count, at, end = 0, 0, len(data)
     while at + 3 <= end:
@@ -78,37 +78,37 @@ def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
             continue
         body = data[at + 3 : at + form.length]
         if data[at + 2] == _FMT:
-            kind, made = _form(body)
+            kind, described = _form(body)
             if kind != _FMT:
-                forms[kind] = made
-        elif form.name in found and form.sound:
+                forms[kind] = described
+        elif form.name in by_name and form.sound:
             raw = form.layout.unpack(body)
             values = tuple(v * s if s else float("nan") for v, s in zip(raw, form.scales, strict=True))
-            found[form.name].setdefault(tuple(form.columns), []).append((count + len(damaged), values))
+            by_name[form.name].setdefault(tuple(form.columns), []).append((count + len(damaged), values))
         count += 1
         at += form.length
     if at < end:
         damaged.append(RejectedLine(count + len(damaged) + 1, f"{end - at} bytes at the end that are no message", ""))
-    return found, count, damaged
+    return by_name, count, damaged
 
 
 def _text_messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
     """The same of a log in text, whose values have their scales already; every line is a message."""
     columns: dict[str, tuple[str, ...]] = {}
-    found: _Rows = {name: {} for name in _WANTED}
+    by_name: _Rows = {name: {} for name in _WANTED}
     damaged: list[RejectedLine] = []
     lines = data.decode("utf-8", "replace").splitlines()
     for number, line in enumerate(lines):
         name, *cells = (cell.strip() for cell in line.split(","))
         if name == "FMT" and len(cells) > 4:
             columns[cells[2]] = tuple(cells[4:])
-        if name not in found:
+        if name not in by_name:
             continue
         if len(cells) == len(columns.get(name, ())):
-            found[name].setdefault(columns[name], []).append((number, tuple(map(_number, cells))))
+            by_name[name].setdefault(columns[name], []).append((number, tuple(map(_number, cells))))
         else:
             damaged.append(RejectedLine(number + 1, "a message without the fields of its FMT line", line[:500]))
-    return found, len(lines) - len(damaged), damaged
+    return by_name, len(lines) - len(damaged), damaged
 
 
 def _number(cell: str) -> float:
@@ -118,9 +118,9 @@ def _number(cell: str) -> float:
         return float("nan")
 
 
-def _series(found: _Rows, name: str) -> _autopilot.Series:
+def _series(by_name: _Rows, name: str) -> _autopilot.Series:
     """Messages of one name: of its descriptions the commonest, of instances (sensors, filters) the first."""
-    timed = {names: rows for names, rows in found[name].items() if "TimeUS" in names}
+    timed = {names: rows for names, rows in by_name[name].items() if "TimeUS" in names}
     if not timed:
         return _autopilot.NONE
     names, rows = max(timed.items(), key=lambda item: len(item[1]))
@@ -137,8 +137,8 @@ def _series(found: _Rows, name: str) -> _autopilot.Series:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Telemetry ``vehicle``."""
-    found, count, damaged = _text_messages(data) if _TEXT.match(data) else _messages(data)
-    series = {name: _series(found, name) for name in _WANTED}
+    by_name, count, damaged = _text_messages(data) if _TEXT.match(data) else _messages(data)
+    series = {name: _series(by_name, name) for name in _WANTED}
     gps = series["GPS"]
     place = series["POS"] if len(series["POS"].time_s) else gps
     column = place.columns

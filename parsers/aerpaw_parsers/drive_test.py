@@ -32,7 +32,7 @@ _LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
 # A secondary carrier: it serves beside the primary one.
 _SECONDARY = re.compile(r"\bsc(?:ell|c) ?(\d{0,2})\b")
 _NUMBER = re.compile(r"(?:^| )n?(\d{1,2})(?: |$)")
-_BESIDE = {"RSRQ": "rsrq_db", "RSSI": "rssi_dbm", "SINR": "sinr_db", "path loss": "pathloss_db"}
+_QUALITIES = {"RSRQ": "rsrq_db", "RSSI": "rssi_dbm", "SINR": "sinr_db", "path loss": "pathloss_db"}
 _TOWER_SNR = re.compile(r"snr (lw\d)")
 
 
@@ -63,7 +63,7 @@ class _Cell:
     rsrp: int | None = None
     pci: int | None = None
     arfcn: int | None = None
-    beside: dict[str, int] = field(default_factory=dict)
+    qualities: dict[str, int] = field(default_factory=dict)
 
 
 def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
@@ -78,7 +78,7 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
         if meaning is not None and meaning.kind == "rank":
             ranks.append(i)
             continue
-        if meaning is not None and meaning.name not in ("RSRP", *_BESIDE):
+        if meaning is not None and meaning.name not in ("RSRP", *_QUALITIES):
             others.append(i)
             continue
         rat = "nr" if _NR.search(name) else "lte" if _LTE.search(name) else ""
@@ -94,14 +94,14 @@ def _put(
     cell: _Cell, i: int, meaning: _quantities.Quantity | None, *, is_pci: bool, is_arfcn: bool, others: list[int]
 ) -> None:
     """Column ``i`` to its place; a second column of one quantity is kept as a KPI."""
-    name = "" if meaning is None else _BESIDE.get(meaning.name, "")
+    name = "" if meaning is None else _QUALITIES.get(meaning.name, "")
     if meaning is None and (is_pci or is_arfcn):
         part = "pci" if is_pci else "arfcn"
         setattr(cell, part, i if getattr(cell, part) is None else getattr(cell, part))
     elif meaning is not None and meaning.name == "RSRP" and cell.rsrp is None:
         cell.rsrp = i
-    elif name and name not in cell.beside:
-        cell.beside[name] = i
+    elif name and name not in cell.qualities:
+        cell.qualities[name] = i
     else:
         others.append(i)
 
@@ -115,22 +115,24 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
     for (rat, role), cell in list(cells.items()):
         if cell.rsrp is not None:
             continue
-        same = [other for (access, place), other in cells.items() if place == role and (not rat or access in ("", rat))]
-        homes = [other for other in same if other.rsrp is not None]
+        same = [
+            partner for (access, place), partner in cells.items() if place == role and (not rat or access in ("", rat))
+        ]
+        homes = [partner for partner in same if partner.rsrp is not None]
         if len(homes) == 1:
             home = homes[0]
             home.rat = home.rat or rat
             home.pci = cell.pci if home.pci is None else home.pci
             home.arfcn = cell.arfcn if home.arfcn is None else home.arfcn
-            others += [column for key, column in cell.beside.items() if key in home.beside]
-            home.beside = {**cell.beside, **home.beside}
+            others += [column for key, column in cell.qualities.items() if key in home.qualities]
+            home.qualities = {**cell.qualities, **home.qualities}
             del cells[(rat, role)]
     named = {cell.rat for cell in cells.values()} - {""}
     for key, cell in list(cells.items()):
         if len(named) == 1 and not cell.serving:
             cell.rat = cell.rat or next(iter(named))
         if cell.rsrp is None or (cell.pci is None and not cell.serving):
-            others += [column for column in (cell.rsrp, *cell.beside.values()) if column is not None]
+            others += [column for column in (cell.rsrp, *cell.qualities.values()) if column is not None]
             del cells[key]
     return list(cells.values())
 
@@ -147,7 +149,7 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
         level = sheet.numbers(cell.rsrp)
         row = np.flatnonzero(np.isfinite(level))
         pci, arfcn = (_or_nan(sheet, place, len(level))[row] for place in (cell.pci, cell.arfcn))
-        beside = np.stack([_or_nan(sheet, cell.beside.get(name), len(level))[row] for name in _cells.BESIDE])
+        qualities = np.stack([_or_nan(sheet, cell.qualities.get(name), len(level))[row] for name in _cells.QUALITIES])
         pci = np.where(pci == np.round(pci), pci, np.nan)  # a fraction is no identity of a cell
         rat = np.full(len(row), _cells.RATS.index(cell.rat), dtype=np.int8)
         if of_row is not None and not cell.rat:
@@ -156,7 +158,9 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
         if idle is not None:
             serving &= ~idle[row]
         tables.append(
-            _cells.Table(row=row, rat=rat, pci=pci, arfcn=arfcn, rsrp_dbm=level[row], serving=serving, beside=beside)
+            _cells.Table(
+                row=row, rat=rat, pci=pci, arfcn=arfcn, rsrp_dbm=level[row], serving=serving, qualities=qualities
+            )
         )
     return _cells.joined(tables)
 
@@ -194,12 +198,12 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
 
 def _event_columns(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
     """Columns beside a serving level with values in rows of their own, which become streams: Nemo's rows are events."""
-    found = []
+    columns = []
     for cell in cells:
         if cell.rsrp is not None and cell.serving:
             silent = np.isnan(sheet.numbers(cell.rsrp))
-            found += [i for i in cell.beside.values() if np.isfinite(sheet.numbers(i)[silent]).any()]
-    return found
+            columns += [i for i in cell.qualities.values() if np.isfinite(sheet.numbers(i)[silent]).any()]
+    return columns
 
 
 def _settle_names(sheet: _sheet.Sheet) -> None:
@@ -214,8 +218,8 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
         places, tech = [sheet.plain.index(name) for name in ("level", "qual")], sheet.find(*_quantities.OF_GNETTRACK)
         if tech is not None:
             texts = sheet.texts(tech)
-            other = {text for text in set(texts) if not _TECH.search(text)}
-            sheet.silence(np.array([text in other for text in texts], dtype=bool), places)
+            older = {text for text in set(texts) if not _TECH.search(text)}
+            sheet.silence(np.array([text in older for text in texts], dtype=bool), places)
         if (rssi := sheet.find("lterssi")) is not None:
             sheet.silence(sheet.numbers(rssi) >= 0, [rssi])
     sheet.plain = words
@@ -225,11 +229,11 @@ def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     ri = sheet.numbers(column)
     flag = rows.flag.copy()
     good = (ri >= 1) & (ri <= 8)
-    whole = ri == np.round(ri)
+    integer = ri == np.round(ri)
     _lines.add_flag(flag, ri == 0, "no_csi")
     _lines.add_flag(flag, np.isfinite(ri) & ~good & (ri != 0), "ri_out_of_range")
-    _lines.add_flag(flag, good & ~whole, "rank_is_a_mean")
-    values = {"rank": np.where(good & whole, ri, np.nan), "ri_raw": ri}
+    _lines.add_flag(flag, good & ~integer, "rank_is_a_mean")
+    values = {"rank": np.where(good & integer, ri, np.nan), "ri_raw": ri}
     name = re.sub(r"\W+", "_", sheet.plain[column])
     source = "scheduled PDSCH rank" if "pdsch" in name else "CSI report"
     return rows.stream("rank", name, values, where=np.isfinite(ri), flag=flag, ri_base="one", source=source)
@@ -238,24 +242,24 @@ def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
 def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     values = sheet.numbers(column)
     name = sheet.plain[column]
-    if found := _TOWER_SNR.fullmatch(name):
-        return _rows.snr(rows, found[1].upper(), values)
-    known = np.isfinite(values)
+    if tower := _TOWER_SNR.fullmatch(name):
+        return _rows.snr(rows, tower[1].upper(), values)
+    finite = np.isfinite(values)
     meaning = _quantities.quantity(name)
     if meaning is not None and meaning.kind == "rss" and _NEIGHBOUR.search(name):  # of a cell that nobody names
         return rows.stream(
-            "kpi", re.sub(r"\W+", "_", name), {"value": values}, where=known, unit=meaning.unit, quantity=meaning.name
+            "kpi", re.sub(r"\W+", "_", name), {"value": values}, where=finite, unit=meaning.unit, quantity=meaning.name
         )
-    return _quantities.stream(rows, name, values, unit=sheet.unit_read(column), where=known)
+    return _quantities.stream(rows, name, values, unit=sheet.unit_read(column), where=finite)
 
 
 def _distinct(streams: list[Stream | None]) -> list[Stream | None]:
     """Streams by name: of two columns of one name the first is kept."""
-    kept: dict[str, Stream] = {}
+    by_name: dict[str, Stream] = {}
     for stream in streams:
         if stream is not None:
-            kept.setdefault(stream.name, stream)
-    return list(kept.values())
+            by_name.setdefault(stream.name, stream)
+    return list(by_name.values())
 
 
 READER = Reader(

@@ -93,9 +93,9 @@ def names_of(head: bytes) -> list[str]:
             body, kind = inner[8:], struct.unpack_from(order + "I", inner)[0] if len(inner) >= 8 else 0
         if kind != _MATRIX:
             break
-        found = _name(body, order)
-        if found:
-            names.append(found)
+        name = _name(body, order)
+        if name:
+            names.append(name)
         at += 8 + size
     return names
 
@@ -207,8 +207,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     count = _common_length(table)
     wall, valid, clock = _wall(table)
     keep = np.flatnonzero(valid)
-    kept = {name: column[keep] for name, column in table.items()}
-    instants, warnings = _instants(kept, wall[keep], clock, options)
+    timed = {name: column[keep] for name, column in table.items()}
+    instants, warnings = _instants(timed, wall[keep], clock, options)
     rows = _rows.Rows(
         reader="flight_mat",
         options=options,
@@ -221,7 +221,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         relative=clock == COUNTED and options.time_origin is None,
     )
     instants.flag(rows.flag)
-    return rows.result([_track(rows, kept, clock), *_measured(rows, kept)])
+    return rows.result([_track(rows, timed, clock), *_measured(rows, timed)])
 
 
 def _common_length(table: dict[str, AnyArray]) -> int:

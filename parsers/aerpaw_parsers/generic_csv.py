@@ -27,7 +27,7 @@ from ._sheet import SEPARATORS
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
 # What may stand beside a rank, or beside a level: the positions of a table merged by hand are its track.
-_BESIDE: dict[str, tuple[str, ...]] = {"rank": EXTRA, "rss": (*COLUMNS["telemetry"][:-2], "sinr_db")}
+_COMPANIONS: dict[str, tuple[str, ...]] = {"rank": EXTRA, "rss": (*COLUMNS["telemetry"][:-2], "sinr_db")}
 # Columns that a record of a kind is about.
 _VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": ("rss_db",), "rank": ("ri_raw",)}
 
@@ -74,7 +74,7 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
     """Kind, and the position of the file column for each record column."""
     if options.kind is None:
         raise UsageError("generic_csv does not know what the file holds", expected="'kind:' telemetry, rss or rank")
-    allowed = ["time", *COLUMNS[options.kind], *_BESIDE.get(options.kind, ())]
+    allowed = ["time", *COLUMNS[options.kind], *_COMPANIONS.get(options.kind, ())]
     unknown = sorted(set(options.columns) - set(allowed))
     if unknown:
         near = get_close_matches(unknown[0], allowed, 1)

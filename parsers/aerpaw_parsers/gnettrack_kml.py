@@ -50,18 +50,18 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         )
     texts = [data[first:last] for first, last in zip(begin, [*begin[1:], len(data)][: len(begin)], strict=True)]
     cut = [i for i, text in enumerate(texts) if b"</Placemark>" not in text]
-    found = [_reading(text) for text in texts]
-    kept = [i for i, one in enumerate(found) if one.get("TIME") and i not in cut]
-    names = list(dict.fromkeys(name for i in kept for name in found[i]))
+    readings = [_reading(text) for text in texts]
+    timed = [i for i, reading in enumerate(readings) if reading.get("TIME") and i not in cut]
+    names = list(dict.fromkeys(name for i in timed for name in readings[i]))
     sheet = _sheet.Sheet(
         lines=lines,
         names=names,
-        row=row[kept],
-        cells=[[found[i].get(name, "") for name in names] for i in kept],
-        blank_rows=np.setdiff1d(np.flatnonzero(~lines.blank), row[[*kept, *cut]]),
+        row=row[timed],
+        cells=[[readings[i].get(name, "") for name in names] for i in timed],
+        blank_rows=np.setdiff1d(np.flatnonzero(~lines.blank), row[[*timed, *cut]]),
         rejected=lines.reject_all(row[cut], "a placemark without its end (a cut file?)"),
     )
-    rows = _sheet.rows(sheet, options, reader="gnettrack_kml") if kept else None
+    rows = _sheet.rows(sheet, options, reader="gnettrack_kml") if timed else None
     if rows is None:
         return _sheet.nothing(data, "gnettrack_kml", "no placemark with a time")
     return drive_test.of_sheet(rows, sheet)

@@ -32,14 +32,14 @@ def sniff(head: bytes) -> bool:
 
 def _points(data: bytes) -> list[tuple[int, dict[bytes, bytes]]]:
     """Place and values of each whole point."""
-    found = []
+    points = []
     for point in _POINT.finditer(data):
         if _START.search(point[2]):
             continue  # torn: the next point begins inside
         values = dict(_ATTRIBUTE.findall(point[1]))
         values |= dict(_INSIDE.findall(point[2]))
-        found.append((point.start(), values))
-    return found
+        points.append((point.start(), values))
+    return points
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -48,10 +48,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     points = [(at, values) for at, values in _points(data) if {b"lat", b"lon", b"time"} <= set(values)]
     row = np.searchsorted(lines.starts, np.array([at for at, _ in points], dtype=np.int64), side="right") - 1
     row, first = np.unique(row, return_index=True)
-    kept = [points[i][1] for i in first.tolist()]
-    clock, time, warnings = _stamps.read([values[b"time"].decode("ascii", "replace") for values in kept], options)
+    placed = [points[i][1] for i in first.tolist()]
+    clock, time, warnings = _stamps.read([values[b"time"].decode("ascii", "replace") for values in placed], options)
     column = {
-        name.decode(): np.array([values.get(name, b"") for values in kept] or [b""], dtype=np.bytes_)[: len(kept)]
+        name.decode(): np.array([values.get(name, b"") for values in placed] or [b""], dtype=np.bytes_)[: len(placed)]
         for name in (b"lat", b"lon", b"ele", b"course")
     }
     rows = _rows.built(
@@ -69,7 +69,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 def _torn(lines: _lines.Lines, data: bytes, row: object) -> list[RejectedLine]:
     """Lines on which a point begins that is not whole."""
-    places = np.array([found.start() for found in _START.finditer(data)], dtype=np.int64)
+    places = np.array([start.start() for start in _START.finditer(data)], dtype=np.int64)
     begun = np.unique(np.searchsorted(lines.starts, places, side="right") - 1)
     return lines.reject_all(np.setdiff1d(begun, np.asarray(row)), "a point without position or time (torn?)")
 

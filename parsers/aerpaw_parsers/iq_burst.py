@@ -68,8 +68,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         "frequency_hz": options.frequency_hz or float(named[1]),
         "unit": options.unit or "dB re full scale",
     }
-    for channel, one in enumerate(power.tolist(), start=1):
-        level, flag = rows.level(np.array([10 * np.log10(one) if 0 < one < np.inf else np.nan]))
+    for channel, mean_square in enumerate(power.tolist(), start=1):
+        level, flag = rows.level(np.array([10 * np.log10(mean_square) if 0 < mean_square < np.inf else np.nan]))
         name = f"USRP{channel}"
         streams.append(rows.stream("rss", name, {"rss_db": level}, flag=flag, channel=name, about=about))
     return rows.result(streams)

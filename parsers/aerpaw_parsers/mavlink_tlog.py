@@ -53,25 +53,25 @@ def _packet(data: bytes, at: int) -> tuple[int, int, int, bytes] | None:
         kind, tail = int.from_bytes(data[at + 15 : at + 18], "little"), 15 if data[at + 10] & 1 else 2
     else:
         return None
-    whole = 8 + head + size + tail
-    if at + whole > len(data):
+    length = 8 + head + size + tail
+    if at + length > len(data):
         return None
     begin = at + 8 + head
     if kind in _EXTRA:
         written = int.from_bytes(data[begin + size : begin + size + 2], "little")
         if _crc(data[at + 9 : begin + size] + bytes([_EXTRA[kind]])) != written:
             return None
-    return whole, kind, system, data[begin : begin + size]
+    return length, kind, system, data[begin : begin + size]
 
 
 def sniff(head: bytes) -> bool:
     """Check whether the first three packets follow each other."""
     at = 0
     for _ in range(3):
-        found = _packet(head, at)
-        if found is None:
+        packet = _packet(head, at)
+        if packet is None:
             return False
-        at += found[0]
+        at += packet[0]
         if at == len(head):
             break
     return at > 0
@@ -79,7 +79,7 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Telemetry ``vehicle``."""
-    found: dict[int, list[tuple[int, int, float, tuple[float, ...]]]] = {kind: [] for kind in _EXTRA}
+    messages: dict[int, list[tuple[int, int, float, tuple[float, ...]]]] = {kind: [] for kind in _EXTRA}
     damaged: list[RejectedLine] = []
     count, at = 0, 0
     while at < len(data):
@@ -92,14 +92,16 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
                 RejectedLine(count + len(damaged) + 1, f"{at - begin} bytes at {begin} that are no packet", "")
             )
             continue
-        whole, kind, system, payload = packet
+        length, kind, system, payload = packet
         if kind in _EXTRA:
             layout = _LAYOUT[kind]
             values = layout.unpack(payload[: layout.size].ljust(layout.size, b"\0"))  # trailing zeros are not sent
-            found[kind].append((count + len(damaged), system, int.from_bytes(data[at : at + 8], "big") / 1e6, values))
+            messages[kind].append(
+                (count + len(damaged), system, int.from_bytes(data[at : at + 8], "big") / 1e6, values)
+            )
         count += 1
-        at += whole
-    position, attitude, gps = _of_vehicle(found)
+        at += length
+    position, attitude, gps = _of_vehicle(messages)
     flight = _autopilot.Flight(
         position=position, attitude=attitude, velocity=position, fix=gps,
         utc_minus_clock_s=0.0, messages=count, damaged=damaged, source="MAVLink telemetry log",
@@ -114,20 +116,20 @@ def _next_mark(data: bytes, at: int) -> int:
 
 
 def _of_vehicle(
-    found: dict[int, list[tuple[int, int, float, tuple[float, ...]]]],
+    messages: dict[int, list[tuple[int, int, float, tuple[float, ...]]]],
 ) -> tuple[_autopilot.Series, _autopilot.Series, _autopilot.Series]:
-    systems = [item[1] for item in found[_POSITION]]
+    systems = [item[1] for item in messages[_POSITION]]
     vehicle = max(set(systems), key=systems.count) if systems else -1
-    made = []
+    series_of = []
     for kind in (_POSITION, _ATTITUDE, _GPS):
-        rows = [item for item in found[kind] if item[1] == vehicle]
+        rows = [item for item in messages[kind] if item[1] == vehicle]
         table = np.array([row[3] for row in rows], dtype=np.float64).reshape(len(rows), _FIELDS[kind])
         series = _autopilot.Series(
             np.array([row[2] for row in rows]), np.array([row[0] for row in rows], dtype=np.int64), {}
         )
         series.columns = _columns(kind, table) if len(rows) or kind == _POSITION else {}
-        made.append(series)
-    return made[0], made[1], made[2]
+        series_of.append(series)
+    return series_of[0], series_of[1], series_of[2]
 
 
 def _columns(kind: int, table: np.ndarray) -> dict[str, np.ndarray]:  # type: ignore[type-arg]

@@ -19,7 +19,7 @@ from aerpaw_cmp.logs.records import Stream
 from . import _nemo, _quantities
 
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
-_BESIDE = (("rsrp_dbm", "nr_rsrp"), ("sinr_db", "nr_sinr"), ("cqi", "wb_cqi"))
+_LEVELS = (("rsrp_dbm", "nr_rsrp"), ("sinr_db", "nr_sinr"), ("cqi", "wb_cqi"))
 _CELL = r", ?(?P<%s>" + _lines.NUMBER.decode() + "|nan|NaN|)"
 _ROW = re.compile(
     rb"^\d{1,12}(?:\.0{0,20})?, ?(?P<time>"
@@ -33,12 +33,12 @@ _ROW = re.compile(
 
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     values = {name: rows.number(name) for name in _COLUMNS}
-    beside = [
+    levels = [
         _quantities.stream(rows, name, values[column], where=np.isfinite(values[column]), about={"rat": "nr"})
-        for column, name in _BESIDE
+        for column, name in _LEVELS
     ]  # before rows without a rank are flagged so
     yield _nemo.pdsch_rank(rows, dict(values))
-    yield from beside
+    yield from levels
 
 
 READER = _text.reader(

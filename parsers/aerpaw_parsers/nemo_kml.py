@@ -51,17 +51,17 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         If ``time_origin`` is no time, or is local and no time zone is given.
     """
     lines = _lines.split(data)
-    found = list(_RECORD.finditer(data))
-    row = np.searchsorted(lines.starts, np.array([item.start() for item in found], dtype=np.int64), side="right") - 1
+    reports = list(_RECORD.finditer(data))
+    row = np.searchsorted(lines.starts, np.array([item.start() for item in reports], dtype=np.int64), side="right") - 1
     row, first = np.unique(row, return_index=True)
-    texts = [cells[first] for cells in _lines.columns([item.groups(b"") for item in found], 7)]
+    texts = [cells[first] for cells in _lines.columns([item.groups(b"") for item in reports], 7)]
     names = ("time", "what", "value", "unit", *_POSITION)
     rows = _rows.built(
         lines, row, dict(zip(names, texts, strict=True)), options, reader="nemo_kml", reason=_reason,
         clock="relative_ms", markup=_markup(lines, row),
     )  # fmt: skip
-    if len(found) > len(row):
-        rows.warnings.append(f"{len(found) - len(row)} further reports on lines that hold several were not read")
+    if len(reports) > len(row):
+        rows.warnings.append(f"{len(reports) - len(row)} further reports on lines that hold several were not read")
     position = {name: rows.number(name) for name in _POSITION}
     what = np.array(rows.text("what"), dtype=object)
     if _quantities.is_rank(what[0]) if len(what) else False:
@@ -79,7 +79,7 @@ def _measured(rows: _rows.Rows, name: str, where: BoolArray) -> Stream | None:
 
 def _markup(lines: _lines.Lines, row: IntArray) -> IntArray:
     """Lines without a hint of a report, which is nearly all of the file: they need no second look."""
-    hints = np.array([found.start() for found in _HINT.finditer(lines.data)], dtype=np.int64)
+    hints = np.array([hint.start() for hint in _HINT.finditer(lines.data)], dtype=np.int64)
     plain = np.ones(len(lines), dtype=bool)
     plain[np.searchsorted(lines.starts, hints, side="right") - 1] = False
     plain[row] = False

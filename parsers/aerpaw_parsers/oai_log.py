@@ -50,7 +50,7 @@ def sniff(head: bytes) -> bool:
 
 def _rows_of(lines: _lines.Lines) -> tuple[IntArray, list[dict[str, bytes]], str, AnyArray]:
     """Lines with a quantity, their values, the clock, and the times."""
-    row, found, stamps = [], [], []
+    row, quantities, stamps = [], [], []
     stamp, seconds, frame = b"", b"", -1
     for i in range(len(lines)):
         line = lines.raw(i)
@@ -63,44 +63,44 @@ def _rows_of(lines: _lines.Lines) -> tuple[IntArray, list[dict[str, bytes]], str
         match = next((m for p in (_CSI, _LEVEL, _UE, _UE_LEVEL) if (m := p.search(line))), None)
         if match is not None:
             row.append(i)
-            found.append({key: value for key, value in match.groupdict().items() if value is not None})
+            quantities.append({key: value for key, value in match.groupdict().items() if value is not None})
             stamps.append((stamp, seconds, max(frame, 0) * _FRAMES_S))
     number = np.array(row, dtype=np.int64)
     if stamps and all(item[0] for item in stamps):
-        return number, found, "wall", np.array([item[0] for item in stamps], dtype=np.bytes_)
+        return number, quantities, "wall", np.array([item[0] for item in stamps], dtype=np.bytes_)
     if stamps and all(item[1] for item in stamps):
         value = np.array([float(item[1]) for item in stamps])
-        return number, found, "epoch_s" if value.min() > 1e9 else "relative_s", value
-    return number, found, "relative_s", np.array([item[2] for item in stamps], dtype=np.float64)
+        return number, quantities, "epoch_s" if value.min() > 1e9 else "relative_s", value
+    return number, quantities, "relative_s", np.array([item[2] for item in stamps], dtype=np.float64)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``oai`` and RSRP; UsageError if stamps have no zone and none is given."""
     lines = _lines.split(data)
-    row, found, clock, time = _rows_of(lines)
+    row, quantities, clock, time = _rows_of(lines)
     rows = _rows.built(lines, row, {"time": time}, options, reader="oai_log", reason=lambda _line: None, clock=clock)
-    kept = [found[i] for i in rows.at.tolist()]
+    timed = [quantities[i] for i in rows.at.tolist()]
     value = {
-        name: np.array([float(item.get(name, b"nan")) for item in kept])
+        name: np.array([float(item.get(name, b"nan")) for item in timed])
         for name in ("ri", "cqi", "sinr", "rsrp", "meas")
     }
-    rnti = np.array([float(int(item["rnti"], 16)) if "rnti" in item else np.nan for item in kept])
+    rnti = np.array([float(int(item["rnti"], 16)) if "rnti" in item else np.nan for item in timed])
     reported = np.flatnonzero(~np.isnan(value["ri"]))
     ri = value["ri"][reported]
     good = (ri >= 1) & (ri <= 8)
     flag = rows.flag[reported].copy()
     _lines.add_flag(flag, ~good, "ri_out_of_range")
-    beside = {"rank": np.where(good, ri, np.nan), "ri_raw": ri, "cqi": value["cqi"][reported], "rnti": rnti[reported]}
-    beside |= {"sinr_db": value["sinr"][reported], "rsrp_dbm": value["rsrp"][reported]}
+    columns = {"rank": np.where(good, ri, np.nan), "ri_raw": ri, "cqi": value["cqi"][reported], "rnti": rnti[reported]}
+    columns |= {"sinr_db": value["sinr"][reported], "rsrp_dbm": value["rsrp"][reported]}
     about = {"ri_base": "one", "source": "CSI report, last one"}
-    ranks = _rows.of_ues(rows, "rank", options.channel or "oai", beside, pick=reported, flag=flag, about=about)
+    ranks = _rows.of_ues(rows, "rank", options.channel or "oai", columns, pick=reported, flag=flag, about=about)
     # a gNB prints 0 of 0 measurements
-    heard = np.flatnonzero(~np.isnan(value["rsrp"]) & (np.isnan(value["meas"]) | (value["meas"] > 0)))
+    measured = np.flatnonzero(~np.isnan(value["rsrp"]) & (np.isnan(value["meas"]) | (value["meas"] > 0)))
     level, flag = rows.level(value["rsrp"])
-    levels = {"rss_db": level[heard], "serving": np.ones(len(heard)), "rnti": rnti[heard]}
+    levels = {"rss_db": level[measured], "serving": np.ones(len(measured)), "rnti": rnti[measured]}
     about = {"channel": options.channel or "nr_rsrp", "unit": "dBm", "quantity": "RSRP", "rat": "nr"}
     return rows.result(
-        [*ranks, *_rows.of_ues(rows, "rss", "nr_rsrp", levels, pick=heard, flag=flag[heard], about=about)]
+        [*ranks, *_rows.of_ues(rows, "rss", "nr_rsrp", levels, pick=measured, flag=flag[measured], about=about)]
     )
 
 

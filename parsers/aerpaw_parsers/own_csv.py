@@ -63,28 +63,28 @@ def _number(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-
 def _levels(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     tower, channel, unit = (_text(sheet, name) for name in ("tower", "channel", "unit"))
     level, flag = rows.level(_number(sheet, "measured db"))
-    made = []
+    streams = []
     for node, channel_name in dict.fromkeys(zip(tower.tolist(), channel.tolist(), strict=True)):
         mine: BoolArray = (tower == node) & (channel == channel_name)
         name = f"{node}_{channel_name}"
         about = {"node": node, "channel": channel_name, "unit": str(unit[mine][0])}
-        made.append(rows.stream("rss", name, {"rss_db": level}, where=mine, flag=flag, about=about))
-    return made
+        streams.append(rows.stream("rss", name, {"rss_db": level}, where=mine, flag=flag, about=about))
+    return streams
 
 
 def _ranks(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     tower, ri = _text(sheet, "tower"), _number(sheet, "measured rank")
     values = rows.rank(ri)
-    made = []
+    streams = []
     for node in dict.fromkeys(tower.tolist()):
         about = {"node": node, "ri_base": "one", "source": "report"}
-        made.append(rows.stream("rank", f"{node}_rank", values, where=tower == node, about=about))
-    return made
+        streams.append(rows.stream("rank", f"{node}_rank", values, where=tower == node, about=about))
+    return streams
 
 
 def _tap(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     query, status = _text(sheet, "query"), _text(sheet, "status")
-    made = []
+    streams = []
     for name in ("nr5g_csi", "lte_csi"):
         mine: BoolArray = (query == name) & (status == "ok")
         columns = {"rank": "rank", "ri_raw": "ri raw", "cqi": "cqi", "mcs": "mcs", "uncertainty_s": "uncertainty s"}
@@ -96,14 +96,14 @@ def _tap(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
         name = name.removesuffix("_csi")
         if name == "lte" and not np.isfinite(values["rank"][mine]).any():
             continue
-        made.append(rows.stream("rank", name, values, where=mine, channel=name, ri_base="one", source="CSI report"))
+        streams.append(rows.stream("rank", name, values, where=mine, channel=name, ri_base="one", source="CSI report"))
     cell: BoolArray = (query == "servingcell") & np.isfinite(_number(sheet, "rsrp dbm"))
     level, flag = rows.level(_number(sheet, "rsrp dbm"))
     values = {"rss_db": level, "sinr_db": _number(sheet, "sinr db")}
-    made.append(
+    streams.append(
         rows.stream("rss", "nr5g_rsrp", values, where=cell, flag=flag, channel="nr5g_rsrp", unit="dBm", quantity="RSRP")
     )
-    return made
+    return streams
 
 
 READER = Reader(

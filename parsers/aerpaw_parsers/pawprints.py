@@ -58,30 +58,30 @@ def _reading(row: int, cell: dict[str, Any], connected: float) -> _cells.Reading
         arfcn=arfcn,
         rsrp_dbm=level,
         serving=serving,
-        beside=(quality, _json.number(cell.get("rssi")), ratio, np.nan),
+        qualities=(quality, _json.number(cell.get("rssi")), ratio, np.nan),
     )
 
 
-def _readings(found: list[dict[str, Any]]) -> Iterator[_cells.Reading]:
-    for i, one in enumerate(found):
-        for cell in _json.listed(one, "cells"):
-            yield _reading(i, cell, _json.number(one.get("connected_pci")))
+def _readings(entries: list[dict[str, Any]]) -> Iterator[_cells.Reading]:
+    for i, entry in enumerate(entries):
+        for cell in _json.listed(entry, "cells"):
+            yield _reading(i, cell, _json.number(entry.get("connected_pci")))
 
 
 def _text_cells(line: bytes) -> list[dict[str, Any]] | None:
     """Cells of a line of the text of 2023 in the words of the JSON; None where a block has other fields."""
-    found = []
+    decoded = []
     for block in _BLOCK.findall(line):
         cells = block.split(b",")
         rat = next((name for name in _OF_TEXT if name in cells[:2]), b"")
         place = _OF_TEXT.get(rat)
         if place is None or len(cells) < place["fields"]:
             return None
-        one: dict[str, Any] = {
+        values: dict[str, Any] = {
             key: cells[at].decode("ascii", "replace") for key, at in place.items() if key != "fields"
         }
-        found.append({**one, "technology": rat.decode(), "is_connected": one["connected"]})
-    return found
+        decoded.append({**values, "technology": rat.decode(), "is_connected": values["connected"]})
+    return decoded
 
 
 def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
@@ -89,37 +89,37 @@ def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
     lines = _lines.split(data)
     row, groups = _lines.match(lines, _TEXT)
     cells = [_text_cells(lines.raw(i)) for i in row.tolist()]
-    other = [lines.reject(i, "a block of other fields (quantities switched off in the app?)")
-             for i, one in zip(row.tolist(), cells, strict=True) if one is None]  # fmt: skip
-    kept = np.array([item is not None for item in cells], dtype=bool)
+    odd = [lines.reject(i, "a block of other fields (quantities switched off in the app?)")
+             for i, block in zip(row.tolist(), cells, strict=True) if block is None]  # fmt: skip
+    sound = np.array([item is not None for item in cells], dtype=bool)
     rows = _rows.built(
-        lines, row[kept], {"time": np.array([float(group[0]) for group in groups], dtype=np.float64)[kept]}, options,
+        lines, row[sound], {"time": np.array([float(group[0]) for group in groups], dtype=np.float64)[sound]}, options,
         reader="pawprints", reason=lambda _line: "not a whole 'CELL_LOG_START ... CELL_LOG_STOP' (torn line?)",
-        clock="epoch_ms", extra=other,
+        clock="epoch_ms", extra=odd,
     )  # fmt: skip
-    whole = [item for item in cells if item is not None]
-    readings = [_reading(i, cell, np.nan) for i, at in enumerate(rows.at.tolist()) for cell in whole[at]]
+    blocks = [item for item in cells if item is not None]
+    readings = [_reading(i, cell, np.nan) for i, at in enumerate(rows.at.tolist()) for cell in blocks[at]]
     return rows.result(_cells.streams(rows, readings, source="PawPrints"))
 
 
-def _nr(rows: _rows.Rows, found: list[dict[str, Any]]) -> Stream | None:
+def _nr(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
     """Level of the NR leg: the phone tells it apart from the cells, without a PCI."""
-    legs = [_json.inside(item, "nr_signal_strength") for item in found]
+    legs = [_json.inside(item, "nr_signal_strength") for item in entries]
     level = _json.column(legs, "ss_rsrp")
     if not np.isfinite(level).any():
         return None
-    known = np.isfinite(level)
+    finite = np.isfinite(level)
     shown, flag = rows.level(level)
     values = {"rss_db": shown, "rsrq_db": _json.column(legs, "ss_rsrq"), "sinr_db": _json.column(legs, "ss_sinr")}
     return rows.stream(
-        "rss", "nr_ss_rsrp", values, where=known, flag=flag, channel=rows.options.channel or "nr_ss_rsrp",
+        "rss", "nr_ss_rsrp", values, where=finite, flag=flag, channel=rows.options.channel or "nr_ss_rsrp",
         unit="dBm", quantity="RSRP", rat="nr",
     )  # fmt: skip
 
 
-def _track(rows: _rows.Rows, found: list[dict[str, Any]]) -> Stream | None:
+def _track(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
     """Positions, in the object itself or in its ``location``."""
-    places = [{**_json.inside(item, "gps"), **_json.inside(item, "location"), **item} for item in found]
+    places = [{**_json.inside(item, "gps"), **_json.inside(item, "location"), **item} for item in entries]
     values = {
         "latitude_deg": _json.column(places, "latitude", "lat"),
         "longitude_deg": _json.column(places, "longitude", "lon", "lng"),
@@ -136,18 +136,18 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     if data[:4096].lstrip().startswith(b"CELL_LOG_START,"):
         return _read_text(data, options)
     lines = _lines.split(data)
-    one = _json.objects(lines)
-    found = one.found
-    time = _json.column(found, "companion_abs_time", "abs_time")
+    parsed = _json.objects(lines)
+    entries = parsed.values
+    time = _json.column(entries, "companion_abs_time", "abs_time")
     rows = _rows.built(
-        lines, one.row, {"time": time}, options, reader="pawprints", reason=_json.bracket, clock="epoch_ms",
-        extra=one.rejected, markup=one.more,
+        lines, parsed.row, {"time": time}, options, reader="pawprints", reason=_json.bracket, clock="epoch_ms",
+        extra=parsed.rejected, markup=parsed.more,
     )  # fmt: skip
-    kept = [found[i] for i in rows.at.tolist()]
-    if any("companion_abs_time" not in item for item in kept):
+    timed = [entries[i] for i in rows.at.tolist()]
+    if any("companion_abs_time" not in item for item in timed):
         rows.warnings.append("some lines lack companion_abs_time: the phone's own clock was taken there")
     return rows.result(
-        [_track(rows, kept), *_cells.streams(rows, _readings(kept), source="PawPrints"), _nr(rows, kept)]
+        [_track(rows, timed), *_cells.streams(rows, _readings(timed), source="PawPrints"), _nr(rows, timed)]
     )
 
 

@@ -59,11 +59,11 @@ def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
     for part in text.split(";"):
         if not part:
             continue
-        found = _FIELD.fullmatch(part.strip())
-        if found is None or found[1] not in _TYPES:
+        member = _FIELD.fullmatch(part.strip())
+        if member is None or member[1] not in _TYPES:
             return None
-        kind = _TYPES[found[1]]
-        fields.append((found[3], kind, (int(found[2]),)) if found[2] else (found[3], kind))
+        kind = _TYPES[member[1]]
+        fields.append((member[3], kind, (int(member[2]),)) if member[2] else (member[3], kind))
     try:
         return np.dtype(fields)
     except (ValueError, TypeError):
@@ -116,8 +116,8 @@ def _column(table: AnyArray, *names: str) -> FloatArray | None:
 def _series(table: AnyArray, numbers: list[int], columns: Mapping[str, FloatArray | None]) -> _autopilot.Series:
     if not len(table):
         return _autopilot.NONE
-    kept = {name: values for name, values in columns.items() if values is not None}
-    return _autopilot.Series(table["timestamp"].astype(np.float64) / 1e6, np.array(numbers, dtype=np.int64), kept)
+    present = {name: values for name, values in columns.items() if values is not None}
+    return _autopilot.Series(table["timestamp"].astype(np.float64) / 1e6, np.array(numbers, dtype=np.int64), present)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

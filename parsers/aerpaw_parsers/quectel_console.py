@@ -40,7 +40,7 @@ def _tables(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, 
     """Line, time, title and named values of each row that holds a level or a CSI."""
     time = b""
     names: dict[bytes, list[str]] = {}
-    found, rejected = [], []
+    entries, rejected = [], []
     for i in range(len(lines)):
         line = lines.raw(i)
         if stamp := _STAMP.match(line):
@@ -57,30 +57,30 @@ def _tables(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, 
         if not time or len(cells) != len(heads):
             rejected.append(lines.reject(i, "a table row without a time, or of another width than its head (torn?)"))
             continue
-        found.append((i, time, title.decode("ascii"), dict(zip(heads, map(_number, cells), strict=True))))
-    return found, rejected
+        entries.append((i, time, title.decode("ascii"), dict(zip(heads, map(_number, cells), strict=True))))
+    return entries, rejected
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Cells by PCI, and rank where CSI tables stand; UsageError if no time zone is given."""
     lines = _lines.split(data)
-    found, rejected = _tables(lines)
-    row = np.array([item[0] for item in found], dtype=np.int64)
-    time = np.array([item[1] for item in found] or [b""], dtype=np.bytes_)[: len(found)]
+    entries, rejected = _tables(lines)
+    row = np.array([item[0] for item in entries], dtype=np.int64)
+    time = np.array([item[1] for item in entries] or [b""], dtype=np.bytes_)[: len(entries)]
     rows = _rows.built(
         lines, row, {"time": time}, options, reader="quectel_console", reason=lambda _line: None, extra=rejected
     )
-    kept = [found[i] for i in rows.at.tolist()]
+    timed = [entries[i] for i in rows.at.tolist()]
     readings = [
         _cells.Reading(
             row=i, rat="lte" if title == "LTE" else "nr", pci=value.get("PCID", np.nan),
             arfcn=value.get("earfcn", value.get("ARFCN", np.nan)),
             rsrp_dbm=value.get("RSRP", np.nan), serving=True,
-            beside=(value.get("RSRQ", np.nan), value.get("RSSI", np.nan), value.get("SINR", np.nan), np.nan),
+            qualities=(value.get("RSRQ", np.nan), value.get("RSSI", np.nan), value.get("SINR", np.nan), np.nan),
         )
-        for i, (_, _, title, value) in enumerate(kept) if "RSRP" in value
+        for i, (_, _, title, value) in enumerate(timed) if "RSRP" in value
     ]  # fmt: skip
-    ranks = [_rank(rows, name, [(item[2], item[3]) for item in kept]) for name in _CSI]
+    ranks = [_rank(rows, name, [(item[2], item[3]) for item in timed]) for name in _CSI]
     return rows.result([*ranks, *_cells.streams(rows, readings, source="Quectel console")])
 
 

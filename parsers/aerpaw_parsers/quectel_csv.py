@@ -106,16 +106,16 @@ def _reason(line: bytes) -> str | None:
 def _table(lines: _lines.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
     """Lines of all kinds of row, and their columns of text; ``form`` is the kind, an index into ``_FORMS``."""
     serving = b"servingcell" in lines.data  # a search of a whole log of CSI would find nothing, slowly
-    found: list[tuple[IntArray, dict[str, AnyArray]]] = []
+    tables: list[tuple[IntArray, dict[str, AnyArray]]] = []
     for i, (pattern, names) in enumerate(_FORMS if serving else _FORMS[:1]):
         row, groups = _lines.match(lines, pattern)
         column = dict(zip(names.split(), _lines.columns(groups, pattern.groups), strict=True))
-        found.append((row, {**column, "form": np.full(len(row), float(i))}))
-    row = np.concatenate([row for row, _ in found])
+        tables.append((row, {**column, "form": np.full(len(row), float(i))}))
+    row = np.concatenate([row for row, _ in tables])
     order = np.argsort(row, kind="stable")
     every = dict.fromkeys(name for _, names in _FORMS for name in ("form", *names.split()) if name != ".")
     table = {
-        name: np.concatenate([column.get(name, np.zeros(len(row), dtype="S1")) for row, column in found])[order]
+        name: np.concatenate([column.get(name, np.zeros(len(row), dtype="S1")) for row, column in tables])[order]
         for name in every
     }
     return row[order], table
@@ -157,15 +157,15 @@ def _levels(rows: _rows.Rows, rat: str, where: BoolArray) -> Iterator[Stream | N
     carrier = np.where(arfcn > 0, arfcn, np.inf)
     cells = sorted(set(zip(pci[named].tolist(), carrier[named].tolist(), strict=True)))
     common: dict[str, Attribute | None] = {"unit": rows.options.unit or "dBm", "quantity": "RSRP", "rat": rat}
-    for one, its_carrier in cells if len(cells) > 1 else ():
-        twice = sum(other == one for other, _ in cells) > 1 and its_carrier < np.inf
-        name = f"{rat}_pci{int(one)}" + (f"_arfcn{int(its_carrier)}" if twice else "")
-        mine = named & (pci == one) & (carrier == its_carrier)
-        about = common | _identity(one, its_carrier)
+    for its_pci, its_carrier in cells if len(cells) > 1 else ():
+        twice = sum(pci_of_cell == its_pci for pci_of_cell, _ in cells) > 1 and its_carrier < np.inf
+        name = f"{rat}_pci{int(its_pci)}" + (f"_arfcn{int(its_carrier)}" if twice else "")
+        mine = named & (pci == its_pci) & (carrier == its_carrier)
+        about = common | _identity(its_pci, its_carrier)
         yield rows.stream("rss", name, values, where=mine, flag=flag, channel=name, about=about)
-    rest = where & ~named if len(cells) > 1 else where
+    unnamed = where & ~named if len(cells) > 1 else where
     common |= _identity(*cells[0]) if len(cells) == 1 else {}
-    yield rows.stream("rss", f"{rat}_rsrp", values, where=rest, flag=flag, channel=f"{rat}_rsrp", about=common)
+    yield rows.stream("rss", f"{rat}_rsrp", values, where=unnamed, flag=flag, channel=f"{rat}_rsrp", about=common)
 
 
 def _identity(pci: float, arfcn: float) -> dict[str, Attribute | None]:

@@ -68,11 +68,11 @@ def _column(captures: list[dict[str, Any]], field: str, *names: str) -> FloatArr
 
 
 def _times(captures: list[dict[str, Any]], *fields: str) -> list[str]:
-    found: list[str] = []
+    texts: list[str] = []
     for capture in captures:
         value = next((capture[field] for field in fields if field in capture), None)
-        found += [str(item) for item in _list(value)]
-    return found
+        texts += [str(item) for item in _list(value)]
+    return texts
 
 
 def _rows_of(texts: list[str], options: ReadOptions) -> _rows.Rows:
@@ -228,7 +228,7 @@ def _powers(
 def _samples(common: dict[str, Any], options: ReadOptions) -> AnyArray | None:
     """The samples beside the meta file as they are stored, shape (n, channels, 1 or 2); None where there are none."""
     kind = str(common.get("core:datatype", ""))
-    data = options.beside(_data_name(options)) if options.beside else None
+    data = options.neighbour(_data_name(options)) if options.neighbour else None
     if data is None or kind.split("_")[0] not in _SAMPLES:
         return None
     stored = np.dtype((">" if kind.endswith("_be") else "<") + _SAMPLES[kind.split("_")[0]][0])

@@ -63,10 +63,10 @@ class _Samples:
     def join(self, *others: _Samples) -> _Samples:
         """Samples of all in the order of their lines, those of one line in this order."""
         parts = (self, *others)
-        made = _Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS))
-        if np.all(made.line[1:] > made.line[:-1]):
-            return made
-        return made.take(np.argsort(made.line, kind="stable"))
+        joined = _Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS))
+        if np.all(joined.line[1:] > joined.line[:-1]):
+            return joined
+        return joined.take(np.argsort(joined.line, kind="stable"))
 
 
 _COLUMNS = ("line", "wall", "offset", "value")
@@ -97,7 +97,7 @@ def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
     Second, such lines whose offset is no octal number.
     """
     length = lines.ends - lines.starts
-    found, wrong = [], [np.zeros(0, dtype=np.int64)]
+    parts, wrong = [], [np.zeros(0, dtype=np.int64)]
     for width in _WIDTHS:
         rows = np.flatnonzero(length == _STAMP + 1 + width + _VALUE)
         if not len(rows):
@@ -110,8 +110,8 @@ def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
         valid &= cells[:, _STAMP + 1 + width] == 32
         digits = (cells[:, _STAMP + 1 : _STAMP + 1 + width] - np.uint8(48) <= 9).all(axis=1)
         wrong.append(rows[valid & ~octal & digits])
-        found.append(_Samples(rows, wall, offset, value).take(valid & octal))
-    return _Samples.none().join(*found), np.concatenate(wrong)
+        parts.append(_Samples(rows, wall, offset, value).take(valid & octal))
+    return _Samples.none().join(*parts), np.concatenate(wrong)
 
 
 @dataclass
@@ -129,12 +129,12 @@ def _piece(lines: _lines.Lines, rejects: _lines.Rejects) -> _Piece:
     """Samples of od's layout at once, the few other lines one by one."""
     fixed, wrong = _fixed_layout(lines)
     rejects.add(lines, wrong, "the offset is no octal number: not written by od")
-    left = np.ones(len(lines), dtype=bool)
-    left[fixed.line] = left[wrong] = False
+    unread = np.ones(len(lines), dtype=bool)
+    unread[fixed.line] = unread[wrong] = False
     samples: list[tuple[int, bytes, bytes, float]] = []
     marks: list[tuple[int, bytes, bytes, float]] = []
     blank, torn = 0, len(lines) - 1 if lines.unterminated else -1
-    for i in np.flatnonzero(left).tolist():
+    for i in np.flatnonzero(unread).tolist():
         line = lines.raw(i)
         sample, star, foot = (form.match(line) for form in (_ODD, _STAR, _FOOT))
         if sample is not None and i == torn and len(line) < _STAMP + 1 + len(sample[2]) + _VALUE:
@@ -201,20 +201,20 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
             for i in stars.line[~ok]]  # fmt: skip
     bad += [(int(i), "a second '*' in one run") for i in stars.line[ok & same]]
     chosen = np.flatnonzero(ok & ~same)
-    left, right = before[chosen], after[chosen]
-    count = (ends.offset[right] - samples.offset[left]) // 4 - 1
+    start, end = before[chosen], after[chosen]
+    count = (ends.offset[end] - samples.offset[start]) // 4 - 1
     fits = (count >= 0) & (np.cumsum(np.maximum(count, 0)) <= _MOST_REPEATS)
     bad += [(int(i), "'*' between offsets that do not bound a run of believable length")
             for i in stars.line[chosen[~fits]]]  # fmt: skip
-    chosen, left, right, count = chosen[fits], left[fits], right[fits], count[fits]
+    chosen, start, end, count = chosen[fits], start[fits], end[fits], count[fits]
     step = np.concatenate([np.arange(1, n + 1) for n in count.tolist()]) if len(count) else np.zeros(0, dtype=np.int64)
     part = step / np.repeat(count + 1, count)
-    span = (ends.wall[right] - samples.wall[left]).astype(np.float64)
+    span = (ends.wall[end] - samples.wall[start]).astype(np.float64)
     repeats = _Samples(
         np.repeat(stars.line[chosen], count),
-        np.repeat(samples.wall[left], count) + np.round(part * np.repeat(span, count)).astype(np.int64),
-        np.repeat(samples.offset[left], count) + 4 * step,
-        np.repeat(samples.value[left], count),
+        np.repeat(samples.wall[start], count) + np.round(part * np.repeat(span, count)).astype(np.int64),
+        np.repeat(samples.offset[start], count) + 4 * step,
+        np.repeat(samples.value[start], count),
     )
     return repeats, stars.line[chosen], bad
 
@@ -259,14 +259,14 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     accepted = len(samples.line) + len(used)
     warnings: list[str] = []
     stream = _stream(samples, repeats, before - 1 if unterminated else -1, options, warnings)
-    kept, reasons = rejects.result()
+    rejected, reasons = rejects.result()
     return ReadResult(
         reader="sounder_log",
         streams=(stream,) if stream is not None else (),
         lines=before,
         accepted=accepted,
         blank=blank,
-        rejected=kept,
+        rejected=rejected,
         warnings=tuple(warnings),
         reasons=reasons,
     )

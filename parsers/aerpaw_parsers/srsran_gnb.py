@@ -63,10 +63,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     torn = _rows.torn(_TORN, "an incomplete line of the table (torn line?)")
     rows = _rows.matched(data, pattern, options, reader="srsran_gnb", reason=torn)
     rnti = np.array([int(text, 16) if text else np.nan for text in rows.text("rnti")], dtype=np.float64)
-    beside = {"cqi": rows.number("cqi"), "mcs": rows.number("mcs"), "rnti": rnti, "pci": rows.number("pci")}
+    columns = {"cqi": rows.number("cqi"), "mcs": rows.number("mcs"), "rnti": rnti, "pci": rows.number("pci")}
     ri = rows.number("ri")
     rows.clock_from = rows.clock_from or ("program" if own_stamp else None)
-    return rows.result(_rows.mean_rank(rows, ri, beside, none=ri == 0))
+    return rows.result(_rows.mean_rank(rows, ri, columns, none=ri == 0))
 
 
 def sniff_json(head: bytes) -> bool:
@@ -79,9 +79,9 @@ def sniff_json(head: bytes) -> bool:
     )
 
 
-def _ues(one: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _ues(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """The UEs of an object, at the top or in its cells."""
-    for place in (one, *_json.listed(one, "cells"), *_json.listed(one, "cell_list")):
+    for place in (report, *_json.listed(report, "cells"), *_json.listed(report, "cell_list")):
         for ue in _json.listed(_json.inside(place, "cell_container") or place, "ue_list"):
             yield _json.inside(ue, "ue_container") or ue
 
@@ -90,9 +90,9 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb``: a record per UE and report."""
     lines = _lines.split(data)
     reports = _json.objects(lines)
-    row, found = reports.row, reports.found
-    with_ue = [i for i, one in enumerate(found) if any(True for _ in _ues(one))]
-    texts = [str(found[i].get("timestamp", "")) for i in with_ue]
+    row, entries = reports.row, reports.values
+    with_ue = [i for i, entry in enumerate(entries) if any(True for _ in _ues(entry))]
+    texts = [str(entries[i].get("timestamp", "")) for i in with_ue]
     if options.clock is None:
         options = replace(options, clock="utc")
     clock, time, warnings = _stamps.read(texts, options)
@@ -109,13 +109,13 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
         markup=np.concatenate((mute, reports.more)),
     )
     rows.warnings += warnings
-    pairs = [(i, ue) for i, at in enumerate(rows.at.tolist()) for ue in _ues(found[with_ue[at]])]
+    pairs = [(i, ue) for i, at in enumerate(rows.at.tolist()) for ue in _ues(entries[with_ue[at]])]
     pick = np.array([i for i, _ in pairs], dtype=np.int64)
     ues = [ue for _, ue in pairs]
     names = {"cqi": ("cqi", "dl_cqi"), "mcs": ("dl_mcs", "mcs"), "rnti": ("rnti",), "pci": ("pci",)}
-    beside = {name: _json.column(ues, *keys) for name, keys in names.items()}
+    columns = {name: _json.column(ues, *keys) for name, keys in names.items()}
     ri = _json.column(ues, "dl_ri", "ri")
-    return rows.result(_rows.mean_rank(rows, ri, beside, none=ri == 0, pick=pick))
+    return rows.result(_rows.mean_rank(rows, ri, columns, none=ri == 0, pick=pick))
 
 
 READER = Reader(

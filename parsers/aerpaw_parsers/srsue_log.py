@@ -41,7 +41,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
             arfcn=np.nan,
             rsrp_dbm=rsrp[i],
             serving=True,
-            beside=(np.nan, np.nan, snr[i], loss[i]),
+            qualities=(np.nan, np.nan, snr[i], loss[i]),
         )
         for i in range(len(rows))
     ]

@@ -162,10 +162,10 @@ class _Log:
             self.numbers.add(int(record["n"]))
         if kind == "header" and self.header is None:
             self.header = record
-            found = record.get("schema")
-            if found != SCHEMA:
+            schema = record.get("schema")
+            if schema != SCHEMA:
                 cause = "it was written by another version"
-                raise InputError(f"the log has schema {found!r}", expected=SCHEMA, cause=cause)
+                raise InputError(f"the log has schema {schema!r}", expected=SCHEMA, cause=cause)
         closed = record.get("state") == "closed"
         if kind == "gap":
             self.open_gap = None if closed else record
@@ -180,17 +180,17 @@ class _Log:
 
     def warnings(self) -> tuple[str, ...]:
         """Gaps, clock steps, lost and missing records, torn tail, missing end."""
-        found = list(self.events)
+        texts = list(self.events)
         if self.open_gap is not None:
-            found.append(f"the log ends inside a gap: {self.open_gap.get('reason', '')}")
+            texts.append(f"the log ends inside a gap: {self.open_gap.get('reason', '')}")
         missing = max(self.numbers) - min(self.numbers) + 1 - len(self.numbers) if self.numbers else 0
         if missing:
-            found.append(f"{missing} record numbers are missing in this segment")
+            texts.append(f"{missing} record numbers are missing in this segment")
         if self.rejected and self.rejected[-1].reason.startswith("torn tail"):
-            found.append("the last line is torn (power loss or kill while writing)")
+            texts.append("the last line is torn (power loss or kill while writing)")
         if not self.ended:
-            found.append("no end record: the session was cut")
-        return tuple(found)
+            texts.append("no end record: the session was cut")
+        return tuple(texts)
 
 
 def _joined(kind: Kind, pieces: list[Columns]) -> pd.DataFrame | None:

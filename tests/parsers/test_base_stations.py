@@ -105,7 +105,7 @@ def test_power_of_sigmf_samples() -> None:
         ("ci16_le", np.round(np.stack([wave.real, wave.imag], axis=1) * 2**15).astype("<i2").tobytes()),
     ):
         meta["global"]["core:datatype"] = kind  # type: ignore[index]
-        options = replace(PLAIN, file_name="b.sigmf-meta", beside={"b.sigmf-data": data}.get)
+        options = replace(PLAIN, file_name="b.sigmf-meta", neighbour={"b.sigmf-data": data}.get)
         (stream,) = read("sigmf", json.dumps(meta).encode(), options).streams
         assert stream.frame["rss_db"].tolist() == pytest.approx([-6.0206, -26.0206, -46.0206], abs=0.01)
         assert (stream.frame["time"].diff().dropna().dt.total_seconds() == 0.02).all()

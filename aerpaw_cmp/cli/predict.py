@@ -39,7 +39,8 @@ def predict(
     ] = None,
     spacing: Annotated[float, Option(min=1.0, help="Spacing of a grid [m].")] = 30.0,
     heading: Annotated[
-        float | None, Option(help="Heading of the nose on a grid [deg]; without it all headings count alike.")
+        float | None,
+        Option(help="Heading of a grid, and of points without yaw [deg]; without it all headings count alike."),
     ] = None,
     threshold: Annotated[
         float | None, Option(help="Also the probability that the level exceeds this, in the unit of the logs.")

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
+from ..common.errors import UsageError
 from ..jobs.options import RunOptions
 from .app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, command, output, site_app
 from .shown import print_files, print_json, print_plan, say, table
@@ -62,7 +63,13 @@ def site_import(
     from ..jobs.mapping import site_scene
 
     files = files or []
-    if len(files) == 1 and site_scene.is_scene(files[0]):
+    scene = len(files) == 1 and site_scene.is_scene(files[0])
+    of_scenes = {"--origin": origin, "--tower": tower, "--material": material, "--turn": turn}
+    of_maps = {"--untagged": untagged, "--canopy": canopy, "--buildings": buildings}
+    for option in (name for name, value in (of_maps if scene else of_scenes).items() if value):
+        kinds = ("a Mitsuba scene", "map files") if scene else ("map files", "one Mitsuba XML")
+        raise UsageError(f"{option} with {kinds[0]}", expected=f"{kinds[1]}, or no {option}")
+    if scene:
         facts = site_scene.SceneOptions(
             origin=origin, base=base, towers=tower or (), materials=material or (), turn_deg=turn, merge_m=merge_m
         )

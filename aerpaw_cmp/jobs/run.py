@@ -708,12 +708,15 @@ def run_calibrate(
         With what was found, expected, and the likely cause.
     """
     from ..site.learned import remember
+    from ..site.siteyaml import site_model
     from .learning.calibrate import calibrate, load_calibration, read_flights
     from .learning.calibrate_rank import fit_rank
     from .learning.calibration_files import Calibrated, site_entries, write_files
     from .tasks.manifest import inputs_of_flights, inputs_of_site
 
     settings = load_calibration(path)
+    if into_site is not None:
+        site_model(into_site)  # a misspelt one is told before the fit, and gets no memory of its own
     target = options.out or Path(f"{settings.calibration}.calibrated.yaml")
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError("the output is no YAML file", expected="-o NAME.yaml", path=target)

@@ -360,3 +360,10 @@ def test_a_cut_download_leaves_nothing_and_a_whole_one_is_checked(
     finally:
         server.shutdown()
         server.server_close()
+
+
+def test_a_template_without_a_flight_names_a_file_that_lacks(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    with pytest.raises(InputError, match=r"no test flight is at hand.* fetch"):
+        benchmark_run.write_template(tmp_path / "logs", tmp_path / "p.csv")
+    assert not list(tmp_path.glob("*.csv"))

@@ -149,6 +149,18 @@ def test_bad_input_is_one_message(folder: Path, capsys: pytest.CaptureFixture[st
     write_yaml(folder / "high.yaml", high)
     assert "3.3 and 3.7 GHz" in refusal(folder, capsys, base | {"flights": ["first.yaml", "high.yaml"]})
     assert "gone.yaml" in refusal(folder, capsys, base | {"flights": ["first.yaml", "gone.yaml"]}, 3)
+    assert "fit.gain" in refusal(folder, capsys, base | {"fit": {"gain": "none"}})  # no antenna could be written
+
+
+def test_a_misspelt_site_gets_no_memory(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It got one of its own, which no report reads, after the whole fit."""
+    calibration = str(folder / "calibration.yaml")
+    for name in ("my_sit.yaml", "no_folder/site.yaml"):
+        arguments = ["calibrate", calibration, "--into-site", str(folder / name), "-o", str(folder / "unwritten.yaml")]
+        assert main(arguments) in (2, 3)
+        assert name in capsys.readouterr().err
+    assert not list(folder.glob("*sit.learned"))
+    assert not (folder / "unwritten.yaml").exists()
 
 
 def test_one_flight_is_learned_and_not_scored(folder: Path) -> None:

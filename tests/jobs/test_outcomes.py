@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -323,3 +324,14 @@ def test_a_lost_worker_costs_its_own_task_one_more_try(
     assert found[-1].failure is not None
     assert "worker process ended" in found[-1].failure.message
     assert [one.track.flight for one in found[:6] if one.track is not None] == [f"f{i}" for i in range(6)]
+
+
+def test_a_fault_in_the_rows_of_a_flight_is_a_failure_of_that_flight(
+    flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ended the whole campaign: only the replay stood where faults become messages."""
+    nothing = SimpleNamespace(data=None, result=None)
+    monkeypatch.setattr(campaign_tasks, "run_flight", lambda *_, **__: nothing)
+    outcome = campaign_tasks.run_task(Task(flight, "f", "as written", {}, None))
+    assert outcome.failure is not None
+    assert "a fault of the program itself" in outcome.failure.message

@@ -342,3 +342,9 @@ def test_directions_are_evaluated_once_per_degree_over_all_parts(monkeypatch: py
     np.testing.assert_allclose(whole[0], gain(samples)[0], atol=0.3)
     other = predict(dataclasses.replace(samples, channel="b", at_tower=-ray, at_uav=ray))
     np.testing.assert_allclose(other[0], -whole[0], atol=0.6)
+
+
+def test_a_heading_counts_for_points_without_one(tmp_path):
+    (tmp_path / "p.csv").write_text("east_m,north_m,height_m,yaw_deg\n1,2,30,\n1,2,30,90\n")
+    targets = find_targets(tmp_path / "p.csv", load_site("lake_wheeler"), TargetOptions(heading_deg=200.0))
+    assert targets.yaw_deg.tolist() == [200.0, 90.0]

@@ -167,3 +167,17 @@ def test_a_report_of_a_scene_is_audited_and_its_paths_explained(
     told = json.loads(capsys.readouterr().out)
     assert told["paths"][0]["path"] == "line of sight"
     assert len(told["paths"]) > 1
+
+
+@pytest.mark.parametrize(
+    "option", ["--origin 1,2", "--tower A=1,2,3", "--material a=concrete", "--turn 5", "--untagged forest"]
+)
+def test_an_option_of_the_other_kind_is_refused(
+    option: str, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They were ignored: a site whose tower or origin was not the one that was asked for."""
+    file = room if option.startswith("--untagged") else tmp_path / "farm.geojson"
+    arguments = ["site", "import", str(file), *option.split(), "-o", str(tmp_path / "site.yaml")]
+    assert main(arguments) == 2
+    assert f"{option.split()[0]} with " in capsys.readouterr().err
+    assert not (tmp_path / "site.yaml").exists()

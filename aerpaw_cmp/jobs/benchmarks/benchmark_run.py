@@ -281,6 +281,10 @@ def write_template(
     test_parts = [benchmark.truth(bench, task) for task in chosen]
     train_parts = [benchmark.truth(bench, task, training=True) for task in chosen]
     test = pd.concat(test_parts, ignore_index=True).drop(columns="measured")
+    if test.empty:
+        first = bench.skipped(chosen[0], training=False)[0]
+        expected = f"--data with published logs ('aerpaw-cmp benchmark fetch' gets them), such as {first}"
+        raise InputError("no test flight is at hand", expected=expected, path=data)
     test["level_db"], test["sd_db"] = "", ""
     if any(bench.manifest.tasks[task].kind == "rank" for task in chosen):
         test = test.assign(p_rank1="", p_rank2="", p_rank3="", p_rank4="")

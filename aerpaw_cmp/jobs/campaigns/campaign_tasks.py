@@ -115,11 +115,15 @@ def run_task(task: Task) -> Outcome:
     """Replay and compare one flight under one setting; whatever goes wrong becomes a message."""
     try:
         flight_run = run_flight(flight_data(task), audit=False)
+        return _rows_of(task, flight_run.data, flight_run.result)
     except AerpawCmpError as error:
         return _failed(task, str(error), error)
     except Exception as error:  # one flight's fault must not cost the others their numbers
         return _failed(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
-    data, result = flight_run.data, flight_run.result
+
+
+def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
+    """Outcome of a flight that was compared."""
     return Outcome(
         rss=tuple(
             _rss_row(task, data.settings.rss, compared, logs_of(data, series))
@@ -130,7 +134,7 @@ def run_task(task: Task) -> Outcome:
             for compared, series in zip(result.rank, data.rank, strict=True)
             for row in _rank_rows(task, compared, logs_of(data, series))
         ),
-        track=_flown(task, flight_run.result),
+        track=_flown(task, result),
         flown=tuple(
             FlownRank(
                 flight=task.flight,
@@ -141,7 +145,7 @@ def run_task(task: Task) -> Outcome:
                 time_s=_elapsed_s(item.time),
                 start_ns=_start_ns(item.time),
             )
-            for item in flight_run.result.rank
+            for item in result.rank
         ),
     )
 

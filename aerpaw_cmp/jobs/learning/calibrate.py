@@ -50,7 +50,7 @@ class PatternsSettings(StrictModel):
 class FitSettings(StrictModel):
     """Selection of what is learned."""
 
-    gain: Literal["both", "uav", "tower", "none"] = "both"
+    gain: Literal["both", "uav", "tower"] = "both"
     mount: Literal["azimuth", "tilt", "none"] = "azimuth"
     """Of antennas with a pattern."""
     place: bool = False
@@ -115,6 +115,12 @@ class Calibration:
     """By antenna, of receivers that lose their lock."""
     warnings: tuple[str, ...]
     words: tuple[str, ...]
+
+    @property
+    def fit(self) -> direction_gain.GainFit:
+        """The learned gain over direction: every ``fit.gain`` has one."""
+        assert self.learned.fit is not None
+        return self.learned.fit
 
     @property
     def names(self) -> list[str]:
@@ -377,7 +383,6 @@ def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: P
         "both": direction_gain.ANTENNA_TERMS,
         "uav": direction_gain.UAV_TERMS,
         "tower": direction_gain.TOWER_TERMS,
-        "none": (),
     }
     patterns: dict[str, GainOf] = {}
     if settings.patterns.uav is not None:

@@ -15,7 +15,6 @@ import numpy as np
 
 from ... import __version__
 from ...common.cf import file_attributes
-from ...common.errors import UsageError
 from ...common.gaussian import determining, gaussian_kernel
 from ...common.jsonable import named
 from ...common.provenance import KEY, union
@@ -48,12 +47,7 @@ def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
     """Every antenna over the sphere, by ``(tower.channel, "uav" or "tower")``."""
     theta, azimuth, vectors = sphere_grid()
     flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
-    fit = calibration.learned.fit
-    if fit is None:
-        raise UsageError(
-            "fit.gain is 'none': there is no gain over direction to write", expected="gain: both, uav or tower"
-        )
-    out = {}
+    fit, out = calibration.fit, {}
     for antenna in fit.antennas:
         ends: tuple[tuple[str, Frame, str], ...] = (("uav", "body", "uav"), ("tower", "mast", antenna))
         for end, frame, name in ends:
@@ -122,9 +116,9 @@ def _notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
 
 def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
     """Notes of the tower's file about the gain towards both ends at once; empty where none was learned."""
-    fit = calibration.learned.fit
-    term = next((t for t in fit.model.terms if t.frame == "pair"), None) if fit else None
-    if fit is None or term is None or end == "uav":
+    fit = calibration.fit
+    term = next((t for t in fit.model.terms if t.frame == "pair"), None)
+    if term is None or end == "uav":
         return ()
     directions, length = fit.seen("pair", antenna), term.length
     at = directions[
@@ -151,7 +145,7 @@ def settings_text(calibration: Calibration, folder_name: str) -> str:
         "link:",
         "  channels:",
     ]
-    for antenna in calibration.learned.fit.antennas if calibration.learned.fit else ():
+    for antenna in calibration.fit.antennas:
         channel, link = antenna.partition(".")[2], calibration.first_series(antenna)[1].link
         ends = {end: f"{folder_name}/{safe_name(f'{antenna}.{end}')}.csv" for end in ("tower", "uav")}
         lines += [
@@ -309,7 +303,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
     name, maps = calibration.settings.calibration, antenna_maps(calibration)
     tables: dict[str, bytes] = {}
     series = []
-    for antenna in calibration.learned.fit.antennas if calibration.learned.fit else ():
+    for antenna in calibration.fit.antennas:
         files = {}
         for end in ("tower", "uav"):
             sphere_map = maps[antenna, end]

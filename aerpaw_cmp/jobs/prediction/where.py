@@ -174,7 +174,7 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
         targets = _planned(flight, site) if flight.flight.plan is not None else _flown(flight, where, logs_root)
     elif is_settings(where) or not where.exists():
         targets = _grid(site, options)
-    elif (local := _local_points(where)) is not None:
+    elif (local := _local_points(where, options.heading_deg)) is not None:
         targets = local
     else:
         targets = _route(where, site, options)
@@ -227,8 +227,8 @@ def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
     )
 
 
-def _local_points(path: Path) -> Targets | None:
-    """Points of a CSV with east_m, north_m and height_m (and yaw_deg); None for another file."""
+def _local_points(path: Path, heading_deg: float | None) -> Targets | None:
+    """Points of a CSV with east_m, north_m and height_m (and yaw_deg, else the heading); None for another file."""
     if path.suffix.lower() != ".csv":
         return None
     try:
@@ -240,12 +240,13 @@ def _local_points(path: Path) -> Targets | None:
         raise InputError(f"no table: {error}", expected="columns east_m, north_m, height_m", path=path) from None
     numbers = table.reindex(columns=["east_m", "north_m", "height_m", "yaw_deg"]).apply(pd.to_numeric, errors="coerce")
     position = numbers[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
+    yaw = numbers["yaw_deg"].to_numpy(np.float64)
     lost = int((~np.isfinite(position).all(axis=1)).sum())
     return Targets(
         kind="points",
         name=path.stem,
         position_m=position,
-        yaw_deg=numbers["yaw_deg"].to_numpy(np.float64),
+        yaw_deg=yaw if heading_deg is None else np.where(np.isfinite(yaw), yaw, heading_deg),
         time_s=np.zeros(len(position)),
         remarks=(f"{lost} of {len(position)} points have no position: they are flagged no_position.",) if lost else (),
     )

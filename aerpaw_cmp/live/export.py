@@ -44,8 +44,8 @@ def _word(value: object) -> str:
 
 
 def _time(utc_ns: int) -> str:
-    whole = datetime.fromtimestamp(utc_ns // 1_000_000_000, tz=timezone.utc)
-    return f"{whole:%Y-%m-%dT%H:%M:%S}.{utc_ns % 1_000_000_000 // 1_000_000:03d}Z"
+    second = datetime.fromtimestamp(utc_ns // 1_000_000_000, tz=timezone.utc)
+    return f"{second:%Y-%m-%dT%H:%M:%S}.{utc_ns % 1_000_000_000 // 1_000_000:03d}Z"
 
 
 def _row(record: Record) -> dict[str, Any] | None:

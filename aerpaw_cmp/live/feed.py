@@ -353,11 +353,11 @@ class Feed:
         """Open and close alarms by the present state; True if one changed."""
         changed = False
         for modem in self._modems:
-            wanted = {} if modem.ended or self._ended else _alarms_of(modem, self.now())
-            for kind in [kind for kind in modem.open if kind not in wanted]:
+            conditions = {} if modem.ended or self._ended else _alarms_of(modem, self.now())
+            for kind in [kind for kind in modem.open if kind not in conditions]:
                 alarm = modem.open.pop(kind)
                 alarm.end_s, alarm.version, changed = self.now(), -1, True
-            for kind, text in wanted.items():
+            for kind, text in conditions.items():
                 if kind not in modem.open:
                     modem.open[kind], changed = self._raise(modem, kind, text), True
         return changed

@@ -234,10 +234,10 @@ class Framer:
     @property
     def buffered(self) -> int:
         """Bytes and lines held now; bounded whatever comes in."""
-        held = sum(len(x) for x in self._stray)
+        count = sum(len(x) for x in self._stray)
         if self._open is not None:
-            held += sum(len(x) for x in self._open.lines)
-        return held + len(self._buffer)
+            count += sum(len(x) for x in self._open.lines)
+        return count + len(self._buffer)
 
     def send(self, command: str, prefixes: tuple[str, ...] | None) -> None:
         """A command goes out.

@@ -259,11 +259,11 @@ def decode_servingcell(lines: Sequence[str], flags: list[str]) -> Values:
             fields = fields[2:]
             if not fields:
                 continue
-        rat, rest = fields[0], fields[1:]
+        rat, cell = fields[0], fields[1:]
         if rat in _NR:
-            values["nr"] = _nr(_NR[rat], rest, flags)
+            values["nr"] = _nr(_NR[rat], cell, flags)
         elif rat == "LTE":
-            values["lte"] = _lte(rest, flags)
+            values["lte"] = _lte(cell, flags)
         else:
             flags.append(f"unknown_rat:{str(rat)[:16]}")
             continue
@@ -478,10 +478,10 @@ class Redactor:
             self.count += 1
             return "<redacted message>"
         self._message_follows = _MESSAGE_FOLLOWS.search(text) is not None
-        whole = _WHOLE.search(text)
-        if whole:
+        private = _WHOLE.search(text)
+        if private:
             self.count += 1
-            return text[: whole.end()] + ": <redacted>"
+            return text[: private.end()] + ": <redacted>"
         cleaned, count = _PERSONAL.subn("<redacted>", text)
         if cut:
             cleaned, more = _CUT_NUMBER.subn("<redacted>", cleaned)

@@ -287,15 +287,15 @@ class SerialPort:
         try:
             if not os.isatty(fd):
                 raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
-            others = holders(path)  # before anything is changed on a port that another one uses
-            if others:
-                raise _busy(path, others)
+            users = holders(path)  # before anything is changed on a port that another one uses
+            if users:
+                raise _busy(path, users)
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             fcntl.ioctl(fd, termios.TIOCEXCL)
             make_raw(fd, baud)
-            others = holders(path)  # again: someone may have come between
-            if others:
-                raise _busy(path, others)
+            users = holders(path)  # again: someone may have come between
+            if users:
+                raise _busy(path, users)
         except (OSError, termios.error, AerpawCmpError) as error:
             os.close(fd)
             if isinstance(error, AerpawCmpError):

@@ -157,10 +157,10 @@ class PredictionWorker:
 
     def results(self) -> list[dict[str, Any]]:
         """Finished predictions, each with measured rank and residual (measured minus predicted)."""
-        done = []
+        finished = []
         while self._done:
-            done.append(self._done.popleft())
-        return done
+            finished.append(self._done.popleft())
+        return finished
 
     def close(self) -> None:
         """Finish what is asked for, at most 2 s long."""

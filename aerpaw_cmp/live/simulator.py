@@ -263,8 +263,8 @@ def _commands_of(command: str | None, lines: tuple[str, ...]) -> Iterator[str]:
 def _lines_for(key: str, lines: tuple[str, ...]) -> tuple[str, ...]:
     for query in QUERIES.values():
         if query.text.upper() == key and query.prefixes:
-            kept = tuple(line for line in lines if line.replace(" ", "").startswith(query.prefixes))
-            return (*kept, "OK")
+            matching = tuple(line for line in lines if line.replace(" ", "").startswith(query.prefixes))
+            return (*matching, "OK")
     return lines
 
 
@@ -477,22 +477,22 @@ class ModemSimulator:
             self._master = -1
 
     def _run(self) -> None:
-        held = b""
+        received = b""
         next_unplug = self._next_unplug()
         while not self._stop.is_set():
             if next_unplug is not None and time.monotonic() > next_unplug:
                 self.unplug()
                 self._stop.wait(self.settings.faults.unplug_s)
                 self.replug()
-                held, next_unplug = b"", self._next_unplug()
+                received, next_unplug = b"", self._next_unplug()
             if self._unplugged.is_set():
-                held = b""
+                received = b""
                 self._stop.wait(0.01)
                 continue
             self._babble()
-            held += self._read()
-            while b"\r" in held:
-                line, held = held.split(b"\r", 1)
+            received += self._read()
+            while b"\r" in received:
+                line, received = received.split(b"\r", 1)
                 self._serve(line.strip(b"\n\0 ").decode("latin-1"))
 
     def _next_unplug(self) -> float | None:

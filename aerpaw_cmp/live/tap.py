@@ -48,20 +48,23 @@ def not_a_modem(path: Path, received: bytes) -> InputError:
     """The error for a port that does not answer ``AT``, by what was received on it."""
     expected = "an answer to 'AT' (interface 02 or 03 of the modem)"
     if _NMEA.search(received):
-        found, cause = "the port speaks NMEA: it is a GPS port", "interface 01 was given, or the numbers moved"
+        sign, cause = "the port speaks NMEA: it is a GPS port", "interface 01 was given, or the numbers moved"
     elif received.count(0x7E) >= 1 and sum(b < 9 or b > 126 for b in received) > len(received) // 10:
-        found, cause = "the port speaks HDLC frames: it is a DIAG port", "interface 00 was given, or the numbers moved"
+        sign, cause = (
+            "the port speaks HDLC frames: it is a DIAG port",
+            "interface 00 was given, or the numbers moved",
+        )
     elif received:
         excerpt = ascii(Redactor().clean(received[:40].decode("latin-1"), cut=True))
-        found, cause = f"the port sends {excerpt} but no answer", "another device, or a wrong baud rate"
+        sign, cause = f"the port sends {excerpt} but no answer", "another device, or a wrong baud rate"
     else:
-        found, cause = "nothing answers on the port", "the modem is off, still starts, or this is not its AT port"
-    return InputError(found, expected=expected, cause=cause, path=path)
+        sign, cause = "nothing answers on the port", "the modem is off, still starts, or this is not its AT port"
+    return InputError(sign, expected=expected, cause=cause, path=path)
 
 
-def _no_port(gone: PortGoneError) -> InputError:
+def _no_port(error: PortGoneError) -> InputError:
     return InputError(
-        str(gone),
+        str(error),
         expected="the modem's AT port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
         cause="the modem is not plugged in or still starts; see 'aerpaw-cmp doctor'",
     )
@@ -431,15 +434,15 @@ class Tap:
         sent_utc, sent = self._clock.utc_ns(), self._clock.mono_ns()
         timeout_ns = int((timeout_s or self._settings.answer_timeout_s) * 1e9)
         self._framer.send(text, query.prefixes if command is None else ())
-        gone: PortGoneError | None = None
+        loss: PortGoneError | None = None
         try:
             self._port.write(data)
             answer, last = self._await(sent + timeout_ns)
         except PortGoneError as error:
-            gone, answer, last = error, self._framer.give_up("lost"), self._clock.mono_ns()
+            loss, answer, last = error, self._framer.give_up("lost"), self._clock.mono_ns()
         decoded = self._record_exchange(name, command is None, answer, sent_utc, sent, last)
-        if gone is not None:
-            raise gone
+        if loss is not None:
+            raise loss
         return answer, decoded
 
     def _await(self, deadline: int) -> tuple[Answer, int]:
@@ -558,10 +561,10 @@ class Tap:
         """Wait, and take what the modem says unasked meanwhile."""
         deadline = self._clock.mono_ns() + int(duration_s * 1e9)
         while not self._stop.count:
-            left = deadline - self._clock.mono_ns()
-            if left <= 0:
+            remaining_ns = deadline - self._clock.mono_ns()
+            if remaining_ns <= 0:
                 return
-            if self._select(left / 1e9):
+            if self._select(remaining_ns / 1e9):
                 self._read()
             self._tick()
 

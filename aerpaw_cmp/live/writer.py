@@ -68,10 +68,10 @@ class LogWriter:
 
     def messages(self) -> list[str]:
         """Messages about the disk since the last call."""
-        taken = []
+        texts = []
         while self._messages:
-            taken.append(self._messages.popleft())
-        return taken
+            texts.append(self._messages.popleft())
+        return texts
 
     def open(self) -> None:
         """Open the log; raises ``InputError`` as :meth:`SegmentLog.open` does."""

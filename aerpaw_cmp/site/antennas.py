@@ -132,7 +132,7 @@ class MeasuredPattern:
         else:
             theta_part, phi_part = _single_valued_poles(e_theta, e_phi)
             torus = [_torus(theta_part, -1), _torus(phi_part, -1)]
-            self._layers = [_spline(layer) for whole in torus for layer in (whole.real, whole.imag)]
+            self._layers = [_spline(layer) for part in torus for layer in (part.real, part.imag)]
 
     def __repr__(self) -> str:
         return f"MeasuredPattern({self.name!r}, peak {self.peak_gain_dbi:.2f} dBi, efficiency {self.efficiency:.2f})"
@@ -185,17 +185,17 @@ def _pole_vectors(e_theta: ComplexArray, e_phi: ComplexArray, row: int, slope: f
     x = slope * e_theta[row] * np.cos(phi) - e_phi[row] * np.sin(phi)
     y = slope * e_theta[row] * np.sin(phi) + e_phi[row] * np.cos(phi)
     power = float((np.abs(x) ** 2 + np.abs(y) ** 2).mean())
-    kept = abs(x.mean()) ** 2 + abs(y.mean()) ** 2
-    return complex(x.mean()), complex(y.mean()), kept / power if power > 0 else 0.0
+    mean_power = abs(x.mean()) ** 2 + abs(y.mean()) ** 2
+    return complex(x.mean()), complex(y.mean()), mean_power / power if power > 0 else 0.0
 
 
 def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Pole rows replaced by the one field vector that they measure from many sides."""
     e_theta, e_phi = e_theta.copy(), e_phi.copy()
     phi = np.arange(e_theta.shape[1]) * (2 * np.pi / e_theta.shape[1])
-    for row, beside, slope in ((0, 1, 1.0), (-1, -2, -1.0)):
+    for row, next_row, slope in ((0, 1, 1.0), (-1, -2, -1.0)):
         x, y, _ = _pole_vectors(e_theta, e_phi, row, slope)
-        near_x, near_y, _ = _pole_vectors(e_theta, e_phi, beside, slope)
+        near_x, near_y, _ = _pole_vectors(e_theta, e_phi, next_row, slope)
         if (x * np.conj(near_x) + y * np.conj(near_y)).real < 0:  # files name the pole's row from either side
             x, y = -x, -y
         e_theta[row] = slope * (x * np.cos(phi) + y * np.sin(phi))
@@ -401,13 +401,13 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
     span = np.pi if folded else 2 * np.pi
     phi_expected = np.arange(len(phi)) * (span / len(phi))
     theta_expected = np.linspace(-np.pi if folded else 0.0, np.pi, len(theta))
-    for what, found, wanted in (("phi", phi, phi_expected), ("theta", theta, theta_expected)):
-        if np.abs(found - wanted).max() > 1e-3:
-            step = math.degrees(wanted[1] - wanted[0]) if len(wanted) > 1 else 0.0
+    for what, axis, grid in (("phi", phi, phi_expected), ("theta", theta, theta_expected)):
+        if np.abs(axis - grid).max() > 1e-3:
+            step = math.degrees(grid[1] - grid[0]) if len(grid) > 1 else 0.0
             raise InputError(
-                f"{what} runs from {math.degrees(found[0]):.1f} to {math.degrees(found[-1]):.1f} deg in {len(found)} "
+                f"{what} runs from {math.degrees(axis[0]):.1f} to {math.degrees(axis[-1]):.1f} deg in {len(axis)} "
                 "values",
-                expected=f"{math.degrees(wanted[0]):.0f} to {math.degrees(wanted[-1]):.1f} deg in steps of {step:.2f}",
+                expected=f"{math.degrees(grid[0]):.0f} to {math.degrees(grid[-1]):.1f} deg in steps of {step:.2f}",
                 cause="angles are missing",
                 path=path,
             )
@@ -427,15 +427,15 @@ def _unfold(folded: ComplexArray) -> ComplexArray:
     inner = slice(1, -1)
     if _apart(far[:, 0, inner], near[:, -1, inner]) > _apart(-far[:, 0, inner], near[:, -1, inner]):
         far = -far
-    for pole, beside in ((0, 1), (-1, -2)):  # a pole's row may be named from either half
-        if _apart(near[:, :, pole], near[:, :, beside]) > _apart(-near[:, :, pole], near[:, :, beside]):
+    for pole, next_row in ((0, 1), (-1, -2)):  # a pole's row may be named from either half
+        if _apart(near[:, :, pole], near[:, :, next_row]) > _apart(-near[:, :, pole], near[:, :, next_row]):
             near[:, :, pole] *= -1
         far[:, :, pole] = -near[:, :, pole]
     return np.concatenate([near, far], axis=1)
 
 
-def _apart(one: ComplexArray, other: ComplexArray) -> float:
-    return float((np.abs(one - other) ** 2).sum())
+def _apart(first: ComplexArray, second: ComplexArray) -> float:
+    return float((np.abs(first - second) ** 2).sum())
 
 
 def _mirrored(half: ComplexArray) -> ComplexArray:
@@ -539,21 +539,21 @@ def _grid_of(content: Mapping[str, Any], variable: str, shape: tuple[int, int], 
 def _check_angles(elevation: FloatArray, azimuth: FloatArray, path: Path) -> None:
     wanted_elevation = np.linspace(-90, 90, len(elevation))
     wanted_azimuth = np.arange(len(azimuth)) * (360.0 / len(azimuth))
-    for what, found, wanted in (
+    for what, axis, grid in (
         ("elevation (theta2)", np.sort(elevation), wanted_elevation),
         ("azimuth (phi2)", np.sort(np.round(azimuth % 360.0, 6) % 360.0), wanted_azimuth),
     ):
-        if len(found) >= 3 and np.abs(found - wanted).max() <= 0.05:  # false for NaN too
+        if len(axis) >= 3 and np.abs(axis - grid).max() <= 0.05:  # false for NaN too
             continue
         causes = (
-            (len(found) >= 3 and 0 < np.abs(found).max() < 7, "radians instead of degrees"),
-            (len(set(found.tolist())) < len(found), "a direction stands twice, such as 0 and 360 deg"),
-            (len(found) >= 3 and np.abs(found - 90 - wanted).max() <= 0.05, "zenith angles in place of elevation"),
+            (len(axis) >= 3 and 0 < np.abs(axis).max() < 7, "radians instead of degrees"),
+            (len(set(axis.tolist())) < len(axis), "a direction stands twice, such as 0 and 360 deg"),
+            (len(axis) >= 3 and np.abs(axis - 90 - grid).max() <= 0.05, "zenith angles in place of elevation"),
             (True, "angles are missing"),
         )
         raise InputError(
-            f"{what} runs from {found.min(initial=np.inf):g} to {found.max(initial=-np.inf):g} in {len(found)} values",
-            expected=f"{wanted[0]:g} to {wanted[-1]:g} deg, equally spaced" if len(found) >= 3 else "a whole sphere",
+            f"{what} runs from {axis.min(initial=np.inf):g} to {axis.max(initial=-np.inf):g} in {len(axis)} values",
+            expected=f"{grid[0]:g} to {grid[-1]:g} deg, equally spaced" if len(axis) >= 3 else "a whole sphere",
             cause=next(cause for holds, cause in causes if holds),
             path=path,
         )

@@ -153,10 +153,10 @@ def building_heights(surface: Dem, footprints: Sequence[Polygon]) -> FloatArray:
     (footprints,)
         Median over the roof less the 10th percentile around it; NaN where the model does not reach.
     """
-    taken = shapely.union_all(list(footprints))
+    measured = shapely.union_all(list(footprints))
     heights = np.full(len(footprints), np.nan)
     for number, footprint in enumerate(footprints):
-        ring = footprint.buffer(RING_M[1]).difference(footprint.buffer(RING_M[0])).difference(taken)
+        ring = footprint.buffer(RING_M[1]).difference(footprint.buffer(RING_M[0])).difference(measured)
         roof, ground = (_sampled(surface, shape) for shape in (footprint, ring))
         if len(roof) and len(ground):
             heights[number] = np.median(roof) - np.percentile(ground, 10)

@@ -70,11 +70,11 @@ def _parts(site: Site, trees: bool) -> list[tuple[str, str, Mesh]]:
         parts.append((f"{number}_{_plain(label.removeprefix('mesh-'))[:60]}", name, mesh))
     # the scene has its own ground
     ground = material(site.ground_material).name
-    beside = {name: mesh for name, mesh in meshes.items() if name != ground or set(mesh.labels) != {"ground"}}
-    if ground in beside:
-        mesh = beside[ground]
-        beside[ground] = replace(mesh, triangles=mesh.triangles[mesh.owner != mesh.labels.index("ground")])
-    return parts + [(f"all_{_plain(name)}", name, mesh) for name, mesh in beside.items()]
+    all_of_material = {name: mesh for name, mesh in meshes.items() if name != ground or set(mesh.labels) != {"ground"}}
+    if ground in all_of_material:
+        mesh = all_of_material[ground]
+        all_of_material[ground] = replace(mesh, triangles=mesh.triangles[mesh.owner != mesh.labels.index("ground")])
+    return parts + [(f"all_{_plain(name)}", name, mesh) for name, mesh in all_of_material.items()]
 
 
 def _plain(name: str) -> str:

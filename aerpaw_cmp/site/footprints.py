@@ -231,7 +231,7 @@ def _along(line_m: FloatArray, spacing_m: float) -> FloatArray:
 
 def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> list[_Shape]:
     """Forests without what lies far outside the site."""
-    kept = []
+    near_shapes = []
     for shape in shapes:
         inside = shape.area if near is None else _areas_only(shape.area.intersection(near))
         if inside.area < 0.999 * shape.area.area:
@@ -241,8 +241,8 @@ def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> 
             )
             shape.area = inside
         if not inside.is_empty:
-            kept.append(shape)
-    return kept
+            near_shapes.append(shape)
+    return near_shapes
 
 
 def _fill(
@@ -273,12 +273,12 @@ def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
     latitude, longitude = np.array(positions).T
     if _distance_m(latitude, longitude, frame).min() <= FAR_M:
         return
-    here = f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}"
+    centre = f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}"
     first = f"latitude {latitude[0]:.5f}, longitude {longitude[0]:.5f}"
     if _distance_m(longitude, latitude, frame).min() <= FAR_M:
         raise InputError(
             f"the positions are of another place ({first})",
-            expected=f"near the site's origin {here}",
+            expected=f"near the site's origin {centre}",
             cause="latitude and longitude are swapped",
             path=path,
         )
@@ -288,7 +288,7 @@ def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
         f"the nearest position is {away / 1000:.0f} km from the site ({first})"
         if math.isfinite(away)
         else f"the positions are no latitudes and longitudes ({first})",
-        expected=f"WGS84 degrees near the site's origin {here}",
+        expected=f"WGS84 degrees near the site's origin {centre}",
         cause="the area crosses the antimeridian (180 deg)"
         if max(spans, default=0) > 180
         else ("metres or feet in place of degrees" if not math.isfinite(away) else "a map of another place"),
@@ -421,20 +421,20 @@ def _warn_of_feet(shapes: list[_Shape], actions: list[str]) -> None:
 def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
     """Drops outlines that cover the same ground as an earlier one; a stated height is kept."""
     tree = shapely.STRtree([shape.area for shape in shapes])
-    gone: set[int] = set()
+    duplicates: set[int] = set()
     for i, shape in enumerate(shapes):
-        if i in gone:
+        if i in duplicates:
             continue
-        for j in sorted(int(k) for k in tree.query(shape.area) if k > i and int(k) not in gone):
+        for j in sorted(int(k) for k in tree.query(shape.area) if k > i and int(k) not in duplicates):
             other = shapes[j]
             ratio = shape.area.area / max(other.area.area, 1e-9)
             if not (0.98 < ratio < 1.02 and shape.area.intersection(other.area).area > 0.98 * shape.area.area):
                 continue
-            gone.add(j)
+            duplicates.add(j)
             actions.append(f"{other.source}: left out, it repeats {shape.source}")
             if other.stated and not shape.stated:
                 shape.height_m, shape.stated = other.height_m, True
-    return [shape for i, shape in enumerate(shapes) if i not in gone]
+    return [shape for i, shape in enumerate(shapes) if i not in duplicates]
 
 
 def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
@@ -456,32 +456,32 @@ def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
     parts = [shape for shape in shapes if shape.part]
     if not parts:
         return shapes
-    tree, kept = shapely.STRtree([shape.area for shape in parts]), []
+    tree, disjoint = shapely.STRtree([shape.area for shape in parts]), []
     for shape in shapes:
         inside = [] if shape.part else [parts[int(i)].area for i in tree.query(shape.area, predicate="intersects")]
-        rest = _areas_only(shape.area.difference(shapely.union_all(inside))) if inside else shape.area
-        if rest.area < 0.98 * shape.area.area:
+        remainder = _areas_only(shape.area.difference(shapely.union_all(inside))) if inside else shape.area
+        if remainder.area < 0.98 * shape.area.area:
             actions.append(f"{shape.source}: gives way to its mapped parts")
-            shape.area = rest
-        if not rest.is_empty:
-            kept.append(shape)
-    return kept
+            shape.area = remainder
+        if not remainder.is_empty:
+            disjoint.append(shape)
+    return disjoint
 
 
 def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
     """Disjoint shapes: of one height and material merged, lower ones cut where they lie under higher ones."""
-    kept: list[_Shape] = []
+    disjoint: list[_Shape] = []
     for group in _groups(shapes):
-        kept += group if len(group) == 1 else _higher_first(group, actions)
-    return kept
+        disjoint += group if len(group) == 1 else _higher_first(group, actions)
+    return disjoint
 
 
 def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
-    kept: list[_Shape] = []
+    disjoint: list[_Shape] = []
     for shape in sorted(group, key=lambda shape: -shape.height_m):
-        over = [other for other in kept if other.area.intersects(shape.area)]
-        free = _areas_only(shape.area.difference(shapely.union_all([other.area for other in over])))
-        same = next((other for other in over if _alike(other, shape)), None)
+        over = [higher for higher in disjoint if higher.area.intersects(shape.area)]
+        free = _areas_only(shape.area.difference(shapely.union_all([higher.area for higher in over])))
+        same = next((higher for higher in over if _alike(higher, shape)), None)
         if free.is_empty:
             actions.append(f"{shape.source}: left out, it lies inside buildings at least as high")
         elif same is not None:
@@ -491,17 +491,17 @@ def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
             if shape.area.area - free.area > 0.01:
                 actions.append(f"{shape.source}: the part under a higher building was cut away")
             shape.area = free
-            kept.append(shape)
-    return kept
+            disjoint.append(shape)
+    return disjoint
 
 
-def _alike(one: _Shape, other: _Shape) -> bool:
-    return abs(one.height_m - other.height_m) <= SAME_HEIGHT_M and one.material == other.material
+def _alike(first: _Shape, second: _Shape) -> bool:
+    return abs(first.height_m - second.height_m) <= SAME_HEIGHT_M and first.material == second.material
 
 
 def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
     """Forests do not overlap: trees would stand twice as dense."""
-    kept: list[_Shape] = []
+    disjoint: list[_Shape] = []
     for group in _groups(shapes):
         covered: BaseGeometry = Polygon()
         for shape in group:
@@ -510,8 +510,8 @@ def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
                 actions.append(f"{shape.source}: the part inside another forest was cut away")
             covered = covered.union(shape.area)
             if not free.is_empty:
-                kept.append(_Shape(shape.name, shape.source, free))
-    return kept
+                disjoint.append(_Shape(shape.name, shape.source, free))
+    return disjoint
 
 
 def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, Polygon]]:

@@ -180,12 +180,12 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
     -------
     list of Path
     """
-    folder, known = folder_of(site), read_learned(site)
+    folder, memory = folder_of(site), read_learned(site)
     folder.mkdir(exist_ok=True)
-    old = known.entries.get(name)
+    old = memory.entries.get(name)
     for file, content in files.items():
         write_whole(folder / file, gzip.compress(content, 9, mtime=0))
-    entries = {**known.entries, name: entry}
+    entries = {**memory.entries, name: entry}
     text = dump_yaml(Learned(entries=dict(sorted(entries.items()))).model_dump(mode="json", exclude_none=True))
     write_whole(folder / INDEX, text)
     for file in sorted(files_of(old) - set(files)) if old is not None else ():
@@ -262,20 +262,20 @@ def find_named(name: str, folder: Path) -> Named:
     UsageError
         No such site, entry or part; a memory that cannot be read.
     """
-    site, _, wanted = name.rpartition("/")
+    site, _, entry_part = name.rpartition("/")
     place = folder / f"{site}.yaml"
     if not place.with_suffix(".learned").is_dir():
         place = Path(site) if folder_of(site).is_dir() else place
-    known = read_learned(place)
-    for entry_name, entry in known.entries.items():
+    memory = read_learned(place)
+    for entry_name, entry in memory.entries.items():
         parts = {"": entry_name, "uav": f"{entry_name}_uav"}
         parts |= {f"{s.tower}.{s.channel}": f"{entry_name}_{s.tower}.{s.channel}" for s in entry.series}
         for part, full in parts.items():
-            if full == wanted:
+            if full == entry_part:
                 return Named(entry=entry, part=part, folder=folder_of(place))
     raise UsageError(
         f"nothing learned is called {name!r}",
         expected="SITE/ENTRY_uav, SITE/ENTRY_TOWER.CHANNEL or SITE/ENTRY, with one of the entries "
-        + (", ".join(known.entries) or "(there are none)"),
+        + (", ".join(memory.entries) or "(there are none)"),
         path=folder_of(place) / INDEX,
     )

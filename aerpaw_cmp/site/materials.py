@@ -175,9 +175,9 @@ def material(name: str) -> Material:
     >>> material("constant with permittivity=3.5 conductivity=0").relative_permittivity(28e9)
     (3.5-0j)
     """
-    plain, _, said = name.partition(" with ")
-    if said:
-        return _stated(plain, said, name)
+    plain, _, numbers = name.partition(" with ")
+    if numbers:
+        return _stated(plain, numbers, name)
     key = name.strip().lower().replace("-", "_").replace(" ", "_").removeprefix("itu_")
     if key not in _TABLE:
         near = difflib.get_close_matches(key, _TABLE, n=1, cutoff=0.4)
@@ -190,23 +190,23 @@ def material(name: str) -> Material:
     return Material(key, bands, thickness)
 
 
-def _stated(plain: str, said: str, name: str) -> Material:
+def _stated(plain: str, numbers: str, name: str) -> Material:
     """A material whose name says its numbers."""
-    known = {"thickness"} if plain != CONSTANT else {"thickness", "permittivity", "conductivity"}
+    allowed = {"thickness"} if plain != CONSTANT else {"thickness", "permittivity", "conductivity"}
     try:
-        values = {key: float(value) for key, value in (word.split("=") for word in said.split())}
+        values = {key: float(value) for key, value in (word.split("=") for word in numbers.split())}
     except ValueError:
         values = {"?": math.nan}
-    good = set(values) <= known and all(math.isfinite(value) and value >= 0.0 for value in values.values())
-    if not good or (plain == CONSTANT and not values.get("permittivity", 0.0) >= 1.0):
+    valid = set(values) <= allowed and all(math.isfinite(value) and value >= 0.0 for value in values.values())
+    if not valid or (plain == CONSTANT and not values.get("permittivity", 0.0) >= 1.0):
         raise UsageError(
             f"unknown material '{name}'",
             expected="'concrete with thickness=0.1' or 'constant with permittivity=3.5 conductivity=0.02'",
         )
     thickness = values.get("thickness")
     if plain != CONSTANT:
-        one = material(plain)
-        return Material(f"{one.name} with thickness={thickness:.9g}", one.bands, thickness or 1e-9)
+        base = material(plain)
+        return Material(f"{base.name} with thickness={thickness:.9g}", base.bands, thickness or 1e-9)
     band = (0.0, math.inf, values["permittivity"], 0.0, values.get("conductivity", 0.0), 0.0)
     return Material(stated_name(band[2], band[4], thickness), (band,), None if thickness is None else thickness or 1e-9)
 

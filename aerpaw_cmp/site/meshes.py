@@ -90,16 +90,16 @@ def _bodies(
         tips = np.concatenate([centre_m, high_m[:, None]], axis=1)[:, None]
         feet = np.concatenate([centre_m, low_m[:, None]], axis=1)[:, None]
         vertices = np.concatenate([bottom, tips, feet], axis=1)
-        one = np.concatenate(
+        faces = np.concatenate(
             [np.stack([a, b, np.full(sides, sides)], axis=1), np.stack([b, a, np.full(sides, sides + 1)], axis=1)]
         )
     else:
         top = bottom.copy()
         top[..., 2] = high_m[:, None]
         vertices = np.concatenate([bottom, top], axis=1)
-        one = np.concatenate([np.stack([a, b, b + sides], axis=1), np.stack([a, b + sides, a + sides], axis=1)])
+        faces = np.concatenate([np.stack([a, b, b + sides], axis=1), np.stack([a, b + sides, a + sides], axis=1)])
     per = vertices.shape[1]
-    triangles = one + (np.arange(count) * per)[:, None, None]
+    triangles = faces + (np.arange(count) * per)[:, None, None]
     return vertices.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64)
 
 

@@ -106,12 +106,12 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
     """
     path = Path(path)
     root, data = _root(path)
-    given = dict(materials or {})
-    for name in given.values():
+    parameters = dict(materials or {})
+    for name in parameters.values():
         material(name)  # or say what is wrong with it
     defaults = {item.get("name", ""): item.get("value", "") for item in root.iter("default")}
     _substitute(root, defaults, path)
-    radio, unknown, notes = _materials(root, given, path)
+    radio, unknown, notes = _materials(root, parameters, path)
     reading = _Reading(path, path.parent.resolve(), radio)
     reading.digest.update(data)
     for shape in _shapes(root):
@@ -164,7 +164,7 @@ def _substitute(root: ElementTree.Element, defaults: Mapping[str, str], path: Pa
 
 
 def _materials(
-    root: ElementTree.Element, given: Mapping[str, str], path: Path
+    root: ElementTree.Element, parameters: Mapping[str, str], path: Path
 ) -> tuple[dict[str, str], dict[str, str], list[str]]:
     """Radio material by id; type by id of those that are none; notes."""
     radio: dict[str, str] = {}
@@ -173,8 +173,8 @@ def _materials(
     for number, bsdf in enumerate((*root.findall("./bsdf"), *root.findall(".//shape/bsdf"))):
         name = bsdf.get("id") or bsdf.get("name") or f"unnamed {number + 1}"
         bsdf.set("id", name)
-        if name in given:
-            radio[name] = given[name]
+        if name in parameters:
+            radio[name] = parameters[name]
             continue
         material = _radio_material(bsdf, name, path)
         if material is None:
@@ -183,7 +183,7 @@ def _materials(
             radio[name] = material
             if _float(bsdf, "scattering_coefficient", 0.0, path) > 0.0:
                 rough.append(name)
-    stray = sorted(set(given) - set(radio))
+    stray = sorted(set(parameters) - set(radio))
     if stray:
         raise UsageError(
             f"the scene has no material '{stray[0]}'", expected="one of " + ", ".join([*radio, *unknown]), path=path

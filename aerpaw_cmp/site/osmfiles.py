@@ -192,10 +192,10 @@ def _multipolygon(relation: Element, data: _Data, outline: Outline) -> None:
     outline.parts += [(ring, [hole for hole in inner if not _inside(ring, hole)]) for ring in outer]
 
 
-def _inside(ring: list[Position], other: list[Position]) -> bool:
-    if len(set(ring)) < 3 or len(set(other)) < 3:
+def _inside(ring: list[Position], shell: list[Position]) -> bool:
+    if len(set(ring)) < 3 or len(set(shell)) < 3:
         return False
-    shapes = [Polygon(line) for line in (ring, other)]
+    shapes = [Polygon(line) for line in (ring, shell)]
     if any(not shape.is_valid and is_tangled(shape) for shape in shapes):
         return False
     inner, outer = (shapely.make_valid(shape) for shape in shapes)

@@ -72,9 +72,9 @@ def _planet(text: str, path: Path) -> dict[str, FloatArray]:
         raise InputError("no line 'GAIN value dBi'", expected="GAIN in dBi or dBd", path=path)
     peak = float(gain[1]) + (0.0 if (gain[2] or "dBd").lower() == "dbi" else DBI_OF_DBD)
     cuts: dict[str, FloatArray] = {}
-    for found in _PLANET.finditer(text):
-        rows = _pairs(text[found.end() :].split("\n"), int(found[2]), path)
-        cuts[found[1].upper()] = peak - _each_degree(rows, found[1], path)
+    for cut in _PLANET.finditer(text):
+        rows = _pairs(text[cut.end() :].split("\n"), int(cut[2]), path)
+        cuts[cut[1].upper()] = peak - _each_degree(rows, cut[1], path)
     return cuts
 
 
@@ -88,17 +88,17 @@ def _nsma(text: str, path: Path) -> dict[str, FloatArray]:
     unit = fields.get("GUNITS", "DBI").upper().partition("/")[0]
     peak = float(gain) + (DBI_OF_DBD if "DBD" in unit else 0.0)
     cuts: dict[str, FloatArray] = {}
-    for found in _NSMA.finditer(text):
-        kind = "HORIZONTAL" if found[1].upper() in ("AZ", "H") else "VERTICAL"
+    for cut in _NSMA.finditer(text):
+        kind = "HORIZONTAL" if cut[1].upper() in ("AZ", "H") else "VERTICAL"
         if kind in cuts:
             continue  # the first of each: others are of another frequency or cross-polarised
-        ends = re.search(r"(?m)^\s*(PATCUT|ENDFIL):", text[found.end() :])
-        body = text[found.end() : found.end() + ends.start()] if ends else text[found.end() :]
+        ends = re.search(r"(?m)^\s*(PATCUT|ENDFIL):", text[cut.end() :])
+        body = text[cut.end() : cut.end() + ends.start()] if ends else text[cut.end() :]
         lines = [line.replace(",", " ") for line in body.split("\n") if re.match(r"\s*[-+]?\d", line)]
         rows = _pairs(lines, len(lines), path)
         if kind == "VERTICAL":
             rows = rows * [-1.0, 1.0]  # elevation is positive upwards there
-        cuts[kind] = _each_degree(rows, found[1], path) + (peak if relative else 0.0)
+        cuts[kind] = _each_degree(rows, cut[1], path) + (peak if relative else 0.0)
     return cuts
 
 

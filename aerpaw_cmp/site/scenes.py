@@ -174,23 +174,25 @@ def _outlines(scene: TriangleScene) -> tuple[Building, ...]:
     plan = shapely.polygons(corners[:, :, :2])
     area = shapely.area(plan)
     low, high = bounds(scene)
-    whole = float((high[0] - low[0]) * (high[1] - low[1]))
+    ground_m2 = float((high[0] - low[0]) * (high[1] - low[1]))
     outlines: list[tuple[str, Polygon, float]] = []
-    seen = area > 1e-3  # walls are lines from above
-    for shape in np.unique(scene.shape[seen]).tolist():
-        rows = np.flatnonzero(seen & (scene.shape == shape))
+    from_above = area > 1e-3  # walls are lines from above
+    for shape in np.unique(scene.shape[from_above]).tolist():
+        rows = np.flatnonzero(from_above & (scene.shape == shape))
         parts = shapely.get_parts(shapely.union_all(shapely.buffer(plan[rows], 0.01, join_style="mitre")))
         part, row = shapely.STRtree(shapely.centroid(plan[rows])).query(parts, predicate="contains")
         for number, outline in enumerate(parts):
             mine = corners[rows[row[part == number]]][:, :, 2]
             simple = outline.simplify(DRAWN_SIMPLER_M)
-            if mine.size and simple.geom_type == "Polygon" and DRAWN_M2 < simple.area < GROUND_PART * whole:
+            if mine.size and simple.geom_type == "Polygon" and DRAWN_M2 < simple.area < GROUND_PART * ground_m2:
                 outlines.append((scene.shapes[shape], simple, float(mine.max())))
-    outlines = sorted(outlines, key=lambda one: -one[1].area)[:DRAWN_MOST]
+    outlines = sorted(outlines, key=lambda drawn: -drawn[1].area)[:DRAWN_MOST]
     # down to the lowest corner of anything under it: roofs are often shapes of their own
     feet = np.array([top for *_, top in outlines])
     boxes = shapely.buffer([outline for _, outline, _ in outlines], 0.5)
-    here, corner = shapely.STRtree(shapely.points(scene.vertices_m[:, :2])).query(boxes, predicate="contains")
-    np.minimum.at(feet, here, scene.vertices_m[corner, 2])
-    tall = [(one, float(foot)) for one, foot in zip(outlines, feet, strict=True) if one[2] - foot > DRAWN_TALLER_M]
+    box, corner = shapely.STRtree(shapely.points(scene.vertices_m[:, :2])).query(boxes, predicate="contains")
+    np.minimum.at(feet, box, scene.vertices_m[corner, 2])
+    tall = [
+        (drawn, float(foot)) for drawn, foot in zip(outlines, feet, strict=True) if drawn[2] - foot > DRAWN_TALLER_M
+    ]
     return tuple(Building(name, outline, top - foot, foot) for (name, outline, top), foot in tall)

@@ -138,8 +138,8 @@ class TowerModel(StrictModel):
 
     @model_validator(mode="after")
     def _one_way(self) -> TowerModel:
-        here = (self.latitude_deg is not None) + (self.longitude_deg is not None)
-        if here == 1 or (here == 2) == bool(self.positions):
+        ways = (self.latitude_deg is not None) + (self.longitude_deg is not None)
+        if ways == 1 or (ways == 2) == bool(self.positions):
             raise ValueError("give latitude_deg and longitude_deg, or positions, not both")
         if self.antenna is not None and self.antenna_height_m is not None:
             raise ValueError("give antenna_height_m (above ground) or antenna, not both")
@@ -515,8 +515,8 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
     if len(buildings) < 2:
         return []
     shapes = [building.footprint for building in buildings]
-    left, right = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-    pairs = [(int(i), int(j)) for i, j in zip(left, right, strict=True) if i < j]
+    first, second = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+    pairs = [(int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j]
     # outlines simplified by 'site import' may still overlap by some decimetres
     overlapping = [(i, j) for i, j in pairs if not shapes[i].intersection(shapes[j]).buffer(-OVERLAP_M / 2).is_empty]
     if not overlapping:
@@ -581,20 +581,20 @@ def _tower(
 
 
 def _chosen_position(
-    name: str, model: TowerModel, wanted: str | None, frame: SiteFrame, notes: list[str]
+    name: str, model: TowerModel, source_name: str | None, frame: SiteFrame, notes: list[str]
 ) -> PositionModel:
     if model.latitude_deg is not None and model.longitude_deg is not None:
         return PositionModel(latitude_deg=model.latitude_deg, longitude_deg=model.longitude_deg, source=model.source)
-    key = next(iter(model.positions)) if wanted is None else wanted
+    key = next(iter(model.positions)) if source_name is None else source_name
     if key not in model.positions:
         raise UsageError(f"tower '{name}' has no position '{key}'", expected="one of " + ", ".join(model.positions))
     chosen = model.positions[key]
-    here = frame.to_local(chosen.latitude_deg, chosen.longitude_deg)
-    for other, position in model.positions.items():
-        if other != key:
-            there = frame.to_local(position.latitude_deg, position.longitude_deg)
-            apart = math.hypot(float(here[0] - there[0]), float(here[1] - there[1]))
-            notes.append(f"{name}: source {other} lies {apart:.1f} m from source {key}, which is used")
+    place = frame.to_local(chosen.latitude_deg, chosen.longitude_deg)
+    for source, position in model.positions.items():
+        if source != key:
+            place_of_source = frame.to_local(position.latitude_deg, position.longitude_deg)
+            apart = math.hypot(float(place[0] - place_of_source[0]), float(place[1] - place_of_source[1]))
+            notes.append(f"{name}: source {source} lies {apart:.1f} m from source {key}, which is used")
     return chosen
 
 

@@ -242,14 +242,14 @@ def _row(line: str, number: int, width: int, path: Path) -> list[float]:
 
 
 def _check_grid(azimuth: FloatArray, elevation: FloatArray, count: int, path: Path) -> None:
-    whole = (
+    is_sphere = (
         len(azimuth) >= 4
         and len(azimuth) % 2 == 0
         and len(elevation) >= 3
         and np.allclose(azimuth, np.arange(len(azimuth)) * 360.0 / len(azimuth), atol=1e-3)
         and np.allclose(elevation, np.linspace(90.0, -90.0, len(elevation)), atol=1e-3)
     )
-    if not whole or count != len(azimuth) * len(elevation):
+    if not is_sphere or count != len(azimuth) * len(elevation):
         raise InputError(
             f"{count} directions of {len(azimuth)} azimuths and {len(elevation)} elevations",
             expected="a full sphere: azimuth from 0 deg and elevation from 90 to -90 deg in equal steps, each once",

@@ -174,14 +174,14 @@ def wanted_trees(forest: Forest, keep_clear: BaseGeometry | None = None) -> int:
     return round(forest.trees_per_hectare * float(area.area) / 10_000.0)
 
 
-def _scatter(area: BaseGeometry, wanted: int, spacing_m: float, random: np.random.Generator) -> FloatArray:
+def _scatter(area: BaseGeometry, count: int, spacing_m: float, random: np.random.Generator) -> FloatArray:
     """Up to ``wanted`` random points (n, 2) in an area, at least ``spacing_m`` apart."""
     placed = np.zeros((0, 2))
-    if wanted <= 0 or area.is_empty:
+    if count <= 0 or area.is_empty:
         return placed
-    if wanted > MAXIMUM_TREES:
+    if count > MAXIMUM_TREES:
         raise UsageError(
-            f"a forest of {area.area / 1e4:.0f} ha asks for {wanted} trees",
+            f"a forest of {area.area / 1e4:.0f} ha asks for {count} trees",
             expected=f"at most {MAXIMUM_TREES}",
             cause="trees_per_hectare is too high, or the outline reaches far outside the site",
         )
@@ -190,17 +190,17 @@ def _scatter(area: BaseGeometry, wanted: int, spacing_m: float, random: np.rando
     low, span = np.array([east_min, north_min]), np.array([east_max - east_min, north_max - north_min])
     share = area.area / max(float(span.prod()), 1e-300)
     stalled = 0
-    while len(placed) < wanted and stalled < _STALLED_ROUNDS:
-        missing = wanted - len(placed)
+    while len(placed) < count and stalled < _STALLED_ROUNDS:
+        missing = count - len(placed)
         darts = low + span * random.random((min(int(1.5 * missing / share) + 16, 2_000_000), 2))
         darts = darts[shapely.contains_xy(area, darts[:, 0], darts[:, 1])]
         if spacing_m > 0:
             if len(placed):
                 darts = darts[cKDTree(placed).query(darts, distance_upper_bound=spacing_m)[0] >= spacing_m]
             darts = darts[_first_come(darts, spacing_m)]
-        kept = darts[:missing]
-        stalled = stalled + 1 if len(kept) < 1e-3 * wanted else 0
-        placed = np.concatenate([placed, kept])
+        added = darts[:missing]
+        stalled = stalled + 1 if len(added) < 1e-3 * count else 0
+        placed = np.concatenate([placed, added])
     return placed
 
 

@@ -141,6 +141,6 @@ def test_objects_over_several_lines_are_read_behind_any_number_of_damaged_ones()
     good = json.dumps({"timestamp": 1740927601.25, "ue_list": []}, indent=2).encode() + b"\n"
     lines = _lines.split(40 * damaged + good)
     found = _json.objects(lines)
-    assert [one["timestamp"] for one in found.found] == [1740927601.25]
+    assert [one["timestamp"] for one in found.values] == [1740927601.25]
     assert len(found.rejected) == 40
     assert found.row.tolist() == [40]

@@ -20,8 +20,8 @@ def make_site(buildings=(), towers=((0.0, 0.0, 10.0),), **settings):
 
 
 def random_buildings(rng, count, *, spread_m=150.0, clear_m=20.0, holes=False):
-    found = []
-    while len(found) < count:
+    buildings = []
+    while len(buildings) < count:
         east, north = rng.uniform(-spread_m, spread_m, 2)
         half = rng.uniform(5, 15, 2)
         shape = box(east - half[0], north - half[1], east + half[0], north + half[1])
@@ -32,10 +32,10 @@ def random_buildings(rng, count, *, spread_m=150.0, clear_m=20.0, holes=False):
         elif rng.random() < 0.4:  # L shape
             shape = shape.difference(box(east, north, east + 99, north + 99))
         shape = affinity.rotate(shape, rng.uniform(0, 180))
-        if shape.distance(shapely.Point(0, 0)) < clear_m or any(shape.distance(b.footprint) < 2 for b in found):
+        if shape.distance(shapely.Point(0, 0)) < clear_m or any(shape.distance(b.footprint) < 2 for b in buildings):
             continue
-        found.append(Building(f"b{len(found)}", shape, float(rng.uniform(4, 14))))
-    return tuple(found)
+        buildings.append(Building(f"b{len(buildings)}", shape, float(rng.uniform(4, 14))))
+    return tuple(buildings)
 
 
 def make_poses(position_m, rotation=None):
@@ -85,7 +85,7 @@ def _on_face(faces, index, point):
 
 def brute_force(site, faces, source, target, max_depth):
     """Every face sequence of one link, tried one by one; sequences as tuples."""
-    found = set()
+    sequences = set()
     for depth in range(max_depth + 1):
         for sequence in itertools.product(range(len(faces)), repeat=depth):
             if any(a == b for a, b in itertools.pairwise(sequence)):
@@ -114,8 +114,8 @@ def brute_force(site, faces, source, target, max_depth):
                     for p in (points[k], points[k + 2])
                 ]
                 if all(sides) and not any(_covered(site, a, b) for a, b in itertools.pairwise(points)):
-                    found.add(sequence + (-1,) * (max_depth - depth))
-    return found
+                    sequences.add(sequence + (-1,) * (max_depth - depth))
+    return sequences
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,17 @@ GROUND = (2, 1, 0)
 
 def faces_of(boxes):
     """[(plane, bounds)] with bounds {other axis: (low, high)}; the ground has none."""
-    found = [(GROUND, {})]
+    faces = [(GROUND, {})]
     for west, east, south, north, top in boxes:
         upright = {2: (None, top)}
-        found += [
+        faces += [
             ((0, -1, west), {1: (south, north), **upright}),
             ((0, 1, east), {1: (south, north), **upright}),
             ((1, -1, south), {0: (west, east), **upright}),
             ((1, 1, north), {0: (west, east), **upright}),
             ((2, 1, top), {0: (west, east), 1: (south, north)}),
         ]
-    return found
+    return faces
 
 
 def _height(plane, point):
@@ -45,15 +45,15 @@ def _between(bounds, point):
 def paths(boxes, source, target, max_depth=2):
     """Set of the paths between two integer points that are not the same."""
     faces = faces_of(boxes)
-    found = set()
+    sequences = set()
     if not blocked(boxes, source, target):
-        found.add(())
+        sequences.add(())
     for depth in range(1, max_depth + 1):
         for sequence in itertools.product(range(len(faces)), repeat=depth):
             points = _points([faces[k] for k in sequence], source, target)
             if points and not any(blocked(boxes, a, b) for a, b in itertools.pairwise(points)):
-                found.add(tuple(faces[k][0] for k in sequence))
-    return found
+                sequences.add(tuple(faces[k][0] for k in sequence))
+    return sequences
 
 
 def _points(sequence, source, target):
@@ -123,10 +123,10 @@ def strictly_inside(b, point):
 
 def random_scene(rng, boxes=3, half=6, poses=12):
     """Integer boxes, a source and targets on the same grid; walls touch and ends lie on faces often."""
-    found = []
+    solids = []
     for _ in range(boxes):
         west, south = (2 * rng.integers(-half // 2, half // 2, 2)).tolist()
-        found.append(
+        solids.append(
             (
                 west,
                 west + 2 * int(rng.integers(1, 4)),
@@ -138,9 +138,9 @@ def random_scene(rng, boxes=3, half=6, poses=12):
     ends = []
     while len(ends) < poses + 1:
         point = (*rng.integers(-half - 3, half + 4, 2).tolist(), int(rng.integers(0 if ends else 1, 7)))
-        if point not in ends and not any(strictly_inside(b, point) for b in found):
+        if point not in ends and not any(strictly_inside(b, point) for b in solids):
             ends.append(point)
-    return found, ends[0], ends[1:]
+    return solids, ends[0], ends[1:]
 
 
 def planes_found(paths_, faces, pose):

@@ -33,13 +33,13 @@ def paths(corners, sources, targets, depth):
     corners, normal = corners[good], normal[good]
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     offset = (normal * corners[:, 0]).sum(axis=1)
-    found = []
+    polylines = []
     for t, source in enumerate(sources):
         for length in range(depth + 1):
             for points, pose in _candidates(corners, normal, offset, source, targets, length):
                 if not _cut(corners, normal, offset, source, points, targets[pose]):
-                    found.append((t, pose, [p for p, _ in points]))
-    return _distinct(found)
+                    polylines.append((t, pose, [p for p, _ in points]))
+    return _distinct(polylines)
 
 
 def _candidates(corners, normal, offset, source, targets, length):
@@ -94,12 +94,12 @@ def _inside(corners, normal, points):
 def _edges(corners, normal):
     """For each side: the inward unit vectors (mirrors, 3), and the least component along them of a point inside."""
     corners, normal = np.frombuffer(corners).reshape(-1, 3, 3), np.frombuffer(normal).reshape(-1, 3)
-    found = []
+    sides = []
     for k in range(3):
         edge = corners[:, (k + 1) % 3] - corners[:, k]
         inward = np.cross(normal, edge) / np.linalg.norm(edge, axis=1, keepdims=True)
-        found.append((inward, (corners[:, k] * inward).sum(axis=-1) - 1e-6))
-    return found
+        sides.append((inward, (corners[:, k] * inward).sum(axis=-1) - 1e-6))
+    return sides
 
 
 def _cut(corners, normal, offset, source, points, target):
@@ -122,14 +122,14 @@ def _cut(corners, normal, offset, source, points, target):
     return False
 
 
-def _distinct(found):
+def _distinct(polylines):
     """One of paths whose points coincide within 5 mm."""
-    kept = {}
-    for tower, pose, points in found:
-        mine = kept.setdefault((tower, pose, len(points)), [])
+    distinct = {}
+    for tower, pose, points in polylines:
+        mine = distinct.setdefault((tower, pose, len(points)), [])
         if not any(all(np.abs(p - q).max() < 5e-3 for p, q in zip(points, other, strict=True)) for other in mine):
             mine.append(points)
-    return kept
+    return distinct
 
 
 def compare(ours, theirs):

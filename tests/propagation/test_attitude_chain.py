@@ -121,10 +121,8 @@ def test_each_port_has_its_own_pattern(scenes):
     site = scenes.site()
     gains = (1.0, 2.0, 3.0, 0.5)
     each = Array(np.zeros((4, 3)), np.zeros(4), tuple(Fixed(g) for g in gains))
-    one = replay(site, scenes.link(site, uav_array=each), scenes.poses([[80.0, 0.0, 10.0]]), Search(max_depth=0)).h[
-        0, 0
-    ]
-    assert (one / one[0, 0]).real.ravel() == pytest.approx(gains)
+    h = replay(site, scenes.link(site, uav_array=each), scenes.poses([[80.0, 0.0, 10.0]]), Search(max_depth=0)).h[0, 0]
+    assert (h / h[0, 0]).real.ravel() == pytest.approx(gains)
 
 
 def test_each_tower_has_its_own_array(scenes, tmp_path):

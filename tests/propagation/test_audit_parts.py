@@ -47,37 +47,39 @@ POSES = Poses(np.array([[120.0, 60.0, 40.0]]), np.eye(3)[None])
 
 
 def test_a_path_that_the_other_engine_alone_has_is_missing_only_where_it_exists() -> None:
-    found = replay(SITE, LINK, POSES, Search("image", max_depth=1))
-    known = found.paths
-    assert len(known) >= 2
-    every = np.arange(len(known))
-    missing = _lacking(SITE, found, known, found.faces, every, POSES, Expected.of(LINK))
-    assert (missing.missing_paths, missing.doubtful) == (len(known), 0)
-    assert missing.failures == (f"{len(known)} paths that Sionna has are missing",)
+    replayed = replay(SITE, LINK, POSES, Search("image", max_depth=1))
+    paths = replayed.paths
+    assert len(paths) >= 2
+    every = np.arange(len(paths))
+    missing = _lacking(SITE, replayed, paths, replayed.faces, every, POSES, Expected.of(LINK))
+    assert (missing.missing_paths, missing.doubtful) == (len(paths), 0)
+    assert missing.failures == (f"{len(paths)} paths that Sionna has are missing",)
     # the same paths off walls that look away from the tower: none can exist
     source = SITE.towers["LW1"].position_m
-    away = np.flatnonzero((found.faces.solid >= 0) & (found.faces.normal @ source < found.faces.offset_m - 1.0))
-    bounced = known.select(np.flatnonzero(known.depth == 1)[:1])
+    away = np.flatnonzero(
+        (replayed.faces.solid >= 0) & (replayed.faces.normal @ source < replayed.faces.offset_m - 1.0)
+    )
+    bounced = paths.select(np.flatnonzero(paths.depth == 1)[:1])
     for face in away[:5]:
         phantom = dataclasses.replace(bounced, faces=np.full_like(bounced.faces, face))
-        judged = _lacking(SITE, found, phantom, found.faces, np.array([0]), POSES, Expected.of(LINK))
+        judged = _lacking(SITE, replayed, phantom, replayed.faces, np.array([0]), POSES, Expected.of(LINK))
         assert (judged.missing_paths, judged.doubtful, judged.failures) == (0, 1, ())
     assert len(away) > 5
 
 
 def test_paths_that_the_other_engine_lacks_are_invented_only_where_none_can_be() -> None:
-    found = replay(SITE, LINK, POSES, Search("image", max_depth=1))
-    every = np.arange(len(found.paths))
-    assert impossible(SITE, POSES, found, every, Expected.of(LINK)).failures == ()
-    row = int(np.flatnonzero(found.paths.depth == 1)[0])
+    replayed = replay(SITE, LINK, POSES, Search("image", max_depth=1))
+    every = np.arange(len(replayed.paths))
+    assert impossible(SITE, POSES, replayed, every, Expected.of(LINK)).failures == ()
+    row = int(np.flatnonzero(replayed.paths.depth == 1)[0])
     source = SITE.towers["LW1"].position_m
-    faces = found.paths.faces.copy()
-    faces[row, 0] = np.flatnonzero((found.faces.solid >= 0) & (found.faces.normal @ source < found.faces.offset_m - 1))[
-        0
-    ]
-    planted = dataclasses.replace(found, paths=dataclasses.replace(found.paths, faces=faces))
-    seen = impossible(SITE, POSES, planted, every, Expected.of(LINK))
-    assert (seen.phantom_paths, seen.failures) == (1, ("1 paths that cannot exist",))
+    faces = replayed.paths.faces.copy()
+    faces[row, 0] = np.flatnonzero(
+        (replayed.faces.solid >= 0) & (replayed.faces.normal @ source < replayed.faces.offset_m - 1)
+    )[0]
+    planted = dataclasses.replace(replayed, paths=dataclasses.replace(replayed.paths, faces=faces))
+    audit = impossible(SITE, POSES, planted, every, Expected.of(LINK))
+    assert (audit.phantom_paths, audit.failures) == (1, ("1 paths that cannot exist",))
     assert impossible(SITE, POSES, planted, np.setdiff1d(every, row), Expected.of(LINK)).phantom_paths == 0
 
 
@@ -100,13 +102,13 @@ def test_coefficients_of_paths_are_compared_entry_by_entry(planted: str, size: f
     turns = np.array([rotation_from_yaw_pitch_roll(*generator.uniform(-0.4, 0.4, 3)) for _ in range(4)])
     spots = np.array([[120.0, 60.0, 40.0], [40.0, -90.0, 25.0], [-700.0, 300.0, 60.0], [60.0, 10.0, 30.0]])
     few = Poses(spots, turns)
-    found = replay(SITE, LINK, few, Search("image", max_depth=1))
+    replayed = replay(SITE, LINK, few, Search("image", max_depth=1))
     probe, left = _probe(LINK)
     assert left == ()
-    scene, paths = Scene.of(SITE, probe, few), found.paths
+    scene, paths = Scene.of(SITE, probe, few), replayed.paths
     alone = dataclasses.replace(paths, pose=np.arange(len(paths)))
     many = Poses(spots[paths.pose], turns[paths.pose])
-    own = channel_matrices(alone, found.faces, scene.sources_m, many, probe).h[np.arange(len(paths)), paths.tower]
+    own = channel_matrices(alone, replayed.faces, scene.sources_m, many, probe).h[np.arange(len(paths)), paths.tower]
     length = path_lengths(paths, scene.sources_m, spots)
     gain, k = own.copy(), int(np.argmin(length))
     strong = np.unravel_index(np.abs(own[k]).argmax(), (2, 2))
@@ -128,14 +130,14 @@ def test_coefficients_of_paths_are_compared_entry_by_entry(planted: str, size: f
     other = generator.permutation(len(paths))
     theirs = OwnPaths(np.empty_like(gain), np.empty_like(length))
     theirs.gain[other], theirs.length_m[other] = gain, length
-    seen = _paths_against_sionna(paths, found, scene, few, probe, theirs, other)
-    assert (seen.paths, seen.phases) == (len(paths), int((length < 300.0).sum()))
-    assert 0 < seen.phases < seen.paths
-    assert seen.phase_max_rad == pytest.approx(phase, abs=1e-9)
-    assert seen.phase_rms_rad == pytest.approx(phase / np.sqrt(seen.phases), abs=1e-9)
-    assert seen.power_max_db == pytest.approx(power, abs=1e-9)
-    assert seen.power_rms_db == pytest.approx(power / np.sqrt(len(paths)), abs=1e-9)
-    words = " ".join(seen.failures)
+    audit = _paths_against_sionna(paths, replayed, scene, few, probe, theirs, other)
+    assert (audit.paths, audit.phases) == (len(paths), int((length < 300.0).sum()))
+    assert 0 < audit.phases < audit.paths
+    assert audit.phase_max_rad == pytest.approx(phase, abs=1e-9)
+    assert audit.phase_rms_rad == pytest.approx(phase / np.sqrt(audit.phases), abs=1e-9)
+    assert audit.power_max_db == pytest.approx(power, abs=1e-9)
+    assert audit.power_rms_db == pytest.approx(power / np.sqrt(len(paths)), abs=1e-9)
+    words = " ".join(audit.failures)
     assert (f"1 paths differ from Sionna's own by up to {size:.3g} dB" in words) == (planted == "level" and size > 0.05)
     assert (f"1 paths differ from Sionna's own by up to {size:.3g} rad" in words) == (
         planted == "phase" and size > 0.01
@@ -169,20 +171,20 @@ def test_paths_of_the_asked_poses_are_matched_and_those_that_are_lacking_counted
     monkeypatch.setattr("aerpaw_cmp.propagation.search.sionna.own_coefficients", own)
     clean = replay(SITE, link, poses, search)
     asked = int(np.isin(clean.paths.pose, chosen).sum())
-    gone = int(np.flatnonzero((clean.paths.pose == 2) & (clean.paths.depth == 1))[0])
-    fewer = dataclasses.replace(clean, paths=clean.paths.select(np.setdiff1d(np.arange(len(clean.paths)), gone)))
+    dropped = int(np.flatnonzero((clean.paths.pose == 2) & (clean.paths.depth == 1))[0])
+    fewer = dataclasses.replace(clean, paths=clean.paths.select(np.setdiff1d(np.arange(len(clean.paths)), dropped)))
     for replayed, lacking in ((clean, 0), (fewer, 1)):
-        found = against_sionna(SITE, link, poses, replayed, chosen, Expected.of(link), search, complete=complete)
-        assert (found.paths, found.missing_paths) == (asked - lacking, lacking if complete else 0)
-        assert found.power_max_db < 1e-9
-        assert bool(found.failures) == bool(lacking and complete)
+        audit = against_sionna(SITE, link, poses, replayed, chosen, Expected.of(link), search, complete=complete)
+        assert (audit.paths, audit.missing_paths) == (asked - lacking, lacking if complete else 0)
+        assert audit.power_max_db < 1e-9
+        assert bool(audit.failures) == bool(lacking and complete)
 
 
 def test_a_link_s_error_is_that_of_its_sum_where_all_paths_are_near_and_none_fades() -> None:
     """Five links of two poses and three towers; the second has a far path, the third fades, the last has no path."""
-    found = replay(SITE, LINK, POSES, Search("image", max_depth=1)).paths
+    traced = replay(SITE, LINK, POSES, Search("image", max_depth=1)).paths
     link = np.array([0, 0, 1, 1, 2, 2, 3, 4])
-    paths = dataclasses.replace(found.select(np.zeros(8, dtype=np.int64)), pose=link // 3, tower=link % 3)
+    paths = dataclasses.replace(traced.select(np.zeros(8, dtype=np.int64)), pose=link // 3, tower=link % 3)
     generator = np.random.default_rng(2)
     h = generator.normal(size=(8, 2, 2)) + 1j * generator.normal(size=(8, 2, 2))
     h[5] = -h[4] * 0.999
@@ -207,25 +209,25 @@ def test_two_replays_differ_by_what_was_planted() -> None:
     assert (same.missing_paths, same.extra_paths, same.coverage_differs) == (0, 0, 0)
     assert (same.rss_max_error_db, set(same.rank_disagreement.values())) == (0.0, {0.0})
     paths, level, covered = clean.paths, clean.rss_dbm.copy(), clean.has_path.copy()
-    gone, bent = (int(np.flatnonzero((paths.pose == pose) & (paths.depth == 1))[0]) for pose in (0, 3))
+    dropped, bent = (int(np.flatnonzero((paths.pose == pose) & (paths.depth == 1))[0]) for pose in (0, 3))
     faces = paths.faces.copy()
     plane = clean.faces.normal[faces[bent, 0]], clean.faces.offset_m[faces[bent, 0]]
     other = (clean.faces.normal != plane[0]).any(axis=1) | (clean.faces.offset_m != plane[1])
     unused = np.setdiff1d(np.flatnonzero(other), faces[paths.pose == 3])
     faces[bent, 0] = unused[0]
-    rows = np.setdiff1d(np.arange(len(paths)), gone)
+    rows = np.setdiff1d(np.arange(len(paths)), dropped)
     level[[4, 0, 1], 0] += [3.0, -1.0, 50.0]  # the second is not compared
     level[3, 0], covered[3, 0] = np.nan, False
     planted = dataclasses.replace(
         clean, paths=dataclasses.replace(paths, faces=faces).select(rows), rss_dbm=level, has_path=covered,
         h=clean.h * (np.arange(6) != 3)[:, None, None, None],
     )  # fmt: skip
-    found = compare(planted, few, chosen, (10.0, 1000.0))
-    assert (found.missing_paths, found.extra_paths, found.reference_paths) == (2, 1, len(few.paths))
-    assert found.rss_max_error_db == pytest.approx(3.0)
-    assert found.rss_rms_error_db == pytest.approx(np.sqrt((9.0 + 1.0) / 2))
-    assert found.coverage_differs == 1
-    assert found.rank_disagreement == pytest.approx({10.0: 1 / 3, 1000.0: 1 / 3})
+    difference = compare(planted, few, chosen, (10.0, 1000.0))
+    assert (difference.missing_paths, difference.extra_paths, difference.reference_paths) == (2, 1, len(few.paths))
+    assert difference.rss_max_error_db == pytest.approx(3.0)
+    assert difference.rss_rms_error_db == pytest.approx(np.sqrt((9.0 + 1.0) / 2))
+    assert difference.coverage_differs == 1
+    assert difference.rank_disagreement == pytest.approx({10.0: 1 / 3, 1000.0: 1 / 3})
     assert extra_rows(planted, few, chosen).tolist() == [int(np.flatnonzero(rows == bent)[0])]
     none = compare(dataclasses.replace(planted, rss_dbm=np.full((6, 1), np.nan)), few, chosen)
     assert np.isnan([none.rss_max_error_db, none.rss_rms_error_db]).all()
@@ -255,17 +257,17 @@ def test_explicit_arrays_are_asked_next_to_the_towers(
         return ours + np.where(np.arange(2) == 1, wrong, 0.0)
 
     monkeypatch.setattr("aerpaw_cmp.propagation.search.sionna.own_channels", own)
-    found = _explicit(SITE, link, poses, 1)
+    audit = _explicit(SITE, link, poses, 1)
     assert asked == [20, 40, 60, 80, 90, 100, 110, 120, 130, 140]
-    assert found.explicit_links == 20
-    assert found.explicit_max_error == pytest.approx(off, abs=1e-12)
-    assert bool(found.failures) == failed
+    assert audit.explicit_links == 20
+    assert audit.explicit_max_error == pytest.approx(off, abs=1e-12)
+    assert bool(audit.failures) == failed
     slanted = dataclasses.replace(array, positions_m=2 * array.positions_m)
-    one = single_element(Isotropic())
+    element = single_element(Isotropic())
     for other in (
         dataclasses.replace(link, uav_array=single_element(HalfWaveDipole())),
         dataclasses.replace(link, tower_arrays={"LW1": array, "LW2": slanted}),
-        dataclasses.replace(link, tower_arrays={"LW1": one, "LW2": one}, uav_array=one),
+        dataclasses.replace(link, tower_arrays={"LW1": element, "LW2": element}, uav_array=element),
     ):
         assert _explicit(SITE, other, poses, 1).explicit_links == 0
     assert _explicit(SITE, link, Poses(spots[2:3], np.eye(3)[None]), 1).explicit_links == 0
@@ -286,27 +288,29 @@ def test_an_audit_adds_up_its_checks(monkeypatch: pytest.MonkeyPatch, samples: o
     monkeypatch.setattr(audit_module, "against_sionna", sionna)
     second = Second(reference="image", links=3, expected=Expected.of(LINK), reference_links=2)
     wanted = dataclasses.replace(search, samples=samples)
-    found = audit_module.audit(SITE, LINK, poses, clean, wanted, second=second)
-    assert (found.engine, found.reference, found.links, found.missing_paths, found.extra_paths) == (
+    audit = audit_module.audit(SITE, LINK, poses, clean, wanted, second=second)
+    assert (audit.engine, audit.reference, audit.links, audit.missing_paths, audit.extra_paths) == (
         "image",
         "image",
         3,
         0,
         0,
     )
-    assert found.field is not None
-    assert (found.field.paths, found.field.reference_links, found.field.failures) == (7, 2, ())
+    assert audit.field is not None
+    assert (audit.field.paths, audit.field.reference_links, audit.field.failures) == (7, 2, ())
     assert asked == [([0, 2, 4], rays, True)]
-    assert found.seconds == clean.seconds
+    assert audit.seconds == clean.seconds
     faces, row = clean.paths.faces.copy(), int(np.flatnonzero((clean.paths.depth == 1) & (clean.paths.pose == 2))[0])
     source = SITE.towers["LW1"].position_m
     faces[row, 0] = np.flatnonzero((clean.faces.solid >= 0) & (clean.faces.normal @ source < clean.faces.offset_m - 1))[
         0
     ]
     planted = dataclasses.replace(clean, paths=dataclasses.replace(clean.paths, faces=faces))
-    seen = audit_module.audit(SITE, LINK, poses, planted, wanted, second=dataclasses.replace(second, reference_links=0))
-    assert seen.field is not None
-    assert (seen.missing_paths, seen.extra_paths, seen.field.phantom_paths) == (1, 1, 1)
+    phantom = audit_module.audit(
+        SITE, LINK, poses, planted, wanted, second=dataclasses.replace(second, reference_links=0)
+    )
+    assert phantom.field is not None
+    assert (phantom.missing_paths, phantom.extra_paths, phantom.field.phantom_paths) == (1, 1, 1)
     few = replay(SITE, LINK, Poses(spots[::2], np.tile(np.eye(3), (3, 1, 1))), search)
     monkeypatch.setattr(audit_module, "run_replay", lambda *_: few)
     mesh = audit_module.audit(dataclasses.replace(SITE, scene=object()), LINK, poses, planted, wanted, second=second)

@@ -198,8 +198,8 @@ def test_normal_incidence_is_continuous(scenes, tilt):
     lam = wavelength_m(scenes.carrier_hz)
     eta = material("medium_dry_ground").relative_permittivity(3.4e9)
     gamma = (1 - np.sqrt(eta)) / (1 + np.sqrt(eta))
-    two = lam / (4 * np.pi) * (np.exp(-2j * np.pi * 20 / lam) / 20 + gamma * np.exp(-2j * np.pi * 40 / lam) / 40)
-    assert abs(result.h[0, 0, 0, 0]) == pytest.approx(abs(two), rel=1e-4 if tilt > 1e-6 else 1e-9)
+    two_rays = lam / (4 * np.pi) * (np.exp(-2j * np.pi * 20 / lam) / 20 + gamma * np.exp(-2j * np.pi * 40 / lam) / 40)
+    assert abs(result.h[0, 0, 0, 0]) == pytest.approx(abs(two_rays), rel=1e-4 if tilt > 1e-6 else 1e-9)
 
 
 def test_slant_follows_tr_38_901_model_2(scenes):
@@ -227,11 +227,11 @@ def test_attitude_turns_the_array(scenes):
     uav = uav_comparison_array(0.0882, pattern=Crossed())
     poses = scenes.poses([[80.0, 30.0, 40.0]], turn[None])
     moved = Array(uav.positions_m, uav.slant_rad, uav.patterns, turn @ uav.mount)
-    one = replay(site, scenes.link(site, uav_array=uav), poses)
-    two = replay(site, scenes.link(site, uav_array=moved), scenes.poses([[80.0, 30.0, 40.0]]))
-    assert one.h == pytest.approx(two.h, rel=1e-9)
+    turned = replay(site, scenes.link(site, uav_array=uav), poses)
+    remounted = replay(site, scenes.link(site, uav_array=moved), scenes.poses([[80.0, 30.0, 40.0]]))
+    assert turned.h == pytest.approx(remounted.h, rel=1e-9)
     level = replay(site, scenes.link(site, uav_array=uav), scenes.poses([[80.0, 30.0, 40.0]]))
-    assert np.abs(level.h - one.h).max() > 0.1 * np.abs(one.h).max()
+    assert np.abs(level.h - turned.h).max() > 0.1 * np.abs(turned.h).max()
 
 
 def test_scene_turned_as_a_whole_gives_the_same_h(scenes):
@@ -254,11 +254,11 @@ def test_scene_turned_as_a_whole_gives_the_same_h(scenes):
     tower = tower_comparison_array(pattern=Crossed())
     turned_tower = Array(tower.positions_m, tower.slant_rad, tower.patterns, turn @ tower.mount)
     uav = uav_comparison_array(0.0882, pattern=Crossed())
-    one = replay(site, scenes.link(site, tower, uav), poses)
-    other = scenes.poses(poses.position_m @ turn.T, turn @ poses.rotation)
-    two = replay(turned_site, scenes.link(turned_site, turned_tower, uav), other)
-    assert len(one.paths) == len(two.paths) > 2 * len(poses)
-    assert two.h == pytest.approx(one.h, rel=1e-8, abs=1e-9 * np.abs(one.h).max())
+    original = replay(site, scenes.link(site, tower, uav), poses)
+    turned_poses = scenes.poses(poses.position_m @ turn.T, turn @ poses.rotation)
+    turned = replay(turned_site, scenes.link(turned_site, turned_tower, uav), turned_poses)
+    assert len(original.paths) == len(turned.paths) > 2 * len(poses)
+    assert turned.h == pytest.approx(original.h, rel=1e-8, abs=1e-9 * np.abs(original.h).max())
 
 
 def test_one_pattern_per_element_or_one_for_all(scenes):
@@ -280,11 +280,11 @@ def test_chunks_do_not_change_the_field(scenes, monkeypatch):
     )
     poses = random_poses(scenes, np.random.default_rng(2), np.full(30, 70.0))
     link = comparison_link(scenes, site, Isotropic())
-    whole = replay(site, link, poses)
+    at_once = replay(site, link, poses)
     monkeypatch.setattr(field_module, "PAIRS_PER_CHUNK", 16 * 7)
     pieces = replay(site, link, poses)
-    assert pieces.h == pytest.approx(whole.h, rel=1e-13, abs=1e-20)
-    assert pieces.rss_power_dbm == pytest.approx(whole.rss_power_dbm, rel=1e-13)
+    assert pieces.h == pytest.approx(at_once.h, rel=1e-13, abs=1e-20)
+    assert pieces.rss_power_dbm == pytest.approx(at_once.rss_power_dbm, rel=1e-13)
 
 
 def test_loss_is_applied_per_path(scenes):

@@ -152,14 +152,14 @@ def test_slabs_thinner_and_thicker_than_a_wave_reflect_and_pass_the_same(monkeyp
 @needs_numba
 def test_threads_and_chunks_change_no_bit(monkeypatch, case):
     link = with_patterns(case[1], PATTERNS["one each"])
-    found = []
+    fields = []
     for chunk, threads in ((10_000, 1), (7, 1), (7, 3), (64, 2)):
         monkeypatch.setattr(field_sum, "PATHS_PER_PART", chunk)
-        found.append(both(monkeypatch, case, link, threads=threads)[1])
-    for other in found[1:]:
-        assert np.array_equal(other.h, found[0].h)
-        assert np.array_equal(other.path_power, found[0].path_power)
-        assert np.array_equal(other.power, found[0].power)
+        fields.append(both(monkeypatch, case, link, threads=threads)[1])
+    for other in fields[1:]:
+        assert np.array_equal(other.h, fields[0].h)
+        assert np.array_equal(other.path_power, fields[0].path_power)
+        assert np.array_equal(other.power, fields[0].power)
 
 
 def test_no_pose_is_shared_by_two_threads(case):
@@ -227,10 +227,10 @@ def test_sine_and_cosine_of_turns_within_one_unit_of_the_last_place():
 # ---------------------------------------------------------------- paths
 
 
-def same_paths(one, two):
+def same_paths(first, second):
     for column in ("pose", "tower", "depth", "faces"):
-        np.testing.assert_array_equal(getattr(one, column), getattr(two, column))
-    np.testing.assert_allclose(one.vertices_m, two.vertices_m, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(getattr(first, column), getattr(second, column))
+    np.testing.assert_allclose(first.vertices_m, second.vertices_m, rtol=0, atol=1e-9)
 
 
 def searched(faces, sources, targets, usable=None, excluded=None, **options):
@@ -242,15 +242,15 @@ def searched(faces, sources, targets, usable=None, excluded=None, **options):
 
 def whole_metres(rng, buildings):
     """Boxes, L shapes and towers on a grid of whole metres, so that walls, edges, roofs and ends coincide."""
-    found = []
+    shapes = []
     for _ in range(buildings):
         east, north = rng.integers(-6, 6, 2)
         shape = box(east, north, east + rng.integers(1, 4), north + rng.integers(1, 4))
         if rng.uniform() < 0.5:
             shape = shapely.union(shape, box(east, north, east + 1, north + 5))
-        if not any(shapely.area(shapely.intersection(shape, other.footprint)) > 0 for other in found):
-            found.append(Building(f"b{len(found)}", shape, float(rng.integers(1, 4))))
-    return tuple(found)
+        if not any(shapely.area(shapely.intersection(shape, other.footprint)) > 0 for other in shapes):
+            shapes.append(Building(f"b{len(shapes)}", shape, float(rng.integers(1, 4))))
+    return tuple(shapes)
 
 
 @needs_numba
@@ -262,8 +262,8 @@ def test_the_same_paths_among_aligned_and_touching_buildings(scenes, seed):
     targets[:, 2] = np.abs(targets[:, 2]) // 2
     targets[5] = np.nan
     sources = np.array([[0.0, 0.0, 5.0], [-7.0, 3.0, 2.0], [8.0, 8.0, 1.0]])
-    found = searched(faces, sources, targets, max_depth=2)
-    assert len(found) > 100
+    paths = searched(faces, sources, targets, max_depth=2)
+    assert len(paths) > 100
 
 
 @needs_numba
@@ -275,11 +275,11 @@ def test_the_same_paths_at_any_depth_and_with_links_left_out(case, max_depth):
     usable[1, ::3] = False
     excluded = scene.excluded.copy()
     excluded[0, ::4] = True
-    found = searched(
+    paths = searched(
         scene.faces, scene.sources_m, poses.position_m[:40],
         max_depth=max_depth, usable=usable, excluded=excluded[:, :40],
     )  # fmt: skip
-    assert found.depth.max() == min(max_depth, 2) or max_depth == 3
+    assert paths.depth.max() == min(max_depth, 2) or max_depth == 3
 
 
 @needs_numba
@@ -297,14 +297,14 @@ def test_a_replay_on_three_threads_is_that_on_one_bit_by_bit(monkeypatch, case, 
     monkeypatch.setattr(replay_module, "LEVELS_AT_ONCE", 7)
     site, link, poses, _ = case
     link = dataclasses.replace(link, noise_floor_dbm=-58.0)
-    one, three = (replay(site, link, poses, run=Run(threads=threads)) for threads in (1, 3))
-    assert 0 < np.isnan(one.rss_dbm).sum() < one.rss_dbm.size
-    np.testing.assert_array_equal(one.has_path, np.isfinite(one.rss_dbm))
-    assert not one.h[~one.has_path].any()
+    serial, threaded = (replay(site, link, poses, run=Run(threads=threads)) for threads in (1, 3))
+    assert 0 < np.isnan(serial.rss_dbm).sum() < serial.rss_dbm.size
+    np.testing.assert_array_equal(serial.has_path, np.isfinite(serial.rss_dbm))
+    assert not serial.h[~serial.has_path].any()
     for name in ("rss_dbm", "rss_power_dbm", "h", "has_path"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+        np.testing.assert_array_equal(getattr(serial, name), getattr(threaded, name))
     for name in ("pose", "tower", "depth", "faces", "vertices_m", "tree"):
-        np.testing.assert_array_equal(getattr(one.paths, name), getattr(three.paths, name))
+        np.testing.assert_array_equal(getattr(serial.paths, name), getattr(threaded.paths, name))
 
 
 # ---------------------------------------------------------------- choosing and doing without
@@ -450,11 +450,13 @@ def test_many_faces_without_compiled_code(monkeypatch, fresh, case, way):
     for module in (compiled, engines):
         monkeypatch.setattr(module, "find_spec", lambda _: True)
     monkeypatch.setenv(compiled.SWITCH, "never" if way == "never" else "auto")
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(2):
             same_paths(replay(site, link, poses).paths, paths)
-    assert [str(one.message)[:24] for one in told] == (["compiled code cannot run"] if way == "broken" else [])
+    assert [str(warning.message)[:24] for warning in caught] == (
+        ["compiled code cannot run"] if way == "broken" else []
+    )
     corners = np.array([[0.0, 0, 0], [9, 0, 0], [0, 9, 0]])
     mesh = TriangleScene(corners, np.array([[0, 1, 2]]), np.zeros(1, np.int64), ("floor",), ("concrete",))
     with pytest.raises(UsageError, match=r"triangles, but (compiled code cannot run|AERPAW_CMP_COMPILED=never)"):

@@ -56,9 +56,9 @@ def opaque_replay(scenes, site, position, array=None, **settings):
 
 def bounces(scenes, site, position, **settings):
     """The paths off crowns of a replay, as (label of the faces in order) per path."""
-    found = opaque_replay(scenes, site, position, **settings)
-    off = found.paths.select(found.paths.off_crown)
-    return [tuple(found.faces.label[f] for f in faces if f >= 0) for faces in off.faces], off
+    replayed = opaque_replay(scenes, site, position, **settings)
+    off = replayed.paths.select(replayed.paths.off_crown)
+    return [tuple(replayed.faces.label[f] for f in faces if f >= 0) for faces in off.faces], off
 
 
 # ---------------------------------------------------------------- closed forms
@@ -88,15 +88,15 @@ def test_one_bounce_has_the_length_and_the_fresnel_amplitude_of_the_closed_form(
     target = point + 70.0 * (np.cos(turn) * normal - np.sin(turn) * tangent)
     site = scenes.site(towers=(tuple(source),), trees=trees((100, 0, 0, 20, 10, 5)))
     element = Array(np.zeros((1, 3)), np.radians([slant_deg]), (Isotropic(),))
-    found = opaque_replay(scenes, site, target, element, max_depth=1)
-    one = found.paths.select(found.paths.off_crown)
-    assert found.left_out == []
-    assert len(one) == 1
-    np.testing.assert_allclose(one.vertices_m[0, 0], point, atol=1e-9)
-    assert found.faces.label[one.faces[0, 0]] == "crown 1 side 5"
-    np.testing.assert_allclose(found.faces.normal[one.faces[0, 0]], normal, atol=1e-12)
+    replayed = opaque_replay(scenes, site, target, element, max_depth=1)
+    bounce = replayed.paths.select(replayed.paths.off_crown)
+    assert replayed.left_out == []
+    assert len(bounce) == 1
+    np.testing.assert_allclose(bounce.vertices_m[0, 0], point, atol=1e-9)
+    assert replayed.faces.label[bounce.faces[0, 0]] == "crown 1 side 5"
+    np.testing.assert_allclose(replayed.faces.normal[bounce.faces[0, 0]], normal, atol=1e-12)
     link, pose = scenes.link(site, element, element), scenes.poses(target)
-    alone = channel_matrices(one, found.faces, source[None], pose, link).h[0, 0, 0, 0]
+    alone = channel_matrices(bounce, replayed.faces, source[None], pose, link).h[0, 0, 0, 0]
     # field in TE and TM components, by hand
     eta = VEGETATION.relative_permittivity(scenes.carrier_hz)
     cosine, root = np.cos(turn), np.sqrt(eta - np.sin(turn) ** 2)
@@ -104,10 +104,10 @@ def test_one_bounce_has_the_length_and_the_fresnel_amplitude_of_the_closed_form(
     before, after = (point - source) / 90.0, (target - point) / 70.0
     s = np.cross(before, normal)
     s /= np.linalg.norm(s)
-    sent, taken = polarisation(before, slant_deg), polarisation(-after, slant_deg)
+    sent, received = polarisation(before, slant_deg), polarisation(-after, slant_deg)
     wave = te * (sent @ s) * s + tm * (sent @ np.cross(before, s)) * np.cross(after, s)
     wavelength = wavelength_m(scenes.carrier_hz)
-    expected = taken @ wave * wavelength / (4 * np.pi * 160.0) * np.exp(-2j * np.pi * 160.0 / wavelength)
+    expected = received @ wave * wavelength / (4 * np.pi * 160.0) * np.exp(-2j * np.pi * 160.0 / wavelength)
     assert alone == pytest.approx(expected, rel=1e-6, abs=1e-9 * abs(expected) + 1e-15)
 
 
@@ -150,7 +150,7 @@ def blocked(site, woods, tree, points, crown_step, covered):
 
 def one_by_one(site, woods, source, target, max_depth, covered):
     """Crown bounces of one link as {(kind, tree, rounded point)}: every triangle, barycentric coordinates."""
-    found = set()
+    bounced = set()
     down, solids = np.array([1.0, 1.0, -1.0]), triangles_of(site)
     for before, after in itertools.product((False, True), repeat=2):
         if 1 + before + after > max_depth:
@@ -159,7 +159,7 @@ def one_by_one(site, woods, source, target, max_depth, covered):
         # every triangle of every crown at once: its plane's image of the start, and where the line from there cuts it
         a, b, c = np.moveaxis(solids, 2, 0)
         n = np.cross(b - a, c - a)
-        fore, aft = (((one - a) * n).sum(axis=-1) for one in (start, end))
+        fore, aft = (((end_point - a) * n).sum(axis=-1) for end_point in (start, end))
         image = start - 2 * (fore / (n * n).sum(axis=-1))[..., None] * n
         edges = np.stack([b - a, c - a, image - end], axis=-1)
         ahead = (fore > 0) & (aft > 0)
@@ -176,15 +176,15 @@ def one_by_one(site, woods, source, target, max_depth, covered):
             if before:
                 points.insert(1, start + start[2] / (start[2] - point[2]) * (point - start))
             if not blocked(site, woods, tree, points, int(before), covered):
-                found.add((before, after, int(tree), *np.round(point, 5)))
-    return found
+                bounced.add((before, after, int(tree), *np.round(point, 5)))
+    return bounced
 
 
 def aimed_positions(rng, site, source, count):
     """Poses on the way of rays that were reflected somewhere on the crowns, some of them first or last at the ground."""
     solid = triangles_of(site)
-    found = []
-    while len(found) < count:
+    positions = []
+    while len(positions) < count:
         a, b, c = solid[rng.integers(len(solid)), rng.integers(solid.shape[1])]
         start = source * [1, 1, rng.choice([1, -1])]
         point = rng.dirichlet([1, 1, 1]) @ np.array([a, b, c])
@@ -195,8 +195,8 @@ def aimed_positions(rng, site, source, count):
         place = point + rng.uniform(0.1, 1.5) * (ray - 2 * (n @ ray) * n)
         place[2] = abs(place[2])
         if 1.0 < place[2] < 150:
-            found.append(place)
-    return np.array(found)
+            positions.append(place)
+    return np.array(positions)
 
 
 @pytest.mark.parametrize(
@@ -213,10 +213,10 @@ def test_every_bounce_is_found_and_none_is_invented(scenes, seed, height, kind):
         np.column_stack([rng.uniform(-150, 150, (15, 2)), rng.uniform(2, 90, 15)]),
         aimed_positions(rng, site, source, 35),
     ])  # fmt: skip
-    found = opaque_replay(scenes, site, position, max_depth=3)
-    assert found.left_out == ["paths over a crown and a building, or over two crowns"]
-    off = found.paths.select(found.paths.off_crown)
-    ground = found.faces.label.index("ground")
+    replayed = opaque_replay(scenes, site, position, max_depth=3)
+    assert replayed.left_out == ["paths over a crown and a building, or over two crowns"]
+    off = replayed.paths.select(replayed.paths.off_crown)
+    ground = replayed.faces.label.index("ground")
     ours = [set() for _ in position]
     for pose, faces, vertices, tree in zip(off.pose, off.faces, off.vertices_m, off.tree, strict=True):
         at = int(np.flatnonzero(tree >= 0)[0])
@@ -276,9 +276,9 @@ def test_thinning_out_loses_no_pose_close_to_its_facet(scenes):
         ray = point - source
         pose = point + rng.choice([1e-3, 0.05]) * (ray - 2 * (n @ ray) * n)
         for few in (pose[None], np.stack([pose, pose + 1e-5])):  # looked up in rectangles, and tried one by one
-            facet, target, found = module._single_bounces(facets, beams, few, 1e-9)
+            facet, target, points = module._single_bounces(facets, beams, few, 1e-9)
             mine = (facet == number) & (target == 0)
-            np.testing.assert_allclose(found[mine], point[None], atol=1e-6)
+            np.testing.assert_allclose(points[mine], point[None], atol=1e-6)
         tried += 1
     assert tried > 60
 
@@ -302,24 +302,24 @@ def crown_and_ends(scenes, rng):
 
 @given(st.integers(0, 10_000))
 def test_law_of_reflection_and_reciprocity(scenes, seed):
-    stand, point, normal, one, two = crown_and_ends(scenes, np.random.default_rng(seed))
-    if min(one[2], two[2]) < 1.0 or abs(normal @ (one - point)) < 0.1:
+    stand, point, normal, near, far = crown_and_ends(scenes, np.random.default_rng(seed))
+    if min(near[2], far[2]) < 1.0 or abs(normal @ (near - point)) < 0.1:
         return
     element = Array(np.zeros((1, 3)), np.radians([37.0]), (Isotropic(),))
     amplitude = []
-    for source, target in ((one, two), (two, one)):
+    for source, target in ((near, far), (far, near)):
         site = scenes.site(towers=(tuple(source),), trees=stand)
-        found = opaque_replay(scenes, site, target, element)
-        off = found.paths.select(found.paths.off_crown)
+        replayed = opaque_replay(scenes, site, target, element)
+        off = replayed.paths.select(replayed.paths.off_crown)
         direct = off.select(off.depth == 1)
         assert len(direct) == 1
-        vertex, n = direct.vertices_m[0, 0], found.faces.normal[direct.faces[0, 0]]
+        vertex, n = direct.vertices_m[0, 0], replayed.faces.normal[direct.faces[0, 0]]
         np.testing.assert_allclose(vertex, point, atol=1e-6)
         into, out = vertex - source, target - vertex
         into, out = into / np.linalg.norm(into), out / np.linalg.norm(out)
         np.testing.assert_allclose(into - 2 * (n @ into) * n, out, atol=1e-7)
         link, pose = scenes.link(site, element, element), scenes.poses(target)
-        amplitude.append(channel_matrices(off, found.faces, source[None], pose, link).h[0, 0, 0, 0])
+        amplitude.append(channel_matrices(off, replayed.faces, source[None], pose, link).h[0, 0, 0, 0])
     assert amplitude[0] == pytest.approx(amplitude[1], rel=1e-6)
 
 
@@ -371,9 +371,9 @@ def test_a_bounce_needs_both_ways_free_of_buildings_and_terrain(scenes):
 def test_a_pose_or_tower_in_its_own_crown_has_no_bounce(scenes):
     # between the facet (apothem) and the round cone: in front of the mirror, yet inside the crown
     at = BOUNCE + 0.05 * NORMAL
-    for one, two in ((ENDS[0], at), (at, ENDS[1])):
-        site = scenes.site(towers=(tuple(one),), trees=trees((100, 0, 0, 20, 10, 5)))
-        assert bounces(scenes, site, two)[0] == []
+    for source, target in ((ENDS[0], at), (at, ENDS[1])):
+        site = scenes.site(towers=(tuple(source),), trees=trees((100, 0, 0, 20, 10, 5)))
+        assert bounces(scenes, site, target)[0] == []
 
 
 def test_bottoms_of_crowns_in_one_plane_reflect_once_where_they_overlap(scenes):
@@ -389,8 +389,8 @@ def test_ground_bounce_is_at_the_ground_of_the_tower(scenes):
     rng = np.random.default_rng(9)
     site = scenes.site(towers=((0, 0, 7.0, 3.0), (0, 0, 10.0, 0.0)), trees=random_trees(rng, 30))
     position = aimed_positions(rng, site, np.array([0, 0, 10.0]), 80)
-    found = opaque_replay(scenes, site, position)
-    off = found.paths.select(found.paths.off_crown & (found.paths.depth == 2))
+    replayed = opaque_replay(scenes, site, position)
+    off = replayed.paths.select(replayed.paths.off_crown & (replayed.paths.depth == 2))
     on_ground = off.vertices_m[off.tree < 0][:, 2]
     np.testing.assert_allclose(on_ground, np.array([3.0, 0.0])[off.tower], atol=1e-9)
     assert (off.tower == 1).sum() > 5
@@ -420,9 +420,9 @@ def test_without_bounces_everything_stays_as_it_was(scenes):
     )
     off = reflecting.paths.off_crown
     assert off.sum() > 5
-    kept = reflecting.paths.select(~off)
+    without_bounces = reflecting.paths.select(~off)
     for name in ("pose", "tower", "depth", "faces", "vertices_m"):
-        np.testing.assert_array_equal(getattr(kept, name), getattr(blocking.paths, name))
+        np.testing.assert_array_equal(getattr(without_bounces, name), getattr(blocking.paths, name))
     elsewhere = np.setdiff1d(np.arange(200), reflecting.paths.pose[off])
     np.testing.assert_array_equal(reflecting.h[elsewhere], blocking.h[elsewhere])
     assert (reflecting.h[reflecting.paths.pose[off]] != blocking.h[reflecting.paths.pose[off]]).all()
@@ -445,15 +445,15 @@ def test_the_audit_compares_paths_over_crowns(scenes):
     position = np.concatenate(
         [aimed_positions(rng, site, site.towers["LW1"].position_m, 60), rng.uniform(20, 50, (9, 3))]
     )
-    found = opaque_replay(scenes, site, position)
+    replayed = opaque_replay(scenes, site, position)
     crowns, link, poses = Crowns(stand), scenes.link(site), scenes.poses(position)
     settings = {"field": Field(loss=opaque(crowns)), "second": Second(reference="image", links=40)}
-    same = audit(site, link, poses, found, Search(crowns=crowns), **settings)
+    same = audit(site, link, poses, replayed, Search(crowns=crowns), **settings)
     # the reference has other facets than the whole replay, so that their numbers differ
     assert (same.missing_paths, same.extra_paths, same.rss_max_error_db) == (0, 0, 0.0)
-    without = audit(site, link, poses, found, **settings)
+    without = audit(site, link, poses, replayed, **settings)
     chosen = np.linspace(0, len(position) - 1, 40).round()
-    off = found.paths.select(found.paths.off_crown)
+    off = replayed.paths.select(replayed.paths.off_crown)
     assert without.extra_paths == np.isin(off.pose, chosen).sum() > 10
     assert without.missing_paths == 0
 

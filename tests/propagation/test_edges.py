@@ -67,10 +67,10 @@ def test_paths_and_field_by_plain_loops(seed: int, patterns: tuple) -> None:
     assert ours.edge_paths is not None
     assert len(ours.edge_paths) > 300
     chosen = np.arange(0, 40, 3 * len(arrays))
-    found = against_reference(site, flown, ours, chosen, Expected.of(link), ks=(10.0, 1000.0), max_depth=2)
-    assert found.failures == ()
-    assert found.doubtful <= 3
-    assert found.not_covered == ()
+    audit = against_reference(site, flown, ours, chosen, Expected.of(link), ks=(10.0, 1000.0), max_depth=2)
+    assert audit.failures == ()
+    assert audit.doubtful <= 3
+    assert audit.not_covered == ()
 
 
 def test_the_audit_sees_a_path_over_an_edge_that_is_not_there() -> None:
@@ -87,9 +87,9 @@ def test_the_audit_sees_a_path_over_an_edge_that_is_not_there() -> None:
         (True, False),
     }
     for planted in (ours, replace(ours, edge_paths=few), replace(ours, h=0.9999 * ours.h)):
-        found = against_reference(barn, where, planted, np.arange(2), Expected.of(link), ks=(10.0,), max_depth=2)
-        assert bool(found.failures) == (planted is not ours)
-        assert found.doubtful == 0
+        audit = against_reference(barn, where, planted, np.arange(2), Expected.of(link), ks=(10.0,), max_depth=2)
+        assert bool(audit.failures) == (planted is not ours)
+        assert audit.doubtful == 0
 
 
 # Two edges that meet are crossed so near their corner that the iteration has not ended: nothing is judged there.
@@ -127,14 +127,14 @@ class ByForce:
     def shortest(self, routes: np.ndarray, s: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         e, h = routes[:, 0], np.where(routes[:, 1] < 0, routes[:, 0], routes[:, 1])
         p, q = (self.edges.start_m[k] + 0.5 * (self.edges.end_m - self.edges.start_m)[k] for k in (e, h))
-        two = (routes[:, 1] >= 0)[:, None]
-        for _ in range(300 if two.any() else 1):
-            p = self.hero(e, np.broadcast_to(s, p.shape), np.where(two, q, t))
-            q = np.where(two, self.hero(h, p, np.broadcast_to(t, p.shape)), p)
+        has_second = (routes[:, 1] >= 0)[:, None]
+        for _ in range(300 if has_second.any() else 1):
+            p = self.hero(e, np.broadcast_to(s, p.shape), np.where(has_second, q, t))
+            q = np.where(has_second, self.hero(h, p, np.broadcast_to(t, p.shape)), p)
         return p, q
 
     def paths(self, source: np.ndarray, target: np.ndarray, every: bool) -> dict[tuple[int, ...], np.ndarray]:
-        found = {}
+        polylines = {}
         mirrors = range(len(self.faces)) if every else np.flatnonzero(self.faces.solid < 0).tolist()
         for f, g in itertools.product((-1, *mirrors), repeat=2):
             wall = max(self.faces.solid[[k for k in (f, g) if k >= 0]], default=-1) >= 0
@@ -149,8 +149,8 @@ class ByForce:
             for route, p, q in zip(routes[on].tolist(), *(corner[on] for corner in corners), strict=True):
                 line = self.polyline(route, (f, g), (source, p, q, target))
                 if line is not None:
-                    found[(*route, f, g)] = np.array(line)
-        return found
+                    polylines[(*route, f, g)] = np.array(line)
+        return polylines
 
     def polyline(self, route, mirrors, points):
         source, p, q, target = points
@@ -310,11 +310,11 @@ def test_edges_of_a_box_and_of_a_hole() -> None:
 def test_a_face_that_another_building_covers_has_no_edge() -> None:
     halves = [Building("west", box(40, -15, 46, 25), 8.0), Building("east", box(46, -15, 52, 25), 8.0)]
     where = poses((70.0, 3.0, 2.0), (30.0, 60.0, 1.0), (60.0, -40.0, 9.0))
-    one, two = (
+    undivided, divided = (
         trace(place(BARN), LINK, where, diffraction="edges"),
         trace(place(*halves), LINK, where, diffraction="edges"),
     )
-    assert one.rss_dbm == pytest.approx(two.rss_dbm, abs=1e-9)
+    assert undivided.rss_dbm == pytest.approx(divided.rss_dbm, abs=1e-9)
 
 
 @pytest.mark.parametrize("east_m", [8.0, 12.0])
@@ -332,8 +332,8 @@ def test_no_path_bends_where_a_neighbour_touches_a_face(east_m: float, mode: str
     assert between.any() == (east_m > 8.0)
     assert {40.0, 52.0} <= set(np.round(corners[:, 0], 6))
     if east_m == 8.0 and mode == "edges":  # two edges need a face in common, and the roof has two parts here
-        one = trace(place(BARN, tower=(0.0, 0.0, 16.0)), LINK, where, diffraction=mode)
-        assert trace(halves, LINK, where, diffraction=mode).rss_dbm == pytest.approx(one.rss_dbm, abs=1e-9)
+        undivided = trace(place(BARN, tower=(0.0, 0.0, 16.0)), LINK, where, diffraction=mode)
+        assert trace(halves, LINK, where, diffraction=mode).rss_dbm == pytest.approx(undivided.rss_dbm, abs=1e-9)
 
 
 def test_ends_on_an_edge_are_no_numbers_that_are_none() -> None:
@@ -350,11 +350,11 @@ def test_a_side_without_length_is_no_edge(apart_m: float, mode: str) -> None:
     """A corner given twice, or two corners closer than a wave can tell."""
     twice = Polygon([(40, -15), (52, -15), (52, -15 + apart_m), (52, 25), (40, 25)])
     where = poses((70.0, 3.0, 2.0), (30.0, 60.0, 1.0), (60.0, -40.0, 9.0), (52.0, -15.0, 4.0))
-    one, other = (
+    clean, degenerate = (
         trace(place(building), LINK, where, diffraction=mode) for building in (BARN, Building("twice", twice, 8.0))
     )
-    assert np.isfinite(other.h).all()
-    assert other.rss_dbm == pytest.approx(one.rss_dbm, abs=1e-3, nan_ok=True)
+    assert np.isfinite(degenerate.h).all()
+    assert degenerate.rss_dbm == pytest.approx(clean.rss_dbm, abs=1e-3, nan_ok=True)
 
 
 def test_what_is_not_modelled_is_said_or_refused() -> None:
@@ -378,14 +378,14 @@ def test_compiled_search_and_field_are_those_of_numpy(monkeypatch: pytest.Monkey
     pytest.importorskip("numba")
     site, link, flown = random_scene(16, buildings=6, towers=2)
     flown.position_m[::2, 2] = 3.0
-    found = {}
+    replayed = {}
     for mode in ("never", "always"):
         monkeypatch.setenv("AERPAW_CMP_COMPILED", mode)
-        found[mode] = replay(site, link, flown, Search(diffraction="edges"))
-    ours, plain = (_rows(found[mode].edge_paths) for mode in ("always", "never"))
+        replayed[mode] = replay(site, link, flown, Search(diffraction="edges"))
+    ours, plain = (_rows(replayed[mode].edge_paths) for mode in ("always", "never"))
     assert len(plain) > 300
     assert ours == plain
-    assert np.abs(found["always"].h - found["never"].h).max() < 1e-11 * np.abs(found["never"].h).max()
+    assert np.abs(replayed["always"].h - replayed["never"].h).max() < 1e-11 * np.abs(replayed["never"].h).max()
 
 
 def _rows(paths) -> set[tuple[int, ...]]:
@@ -403,9 +403,9 @@ def test_a_box_of_triangles_diffracts_as_a_prism() -> None:
     mesh = replace(place(), scene=scene)
     where = poses((70.0, 3.0, 2.0), (30.0, 60.0, 1.0), (60.0, -40.0, 9.0), (46.0, 40.0, 3.0))
     for mode in ("edges", "all"):
-        one, two = (trace(site, LINK, where, diffraction=mode) for site in (prism, mesh))
-        assert len(one.edge_paths or ()) == len(two.edge_paths or ()) > 8
-        assert np.abs(one.h - two.h).max() < 1e-6 * np.abs(one.h).max()
+        by_prism, by_mesh = (trace(site, LINK, where, diffraction=mode) for site in (prism, mesh))
+        assert len(by_prism.edge_paths or ()) == len(by_mesh.edge_paths or ()) > 8
+        assert np.abs(by_prism.h - by_mesh.h).max() < 1e-6 * np.abs(by_prism.h).max()
 
 
 def test_the_face_below_a_point_is_the_highest_beneath_it() -> None:
@@ -439,9 +439,9 @@ def test_the_border_of_a_sheet_is_a_half_plane() -> None:
     edges = Edges.of_surfaces(merged(scene))
     assert np.allclose(edges.exterior, 2.0)
     assert sorted(edges.length_m.tolist()) == pytest.approx([6.0, 6.0, 80.0, 80.0])
-    beside = surfaces_of(replace(place(BARN), scene=scene))
-    assert beside is not None
-    assert {label.split()[0] for label in beside.faces.label} == {"sheet", "barn"}
+    with_barn = surfaces_of(replace(place(BARN), scene=scene))
+    assert with_barn is not None
+    assert {label.split()[0] for label in with_barn.faces.label} == {"sheet", "barn"}
     result = trace(replace(place(), scene=scene), LINK, poses((60.0, 1.0, 2.0)), max_depth=0, diffraction="edges")
     assert result.edge_paths is not None
     at = result.edge_paths.vertices_m[:, 1]
@@ -484,7 +484,7 @@ def heights(a: float, b: float, coupling: float, power: int) -> complex:
     most = 7 / math.sqrt(1 - coupling**2)
     (u, du), (v, dv) = (
         (0.5 * (nodes + 1) * long, 0.5 * weights * long)
-        for long in (min(most, 30 / max(one, 1e-3)) for one in (a, b))
+        for long in (min(most, 30 / max(slope, 1e-3)) for slope in (a, b))
         for nodes, weights in (np.polynomial.legendre.leggauss(160),)
     )
     turn = np.exp(0.25j * np.pi)
@@ -492,9 +492,9 @@ def heights(a: float, b: float, coupling: float, power: int) -> complex:
     return complex((u**power * du) @ grid @ dv * (1 / turn) ** (2 + power))
 
 
-def joined_edges(one, two, coupling: float) -> tuple[complex, list[complex], list[complex]]:
+def joined_edges(wedge_1, wedge_2, coupling: float) -> tuple[complex, list[complex], list[complex]]:
     """Soft, mixed and hard products of what :func:`half_a_wedge` gives of two edges."""
-    (_, a, near_1, slope_1, far_1, bend_1), (_, b, near_2, slope_2, far_2, bend_2) = one, two
+    (_, a, near_1, slope_1, far_1, bend_1), (_, b, near_2, slope_2, far_2, bend_2) = wedge_1, wedge_2
     f, g = (_transition(root**2) for root in (a, b))
     plus, minus = heights(a, b, coupling, 0), heights(a, b, -coupling, 0)
     up, down = heights(a, b, -coupling, 1), heights(b, a, -coupling, 1)
@@ -502,10 +502,10 @@ def joined_edges(one, two, coupling: float) -> tuple[complex, list[complex], lis
     soft += 1j / coupling * slope_1 * slope_2 * (plus - minus)
     mixed, hard = [], []
     for h, k in zip(near_1, near_2, strict=True):
-        one_hard, two_hard = far_1 + h * f / a, far_2 + k * g / b
-        value = bend_1 * two_hard + bend_2 * one_hard + slope_1 * (1 - f) * far_2 + slope_2 * (1 - g) * far_1
+        hard_1, hard_2 = far_1 + h * f / a, far_2 + k * g / b
+        value = bend_1 * hard_2 + bend_2 * hard_1 + slope_1 * (1 - f) * far_2 + slope_2 * (1 - g) * far_1
         mixed.append(value - 4 * (slope_1 * k * up + slope_2 * h * down))
-        hard.append(far_1 * two_hard + h * f / a * far_2 - 2 * h * k * (plus + minus))
+        hard.append(far_1 * hard_2 + h * f / a * far_2 - 2 * h * k * (plus + minus))
     return soft, mixed, hard
 
 
@@ -536,15 +536,15 @@ def test_field_over_two_edges_a_second_time(material: str) -> None:
         legs = np.diff(line, axis=0)
         s = np.linalg.norm(legs, axis=1)
         rays = legs / s[:, None]
-        one = half_a_wedge(
+        wedge_1 = half_a_wedge(
             edges, e, paths.shared[row, 0], line[0], (s[0], s[1], math.dist(line[0], line[2])), rays[1], eta
         )
-        two = half_a_wedge(
+        wedge_2 = half_a_wedge(
             edges, h, paths.shared[row, 1], line[3], (s[2], s[1], math.dist(line[3], line[1])), rays[1], eta
         )
         out = edges.normal_n[e] if paths.shared[row, 0] else edges.normal[e]
         joined = []
-        soft, mixed, hard = joined_edges(one, two, math.sqrt(s[0] * s[2] / ((s[0] + s[1]) * (s[1] + s[2]))))
+        soft, mixed, hard = joined_edges(wedge_1, wedge_2, math.sqrt(s[0] * s[2] / ((s[0] + s[1]) * (s[1] + s[2]))))
         for pole, z in enumerate(impedance):
             q = K * s[1] * z**2 / 2
             w = 1 / (1 + np.sqrt(1j * np.pi * q) + 2j * q)
@@ -559,7 +559,7 @@ def test_field_over_two_edges_a_second_time(material: str) -> None:
             flat = [np.cross(r, b) for r, b in zip((rays[1], ray), basis, strict=True)]
             turns.append([(u @ basis[0]) * basis[1] + (u @ flat[0]) * flat[1] for u in unit])
         sent = [np.array(element_wave(expected, k, expected.mount, tuple(rays[0]))) for k in (0, 1)]
-        got = [np.array(element_wave(expected, k, expected.mount, tuple(-rays[2]))) for k in (0, 1)]
+        received = [np.array(element_wave(expected, k, expected.mount, tuple(-rays[2]))) for k in (0, 1)]
         for u, t in itertools.product((0, 1), repeat=2):
             a, b = line[0] + array.mount @ array.positions_m[t], line[3] + array.mount @ array.positions_m[u]
             p, g = line[1:2], line[2:3]
@@ -567,8 +567,10 @@ def test_field_over_two_edges_a_second_time(material: str) -> None:
                 p = hero(SimpleNamespace(edges=edges), np.array([e]), a[None], g)
                 g = hero(SimpleNamespace(edges=edges), np.array([h]), p, b[None])
             total = float(np.linalg.norm(a - p) + np.linalg.norm(p - g) + np.linalg.norm(g - b))
-            coupling = sum(d * (got[u] @ v) * (sent[t] @ w) for d, w, v in zip(joined, *turns, strict=True))
-            value = coupling / (2 * K**2 * one[0] * two[0] * np.sqrt(s.prod() * total)) * np.exp(-1j * K * total)
+            coupling = sum(d * (received[u] @ v) * (sent[t] @ w) for d, w, v in zip(joined, *turns, strict=True))
+            value = (
+                coupling / (2 * K**2 * wedge_1[0] * wedge_2[0] * np.sqrt(s.prod() * total)) * np.exp(-1j * K * total)
+            )
             assert ours[row, u, t] == pytest.approx(value, abs=2e-5 * np.abs(ours[row]).max())
         seen.add(tuple(paths.shared[row].tolist()))
     assert len(paths) >= 12

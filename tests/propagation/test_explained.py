@@ -30,19 +30,19 @@ def test_reasons_of_geometry(scenes):
     assert why_not(faces, source, target, np.zeros(0, int)) == "occluded by barn"
     wall = next(i for i, label in enumerate(faces.label) if label == "barn wall 4" or faces.normal[i, 0] < -0.9)
     assert "behind a face" in why_not(faces, source, target, np.array([wall]))
-    beside = np.array([0.0, 60, 10])
-    assert "outside barn" in why_not(faces, source, beside, np.array([wall]))
+    past_wall = np.array([0.0, 60, 10])
+    assert "outside barn" in why_not(faces, source, past_wall, np.array([wall]))
     high = np.array([60.0, 0, 60])
     assert why_not(faces, source, high, np.zeros(0, int)) == ""
     assert why_not(faces, source, high, np.array([0])) == "occluded by barn"
     # every path that is found has no reason not to be there, and every one that is not has one
     rng = np.random.default_rng(3)
     targets = np.column_stack([rng.uniform(-80, 80, (40, 2)), rng.uniform(2, 40, 40)])
-    found = find_paths(faces, Links(source[None], targets), max_depth=1)
+    paths = find_paths(faces, Links(source[None], targets), max_depth=1)
     for pose, place in enumerate(targets):
-        there = set(found.faces[(found.pose == pose) & (found.depth == 1), 0].tolist())
+        reflecting = set(paths.faces[(paths.pose == pose) & (paths.depth == 1), 0].tolist())
         for face in range(len(faces)):
-            assert (why_not(faces, source, place, np.array([face])) == "") == (face in there)
+            assert (why_not(faces, source, place, np.array([face])) == "") == (face in reflecting)
 
 
 def test_a_scene_of_triangles_is_no_error(scenes):
@@ -63,8 +63,8 @@ def test_terms_and_places_of_paths_by_hand(scenes):
     assert [path.words for path in paths][:1] == ["line of sight"]
     assert [path.depth for path in paths] == [0, 1, 1, 2]  # the ray to the wall's image reaches the wall first
     assert np.diff([path.level_dbm for path in paths[:3]]).max() < 0.0
-    known = {path.words: path for path in paths}
-    wall = next(name for name in result.faces.label if name.startswith("hall") and name in known)
+    by_words = {path.words: path for path in paths}
+    wall = next(name for name in result.faces.label if name.startswith("hall") and name in by_words)
     flat, wide = 100.0, math.hypot(80, 80)  # seen from above: direct, and to the image of the UAV, 80 m west
     hand = {  # azimuth and elevation at the tower, and where from at the UAV; length
         "line of sight": (36.8699, math.atan2(30, flat), 216.8699, math.atan2(-30, flat), math.hypot(flat, 30)),
@@ -73,16 +73,16 @@ def test_terms_and_places_of_paths_by_hand(scenes):
         f"{wall}, ground": (315.0, math.atan2(-50, wide), 225.0, math.atan2(-50, wide), math.hypot(wide, 50)),
     }
     expected = Expected.of(link).link
-    one, wavelength = reference.Reference(site, "LW1", expected), wavelength_m(scenes.carrier_hz)
-    mirrors = {"ground": one.mirrors[0], wall: next(m for m in one.mirrors if m.normal[0] == 1.0)}
+    second_way, wavelength = reference.Reference(site, "LW1", expected), wavelength_m(scenes.carrier_hz)
+    mirrors = {"ground": second_way.mirrors[0], wall: next(m for m in second_way.mirrors if m.normal[0] == 1.0)}
     for name, (away, rise, back, fall, length) in hand.items():
-        path = known[name]
+        path = by_words[name]
         assert (path.departure_azimuth_deg, path.arrival_azimuth_deg) == pytest.approx((away, back), abs=1e-4)
         assert (path.departure_elevation_deg, path.arrival_elevation_deg) == pytest.approx(np.degrees([rise, fall]))
         assert path.length_m == pytest.approx(length) == pytest.approx(sum(path.segments_m))
         assert path.delay_ns == pytest.approx(length / 0.299792458)
         sequence = [mirrors[part] for part in (name.split(", ") if path.depth else [])]
-        h = one.pair(sequence, 0, 0, tuple(target), reference.turned(0, 0, 0))
+        h = second_way.pair(sequence, 0, 0, tuple(target), reference.turned(0, 0, 0))
         assert np.exp(1j * np.radians(path.phase_deg)) == pytest.approx(h / abs(h), abs=1e-6)
         terms = dict(path.terms_db)
         leaves = terms.pop("leaves")
@@ -96,7 +96,7 @@ def test_terms_and_places_of_paths_by_hand(scenes):
         assert terms["UAV antenna"] == 0.0
         for number, bounce in enumerate(path.bounces):
             mirror = sequence[number]
-            cosine = 50 / length if mirror is one.mirrors[0] else 80 / length
+            cosine = 50 / length if mirror is second_way.mirrors[0] else 80 / length
             constants = reference.permittivity(bounce.material, scenes.carrier_hz)
             te, tm = reference.fresnel(cosine, *constants, wavelength)
             assert (bounce.te_db, bounce.tm_db) == pytest.approx([20 * math.log10(abs(r)) for r in (te, tm)])
@@ -104,7 +104,7 @@ def test_terms_and_places_of_paths_by_hand(scenes):
             assert bounce.loss_db == -terms[f"reflection {number + 1}"] > 0.0
             assert mirror.height((bounce.east_m, bounce.north_m, bounce.up_m)) == pytest.approx(0.0, abs=1e-9)
         assert path.planes == tuple(result.faces.label.index(part) for part in name.split(", ") if path.depth)
-    assert known["ground"].bounces[0].loss_db == pytest.approx(-known["ground"].bounces[0].tm_db)
+    assert by_words["ground"].bounces[0].loss_db == pytest.approx(-by_words["ground"].bounces[0].tm_db)
     assert [path.terms_db["leaves"] for path in paths] == [-1.5, 0.0, 0.0, -math.inf]
     plain = paths[-1].as_dict()
     assert (plain["level_dbm"], plain["terms_db"]["leaves"], "planes" in plain) == (None, None, False)
@@ -119,16 +119,16 @@ def test_terms_and_places_of_paths_by_hand(scenes):
 def test_a_bounce_straight_down_and_paths_through_walls_in_words(scenes):
     site = scenes.site((Building("hall", box(40, -15, 52, 25), 8.0, material="wood"),))
     link, pose = scenes.link(site), scenes.poses([0.0, 0.0, 30.0])
-    found = replay(site, link, pose, Search(max_depth=1))
-    (_, ground) = explain_paths(found.paths, found.faces, np.array([0.0, 0, 10]), pose, link, {})
+    replayed = replay(site, link, pose, Search(max_depth=1))
+    (_, ground) = explain_paths(replayed.paths, replayed.faces, np.array([0.0, 0, 10]), pose, link, {})
     assert (ground.bounces[0].incidence_deg, ground.departure_elevation_deg) == pytest.approx((0.0, -90.0))
     free = 40.0 + 20 * math.log10(wavelength_m(scenes.carrier_hz) / (4 * math.pi * 40.0))
     assert ground.level_dbm == pytest.approx(free + ground.bounces[0].te_db)
     assert ground.bounces[0].te_db == pytest.approx(ground.bounces[0].tm_db)
-    there = scenes.poses([70.0, 3.0, 2.0])
-    assert further_path_lines(found, np.array([0.0, 0, 10]), pose, link) == []
-    lit = replay(site, link, there, Search(max_depth=1, refraction=True))
-    lines = further_path_lines(lit, np.array([0.0, 0, 10]), there, link)
+    behind = scenes.poses([70.0, 3.0, 2.0])
+    assert further_path_lines(replayed, np.array([0.0, 0, 10]), pose, link) == []
+    lit = replay(site, link, behind, Search(max_depth=1, refraction=True))
+    lines = further_path_lines(lit, np.array([0.0, 0, 10]), behind, link)
     levels = [float(line.split()[1]) for line in lines]
     assert levels == sorted(levels, reverse=True)
     assert len(lines) == len(lit.through.paths) >= 2

@@ -48,8 +48,8 @@ def grove(count: int, seed: int) -> Trees:
 
 
 def depth(start: object, end: object, stand: Trees, shape: str = "cone") -> float:
-    one = np.atleast_2d(np.asarray(start, dtype=float)), np.atleast_2d(np.asarray(end, dtype=float))
-    return float(foliage_depth_m(one[0], NO_VERTEX, one[1], CrownIndex(stand, shape))[0])  # type: ignore[arg-type]
+    ends = np.atleast_2d(np.asarray(start, dtype=float)), np.atleast_2d(np.asarray(end, dtype=float))
+    return float(foliage_depth_m(ends[0], NO_VERTEX, ends[1], CrownIndex(stand, shape))[0])  # type: ignore[arg-type]
 
 
 def test_hand_computed_cone_chords() -> None:
@@ -84,31 +84,31 @@ def test_reversal_splitting_and_turning_change_nothing(seed: int, shape: str, cu
     stand = grove(40, seed)
     random = np.random.default_rng(seed)
     start, end = (np.append(random.uniform(-70, 70, 2), random.uniform(0, 30)) for _ in range(2))
-    whole = depth(start, end, stand, shape)
+    full_m = depth(start, end, stand, shape)
     middle = start + cut * (end - start)
     turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     turned = turn @ np.stack([stand.east_m, stand.north_m, np.zeros(40)])
     other = Trees(
         turned[0], turned[1], stand.ground_m, stand.height_m, stand.crown_diameter_m, stand.crown_base_m, stand.ground_m
     )
-    assert depth(end, start, stand, shape) == pytest.approx(whole, abs=1e-6)
-    assert depth(start, middle, stand, shape) + depth(middle, end, stand, shape) == pytest.approx(whole, abs=1e-6)
-    assert depth(turn @ start, turn @ end, other, shape) == pytest.approx(whole, abs=1e-6)
+    assert depth(end, start, stand, shape) == pytest.approx(full_m, abs=1e-6)
+    assert depth(start, middle, stand, shape) + depth(middle, end, stand, shape) == pytest.approx(full_m, abs=1e-6)
+    assert depth(turn @ start, turn @ end, other, shape) == pytest.approx(full_m, abs=1e-6)
 
 
 def test_reflected_path_adds_its_segments() -> None:
     stand = trees((0, 0, 0, 20, 10, 5), (100, 0, 0, 20, 10, 5))
     source, target = np.array([[-20.0, 0, 21], [-20, 0, 21]]), np.array([[120.0, 0, 21], [120, 0, 21]])
     vertex = np.array([[[50.0, 0, 0], [np.nan] * 3], [[np.nan] * 3, [np.nan] * 3]])
-    found = foliage_depth_m(source, vertex, target, stand)
-    assert found[0] == pytest.approx(depth(source[0], vertex[0, 0], stand) + depth(vertex[0, 0], target[0], stand))
-    assert found[0] > 0
-    assert found[1] == 0  # straight above both
+    depth_m = foliage_depth_m(source, vertex, target, stand)
+    assert depth_m[0] == pytest.approx(depth(source[0], vertex[0, 0], stand) + depth(vertex[0, 0], target[0], stand))
+    assert depth_m[0] > 0
+    assert depth_m[1] == 0  # straight above both
 
 
 def test_unknown_positions_have_unknown_depth() -> None:
-    found = foliage_depth_m(np.full((1, 3), np.nan), NO_VERTEX, np.zeros((1, 3)), trees((0, 0, 0, 20, 10, 5)))
-    assert np.isnan(found).all()
+    depth_m = foliage_depth_m(np.full((1, 3), np.nan), NO_VERTEX, np.zeros((1, 3)), trees((0, 0, 0, 20, 10, 5)))
+    assert np.isnan(depth_m).all()
 
 
 def test_no_trees_and_a_tree_that_is_not_a_number() -> None:
@@ -167,8 +167,8 @@ def test_models_by_name() -> None:
 
 
 def test_the_index_of_equal_trees_is_made_once_and_of_others_anew():
-    kept = crown_index(grove(20, 3))
-    assert crown_index(grove(20, 3)) is kept
+    index = crown_index(grove(20, 3))
+    assert crown_index(grove(20, 3)) is index
     taller = grove(20, 3)
     taller.height_m[7] += 1e-9
     assert crown_index(taller).trees is taller
@@ -233,9 +233,9 @@ def test_a_chord_is_what_lies_between_the_surfaces(start, end, shape):
     start, end = np.array(start, dtype=float), np.array(end, dtype=float)
     index = CrownIndex(forest(TREE), shape)
     expected = chord(start, end, TREE, shape)
-    found = index.chords_m(start[None], end[None])[0]
-    assert found == pytest.approx(expected, abs=2e-3 if expected else 1e-9)
-    assert index.chords_m(end[None], start[None])[0] == pytest.approx(found, abs=1e-9)
+    chord_m = index.chords_m(start[None], end[None])[0]
+    assert chord_m == pytest.approx(expected, abs=2e-3 if expected else 1e-9)
+    assert index.chords_m(end[None], start[None])[0] == pytest.approx(chord_m, abs=1e-9)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -245,10 +245,10 @@ def test_random_lines_through_one_crown(seed, shape):
     start, end = rng.uniform([-6, -6, 2], [6, 6, 20], (2, 60, 3))
     end[:10, 2] = start[:10, 2]  # level
     end[10:20, :2] = start[10:20, :2]  # plumb
-    found = CrownIndex(forest(TREE), shape).chords_m(start, end)
+    chords_m = CrownIndex(forest(TREE), shape).chords_m(start, end)
     expected = [chord(a, b, TREE, shape) for a, b in zip(start, end, strict=True)]
-    np.testing.assert_allclose(found, expected, atol=1e-2)  # a graze shorter than the sampling may be missed by hand
-    assert np.quantile(np.abs(found - expected), 0.9) < 1e-8
+    np.testing.assert_allclose(chords_m, expected, atol=1e-2)  # a graze shorter than the sampling may be missed by hand
+    assert np.quantile(np.abs(chords_m - expected), 0.9) < 1e-8
 
 
 def test_crowns_at_the_edges_of_the_grid_are_found_from_all_sides(monkeypatch):
@@ -281,18 +281,18 @@ def test_a_crown_that_reflects_does_not_shade_its_own_path():
     source, target = np.array([[-50.0, 0.0, 3.0]] * 3), np.array([[90.0, 0.0, 3.0]] * 3)
     vertices = np.tile([[[0.0, 0.0, 3.0], [40.0, 0.0, 3.0]]], (3, 1, 1))
     bounced = np.array([[-1, -1], [0, -1], [-1, 1]])  # a path has one reflection off a crown at most
-    whole = float(CrownIndex(stand).chords_m(source[:1], target[:1])[0])
-    each = whole / 2
+    through_both = float(CrownIndex(stand).chords_m(source[:1], target[:1])[0])
+    each = through_both / 2
     free = foliage_depth_m(source, vertices, target, stand, bounced)
-    np.testing.assert_allclose(free, [whole, each, each], atol=1e-9)
+    np.testing.assert_allclose(free, [through_both, each, each], atol=1e-9)
     none = foliage_depth_m(source, vertices, target, stand)
-    np.testing.assert_allclose(none, whole, atol=1e-9)
+    np.testing.assert_allclose(none, through_both, atol=1e-9)
     # an unused vertex is the next one; one bounce, its segments alone
-    one = vertices.copy()
-    one[:, 1] = np.nan
+    lone = vertices.copy()
+    lone[:, 1] = np.nan
     np.testing.assert_allclose(
-        foliage_depth_m(source, one, target, stand, np.array([[0, -1], [1, -1], [-1, -1]])),
-        [each, each, whole], atol=1e-9,
+        foliage_depth_m(source, lone, target, stand, np.array([[0, -1], [1, -1], [-1, -1]])),
+        [each, each, through_both], atol=1e-9,
     )  # fmt: skip
     # a model that is not opaque knows no reflection off crowns
     for model in (foliage.P833(), foliage.NoFoliage()):
@@ -313,8 +313,8 @@ def test_only_the_segments_at_a_vertex_leave_out_its_crown():
     far = float(CrownIndex(stand).chords_m(vertices[:, 1], vertices[:, 2])[0])
     back = float(CrownIndex(stand).chords_m(vertices[:, 2], target)[0])
     assert back > 3.0
-    found = float(foliage_depth_m(source, vertices, target, stand, bounced)[0])
-    assert found == pytest.approx(far + back, abs=1e-9)
+    depth_m = float(foliage_depth_m(source, vertices, target, stand, bounced)[0])
+    assert depth_m == pytest.approx(far + back, abs=1e-9)
     last = float(foliage_depth_m(target, vertices[:, ::-1], source, stand, bounced[:, ::-1])[0])
     assert last == pytest.approx(far + back, abs=1e-9)  # and the way back
 
@@ -335,8 +335,8 @@ def test_models_are_their_formulas_to_the_last_digits():
         scale = ghz**0.284 * (1.0 if leaf else foliage.LEAFLESS_FACTOR)
         expected = [scale * (0.45 * d if d <= 14 else 1.33 * d**0.588) for d in metres]
         np.testing.assert_allclose(foliage.Weissberger(ghz * 1e9, leaf).loss_db(metres), expected, rtol=1e-12)
-    found = foliage.P833(0.2, 0.5).loss_db(metres)  # less than a decibel either
-    np.testing.assert_allclose(found, 0.5 * (1 - np.exp(-0.2 * metres / 0.5)), rtol=1e-12)
+    loss_db = foliage.P833(0.2, 0.5).loss_db(metres)  # less than a decibel either
+    np.testing.assert_allclose(loss_db, 0.5 * (1 - np.exp(-0.2 * metres / 0.5)), rtol=1e-12)
     assert foliage.P833(0.0, 10.0).loss_db(metres).tolist() == [0.0] * 5
     for gamma, most in ((-0.1, 10.0), (0.5, 0.0), (np.nan, 1.0), (0.5, np.inf), (np.inf, 1.0)):
         with pytest.raises(UsageError, match="gamma >= 0 and A_m > 0"):
@@ -348,8 +348,8 @@ def test_batches_of_one_segment_come_to_the_last(count, monkeypatch):
     monkeypatch.setattr(foliage, "_PAIRS_AT_ONCE", 1)
     start = np.column_stack([np.full(count, -9.0), np.linspace(-3, 3, count), np.full(count, 8.0)])
     end = start + np.array([18.0, 0.0, 0.0])
-    found = CrownIndex(forest(TREE), "cylinder").chords_m(start, end)
-    np.testing.assert_allclose(found, 2 * np.sqrt(16.0 - start[:, 1] ** 2), rtol=1e-12)
+    chords_m = CrownIndex(forest(TREE), "cylinder").chords_m(start, end)
+    np.testing.assert_allclose(chords_m, 2 * np.sqrt(16.0 - start[:, 1] ** 2), rtol=1e-12)
 
 
 def test_p833_is_refused_outside_of_its_scope_and_taken_at_its_ends():

@@ -38,8 +38,8 @@ def test_equal_to_the_replay_with_those_arrays():
     site = Site("flat", frame, {"T": Tower("T", 35.7275, -78.696, 0.0, 0.0, HEIGHT_M)})
     wavelength = 299792458.0 / CARRIER_HZ
     tower, uav = tower_comparison_array(), uav_comparison_array(wavelength)
-    found = singular_values_of(some("coherent", 1.0), tower, site.towers["T"].position_m, uav, at, CARRIER_HZ)
-    for geometry, sigma in zip(some("coherent", 1.0), found, strict=True):
+    singular_values = singular_values_of(some("coherent", 1.0), tower, site.towers["T"].position_m, uav, at, CARRIER_HZ)
+    for geometry, sigma in zip(some("coherent", 1.0), singular_values, strict=True):
         slanted = uav_comparison_array(wavelength, geometry.uav_yaw_deg, geometry.uav_roll_deg, geometry.uav_slant_deg)
         if geometry.uav_pitch_deg:
             from aerpaw_cmp.propagation.arrays import rotation_from_yaw_pitch_roll
@@ -76,9 +76,11 @@ def test_no_ground_leaves_the_direct_ray(how):
     at = poses(4)
     tower, uav = tower_comparison_array(), uav_comparison_array(0.0882)
     centre = np.array([0.0, 0.0, HEIGHT_M])
-    one, two = (list(singular_values_of(some(how, g), tower, centre, uav, at, CARRIER_HZ)) for g in (0.0, 1.0))
-    assert any(np.abs(a - b).max() > 1e-9 for a, b in zip(one, two, strict=True))
+    no_ground, with_ground = (
+        list(singular_values_of(some(how, g), tower, centre, uav, at, CARRIER_HZ)) for g in (0.0, 1.0)
+    )
+    assert any(np.abs(a - b).max() > 1e-9 for a, b in zip(no_ground, with_ground, strict=True))
     alone = list(singular_values_of(some("coherent", 0.0), tower, centre, uav, at, CARRIER_HZ))
-    for a, b in zip(one, alone, strict=True):
+    for a, b in zip(no_ground, alone, strict=True):
         # roots of eigenvalues keep half of the digits
         np.testing.assert_allclose(a, b, atol=1e-7 * b.max())

@@ -29,9 +29,9 @@ from tests.propagation import open_surfaces as enumerate_
 WAYS = ({}, {"beams": False}, {"shadows": False})
 
 
-def quad(corner, one, two):
-    corner, one, two = (np.asarray(v, dtype=float) for v in (corner, one, two))
-    return [[corner, corner + one, corner + one + two], [corner, corner + one + two, corner + two]]
+def quad(corner, side, height):
+    corner, side, height = (np.asarray(v, dtype=float) for v in (corner, side, height))
+    return [[corner, corner + side, corner + side + height], [corner, corner + side + height, corner + height]]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -39,13 +39,13 @@ def test_tilted_overlapping_open_quads_against_enumeration(seed):
     rng = np.random.default_rng(seed)
     triangles, shapes = quad((-40, -40, -8), (80, 0, 0), (0, 80, 0)), [20, 20]
     for k in range(8):
-        corner, one = rng.uniform(-20, 20, 3), 8 * rng.normal(size=3)
-        two = np.cross(one, rng.normal(size=3))
-        two *= 8 / np.linalg.norm(two)
-        triangles += quad(corner, one, two)
+        corner, side = rng.uniform(-20, 20, 3), 8 * rng.normal(size=3)
+        height = np.cross(side, rng.normal(size=3))
+        height *= 8 / np.linalg.norm(height)
+        triangles += quad(corner, side, height)
         shapes += [k, k]
         if k % 3 == 0:  # another shape that overlaps in the same plane
-            triangles += quad(corner + 0.3 * one + 0.2 * two, one, two)
+            triangles += quad(corner + 0.3 * side + 0.2 * height, side, height)
             shapes += [8 + k, 8 + k]
     scene = enumerate_.scene_of(triangles, shapes=shapes)
     sources, targets = rng.uniform(-15, 15, (2, 3)), rng.uniform(-15, 15, (6, 3))
@@ -78,13 +78,13 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     source = np.array([[0.0, 0.0, 30.0]])
     words: list[str] = []
     run = SearchRun(on_estimate=lambda said: words.append(str(said)))
-    found = [grow_paths(surfaces, Links(source, targets), run, max_depth=2, shadows=on) for on in (True, False)]
+    paths = [grow_paths(surfaces, Links(source, targets), run, max_depth=2, shadows=on) for on in (True, False)]
     assert len(words) == 2
     assert "first faces" in words[0]
     assert "MiB" in words[0]
-    assert len(found[0]) == len(found[1]) > 50
+    assert len(paths[0]) == len(paths[1]) > 50
     for column in ("pose", "faces"):
-        assert np.array_equal(getattr(found[0], column), getattr(found[1], column))
+        assert np.array_equal(getattr(paths[0], column), getattr(paths[1], column))
 
 
 def cells(*open_cells):
@@ -183,12 +183,12 @@ def test_the_estimate_of_a_search_comes_without_the_search(scenes):
     buildings = town(rng, 400, 900)
     site = scenes.site(buildings, ((0.0, 0.0, 30.0), (50.0, 0.0, 30.0)))
     poses = scenes.poses(rng.uniform([-200, -200, 20], [200, 200, 60], (20, 3)))
-    told = []
-    replay(site, scenes.link(site), poses, run=Run(on_estimate=told.append))
+    estimates = []
+    replay(site, scenes.link(site), poses, run=Run(on_estimate=estimates.append))
     before = estimate_search(site, scenes.link(site), poses)
-    assert [one.first_faces for one in told] == [before.first_faces]
+    assert [forecast.first_faces for forecast in estimates] == [before.first_faces]
     assert before.first_faces > 500
-    assert before.sequences == told[0].sequences > 2 * before.first_faces
+    assert before.sequences == estimates[0].sequences > 2 * before.first_faces
     assert str(before).startswith("about ")
     assert "2 towers" in str(before)
     assert "MiB" in str(before)
@@ -208,8 +208,8 @@ def test_the_estimate_holds_whichever_faces_are_tried():
     first = search.first_faces()
     every = search.follow(first)[3]
     for seed in range(12):
-        told = search.estimate(np.random.default_rng(seed).permutation(first), threads=1)
-        assert 1 / 1.3 < told.sequences / every < 1.3, seed
+        forecast = search.estimate(np.random.default_rng(seed).permutation(first), threads=1)
+        assert 1 / 1.3 < forecast.sequences / every < 1.3, seed
 
 
 def test_paths_can_be_recomputed_from_their_faces():
@@ -264,10 +264,10 @@ def test_prisms_by_beams_have_the_paths_of_the_image_engine(scenes, aligned):
     site = scenes.site(buildings, ((0.0, -20.0, 10.0), (3.0, -5.0, 25.0)))
     scene, poses = Scene.of(site, scenes.link(site), scenes.poses(spots)), scenes.poses(spots)
     expected = image.find_paths(scene.faces, scene.links_to(poses), max_depth=2)
-    found = prisms.find_paths(scene.faces, scene.links_to(poses), max_depth=2)
+    paths = prisms.find_paths(scene.faces, scene.links_to(poses), max_depth=2)
     assert len(expected) > 100
-    assert np.array_equal(found.faces, expected.faces)
-    assert np.array_equal(found.pose, expected.pose)
+    assert np.array_equal(paths.faces, expected.faces)
+    assert np.array_equal(paths.pose, expected.pose)
 
 
 def test_a_thousand_buildings_are_searched_not_refused(scenes):
@@ -282,17 +282,19 @@ def test_what_hides_a_path_is_named_by_other_code(scenes):
     site = scenes.site((), ((-20.0, 0.0, 20.0),), scene=placed_scene(enumerate_.shipped("simple_street_canyon")))
     rng = np.random.default_rng(14)
     spots = np.column_stack([rng.uniform(-60, 60, 40), rng.uniform(-40, 40, 40), rng.uniform(1, 30, 40)])
-    found = replay(site, scenes.link(site), scenes.poses(spots))
+    replayed = replay(site, scenes.link(site), scenes.poses(spots))
     source, none = np.array([-20.0, 0.0, 20.0]), np.zeros(0, dtype=np.int64)
-    direct = set(found.paths.pose[found.paths.depth == 0].tolist())
+    direct = set(replayed.paths.pose[replayed.paths.depth == 0].tolist())
     for pose, spot in enumerate(spots):
-        reason = why_not_there(found.surfaces, source, spot, none)
+        reason = why_not_there(replayed.surfaces, source, spot, none)
         assert (reason == "") == (pose in direct)
         assert reason == "" or reason.startswith("occluded by mesh-building_")
-    for row in np.flatnonzero(found.paths.depth)[:40]:
-        assert why_not_there(found.surfaces, source, spots[found.paths.pose[row]], found.paths.faces[row]) == ""
-    other = np.array([int(found.paths.faces[found.paths.depth == 1][0, 0])])
-    reasons = {why_not_there(found.surfaces, source, spot, other) for spot in spots}
+    for row in np.flatnonzero(replayed.paths.depth)[:40]:
+        assert (
+            why_not_there(replayed.surfaces, source, spots[replayed.paths.pose[row]], replayed.paths.faces[row]) == ""
+        )
+    other = np.array([int(replayed.paths.faces[replayed.paths.depth == 1][0, 0])])
+    reasons = {why_not_there(replayed.surfaces, source, spot, other) for spot in spots}
     assert len(reasons) >= 3
 
 

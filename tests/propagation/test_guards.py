@@ -140,31 +140,31 @@ def test_a_batch_with_nearly_as_many_paths_as_fit_is_refused(many):
     valid[0, 1, : many - 2 * (many // 3)] = True
     a = np.random.default_rng(2).normal(size=(2, 3, 2, 2, 2, 30))
     as_array = [SimpleNamespace(numpy=lambda part=part: part) for part in a]
-    whole = SimpleNamespace(numpy=lambda: np.zeros((1, 3, 2, 30)))
+    padded = SimpleNamespace(numpy=lambda: np.zeros((1, 3, 2, 30)))
     finder = object.__new__(sionna._Finder)
     finder.limit = 10
     traced = SimpleNamespace(
-        a=as_array, valid=SimpleNamespace(numpy=lambda: valid), interactions=whole, objects=whole, primitives=whole
+        a=as_array, valid=SimpleNamespace(numpy=lambda: valid), interactions=padded, objects=padded, primitives=padded
     )
     finder.trace = lambda *_: traced
     if many == 10:
         with pytest.raises(CheckError, match="nearly 10 paths"):
             finder.searched(TARGETS, 1, 9)
         return
-    found = finder.searched(TARGETS, 1, 9)
-    assert (found["valid"].shape, found["kind"].shape) == ((2, 2, 30), (1, 2, 2, 30))
-    assert found["gain"][1, 0, 4] == pytest.approx(np.linalg.norm(a[:, 1, :, 0, :, 4]))
+    searched = finder.searched(TARGETS, 1, 9)
+    assert (searched["valid"].shape, searched["kind"].shape) == ((2, 2, 30), (1, 2, 2, 30))
+    assert searched["gain"][1, 0, 4] == pytest.approx(np.linalg.norm(a[:, 1, :, 0, :, 4]))
 
 
 def test_slanted_elements_take_their_share_of_both_halves():
     generator = np.random.default_rng(3)
     uav, tower = (Array(np.zeros((n, 3)), generator.uniform(-2, 2, n)) for n in (2, 3))
     a = generator.normal(size=(4, 2 * 2, 5, 2 * 3)) + 1j * generator.normal(size=(4, 2 * 2, 5, 2 * 3))
-    found = sionna._slanted(a, uav, tower)
+    h = sionna._slanted(a, uav, tower)
     for rx, u, tx, t in ((0, 0, 0, 0), (3, 1, 4, 2), (2, 0, 1, 1)):
         halves = a[rx, [[u], [u + 2]], tx, [t, t + 3]]
         weights = [np.array([np.cos(s), np.sin(s)]) for s in (uav.slant_rad[u], tower.slant_rad[t])]
-        assert found[rx, u, tx, t] == pytest.approx(weights[0] @ halves @ weights[1])
+        assert h[rx, u, tx, t] == pytest.approx(weights[0] @ halves @ weights[1])
 
 
 def test_primitives_become_faces_and_other_interactions_are_dropped():
@@ -182,10 +182,10 @@ def test_refinement_drops_duplicates_and_points_outside_their_face(scenes):
     targets = np.array([[20.0, 10.0, 15.0], [20.0, 70.0, 15.0], SOURCES[0], [0.0, 0.0, -10.0]])
     pose, sequence = np.array([0, 0, 1, 2, 3, 3]), np.full((6, 2), -1)
     sequence[:3, 0] = wall
-    found = sionna._refine(faces, SOURCES, targets, pose, np.zeros(6, dtype=int), sequence, 1e-9)
-    assert (found.pose.tolist(), found.depth.tolist()) == ([0, 3], [1, 0])
-    assert found.vertices_m[0, 0, 0] == pytest.approx(40.0, abs=1e-12)
-    assert np.isnan(found.vertices_m[1]).all()
+    paths = sionna._refine(faces, SOURCES, targets, pose, np.zeros(6, dtype=int), sequence, 1e-9)
+    assert (paths.pose.tolist(), paths.depth.tolist()) == ([0, 3], [1, 0])
+    assert paths.vertices_m[0, 0, 0] == pytest.approx(40.0, abs=1e-12)
+    assert np.isnan(paths.vertices_m[1]).all()
     assert not len(sionna._refine(faces, SOURCES, targets, pose[:0], pose[:0], sequence[:0], 1e-9))
 
 
@@ -194,10 +194,10 @@ def test_reflections_named_on_the_wrong_part_of_a_plane_are_moved(scenes):
     faces = site_faces(site)
     left, right = np.flatnonzero(faces.normal[:, 0] == -1.0)
     sequence = np.array([[left, -1]])
-    found = sionna._refine(
+    paths = sionna._refine(
         faces, SOURCES, np.array([[10.0, 10.0, 10.0]]), np.zeros(1, int), np.zeros(1, int), sequence, 1e-9
     )
-    assert found.faces.tolist() == [[right, -1]]
+    assert paths.faces.tolist() == [[right, -1]]
 
 
 @pytest.mark.parametrize(("batch", "refused"), [(0, True), (1, False), (100, False), (101, True)])
@@ -224,8 +224,8 @@ def peak_bytes(poses, link, site):
     result = replay(site, link, poses)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    kept = sum(getattr(result.paths, name).nbytes for name in ("pose", "tower", "depth", "faces", "vertices_m"))
-    return peak, kept + result.h.nbytes
+    columns = sum(getattr(result.paths, name).nbytes for name in ("pose", "tower", "depth", "faces", "vertices_m"))
+    return peak, columns + result.h.nbytes
 
 
 def test_memory_beyond_the_results_does_not_grow_with_the_poses(scenes, monkeypatch):
@@ -236,8 +236,8 @@ def test_memory_beyond_the_results_does_not_grow_with_the_poses(scenes, monkeypa
 
     def work(count):
         position = np.random.default_rng(5).uniform([-500, -500, 5], [500, 500, 100], (count, 3))
-        peak, kept = peak_bytes(scenes.poses(position), link, site)
-        return peak, kept
+        peak, results = peak_bytes(scenes.poses(position), link, site)
+        return peak, results
 
     small, large = work(1_000), work(4_000)
     # what grows: the results, held a few times over while they are merged

@@ -235,9 +235,11 @@ def test_tower_and_uav_at_the_same_point(scenes):
 def test_elements_of_two_arrays_at_the_same_point(scenes):
     """Array centres apart, one element of each in one place: finite, and no gain."""
     site = scenes.site()
-    one = Array(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.zeros(2))
-    other = Array(np.array([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), np.zeros(2))
-    result = replay(site, scenes.link(site, one, other), scenes.poses([[1.0, 0.0, 10.0]]), Search(max_depth=0))
+    tower_array = Array(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.zeros(2))
+    uav_array = Array(np.array([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), np.zeros(2))
+    result = replay(
+        site, scenes.link(site, tower_array, uav_array), scenes.poses([[1.0, 0.0, 10.0]]), Search(max_depth=0)
+    )
     assert np.isfinite(result.h).all()
     assert np.abs(result.h).max() <= 1.0
 
@@ -269,12 +271,12 @@ def test_scaled_scene_and_wavelength_give_the_same_channel(scenes, scale):
         ((0.0, 0.0, 10.0 * scale),), ground_material="metal",
     )  # fmt: skip
     position = np.array([[20.0, 15.0, 12.0], [-35.0, 5.0, 20.0]])
-    one = replay(site, scenes.link(site), scenes.poses(position))
+    small = replay(site, scenes.link(site), scenes.poses(position))
     link = replace(scenes.link(big), carrier_hz=3.4e9 / scale)
-    two = replay(big, link, scenes.poses(position * scale))
-    assert (one.paths.faces == two.paths.faces).all()
-    assert len(one.paths) > 4
-    assert two.h == pytest.approx(one.h, rel=2e-2)  # metal's loss changes a little with frequency
+    scaled = replay(big, link, scenes.poses(position * scale))
+    assert (small.paths.faces == scaled.paths.faces).all()
+    assert len(small.paths) > 4
+    assert scaled.h == pytest.approx(small.h, rel=2e-2)  # metal's loss changes a little with frequency
 
 
 def test_path_3_km_long_to_a_millionth_of_a_wavelength(scenes):

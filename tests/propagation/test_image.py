@@ -100,11 +100,11 @@ def test_reflections_obey_the_law_of_reflection(scenes):
 def test_chunks_do_not_change_the_paths(scenes, monkeypatch):
     site = scenes.site(scenes.buildings(np.random.default_rng(9), 8, spread_m=80.0))
     targets = np.random.default_rng(10).uniform([-90, -90, 15], [90, 90, 40], (100, 3))
-    _, whole = search(site, targets)
+    _, at_once = search(site, targets)
     monkeypatch.setattr("aerpaw_cmp.propagation.search.mirror.CELLS_PER_CHUNK", 150)
     _, pieces = search(site, targets)
-    assert (whole.faces == pieces.faces).all()
-    assert (whole.pose == pieces.pose).all()
+    assert (at_once.faces == pieces.faces).all()
+    assert (at_once.pose == pieces.pose).all()
 
 
 @settings(max_examples=40, deadline=None)
@@ -221,11 +221,11 @@ def test_faces_that_may_not_reflect_do_not_at_any_place_of_a_sequence(scenes):
     site = scenes.site([Building("a", box(40, -50, 45, 50), 30.0)])
     faces = site_faces(site)
     target = np.array([[10.0, 20.0, 15.0]])
-    whole = find_paths(faces, Links(SOURCE, target), max_depth=2)
+    all_paths = find_paths(faces, Links(SOURCE, target), max_depth=2)
     wall = int(np.flatnonzero(faces.normal[:, 0] == -1.0)[0])
-    assert {0, wall} in [set(row) for row in whole.faces.tolist()]  # a corner reflection
+    assert {0, wall} in [set(row) for row in all_paths.faces.tolist()]  # a corner reflection
     for face in (0, wall):
         usable = np.ones((1, len(faces)), dtype=bool)
         usable[0, face] = False
         some = find_paths(faces, Links(SOURCE, target, usable), max_depth=2)
-        assert scenes.keys(some) == {key for key in scenes.keys(whole) if face not in key[2:]}
+        assert scenes.keys(some) == {key for key in scenes.keys(all_paths) if face not in key[2:]}

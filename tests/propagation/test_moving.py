@@ -44,18 +44,18 @@ def test_a_node_that_stands_still_is_a_fixed_tower_to_the_last_digit():
 
 
 def test_every_pose_is_traced_from_its_own_place_whatever_the_blocks(monkeypatch):
-    found = replay_moving(SITE, LINK, poses(), rover(), Search(max_depth=2))
-    assert len(found.paths) > N
+    replayed = replay_moving(SITE, LINK, poses(), rover(), Search(max_depth=2))
+    assert len(replayed.paths) > N
     for i in range(0, N, 11):
-        one = Poses(poses().position_m[i : i + 1], np.eye(3)[None])
-        alone = replay(site_with_tower_at(SITE, "LW1", rover()[i]), LINK, one, Search(max_depth=2))
-        assert found.rss_dbm[i, 0] == pytest.approx(alone.rss_dbm[0, 0], abs=1e-9, nan_ok=True)
-        assert (found.paths.pose == i).sum() == len(alone.paths)
+        pose = Poses(poses().position_m[i : i + 1], np.eye(3)[None])
+        alone = replay(site_with_tower_at(SITE, "LW1", rover()[i]), LINK, pose, Search(max_depth=2))
+        assert replayed.rss_dbm[i, 0] == pytest.approx(alone.rss_dbm[0, 0], abs=1e-9, nan_ok=True)
+        assert (replayed.paths.pose == i).sum() == len(alone.paths)
     for most in (1, 7):
         monkeypatch.setattr(moving, "PLACES_AT_ONCE", most)
-        np.testing.assert_allclose(replay_moving(SITE, LINK, poses(), rover()).h, found.h, rtol=1e-9)
-    again = channel_matrices(found.paths, found.faces, rover()[:, None], poses(), LINK)
-    np.testing.assert_allclose(again.h, found.h, rtol=1e-12)
+        np.testing.assert_allclose(replay_moving(SITE, LINK, poses(), rover()).h, replayed.h, rtol=1e-9)
+    again = channel_matrices(replayed.paths, replayed.faces, rover()[:, None], poses(), LINK)
+    np.testing.assert_allclose(again.h, replayed.h, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("places", "links"), [(64, 16_384), (3, 16_384), (64, 20), (5, 3)])
@@ -82,22 +82,22 @@ def test_blocks_hold_each_pose_once_and_as_many_places_as_fit(monkeypatch, place
 
 def test_reciprocity_the_moving_end_may_be_called_tower_or_uav():
     """A node on a track against a hovering UAV, and a UAV on that track against a tower where the other hovered."""
-    track, there = rover(up_m=35.0), np.array([40.0, -120.0, 18.0])
-    hovering = Poses(np.tile(there, (N, 1)), np.broadcast_to(np.eye(3), (N, 3, 3)))
-    one = replay_moving(SITE, LINK, hovering, track, Search(max_depth=2))
+    track, fixed = rover(up_m=35.0), np.array([40.0, -120.0, 18.0])
+    hovering = Poses(np.tile(fixed, (N, 1)), np.broadcast_to(np.eye(3), (N, 3, 3)))
+    tower_moves = replay_moving(SITE, LINK, hovering, track, Search(max_depth=2))
     flying = Poses(track, np.broadcast_to(np.eye(3), (N, 3, 3)))
-    other = replay(site_with_tower_at(SITE, "LW1", there), LINK, flying, Search(max_depth=2))
-    assert np.isfinite(one.rss_dbm).all()
-    np.testing.assert_allclose(one.rss_dbm, other.rss_dbm, atol=1e-6)
+    uav_moves = replay(site_with_tower_at(SITE, "LW1", fixed), LINK, flying, Search(max_depth=2))
+    assert np.isfinite(tower_moves.rss_dbm).all()
+    np.testing.assert_allclose(tower_moves.rss_dbm, uav_moves.rss_dbm, atol=1e-6)
 
 
 def test_free_space_and_two_rays_along_a_moving_node_are_the_closed_forms():
     for depth, form in ((0, free_space_dbm), (1, two_ray_dbm)):
-        found = replay_moving(BARE, LINK, poses(), rover(), Search(max_depth=depth))
+        replayed = replay_moving(BARE, LINK, poses(), rover(), Search(max_depth=depth))
         expected = np.array(
             [form(s[None], p[None], 3.4e9, 40.0)[0, 0] for s, p in zip(rover(), poses().position_m, strict=True)]
         )
-        np.testing.assert_allclose(found.rss_dbm[:, 0], expected, atol=1e-6)
+        np.testing.assert_allclose(replayed.rss_dbm[:, 0], expected, atol=1e-6)
         np.testing.assert_array_equal(form(rover()[:, None], poses().position_m, 3.4e9, 40.0)[:, 0], expected)
     # and not those of the node's middle
     middle = free_space_dbm(rover().mean(axis=0)[None], poses().position_m, 3.4e9, 40.0)[:, 0]
@@ -111,21 +111,21 @@ def test_crowns_that_reflect_are_numbered_as_one():
         for f in dataclasses.fields(SITE.trees) if isinstance(getattr(SITE.trees, f.name), np.ndarray)
     })  # fmt: skip
     few, site = poses(40), dataclasses.replace(BARE, trees=trees)
-    found = replay_moving(site, LINK, few, rover(40), Search(max_depth=1, crowns=Crowns(trees)))
+    replayed = replay_moving(site, LINK, few, rover(40), Search(max_depth=1, crowns=Crowns(trees)))
     for i in range(0, 40, 5):
-        one = Poses(few.position_m[i : i + 1], np.eye(3)[None])
-        here = site_with_tower_at(site, "LW1", rover(40)[i])
-        alone = replay(here, LINK, one, Search(max_depth=1, crowns=Crowns(trees)))
-        assert found.rss_dbm[i, 0] == pytest.approx(alone.rss_dbm[0, 0], abs=1e-9, nan_ok=True)
-        assert (found.paths.pose == i).sum() == len(alone.paths)
+        pose = Poses(few.position_m[i : i + 1], np.eye(3)[None])
+        still = site_with_tower_at(site, "LW1", rover(40)[i])
+        alone = replay(still, LINK, pose, Search(max_depth=1, crowns=Crowns(trees)))
+        assert replayed.rss_dbm[i, 0] == pytest.approx(alone.rss_dbm[0, 0], abs=1e-9, nan_ok=True)
+        assert (replayed.paths.pose == i).sum() == len(alone.paths)
 
 
 def test_what_cannot_move_is_refused_in_one_message():
     with pytest.raises(UsageError, match="moves and the engine is 'sionna'"):
         replay_moving(SITE, LINK, poses(), rover(), Search("sionna"))
-    two = Link(3.4e9, dict.fromkeys(("LW1", "LW2"), single_element()), single_element())
+    two_towers = Link(3.4e9, dict.fromkeys(("LW1", "LW2"), single_element()), single_element())
     with pytest.raises(UsageError, match="2 towers"):
-        replay_moving(SITE, two, poses(), rover())
+        replay_moving(SITE, two_towers, poses(), rover())
     empty = replay_moving(SITE, LINK, poses(0), rover(0))
     assert empty.rss_dbm.shape == (0, 1)
 
@@ -133,19 +133,19 @@ def test_what_cannot_move_is_refused_in_one_message():
 def test_messages_of_blocks_are_counted_together():
     far = poses()
     far.position_m[[3, 80]] = 1e9
-    found = replay_moving(BARE, LINK, far, rover(), Search(max_depth=0))
-    (text,) = found.left_out
+    replayed = replay_moving(BARE, LINK, far, rover(), Search(max_depth=0))
+    (text,) = replayed.left_out
     assert text.startswith("2 poses further than 100 km")
-    assert np.isnan(found.rss_dbm[[3, 80]]).all()
+    assert np.isnan(replayed.rss_dbm[[3, 80]]).all()
 
 
 def test_a_place_that_is_visited_again_keeps_the_order_of_the_poses():
     """Out and back: poses of one place lie far apart, and their paths stand where other parts look for them."""
     way = np.concatenate([rover(N // 2), rover(N // 2)[::-1]])
-    found = replay_moving(SITE, LINK, poses(), way, Search(max_depth=1))
-    assert (np.diff(found.paths.pose) >= 0).all()
+    replayed = replay_moving(SITE, LINK, poses(), way, Search(max_depth=1))
+    assert (np.diff(replayed.paths.pose) >= 0).all()
     for i in (3, N // 2 + 5, N - 4):
-        one = Poses(poses().position_m[i : i + 1], np.eye(3)[None])
-        alone = replay(site_with_tower_at(SITE, "LW1", way[i]), LINK, one, Search(max_depth=1))
-        rows = slice(*np.searchsorted(found.paths.pose, [i, i + 1]))
-        np.testing.assert_allclose(found.paths.vertices_m[rows], alone.paths.vertices_m, rtol=1e-12)
+        pose = Poses(poses().position_m[i : i + 1], np.eye(3)[None])
+        alone = replay(site_with_tower_at(SITE, "LW1", way[i]), LINK, pose, Search(max_depth=1))
+        rows = slice(*np.searchsorted(replayed.paths.pose, [i, i + 1]))
+        np.testing.assert_allclose(replayed.paths.vertices_m[rows], alone.paths.vertices_m, rtol=1e-12)

@@ -119,10 +119,15 @@ def test_a_table_and_a_merged_file_have_their_rows_and_readings() -> None:
     noon = microseconds(2024, 7, 15, 15, 48, 16) + 500_000
     table = raw.read_log(TABLE, ZONE)
     assert table is not None
-    one, two = table.rows  # the others have no instant, too few cells or no height
-    assert (one.time_us, one.latitude_deg, one.longitude_deg, one.altitude_m) == (noon, 35.7, -78.6, 12.5)
-    assert one.angles_deg == pytest.approx([math.degrees(x) for x in (0.1, 0.2, 0.3)])
-    assert (two.time_us, two.latitude_deg, two.angles_deg) == (noon + 2_000_000, 35.8, None)
+    turned_row, plain_row = table.rows  # the others have no instant, too few cells or no height
+    assert (turned_row.time_us, turned_row.latitude_deg, turned_row.longitude_deg, turned_row.altitude_m) == (
+        noon,
+        35.7,
+        -78.6,
+        12.5,
+    )
+    assert turned_row.angles_deg == pytest.approx([math.degrees(x) for x in (0.1, 0.2, 0.3)])
+    assert (plain_row.time_us, plain_row.latitude_deg, plain_row.angles_deg) == (noon + 2_000_000, 35.8, None)
     assert {line: (reading.time_us - noon, reading.values.get("rsrp")) for line, reading in table.readings.items()} == {
         2: (0, -80.5), 5: (2_000_000, None), 6: (3_000_000, -60.0),
     }  # fmt: skip

@@ -51,10 +51,10 @@ def case(scenes):
     return site, link, poses
 
 
-def audited(site, link, poses, found, loss=None, **settings):
+def audited(site, link, poses, replayed, loss=None, **settings):
     expected = field_audit.Expected.of(link, loss)
     rows = np.arange(len(poses))
-    return field_audit.against_reference(site, poses, found, rows, expected, ks=KS, max_depth=2, **settings)
+    return field_audit.against_reference(site, poses, replayed, rows, expected, ks=KS, max_depth=2, **settings)
 
 
 @pytest.mark.parametrize("pattern", [None, HalfWaveDipole(), TR38901()])
@@ -63,12 +63,12 @@ def test_replay_equals_the_second_implementation(scenes, case, pattern):
     if pattern is not None:
         uav = uav_comparison_array(wavelength_m(scenes.carrier_hz), pattern=pattern)
         link = scenes.link(site, tower_comparison_array(pattern=pattern), uav)
-    found = audited(site, link, poses, replay(site, link, poses))
-    assert found.failures == ()
-    assert found.h_max_error < 1e-11
-    assert (found.missing_paths, found.phantom_paths, found.doubtful) == (0, 0, 0)
-    assert found.reference_paths > 20
-    assert found.reference_links == 2 * len(poses)
+    audit = audited(site, link, poses, replay(site, link, poses))
+    assert audit.failures == ()
+    assert audit.h_max_error < 1e-11
+    assert (audit.missing_paths, audit.phantom_paths, audit.doubtful) == (0, 0, 0)
+    assert audit.reference_paths > 20
+    assert audit.reference_links == 2 * len(poses)
 
 
 @pytest.mark.parametrize(
@@ -80,8 +80,8 @@ def test_foliage_equals_the_second_implementation(scenes, case, name, in_leaf):
     model = foliage_model(name, scenes.carrier_hz, in_leaf=in_leaf)
     crowns = Crowns(site.trees) if name == "opaque" else None
     result = replay(site, link, poses, Search(crowns=crowns), Field(loss=loss_of(site.trees, model)))
-    found = audited(site, link, poses, result, reference.ExpectedLoss(name, in_leaf=in_leaf))
-    assert found.failures == ()
+    audit = audited(site, link, poses, result, reference.ExpectedLoss(name, in_leaf=in_leaf))
+    assert audit.failures == ()
     bare = replay(site, link, poses)
     assert not np.allclose(result.rss_dbm, bare.rss_dbm, equal_nan=True)  # trees are in the way
     lighter = audited(site, link, poses, result, reference.ExpectedLoss("p833", gamma_db_per_m=0.4))
@@ -165,10 +165,10 @@ def test_elements_are_where_their_array_has_them_in_the_second_implementation(sc
     site = scenes.site()
     arrays = [Array(np.array([place]), np.zeros(1)) for place in ([0.3, 0.7, 1.1], [-0.2, 0.5, -0.4])]
     link = scenes.link(site, *arrays)
-    one = reference.Reference(site, "LW1", field_audit.Expected.of(link).link)
+    second_way = reference.Reference(site, "LW1", field_audit.Expected.of(link).link)
     target = np.array([300.0, 40.0, 35.0])
-    length = np.linalg.norm(target + arrays[1].positions_m[0] - np.array(one.source) - arrays[0].positions_m[0])
-    h = one.pair((), 0, 0, tuple(target), reference.turned(0, 0, 0))
+    length = np.linalg.norm(target + arrays[1].positions_m[0] - np.array(second_way.source) - arrays[0].positions_m[0])
+    h = second_way.pair((), 0, 0, tuple(target), reference.turned(0, 0, 0))
     turns = length / wavelength_m(link.carrier_hz)
     assert np.angle(h * np.exp(2j * np.pi * turns)) == pytest.approx(0.0, abs=1e-6)
     assert abs(h) == pytest.approx(1 / (4 * np.pi * turns), rel=0.02)
@@ -182,10 +182,10 @@ def test_of_wall_and_ground_a_path_meets_first_what_it_reaches_first(scenes, wal
     clear_m = max(slope, 1.0) * 5e-7 if clear_m is None else clear_m
     above_m = clear_m if wall_first else -clear_m
     site = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), ((-10.0, 0.0, 10 * slope + above_m),))
-    one = reference.Reference(site, "LW1", field_audit.Expected.of(scenes.link(site)).link)
-    (wall,) = (m for m in one.mirrors if m.normal[0] == -1.0)
-    sequence = (wall, one.mirrors[0]) if wall_first else (one.mirrors[0], wall)
-    assert one.verdict(sequence, (-6.0, 3.0, 6 * slope - above_m)) is expected
+    second_way = reference.Reference(site, "LW1", field_audit.Expected.of(scenes.link(site)).link)
+    (wall,) = (m for m in second_way.mirrors if m.normal[0] == -1.0)
+    sequence = (wall, second_way.mirrors[0]) if wall_first else (second_way.mirrors[0], wall)
+    assert second_way.verdict(sequence, (-6.0, 3.0, 6 * slope - above_m)) is expected
 
 
 @pytest.mark.parametrize(
@@ -206,14 +206,14 @@ def test_of_wall_and_ground_a_path_meets_first_what_it_reaches_first(scenes, wal
 def test_a_path_exists_up_to_the_surfaces(scenes, source, target, walls, expected):
     """Mirrors by number, -1 the ground; an end may lie on its mirror, and what a hair decides is not judged."""
     site = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), (source,))
-    one = reference.Reference(site, "LW1", field_audit.Expected.of(scenes.link(site)).link)
-    mirror = {-1: one.mirrors[0], 0: next(m for m in one.mirrors if m.normal[0] == -1.0)}
-    assert one.verdict([mirror[k] for k in walls], target) is expected
+    second_way = reference.Reference(site, "LW1", field_audit.Expected.of(scenes.link(site)).link)
+    mirror = {-1: second_way.mirrors[0], 0: next(m for m in second_way.mirrors if m.normal[0] == -1.0)}
+    assert second_way.verdict([mirror[k] for k in walls], target) is expected
     if expected is not None:  # and so says the image engine
-        found = replay(site, scenes.link(site), scenes.poses(target))
-        number = {0: -1, int(np.flatnonzero(found.faces.normal[:, 0] == -1.0)[0]): 0}
-        there = [tuple(number.get(f, 9) for f in row if f >= 0) for row in found.paths.faces.tolist()]
-        assert (walls in there) == expected
+        replayed = replay(site, scenes.link(site), scenes.poses(target))
+        number = {0: -1, int(np.flatnonzero(replayed.faces.normal[:, 0] == -1.0)[0]): 0}
+        sequences = [tuple(number.get(f, 9) for f in row if f >= 0) for row in replayed.paths.faces.tolist()]
+        assert (walls in sequences) == expected
 
 
 def test_limits_of_links_are_those_of_the_replay(scenes):
@@ -222,23 +222,25 @@ def test_limits_of_links_are_those_of_the_replay(scenes):
     spots = [(0.5, 0, 10.5), (0.0101, 0, 10.5), (0.0099, 0, 10.5), (99_999.5, 0, 10.5), (100_000.5, 0, 10.5),
              (40, 0, -0.5), (40, 0, 0.7), (40, 0, 0.0)]  # fmt: skip
     poses, link = scenes.poses(spots), scenes.link(site)
-    found = replay(site, link, poses)
-    assert found.has_path[:, 0].tolist() == [True, True, False, True, False, False, True, True]
-    seen = audited(site, link, poses, found)
-    assert (seen.failures, seen.missing_paths, seen.phantom_paths, seen.doubtful) == ((), 0, 0, 0)
+    replayed = replay(site, link, poses)
+    assert replayed.has_path[:, 0].tolist() == [True, True, False, True, False, False, True, True]
+    audit = audited(site, link, poses, replayed)
+    assert (audit.failures, audit.missing_paths, audit.phantom_paths, audit.doubtful) == ((), 0, 0, 0)
     rim = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), ((-10.0, 0.0, 8.0),))
     poses, link = scenes.poses([(-10.0, 6.0, 8.0)]), scenes.link(rim)
-    seen = audited(rim, link, poses, replay(rim, link, poses))
-    assert (seen.failures, seen.doubtful) == ((), 1)  # over the upper rim of the wall
+    audit = audited(rim, link, poses, replay(rim, link, poses))
+    assert (audit.failures, audit.doubtful) == ((), 1)  # over the upper rim of the wall
 
 
 def test_rough_ground_and_each_reflection_lose_what_their_formulas_say(scenes):
     """Ament's factor at the ground alone, whatever else a path meets; a roof is level, too, and not the ground."""
     site = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), ((-10.0, 0.0, 20.0),))
     link = field_audit.Expected.of(scenes.link(site)).link
-    one = reference.Reference(site, "LW1", link, reference.ExpectedLoss(reflection_db=2.0, ground_roughness_m=0.03))
-    ground, roof = one.mirrors[0], next(m for m in one.mirrors if m.roof is not None)
-    wall = next(m for m in one.mirrors if m.normal[0] == -1.0)
+    second_way = reference.Reference(
+        site, "LW1", link, reference.ExpectedLoss(reflection_db=2.0, ground_roughness_m=0.03)
+    )
+    ground, roof = second_way.mirrors[0], next(m for m in second_way.mirrors if m.roof is not None)
+    wall = next(m for m in second_way.mirrors if m.normal[0] == -1.0)
     wavelength = wavelength_m(scenes.carrier_hz)
 
     def rough_db(flat, drop):
@@ -251,15 +253,15 @@ def test_rough_ground_and_each_reflection_lose_what_their_formulas_say(scenes):
         ((wall, ground), (-8.0, 3.0, 4.0), 4.0 + rough_db(np.hypot(18.0, 3.0), 24.0)),
         ((ground, wall), (-8.0, 3.0, 4.0), 4.0 + rough_db(np.hypot(18.0, 3.0), 24.0)),
     ):
-        assert one.loss_db(sequence, target) == pytest.approx(expected, rel=1e-8)
+        assert second_way.loss_db(sequence, target) == pytest.approx(expected, rel=1e-8)
 
 
 def test_free_space_and_a_perfect_ground_in_closed_form(scenes):
     site = scenes.site()
     link = field_audit.Expected.of(scenes.link(site)).link
-    one = reference.Reference(site, "LW1", link)
+    second_way = reference.Reference(site, "LW1", link)
     turn = reference.turned(0, 0, 0)
-    h = one.pair((), 0, 0, (300.0, 0.0, 10.0), turn)
+    h = second_way.pair((), 0, 0, (300.0, 0.0, 10.0), turn)
     assert abs(h) == pytest.approx(wavelength_m(link.carrier_hz) / (4 * np.pi * 300), rel=1e-12)
     assert reference.fresnel(1.0, 4 + 0j, None, 0.1) == pytest.approx((-1 / 3, 1 / 3))
     te, tm = reference.fresnel(0.3, 1e12 - 1e12j, None, 0.1)
@@ -267,13 +269,13 @@ def test_free_space_and_a_perfect_ground_in_closed_form(scenes):
 
 
 def test_chord_through_a_crown_in_closed_form():
-    one = Trees(*(np.array([x]) for x in (10.0, 0.0, 0.0, 20.0, 8.0, 4.0, 0.4)))
+    tree = Trees(*(np.array([x]) for x in (10.0, 0.0, 0.0, 20.0, 8.0, 4.0, 0.4)))
     # level, through the axis: the cone is 4 m in radius at 4 m and 0 at 20 m
-    assert reference.crown_depth_m(one, (0, 0, 8), (20, 0, 8), set()) == pytest.approx(6.0, abs=1e-9)
-    assert reference.crown_depth_m(one, (10, 0, 30), (10, 0, 0), set()) == pytest.approx(16.0, abs=1e-9)
-    assert reference.crown_depth_m(one, (0, 0, 2), (20, 0, 2), set(), trunks=True) == pytest.approx(0.4, abs=1e-9)
-    assert reference.crown_depth_m(one, (0, 0, 8), (20, 0, 8), {0}) == 0.0
-    assert reference.crown_depth_m(one, (0, 3.9, 8), (20, 3.9, 8), set()) == 0.0  # below its rim, beside the cone
+    assert reference.crown_depth_m(tree, (0, 0, 8), (20, 0, 8), set()) == pytest.approx(6.0, abs=1e-9)
+    assert reference.crown_depth_m(tree, (10, 0, 30), (10, 0, 0), set()) == pytest.approx(16.0, abs=1e-9)
+    assert reference.crown_depth_m(tree, (0, 0, 2), (20, 0, 2), set(), trunks=True) == pytest.approx(0.4, abs=1e-9)
+    assert reference.crown_depth_m(tree, (0, 0, 8), (20, 0, 8), {0}) == 0.0
+    assert reference.crown_depth_m(tree, (0, 3.9, 8), (20, 3.9, 8), set()) == 0.0  # below its rim, beside the cone
 
 
 def _wrap(monkeypatch, where, name, change):
@@ -321,21 +323,21 @@ def test_dropped_and_invented_paths_are_seen(case):
 def test_audit_of_several_replays_adds_up():
     from aerpaw_cmp.compare.field_difference import FieldAudit
 
-    one = FieldAudit(paths=3, power_rms_db=1.0, power_max_db=2.0, failures=("a",))
-    two = FieldAudit(paths=1, power_rms_db=3.0, power_max_db=1.0, failures=("a", "b"))
-    both = one + two
+    first = FieldAudit(paths=3, power_rms_db=1.0, power_max_db=2.0, failures=("a",))
+    second = FieldAudit(paths=1, power_rms_db=3.0, power_max_db=1.0, failures=("a", "b"))
+    both = first + second
     assert (both.paths, both.power_max_db, both.failed) == (4, 2.0, 2)
     assert both.power_rms_db == pytest.approx(np.sqrt((3 * 1 + 9) / 4))
 
 
 def test_audited_poses_meet_every_kind_of_path(case):
     site, link, poses = case
-    found = replay(site, link, poses)
-    few = field_audit.spread_over_paths(found, np.arange(len(poses)), 3)
+    replayed = replay(site, link, poses)
+    few = field_audit.spread_over_paths(replayed, np.arange(len(poses)), 3)
     assert len(few) == 3
 
     def kinds(rows):
-        here = np.isin(found.paths.pose, rows)
-        return len(np.unique(np.column_stack([found.paths.tower, found.paths.faces])[here], axis=0))
+        chosen = np.isin(replayed.paths.pose, rows)
+        return len(np.unique(np.column_stack([replayed.paths.tower, replayed.paths.faces])[chosen], axis=0))
 
     assert kinds(few) >= kinds([0, 1, 2])

@@ -7,7 +7,7 @@ from aerpaw_cmp.propagation.search.samples import FIRST, MOST, enough_samples, s
 FACES = Faces(np.eye(3), np.zeros(3), ("concrete",) * 3, ("a", "b", "c"))
 
 
-def found(*faces):
+def paths_over(*faces):
     sequence = np.array([[-1], *([f] for f in faces)])
     zero = np.zeros(len(sequence), dtype=np.int64)
     return PathSet(zero, zero, (sequence >= 0).sum(axis=1), sequence, np.zeros((len(sequence), 1, 3)))
@@ -18,7 +18,7 @@ def pilot_that_sees(thresholds):
 
     def pilot(samples):
         asked.append(samples)
-        return found(*(face for face, least in enumerate(thresholds) if samples >= least))
+        return paths_over(*(face for face, least in enumerate(thresholds) if samples >= least))
 
     return pilot, asked
 
@@ -40,7 +40,7 @@ def test_pilots_that_never_agree_end_and_say_so():
 
     def pilot(samples):
         calls.append(samples)
-        return found(*range(len(calls) % 2))
+        return paths_over(*range(len(calls) % 2))
 
     choice = enough_samples(pilot, FACES, 9)
     assert choice.samples == MOST

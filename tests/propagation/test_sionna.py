@@ -283,12 +283,12 @@ def test_cuda_and_llvm_agree(sionna, scenes, lone):
     with tempfile.TemporaryDirectory() as folder:
         entry = Path(folder) / "case"
         entry.write_bytes(pickle.dumps((scene.faces, scene.links_to(poses))))
-        found = []
+        tables = []
         for variant in ("cuda", "llvm"):
             out = Path(folder) / variant
             subprocess.run([sys.executable, "-c", code, entry, variant, out], check=True)
-            found.append(out.read_text())
-    assert found[0] == found[1]
+            tables.append(out.read_text())
+    assert tables[0] == tables[1]
     assert mi.variant()
 
 
@@ -321,11 +321,11 @@ def test_coefficients_of_links_without_a_path(sionna, scenes):
     poses, link = scenes.poses([[52.0, 0, 1.0]]), scenes.link(site, tower_comparison_array(), tower_comparison_array())
     probe, _ = field_audit._probe(link)
     scene = Scene.of(site, link, poses)
-    found = sionna.own_coefficients(
+    coefficients = sionna.own_coefficients(
         scene.faces, scene.links_to(poses), probe, (np.eye(3)[None], poses.rotation),
         sionna.Rays(samples=1000, batch=BATCH),
     )  # fmt: skip
-    assert (len(found.paths), found.gain.shape) == (0, (0, 2, 2))
+    assert (len(coefficients.paths), coefficients.gain.shape) == (0, (0, 2, 2))
 
 
 def test_a_second_search_compiles_nothing(sionna, scenes, lone):

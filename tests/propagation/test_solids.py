@@ -33,8 +33,8 @@ def cut(buildings, scenes, start, end):
 )
 def test_no_bounce_inside_a_building(scenes, source, target, expected):
     building = Building("b", box(-10, -10, 10, 10), 8.0)
-    faces, found = paths_of(scenes, [building], source, target, 1)
-    assert exact.planes_found(found, faces, 0) == expected
+    faces, paths = paths_of(scenes, [building], source, target, 1)
+    assert exact.planes_found(paths, faces, 0) == expected
     assert exact.paths([(-10, 10, -10, 10, 8)], source, target, 1) == expected
 
 
@@ -47,10 +47,10 @@ def test_same_paths_as_rational_arithmetic_on_aligned_geometry(scenes, boxes):
         footprints = [box(w, s, e, n) for w, e, s, n, _ in solids]
         touching += any(a.touches(b) for a in footprints for b in footprints)
         buildings = [Building(f"b{i}", f, float(b[4])) for i, (f, b) in enumerate(zip(footprints, solids, strict=True))]
-        faces, found = paths_of(scenes, buildings, source, targets)
+        faces, paths = paths_of(scenes, buildings, source, targets)
         for pose, target in enumerate(targets):
             where = (solids, source, target)
-            assert exact.planes_found(found, faces, pose) == exact.paths(*where), where
+            assert exact.planes_found(paths, faces, pose) == exact.paths(*where), where
     assert touching or boxes < 3
 
 
@@ -146,12 +146,12 @@ def test_points_inside_the_planes_are_those_inside_a_building(scenes, turn):
     hiding = Occlusion(site_faces(site), 1e-9)
     rng = np.random.default_rng(2)
     points = np.column_stack([rng.uniform(-3, 95, 4000), rng.uniform(-3, 23, 4000), rng.uniform(0.1, 9, 4000)])
-    found = np.zeros((len(points), len(shapes)), dtype=bool)
+    inside = np.zeros((len(points), len(shapes)), dtype=bool)
     for number, pieces in enumerate(hiding.pieces):
         for normal, offset in pieces:
             assert np.allclose(np.linalg.norm(normal, axis=1), 1.0)
-            found[:, number] |= (points @ normal.T < offset).all(axis=1)
+            inside[:, number] |= (points @ normal.T < offset).all(axis=1)
     for number, shape in enumerate(shapes):
         under = shapely.contains_xy(shape, points[:, 0], points[:, 1]) & (points[:, 2] < 4.0 + number)
-        assert (found[:, number] == under).all()
+        assert (inside[:, number] == under).all()
         assert under.sum() > 20

@@ -60,10 +60,10 @@ def test_random_rays_through_a_stand_with_a_glade_lose_what_counted_points_say()
     )
     random = np.random.default_rng(4)
     ends = random.uniform([-80, -60, 0.5], [200, 190, 25], (2, 80, 3))
-    found = loss(wood(area), ends[0], ends[1])
+    losses_db = loss(wood(area), ends[0], ends[1])
     share = (np.arange(40_000) + 0.5) / 40_000
     crossed = 0
-    for start, end, db in zip(*ends, found, strict=True):
+    for start, end, db in zip(*ends, losses_db, strict=True):
         point = start + share[:, None] * (end - start)
         inside = shapely.contains_xy(area, point[:, 0], point[:, 1])
         crown, trunk = (point[:, 2] > 5) & (point[:, 2] < 20), point[:, 2] <= 5
@@ -106,11 +106,11 @@ def test_the_level_has_no_step_where_a_ray_leaves_the_canopy(tilt_m: float, widt
     heights = np.arange(12.0, 28.0, 0.01)
     for model in (foliage_model("p833", 3.4e9), WALL):
         start = np.column_stack([0.0 * heights, 0.0 * heights, heights])
-        found = loss(site, start, start + np.array([400.0, 0.0, tilt_m]), model)
-        assert np.abs(np.diff(found)).max() < 0.1
-        assert found.min() == found[-1] == 0.0
+        loss_db = loss(site, start, start + np.array([400.0, 0.0, tilt_m]), model)
+        assert np.abs(np.diff(loss_db)).max() < 0.1
+        assert loss_db.min() == loss_db[-1] == 0.0
         if model is WALL:
-            assert found[0] > 10.0
+            assert loss_db[0] > 10.0
 
 
 def test_near_the_top_of_a_thin_stand_the_level_is_that_of_a_half_transparent_screen() -> None:
@@ -118,13 +118,13 @@ def test_near_the_top_of_a_thin_stand_the_level_is_that_of_a_half_transparent_sc
     site = wood(box(100.0, -5000.0, 100.001, 5000.0))
     heights = np.linspace(12.0, 28.0, 161)
     start = np.column_stack([0.0 * heights, 0.0 * heights, heights])
-    found = loss(site, start, start + np.array([300.0, 0.0, 0.0]), P833(2e4, 1e6))  # 20 dB in a millimetre
+    loss_db = loss(site, start, start + np.array([300.0, 0.0, 0.0]), P833(2e4, 1e6))  # 20 dB in a millimetre
     nu = (20.0 - heights) * np.sqrt(2 * 300 / (WAVELENGTH * 100 * 200))
     sine, cosine = fresnel(nu)
     free = 0.5 * (1 + 1j) * ((0.5 - cosine) - 1j * (0.5 - sine))
     exact = -20 * np.log10(np.abs(0.1 + 0.9 * free))
-    assert np.abs(found - exact)[np.abs(nu) < 0.8].max() < 1.5, "deeper the two waves beat; their powers add here"
-    assert np.abs(found - exact)[nu < -0.8].max() < 1.5, "the exact field swings about that of free space"
+    assert np.abs(loss_db - exact)[np.abs(nu) < 0.8].max() < 1.5, "deeper the two waves beat; their powers add here"
+    assert np.abs(loss_db - exact)[nu < -0.8].max() < 1.5, "the exact field swings about that of free space"
 
 
 def test_laws() -> None:

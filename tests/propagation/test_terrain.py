@@ -54,8 +54,8 @@ def test_paths_that_terrain_stops_are_counted_of_all_paths_whatever_the_parts(si
     east = np.array([300.0, 320.0, 340.0, 900.0, 910.0, 920.0])
     poses = Poses(np.column_stack([east, 0 * east, 0 * east + 60.0]), np.tile(np.eye(3), (6, 1, 1)))
     for size in (3, 6):
-        found = replay_in_parts(site, link, poses, Search(max_depth=0), Field(), Run(), size=size)
-        assert found.left_out == ["3 of 6 paths end at the terrain of the elevation model"]
+        replayed = replay_in_parts(site, link, poses, Search(max_depth=0), Field(), Run(), size=size)
+        assert replayed.left_out == ["3 of 6 paths end at the terrain of the elevation model"]
     open_air = Poses(poses.position_m[:3], poses.rotation[:3])
     assert replay(site, link, open_air, Search(max_depth=0)).left_out == []
 
@@ -126,7 +126,7 @@ def test_specular_points_of_a_valley_are_those_of_the_smooth_surface(depth_m: fl
     source, target = np.array([0.0, 0.0, 10.0]), np.array([520.0, 40.0, 40.0])
     dem = shaped(height, step=1.0).dem
     assert dem is not None
-    _, found, normal, part = specular_points(dem, source[None], target[None], wavelength_m(3.3e9))
+    _, mirrors, normal, part = specular_points(dem, source[None], target[None], wavelength_m(3.3e9))
 
     def way(spot: Any) -> Any:
         place = np.stack([spot[0], spot[1], height(spot[0], spot[1]) - height(0.0, 0.0)], axis=-1)
@@ -139,10 +139,10 @@ def test_specular_points_of_a_valley_are_those_of_the_smooth_surface(depth_m: fl
     assert len(turns) == points
     assert part[0] > 0.85, "far from the trough the ground is nearly a plane"
     assert (part[1:] < 0.9).all(), "a curved mirror is weaker"
-    rays = [(end - found) / np.linalg.norm(end - found, axis=1)[:, None] for end in (source, target)]
+    rays = [(end - mirrors) / np.linalg.norm(end - mirrors, axis=1)[:, None] for end in (source, target)]
     assert np.abs(np.cross(rays[0] + rays[1], normal)).max() < 0.02, "the normal halves the angle"
-    assert sorted(found[:, 0]) == pytest.approx(sorted(along[turns]), abs=1.5)
-    assert found[:, 2] == pytest.approx(height(found[:, 0], found[:, 1]) - height(0.0, 0.0), abs=0.05)
+    assert sorted(mirrors[:, 0]) == pytest.approx(sorted(along[turns]), abs=1.5)
+    assert mirrors[:, 2] == pytest.approx(height(mirrors[:, 0], mirrors[:, 1]) - height(0.0, 0.0), abs=0.05)
 
 
 @pytest.mark.parametrize("wavelength", [1e-7, 0.1, 1.0])
@@ -163,28 +163,28 @@ def test_mirrors_along_a_profile_are_the_shortest_ways_of_each_zone(wavelength: 
             over = [(end - a) @ [-along[1], along[0]] for end in ends]
             feet = [(end - a) @ along for end in ends]
             spot = a + (feet[0] + (feet[1] - feet[0]) * over[0] / sum(over)) * along
-            beside = [way(b + 1e-6 * (other - b)) - way(b) for other in (a, corners[min(k + 2, 13)])]
+            longer_m = [way(b + 1e-6 * (other - b)) - way(b) for other in (a, corners[min(k + 2, 13)])]
             if a[0] < spot[0] < b[0]:  # between two ends behind the piece the way turns, but nothing reflects
                 turns += [(spot[0], way(spot) if min(over) > 0.0 else np.nan, False)]
-            if k < 12 and beside[0] * beside[1] > 0.0:
+            if k < 12 and longer_m[0] * longer_m[1] > 0.0:
                 turns += [(b[0], way(b), True)]
         turns = [turn for turn in turns if np.isfinite(turn[1])]
         zones = np.cumsum(np.abs(np.diff([turn[1] for turn in turns], prepend=-np.inf)) >= wavelength / 2.0)
         expected = [min((t for t, z in zip(turns, zones, strict=True) if z == zone), key=lambda t: t[1])
                     for zone in np.unique(zones)]  # fmt: skip
         places = np.array([[0.0, 0.0, 0.0], *([end[0], 7.0, end[1]] for end in ends)])
-        column, found, crease, part = _stationary(
+        column, mirror_m, crease, part = _stationary(
             np.tile(places[1], (2, 1)), np.tile(places[2], (2, 1)), np.tile(at[:, None] / 300.0, 2),
             np.tile(corners[:, 1:], 2), wavelength,
         )  # fmt: skip
-        assert np.array_equal(found[column == 0], found[column == 1])
-        one = column == 0
-        for spot, edge, share in zip(found[one], crease[one], part[one], strict=True):
+        assert np.array_equal(mirror_m[column == 0], mirror_m[column == 1])
+        first = column == 0
+        for spot, edge, share in zip(mirror_m[first], crease[first], part[first], strict=True):
             assert any(abs(spot - t[0]) < 1e-9 and edge == t[2] for t in expected)
             assert share == pytest.approx(1.0) or edge or wavelength > 1e-7
         if wavelength == 1e-7:
-            assert found[one & ~crease] == pytest.approx([t[0] for t in expected if not t[2]], abs=1e-9)
-        inner, joined = inner + len(found), joined + len(turns) - len(expected)
+            assert mirror_m[first & ~crease] == pytest.approx([t[0] for t in expected if not t[2]], abs=1e-9)
+        inner, joined = inner + len(mirror_m), joined + len(turns) - len(expected)
     assert inner > 20
     assert (joined > 5) == (wavelength > 1e-7)
 
@@ -201,19 +201,19 @@ def test_a_zone_reaches_to_where_the_way_is_longer_by_half_a_wavelength() -> Non
         for side in (-1, 1):
             before = (spot[column], 0.0)
             for row in np.argsort(side * along[:, column]):
-                here = along[row, column], excess[row, column]
-                if side * (here[0] - spot[column]) <= 0.0:
+                sample = along[row, column], excess[row, column]
+                if side * (sample[0] - spot[column]) <= 0.0:
                     continue
-                if not here[1] < 0.05:
-                    share = (0.05 - before[1]) / (here[1] - before[1])
-                    expected[column] += np.nan_to_num(share) * abs(here[0] - before[0])
+                if not sample[1] < 0.05:
+                    share = (0.05 - before[1]) / (sample[1] - before[1])
+                    expected[column] += np.nan_to_num(share) * abs(sample[0] - before[0])
                     break
-                expected[column] += abs(here[0] - before[0])
-                before = here
-    found = _zone_m(along, spot, excess, 0.1)
-    assert found == pytest.approx(expected, abs=1e-12)
-    assert (found < 20.0).any()
-    assert (found > 60.0).any()
+                expected[column] += abs(sample[0] - before[0])
+                before = sample
+    zone_m = _zone_m(along, spot, excess, 0.1)
+    assert zone_m == pytest.approx(expected, abs=1e-12)
+    assert (zone_m < 20.0).any()
+    assert (zone_m > 60.0).any()
 
 
 def test_a_bump_before_the_specular_point_stops_its_leg_but_not_the_line_of_sight() -> None:
@@ -260,6 +260,6 @@ def test_the_audit_checks_level_ground_and_names_links_over_shaped_ground() -> N
     poses = Poses(places, np.tile(np.eye(3), (2, 1, 1)))
     for site, named in ((shaped(lambda e, _: 0 * e), 0), (shaped(lambda e, n: 8 * np.sin(e / 150) + 0.01 * n), 1)):
         replayed = replay(site, link, poses)
-        found = against_reference(site, poses, replayed, np.arange(2), Expected.of(link), ks=(10.0,), max_depth=2)
-        assert found.failures == ()
-        assert len(found.not_covered) == named
+        audit = against_reference(site, poses, replayed, np.arange(2), Expected.of(link), ks=(10.0,), max_depth=2)
+        assert audit.failures == ()
+        assert len(audit.not_covered) == named

@@ -183,8 +183,8 @@ def test_poses_within_100_km_of_a_tower_count(case, scenes):
         for east, count in ((-99_600.0, 1), (99_600.0, 0), (100_400.0, 0)):
             notes = within_reach(lone, scenes.poses([[east * side, 0, 10], [0, 0, 10]]))[1]
             assert sum(any(note.counts) for note in notes) == count
-    for one in beyond:
-        assert sum(any(note.counts) for note in within_reach(site, scenes.poses(one))[1]) == 1
+    for position in beyond:
+        assert sum(any(note.counts) for note in within_reach(site, scenes.poses(position))[1]) == 1
 
 
 def test_damaged_entry_is_searched_again(case, tmp_path):
@@ -226,15 +226,15 @@ def test_audit_sees_what_a_shallow_replay_lacks(case):
 def test_every_damage_of_an_entry_is_seen_and_told(case, tmp_path):
     first = replay(*case, run=Run(cache_dir=tmp_path))
     (entry,) = tmp_path.glob("*.npz")
-    whole = entry.read_bytes()
+    intact = entry.read_bytes()
     generator = np.random.default_rng(3)
-    for at in generator.integers(0, len(whole), 60).tolist():
-        entry.write_bytes(whole[:at] + bytes([whole[at] ^ int(generator.integers(1, 256))]) + whole[at + 1 :])
+    for at in generator.integers(0, len(intact), 60).tolist():
+        entry.write_bytes(intact[:at] + bytes([intact[at] ^ int(generator.integers(1, 256))]) + intact[at + 1 :])
         again = replay(*case, run=Run(cache_dir=tmp_path))
         assert not again.from_cache, at
         assert any("damaged entry of the path cache" in line for line in again.left_out)
         assert np.array_equal(again.rss_dbm, first.rss_dbm, equal_nan=True)
-    entry.write_bytes(whole[:-1])
+    entry.write_bytes(intact[:-1])
     assert any("damaged entry" in line for line in replay(*case, run=Run(cache_dir=tmp_path)).left_out)
     assert replay(*case, run=Run(cache_dir=tmp_path)).from_cache, "mended by the last search"
 

@@ -34,8 +34,8 @@ def test_open_field_does_not_care(scenes, uav_transmits):
 def test_wall_that_ends_between_two_elements_hides_one_of_them(scenes):
     """Seen from the tower, the wall's edge runs between the two elements of the UAV."""
     site = scenes.site([Building("wall", box(20, 0, 20.5, 30), 30.0)])
-    two = Array(np.array([[0.0, 0.5, 0.0], [0.0, -0.5, 0.0]]), np.zeros(2))
-    link = scenes.link(site, uav_array=two, uav_transmits=False)
+    pair = Array(np.array([[0.0, 0.5, 0.0], [0.0, -0.5, 0.0]]), np.zeros(2))
+    link = scenes.link(site, uav_array=pair, uav_transmits=False)
     pose = scenes.poses([[40.0, 0.0, 10.0]])
     h = replay_pairs(site, link, pose, Search(max_depth=0)).h[0, 0, :, 0]
     assert h[0] == 0
@@ -59,11 +59,15 @@ def test_transposing_the_link_transposes_h(scenes):
     """Reciprocity with each pair's own paths: the two ends exchanged."""
     building = [Building("b", box(10, 5.8, 18, 16), 25.0)]
     here, there = (0.0, 0.0, 10.0), (30.0, 10.0, 12.0)
-    one, two = linear_array(3, 2.0, 20.0), linear_array(2, 3.0, 70.0)
+    three_elements, two_elements = linear_array(3, 2.0, 20.0), linear_array(2, 3.0, 70.0)
     site = scenes.site(building, (here,))
-    forth = replay_pairs(site, scenes.link(site, one, two, uav_transmits=False), scenes.poses([there]))
+    forth = replay_pairs(
+        site, scenes.link(site, three_elements, two_elements, uav_transmits=False), scenes.poses([there])
+    )
     site = scenes.site(building, (there,))
-    back = replay_pairs(site, scenes.link(site, two, one, uav_transmits=False), scenes.poses([here]))
+    back = replay_pairs(
+        site, scenes.link(site, two_elements, three_elements, uav_transmits=False), scenes.poses([here])
+    )
     assert forth.h[0, 0] == pytest.approx(back.h[0, 0].T, rel=1e-9)
     assert 0 < (forth.h != 0).sum() < 6
 
@@ -81,9 +85,9 @@ def test_few_links_of_the_bench_scene_differ():
 def shadowed(scenes):
     """A wall that ends beside the straight way to some poses; the elements of the UAV lie a metre apart."""
     site = scenes.site([Building("wall", box(20, 0, 20.5, 30), 30.0)], ((0.0, 0.0, 10.0), (5.0, -3.0, 12.0)))
-    two = Array(np.array([[0.0, 0.5, 0.0], [0.0, -0.5, 0.0]]), np.zeros(2))
+    pair = Array(np.array([[0.0, 0.5, 0.0], [0.0, -0.5, 0.0]]), np.zeros(2))
     spots = np.column_stack([np.linspace(30, 160, 14), np.linspace(-1.4, 1.6, 14), np.linspace(10, 14, 14)])
-    return site, scenes.link(site, uav_array=two, uav_transmits=False), scenes.poses(spots)
+    return site, scenes.link(site, uav_array=pair, uav_transmits=False), scenes.poses(spots)
 
 
 def by_pairs(scenes):
@@ -100,15 +104,15 @@ def test_what_the_centre_alone_decides_is_counted(scenes, monkeypatch):
     change = [0.0]
     for k, tower in itertools.product(range(1, 14), range(2)):
         spot = scenes.poses(poses.position_m[k : k + 1])
-        one, other = (each(site, link, spot, Search(max_depth=1)) for each in (replay, replay_pairs))
-        a, b = one.h[0, tower], other.h[0, tower]
+        by_centre, paired = (each(site, link, spot, Search(max_depth=1)) for each in (replay, replay_pairs))
+        a, b = by_centre.h[0, tower], paired.h[0, tower]
         differ += not np.allclose(a, b, rtol=1e-8, atol=0)
         ranks += any(channel_rank(a, x) != channel_rank(b, x) for x in (2.0, 10.0))
-        level = abs(other.rss_dbm[0, tower] - one.rss_dbm[0, tower])
+        level = abs(paired.rss_dbm[0, tower] - by_centre.rss_dbm[0, tower])
         change += [level] if np.isfinite(level) else []
-    found = by_pairs(scenes)
-    assert (found.pairs_links, found.pairs_differ) == (26, differ)
-    assert (found.pairs_rank_differs, found.pairs_rss_max_db) == (ranks, pytest.approx(max(change)))
+    audit = by_pairs(scenes)
+    assert (audit.pairs_links, audit.pairs_differ) == (26, differ)
+    assert (audit.pairs_rank_differs, audit.pairs_rss_max_db) == (ranks, pytest.approx(max(change)))
     assert 0 < differ < 26
     assert max(change) > 1.0
 
@@ -131,16 +135,16 @@ def test_explicit_arrays_are_judged_by_the_better_half_of_the_nearest_links(scen
         return h + share[..., None, None] * largest
 
     monkeypatch.setattr(sionna, "own_channels", own)
-    found = by_pairs(scenes)
+    audit = by_pairs(scenes)
     site, _, poses = shadowed(scenes)
     away = np.min([np.linalg.norm(poses.position_m[1:] - t.position_m, axis=1) for t in site.towers.values()], axis=0)
     nearest = np.sort(away)[: field_audit.EXPLICIT_POSES]
     assert sorted(np.min([np.linalg.norm(asked[0] - t.position_m, axis=1) for t in site.towers.values()], axis=0)) == (
         pytest.approx(nearest[nearest < field_audit.EXPLICIT_RANGE_M])
     )
-    assert found.explicit_links == len(shares) < 2 * len(asked[0])
-    assert found.explicit_max_error == pytest.approx(sorted(shares)[: (len(shares) + 1) // 2][-1], rel=1e-6, abs=1e-9)
-    assert bool(found.failures) == wrong
+    assert audit.explicit_links == len(shares) < 2 * len(asked[0])
+    assert audit.explicit_max_error == pytest.approx(sorted(shares)[: (len(shares) + 1) // 2][-1], rel=1e-6, abs=1e-9)
+    assert bool(audit.failures) == wrong
 
 
 def test_pairs_need_the_image_engine(scenes):

@@ -122,8 +122,8 @@ def test_turned_round_the_channel_is_the_same() -> None:
 def test_walls_of_air_and_thin_walls_are_not_there() -> None:
     empty = run(dataclasses.replace(town(), buildings=()), PLACES, max_depth=1)
     air = "constant with permittivity=1 conductivity=0 thickness=0.3"
-    thin = "concrete with thickness=0"
-    for wall in (air, thin):
+    without_thickness = "concrete with thickness=0"
+    for wall in (air, without_thickness):
         site = dataclasses.replace(town(), buildings=tuple(dataclasses.replace(b, material=wall) for b in SCENE))
         same = run(site, PLACES, max_depth=1)
         assert same.through is not None
@@ -177,24 +177,24 @@ def test_a_part_of_a_replay_is_the_replay_of_its_poses() -> None:
 
 
 def test_parts_and_moving_towers_keep_the_paths() -> None:
-    whole = run(town(), PLACES, max_depth=1, diffraction="edges")
-    link, said = Link(CARRIER, {"T": single_element()}, single_element()), ([], [])
+    at_once = run(town(), PLACES, max_depth=1, diffraction="edges")
+    link, shares = Link(CARRIER, {"T": single_element()}, single_element()), ([], [])
     search = Search(max_depth=1, refraction=True, diffraction="edges")
     poses = Poses(PLACES, np.tile(np.eye(3), (len(PLACES), 1, 1)))
-    parted = replay_in_parts(town(), link, poses, search, Field(), Run(progress=said[0].append), size=17)
+    parted = replay_in_parts(town(), link, poses, search, Field(), Run(progress=shares[0].append), size=17)
     places = np.repeat([[0.0, 0.0, 10.0], [0.0, 0.0, 10.0 + 1e-12]], len(PLACES) // 2, axis=0)
-    moving = replay_moving(town(), link, poses, places, search, run=Run(progress=said[1].append))
-    assert said[0] == pytest.approx([0.25, 0.5, 0.75, 1.0])
-    assert said[1] == [1.0]
-    assert whole.through is not None
-    assert whole.edge_paths is not None
+    moving = replay_moving(town(), link, poses, places, search, run=Run(progress=shares[1].append))
+    assert shares[0] == pytest.approx([0.25, 0.5, 0.75, 1.0])
+    assert shares[1] == [1.0]
+    assert at_once.through is not None
+    assert at_once.edge_paths is not None
     for other in (parted, moving):
-        assert other.h == pytest.approx(whole.h, rel=1e-6)
+        assert other.h == pytest.approx(at_once.h, rel=1e-6)
         assert other.through is not None
-        assert np.array_equal(np.bincount(other.through.paths.pose), np.bincount(whole.through.paths.pose))
+        assert np.array_equal(np.bincount(other.through.paths.pose), np.bincount(at_once.through.paths.pose))
         assert other.edge_paths is not None
-        assert other.edge_paths.pose.tolist() == whole.edge_paths.pose.tolist()
-        assert other.edge_paths.vertices_m == pytest.approx(whole.edge_paths.vertices_m, abs=1e-9, nan_ok=True)
+        assert other.edge_paths.pose.tolist() == at_once.edge_paths.pose.tolist()
+        assert other.edge_paths.vertices_m == pytest.approx(at_once.edge_paths.vertices_m, abs=1e-9, nan_ok=True)
     assert replay_in_parts(town(), link, poses, search, Field(), Run(), size=len(PLACES)).seconds > 0.0
 
 
@@ -203,9 +203,11 @@ def test_eight_walls_are_passed_and_ten_are_not(houses: int, seen: bool) -> None
     """Each house takes the same two walls from the level ray; one more house than four takes the path."""
     row = tuple(Building(f"{k}", box(20.0 + 9 * k, -9, 25.0 + 9 * k, 9), 20.0, material="wood") for k in range(houses))
     lit = run(dataclasses.replace(town(), buildings=row), [100.0, 0.0, 10.0])
-    one, open_ = (run(dataclasses.replace(town(), buildings=row[:k]), [100.0, 0.0, 10.0]).h.item() for k in (1, 0))
+    one_house, open_ = (
+        run(dataclasses.replace(town(), buildings=row[:k]), [100.0, 0.0, 10.0]).h.item() for k in (1, 0)
+    )
     assert lit.has_path.item() == seen
-    assert lit.h.item() == pytest.approx((one / open_) ** houses * open_ if seen else 0.0, rel=1e-9)
+    assert lit.h.item() == pytest.approx((one_house / open_) ** houses * open_ if seen else 0.0, rel=1e-9)
 
 
 def test_steps_of_a_path_are_its_walls_in_order_and_roofs_count() -> None:
@@ -213,13 +215,13 @@ def test_steps_of_a_path_are_its_walls_in_order_and_roofs_count() -> None:
     boxes = [((20.0, -30.0), (30.0, 30.0), 9.0), ((60.0, -30.0), (70.0, 30.0), 12.0)]
     row = tuple(Building(f"{k}", box(*low, *high), top, material="wood") for k, (low, high, top) in enumerate(boxes))
     target = np.array([90.0, 8.0, 6.0])
-    found = run(dataclasses.replace(town(), buildings=row), target, max_depth=1)
-    assert found.through is not None
-    paths, kinds, bent = found.through.paths, set(), found.through.reflections()
+    replayed = run(dataclasses.replace(town(), buildings=row), target, max_depth=1)
+    assert replayed.through is not None
+    paths, kinds, bent = replayed.through.paths, set(), replayed.through.reflections()
     for k in range(len(paths)):
         depth = int(paths.depth[k])
         faces, points = paths.faces[k, :depth], paths.vertices_m[k, :depth]
-        own = faces < len(found.through.faces) // 2
+        own = faces < len(replayed.through.faces) // 2
         assert (paths.faces[k, depth:] == -1).all()
         corners = np.array([[0.0, 0.0, 10.0], *points[own], target])
         expected = []
@@ -243,12 +245,12 @@ def test_the_audit_names_links_with_paths_through_walls_and_checks_the_others() 
     places = np.concatenate([PLACES[:4], PLACES[:4] * [-1.0, 1.0, 1.0]])
     poses = Poses(places, np.tile(np.eye(3), (8, 1, 1)))
     replayed = replay(town(), link, poses, Search(max_depth=1, refraction=True))
-    found = against_reference(town(), poses, replayed, np.arange(8), Expected.of(link), ks=(10.0,), max_depth=1)
-    assert found.failures == ()
-    assert found.not_covered == ("paths through walls",)
+    audit = against_reference(town(), poses, replayed, np.arange(8), Expected.of(link), ks=(10.0,), max_depth=1)
+    assert audit.failures == ()
+    assert audit.not_covered == ("paths through walls",)
     assert replayed.through is not None
     open_links = np.setdiff1d(np.arange(8), replayed.through.paths.pose)
     planted = dataclasses.replace(replayed, h=1.01 * replayed.h)
-    seen = against_reference(town(), poses, planted, open_links, Expected.of(link), ks=(10.0,), max_depth=1)
+    open_audit = against_reference(town(), poses, planted, open_links, Expected.of(link), ks=(10.0,), max_depth=1)
     assert len(open_links) > 0
-    assert seen.failures
+    assert open_audit.failures

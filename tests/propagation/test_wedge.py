@@ -146,8 +146,11 @@ def test_reciprocity(seed: int) -> None:
     draw = np.random.default_rng(seed)
     azimuth = draw.uniform(0.02, 1.5 * np.pi - 0.02, 2)
     first, second = (np.array([20 * np.cos(a), 20 * np.sin(a), draw.uniform(-30, 30)]) for a in azimuth)
-    one, other = draw.normal(size=(2, 3))
-    there, back = other @ diffracted(first, second, one), one @ diffracted(second, first, other)
+    first_field, second_field = draw.normal(size=(2, 3))
+    there, back = (
+        second_field @ diffracted(first, second, first_field),
+        first_field @ diffracted(second, first, second_field),
+    )
     assert abs(there - back) < 1e-12 * abs(there)
 
 

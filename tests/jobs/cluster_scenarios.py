@@ -55,16 +55,16 @@ def message(action: Callable[[], Any]) -> str:
 
 
 def on_a_cluster(folder: Path) -> dict[str, Any]:
-    told: list[str] = []
+    messages: list[str] = []
     cluster = distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, security=SECURITY, dashboard_address=None, silence_logs=50
     )
     plain = f"tcp://127.0.0.1:{_port()}"
-    with cluster, open_workers(1, cluster.scheduler_address, progress=lambda text, *_: told.append(text)) as crew:
+    with cluster, open_workers(1, cluster.scheduler_address, progress=lambda text, *_: messages.append(text)) as crew:
         out = {
             "count": crew.count,
             "squares": collected(crew, square, list(range(25))),
-            "told": told,
+            "told": messages,
             "good": message(lambda: check_workers(crew._client, [folder])),
             "unseen": message(lambda: check_workers(crew._client, [folder / "nowhere"])),
             "plain": message(lambda: open_workers(1, plain).__enter__()),
@@ -79,9 +79,9 @@ def on_a_cluster(folder: Path) -> dict[str, Any]:
 
 
 def _port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    with socket.socket() as door:
+        door.bind(("127.0.0.1", 0))
+        return int(door.getsockname()[1])
 
 
 def _scheduler(port: int) -> Any:
@@ -96,28 +96,28 @@ def gone() -> str:
     """The scheduler ends in the middle."""
     port = _port()
     cluster = _scheduler(port)
-    found: dict[int, int] = {}
+    results: dict[int, int] = {}
 
     def done(number: int, result: Any) -> None:
-        found[number] = result
-        if len(found) == 3:
+        results[number] = result
+        if len(results) == 3:
             threading.Thread(target=cluster.close).start()
 
-    def whole() -> None:
+    def run_all() -> None:
         with open_workers(1, f"tls://127.0.0.1:{port}") as crew:
             crew.run(slow, range(200), done)
 
-    return message(whole)
+    return message(run_all)
 
 
 def none_there() -> str:
     workers.CONNECT_S = 0.5
 
-    def whole() -> None:
+    def open_one() -> None:
         with open_workers(1, f"tls://127.0.0.1:{_port()}"):
             pass
 
-    return message(whole)
+    return message(open_one)
 
 
 if __name__ == "__main__":

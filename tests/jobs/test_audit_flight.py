@@ -35,10 +35,10 @@ def flight(attitude="logged", roll=8.0, pitch=-5.0):
 
 @pytest.mark.parametrize("mode", ["logged", "level"])
 def test_attitude_turned_a_second_time(mode):
-    found = audit_flight.attitude_checked(flight(mode), [])
-    assert found.failures == ()
-    assert found.attitude_rows == 20
-    assert found.attitude_max_rad < 1e-12
+    audit = audit_flight.attitude_checked(flight(mode), [])
+    assert audit.failures == ()
+    assert audit.attitude_rows == 20
+    assert audit.attitude_max_rad < 1e-12
 
 
 @pytest.mark.parametrize(

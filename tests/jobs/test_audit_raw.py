@@ -114,16 +114,16 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_right_flight_is_recomputed_to_rounding(flight: Path) -> None:
-    found = checked(flight, scores=True)
-    assert found.failures == ()
-    assert found.not_covered == ()
-    assert found.raw_samples >= 40
-    assert found.raw_levels >= 80
-    assert found.raw_poses >= 100
-    assert found.raw_position_max_m < 1e-3
-    assert found.raw_attitude_max_rad < 1e-9
-    assert found.raw_measured_max_db < 1e-9
-    assert found.raw_level_max_db < 1e-3
+    audit = checked(flight, scores=True)
+    assert audit.failures == ()
+    assert audit.not_covered == ()
+    assert audit.raw_samples >= 40
+    assert audit.raw_levels >= 80
+    assert audit.raw_poses >= 100
+    assert audit.raw_position_max_m < 1e-3
+    assert audit.raw_attitude_max_rad < 1e-9
+    assert audit.raw_measured_max_db < 1e-9
+    assert audit.raw_level_max_db < 1e-3
 
 
 def no_takeoff(patch: pytest.MonkeyPatch) -> None:
@@ -236,8 +236,8 @@ def test_a_fault_between_the_bytes_and_the_level_is_seen(
 ) -> None:
     plant, kind = FAULTS[name]
     plant(monkeypatch)
-    found = checked(flight)
-    assert any(kind in text for text in found.failures), found.failures
+    audit = checked(flight)
+    assert any(kind in text for text in audit.failures), audit.failures
 
 
 def test_scores_are_recomputed_from_the_levels(flight: Path) -> None:
@@ -249,8 +249,8 @@ def test_scores_are_recomputed_from_the_levels(flight: Path) -> None:
         score = results[0].score
         wrong = dataclasses.replace(score, **{key: getattr(score, key) + by for key, by in change.items()})
         changed = [dataclasses.replace(results[0], score=wrong), *results[1:]]
-        found = raw_checked(data, replays.all, expected, changed)
-        assert any(kind in text for text in found.failures), (kind, found.failures)
+        audit = raw_checked(data, replays.all, expected, changed)
+        assert any(kind in text for text in audit.failures), (kind, audit.failures)
 
 
 def test_a_clock_of_the_wrong_sign_is_seen(flight: Path, tmp_path: Path) -> None:
@@ -286,8 +286,8 @@ def test_a_clock_of_the_wrong_sign_is_seen(flight: Path, tmp_path: Path) -> None
         return of
 
     assert checked(tmp_path / "flight.yaml", clocks=clocks(1.0)).failures == ()
-    found = checked(tmp_path / "flight.yaml", clocks=clocks(-1.0))
-    assert sum("wrong sign" in text for text in found.failures) == 2
+    audit = checked(tmp_path / "flight.yaml", clocks=clocks(-1.0))
+    assert sum("wrong sign" in text for text in audit.failures) == 2
 
 
 def test_the_take_off_ground_carries_the_ranks_too(flight: Path) -> None:
@@ -303,7 +303,7 @@ def test_what_cannot_be_read_a_second_time_is_named(flight: Path, tmp_path: Path
         (tmp_path / path.name).write_bytes(path.read_bytes())
     text = FLIGHT.replace("node: T2, channel: A", 'node: T2, channel: A, time_origin: "2025-06-01T10:00:00Z"')
     (tmp_path / "flight.yaml").write_text(text)
-    found = checked(tmp_path / "flight.yaml")
-    assert any("T2_power_log.txt" in line for line in found.not_covered)
-    assert found.raw_samples >= 20
-    assert found.failures == ()
+    audit = checked(tmp_path / "flight.yaml")
+    assert any("T2_power_log.txt" in line for line in audit.not_covered)
+    assert audit.raw_samples >= 20
+    assert audit.failures == ()

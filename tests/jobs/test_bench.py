@@ -14,9 +14,9 @@ def test_equal_error_is_the_fewest_samples_that_find_as_many_paths(monkeypatch):
         return {"ratio": samples / 100.0, "extra_paths": missed[samples], "samples": samples}
 
     monkeypatch.setattr(bench, "path_search", search)
-    found = bench.path_search_ratios()
-    assert found["equal_error"]["samples"] == 10_000
-    assert found["equal_error"]["ratio"] < found["at"]["1e+06"]["ratio"]
+    ratios = bench.path_search_ratios()
+    assert ratios["equal_error"]["samples"] == 10_000
+    assert ratios["equal_error"]["ratio"] < ratios["at"]["1e+06"]["ratio"]
     assert ran == [1_000_000, 1_000, 10_000]  # no more than is needed
 
 

@@ -275,7 +275,7 @@ def test_our_names_are_told_where_one_is_unknown(place: Path) -> None:
 def test_packaged_manifest_is_whole() -> None:
     manifest = benchmark.load_manifest()
     assert len(manifest.tasks) == 9
-    used = {log["path"] for one in manifest.flights.values() for log in one["logs"]}
+    used = {log["path"] for flight in manifest.flights.values() for log in flight["logs"]}
     assert used == set(manifest.files)
     for task in manifest.tasks.values():
         assert not set(task.train) & set(task.test)

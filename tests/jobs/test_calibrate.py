@@ -74,11 +74,11 @@ def test_the_sphere_as_netcdf_is_that_of_the_csv(folder: Path, metrics: dict, cf
     for end in ("tower", "uav"):
         path = folder / "calibrated" / f"LW1.USRP1.{end}.nc"
         table = pd.read_csv(path.with_suffix(".csv"), comment="#")
-        with xarray.open_dataset(path) as found:
-            assert found["gain"].dims == ("elevation", "azimuth")
-            assert found["gain"].attrs["ancillary_variables"] == "gain_sd"
-            assert float(found["frequency"]) == pytest.approx(3.3e9)
-            flat = found.to_dataframe(dim_order=["elevation", "azimuth"]).reset_index()
+        with xarray.open_dataset(path) as sphere:
+            assert sphere["gain"].dims == ("elevation", "azimuth")
+            assert sphere["gain"].attrs["ancillary_variables"] == "gain_sd"
+            assert float(sphere["frequency"]) == pytest.approx(3.3e9)
+            flat = sphere.to_dataframe(dim_order=["elevation", "azimuth"]).reset_index()
         np.testing.assert_allclose(flat["azimuth"], table["azimuth_deg"], atol=1e-9)
         np.testing.assert_allclose(flat["elevation"], table["elevation_deg"], atol=1e-9)
         np.testing.assert_allclose(flat["gain"], table["gain_dbi"], atol=6e-4)
@@ -94,18 +94,18 @@ def test_a_flight_kept_aside_replays_with_the_learned_antennas(folder: Path, met
     for name, file in (("iso", folder / "aside.yaml"), ("learned", path)):
         out = folder / f"report_{name}"
         assert main(["report", str(file), "-o", str(out), "--audit", "none", "--figures", "none"]) == 0
-        found = json.loads((out / "metrics.json").read_text())["rss"]["LW1"]["USRP1"]
-        rmse[name] = found["rmse_db"]
+        channel = json.loads((out / "metrics.json").read_text())["rss"]["LW1"]["USRP1"]
+        rmse[name] = channel["rmse_db"]
         table = pd.read_csv(out / "rss.csv")
         assert ("simulated_sd_db" in table) == (name == "learned")
-        assert (found.get("simulated_sd_db") is None) == (name == "iso")
+        assert (channel.get("simulated_sd_db") is None) == (name == "iso")
     assert rmse["learned"] < 0.6 * rmse["iso"]
     parts = [table[f"{name}_sd_db"] for name in ("gain", "own", "noise", "fading")]
     known = table.dropna(subset=["simulated_sd_db"])
     assert len(known) > 100
     assert (min(part.min() for part in parts)) > 0
     np.testing.assert_allclose(known["simulated_sd_db"] ** 2, sum(part[known.index] ** 2 for part in parts), atol=1e-2)
-    bars = found["error_bars"]
+    bars = channel["error_bars"]
     scored = known.dropna(subset=["residual_db"])
     half = (scored["simulated_high_dbm"] - scored["simulated_low_dbm"]) / 2
     assert bars["inside_90"] == pytest.approx(np.mean(scored["residual_db"].abs() < half), abs=0.01)
@@ -115,14 +115,14 @@ def test_a_report_has_the_level_of_the_fit_itself(folder: Path, metrics: dict) -
     """Antenna files, the gain towards both ends in their comments, and the replay against the fit along the flight."""
     del metrics
     report = pd.read_csv(folder / "report_learned" / "rss.csv")
-    found, _ = calibrated(folder / "calibration.yaml")
+    calibration, _ = calibrated(folder / "calibration.yaml")
     (aside,) = observe(read_flights(load_calibration(folder / "aside_calibration.yaml"), folder, None)[0])[0]
-    gain, sd = found.learned.predict(aside.samples)
+    gain, sd = calibration.learned.predict(aside.samples)
     level = report.dropna(subset=["residual_db"])
     assert len(level) == len(gain) > 100
     difference = level["simulated_dbm"].to_numpy() - (gain + aside.free_space_db)
     assert difference.std() < 0.15
-    pair = found.learned.fit.mean(aside.samples, ("pair",))
+    pair = calibration.learned.fit.mean(aside.samples, ("pair",))
     assert (difference - pair).std() > difference.std()
     assert np.median(np.abs(level["gain_sd_db"].to_numpy() / sd - 1.0)) < 0.1
 
@@ -165,10 +165,10 @@ def test_a_misspelt_site_gets_no_memory(folder: Path, capsys: pytest.CaptureFixt
 
 def test_one_flight_is_learned_and_not_scored(folder: Path) -> None:
     path = write_yaml(folder / "single.yaml", {"calibration": "single", "flights": ["first.yaml"]})
-    found, _ = calibrated(path)
-    assert found.learned.fit is not None
-    assert not any(found.scores.values())
-    assert any("one flight alone" in text for text in found.warnings)
+    calibration, _ = calibrated(path)
+    assert calibration.learned.fit is not None
+    assert not any(calibration.scores.values())
+    assert any("one flight alone" in text for text in calibration.warnings)
 
 
 @pytest.mark.field
@@ -181,10 +181,10 @@ def test_dataset12_each_way(tmp_path: Path) -> None:
     grid = {"model": "gain_grid", "file": "antennas/rad_pat.mat"}
     patterns = {"uav": grid | {"variable": "SA3300"}, "tower": grid | {"variable": "RMWB3300_normal"}}
     path = write_yaml(tmp_path / "c.yaml", {"calibration": "d12", "flights": flights, "patterns": patterns})
-    found = load_calibration(path)
-    flown, _ = read_flights(found, tmp_path, REAL)
+    stated = load_calibration(path)
+    flown, _ = read_flights(stated, tmp_path, REAL)
     observed, _ = observe(flown)
-    scores = calibration.flight_left_out(observed, recipe_of(found, observed, REAL))
+    scores = calibration.flight_left_out(observed, recipe_of(stated, observed, REAL))
     assert mean_rmse(scores) < 3.75
     assert mean_rmse(scores, "rmse_4s_db") < 3.0
     assert mean_rmse(scores, "free_space_rmse_db") == pytest.approx(6.37, abs=0.05)

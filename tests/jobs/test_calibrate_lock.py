@@ -36,8 +36,8 @@ def flight(name: str, seed: int, losing: bool = True) -> Observed:
         flight=name, tower="ROVER", channel="power", time_s=time, position_m=reach[:, None] * line, at_uav=-unit,
         at_tower=unit, residual_db=measured - path_db - SENT_DBM, floor_db=LOCK_FLOOR_DB - path_db - SENT_DBM,
     )  # fmt: skip
-    kept = locked.astype(np.float64) if losing else np.ones(len(time))
-    return Observed(samples, path_db + SENT_DBM, np.zeros(len(time)), locked=kept, sent_dbm=SENT_DBM)
+    lock = locked.astype(np.float64) if losing else np.ones(len(time))
+    return Observed(samples, path_db + SENT_DBM, np.zeros(len(time)), locked=lock, sent_dbm=SENT_DBM)
 
 
 def test_the_planted_lock_is_recovered_and_beats_the_share_on_flights_left_out() -> None:
@@ -73,8 +73,8 @@ def test_what_a_site_remembers_of_the_lock_is_used_with_its_airframe_alone(tmp_p
     link = LinkSettings(carrier_hz=3.32e9)
 
     def known(channel: str, antennas: dict[str, str]) -> LearnedLock | None:
-        one = RssSeries("NODE", channel, "dB re full scale", times, np.zeros(0), link, "")
-        return lock_elsewhere(antennas, one, tmp_path)
+        series = RssSeries("NODE", channel, "dB re full scale", times, np.zeros(0), link, "")
+        return lock_elsewhere(antennas, series, tmp_path)
 
     assert known("power", {"uav": "mine/afar_uav"}) == lock
     assert known("power", {}) is None

@@ -47,11 +47,11 @@ def tried() -> Tried:
     flights = [flight(1), flight(2)]
     truth = Tried.of(flights, SETTINGS).geometries[5]
     planted = []
-    for one in flights:
-        ratio = features_of([truth], one)[0][:, :3]
+    for flown in flights:
+        ratio = features_of([truth], flown)[0][:, :3]
         rank = by_medians(ratio)
         flip = np.random.default_rng(7).random(400) < 0.05
-        planted.append(dataclasses.replace(one, rank=np.where(flip, 1.0 + (rank % 4), rank)))
+        planted.append(dataclasses.replace(flown, rank=np.where(flip, 1.0 + (rank % 4), rank)))
     return Tried.of(planted, SETTINGS)
 
 

@@ -62,12 +62,12 @@ def result(folder: Path, name: str, *arguments: str, code: int = 0, **keys: Any)
     path = write_campaign(folder, name, **keys)
     out = folder / f"{name}_out"
     assert main(["campaign", str(path), "-o", str(out), *arguments]) == code
-    found: dict[str, Any] = json.loads((out / "campaign.json").read_text(encoding="utf-8"))
-    return found
+    campaign: dict[str, Any] = json.loads((out / "campaign.json").read_text(encoding="utf-8"))
+    return campaign
 
 
 @pytest.fixture(scope="module")
-def whole(folder: Path) -> dict[str, Any]:
+def summary(folder: Path) -> dict[str, Any]:
     """One campaign with everything: two settings, shared offsets, a flight that is broken."""
     broken = flight_settings("first", 1, 0.0)
     broken["flight"] = {"name": "broken"}
@@ -79,14 +79,14 @@ def whole(folder: Path) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def test_the_samples_of_all_flights_are_exported(whole: dict[str, Any], folder: Path) -> None:
+def test_the_samples_of_all_flights_are_exported(summary: dict[str, Any], folder: Path) -> None:
     """Read as JSON: each link's residual gives the RMSE of its row, and its times are those of the plan."""
     place = folder / "whole_out" / "exports"
     points = json.loads((place / "rss.geojson").read_text(encoding="utf-8"))["features"]
     links: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for point in (p["properties"] for p in points):
         links.setdefault((point["flight"], point["tower"], point["channel"]), []).append(point)
-    rows = {(r["flight"], r["tower"], r["channel"]): r for r in whole["rss"] if r["setting"] == "as written"}
+    rows = {(r["flight"], r["tower"], r["channel"]): r for r in summary["rss"] if r["setting"] == "as written"}
     assert set(links) == set(rows)
     for key, samples in links.items():
         residual = [p["residual_db"] for p in samples if p["residual_db"] is not None]
@@ -99,18 +99,18 @@ def test_the_samples_of_all_flights_are_exported(whole: dict[str, Any], folder: 
     assert "exports/rss.geojson" in (folder / "whole_out" / "SHA256SUMS").read_text(encoding="utf-8")
 
 
-def test_settings_are_run_on_every_flight(whole: dict[str, Any]) -> None:
-    rmse = whole["mean_rmse_db"]
+def test_settings_are_run_on_every_flight(summary: dict[str, Any]) -> None:
+    rmse = summary["mean_rmse_db"]
     for flight in ("first", "second"):
         assert rmse["as written"][flight] > 4.0
         assert rmse["right azimuth"][flight] == pytest.approx(FADING_DB, abs=0.25)
     assert rmse["as written"]["broken"] is None
-    keys = {(r["setting"], r["flight"], r["channel"]) for r in whole["rss"]}
-    assert len(keys) == len(whole["rss"]) == 8
+    keys = {(r["setting"], r["flight"], r["channel"]) for r in summary["rss"]}
+    assert len(keys) == len(summary["rss"]) == 8
 
 
-def test_offsets_are_shared_per_channel(whole: dict[str, Any]) -> None:
-    groups = {g["group"]: g for g in whole["calibration"]["groups"] if g["setting"] == "right azimuth"}
+def test_offsets_are_shared_per_channel(summary: dict[str, Any]) -> None:
+    groups = {g["group"]: g for g in summary["calibration"]["groups"] if g["setting"] == "right azimuth"}
     assert set(groups) == {"USRP1", "USRP2"}
     mean = np.mean(list(OFFSETS_DB.values()))
     assert groups["USRP1"]["offset_db"] == pytest.approx(mean, abs=0.3)
@@ -120,9 +120,9 @@ def test_offsets_are_shared_per_channel(whole: dict[str, Any]) -> None:
     assert groups["USRP1"]["pooled_rmse_db"] == pytest.approx(np.hypot(FADING_DB, apart / 2), abs=0.3)
 
 
-def test_one_route_flown_twice_repeats_to_the_fading_of_both(whole: dict[str, Any]) -> None:
+def test_one_route_flown_twice_repeats_to_the_fading_of_both(summary: dict[str, Any]) -> None:
     """The model is right nowhere (its azimuth is wrong), and still both flights err alike in every place."""
-    pairs = whole["repeatability"]["pairs"]
+    pairs = summary["repeatability"]["pairs"]
     assert [(p["first"], p["second"], p["channel"]) for p in pairs] == [
         ("first", "second", "USRP1"),
         ("first", "second", "USRP2"),
@@ -136,20 +136,20 @@ def test_one_route_flown_twice_repeats_to_the_fading_of_both(whole: dict[str, An
         assert abs(pair["height_difference_m"]) < 1.0
 
 
-def test_broken_flights_are_rows_with_their_message(whole: dict[str, Any], folder: Path) -> None:
-    messages = {f["flight"]: f["message"] for f in whole["failures"]}
+def test_broken_flights_are_rows_with_their_message(summary: dict[str, Any], folder: Path) -> None:
+    messages = {f["flight"]: f["message"] for f in summary["failures"]}
     assert set(messages) == {"broken", "missing"}
     assert "no such log" in messages["broken"]
     assert "no such file" in messages["missing"]
     with (folder / "whole_out" / "campaign.csv").open(encoding="utf-8", newline="") as handle:
         rows = list(csv.DictReader(handle))
     assert [r["kind"] for r in rows].count("rss") == 8
-    ranking = [entry for entry in whole["season"]["ranking"] if not entry["link"]]
+    ranking = [entry for entry in summary["season"]["ranking"] if not entry["link"]]
     best = ranking[0]["setting"]
     errors = [float(r["held_out_rmse_db"]) for r in rows if r["kind"] == "rss" and r["setting"] == best]
     assert sum(errors) / len(errors) == pytest.approx(ranking[0]["mean_db"])
     assert best == "right azimuth"
-    assert set(whole["season"]["started"]) == {"first", "second"}
+    assert set(summary["season"]["started"]) == {"first", "second"}
     failed = [r for r in rows if r["kind"] == "failed"]
     assert {(r["flight"], r["setting"]) for r in failed} == {
         ("broken", "as written"),
@@ -162,7 +162,7 @@ def test_broken_flights_are_rows_with_their_message(whole: dict[str, Any], folde
     assert page.rstrip().endswith("</html>")
 
 
-def test_every_figure_is_there_and_old_ones_are_not(whole: dict[str, Any], folder: Path) -> None:
+def test_every_figure_is_there_and_old_ones_are_not(summary: dict[str, Any], folder: Path) -> None:
     figures = folder / "whole_out" / "figures"
     expected = {
         "settings_rmse", "tracks", "distance_LW1_USRP1", "distance_LW1_USRP2", "places_LW1_USRP1", "places_LW1_USRP2",
@@ -296,8 +296,8 @@ def test_shared_offsets_have_their_closed_form() -> None:
     assert groups[0].range_db == (3.0, 7.0)
     assert groups[0].spread_db == pytest.approx(np.sqrt(8.0))
     assert groups[0].units == ("dBm", "dB re full scale")
-    everything, (one,) = pool_offsets(rows, "all")
-    assert one.offset_db == 2.3  # 14 / 6 on the grid of 0.1 dB
+    everything, (group,) = pool_offsets(rows, "all")
+    assert group.offset_db == 2.3  # 14 / 6 on the grid of 0.1 dB
     assert len({r.pooled_offset_db for r in everything}) == 1
     own, single = pool_offsets(rows, "link")
     assert [r.pooled_offset_db for r in own] == [3.0, 7.0, -1.0]
@@ -337,11 +337,14 @@ def test_k_is_chosen_on_the_other_flights() -> None:
         for flight, both in errors.items()
         for k, tv in zip((10.0, 1000.0), both, strict=True)
     ]  # fmt: skip
-    found = {t.flight: t for t in transfer_ranks(rows)}
-    assert found["c"].chosen_on == ("a", "b")
-    assert (found["c"].k, found["c"].total_variation, found["c"].kappa) == (10.0, 0.6, 0.3)
-    assert (found["c"].own_k, found["c"].own_total_variation) == (1000.0, 0.05)
-    assert (found["a"].k, found["a"].total_variation) == (1000.0, 0.5)  # (0.4 + 0.05) / 2 against (0.2 + 0.6) / 2
+    transfers = {t.flight: t for t in transfer_ranks(rows)}
+    assert transfers["c"].chosen_on == ("a", "b")
+    assert (transfers["c"].k, transfers["c"].total_variation, transfers["c"].kappa) == (10.0, 0.6, 0.3)
+    assert (transfers["c"].own_k, transfers["c"].own_total_variation) == (1000.0, 0.05)
+    assert (transfers["a"].k, transfers["a"].total_variation) == (
+        1000.0,
+        0.5,
+    )  # (0.4 + 0.05) / 2 against (0.2 + 0.6) / 2
     assert transfer_ranks([r for r in rows if r.flight == "a"]) == []
 
 
@@ -357,18 +360,18 @@ def test_flights_that_never_meet_have_no_floor() -> None:
 
 
 def test_places_are_square_cells_with_mean_residuals() -> None:
-    found = place_means(row("a", "c", [1.0, 3.0, np.nan, 9.0], [0.0] * 4, offset_db=0.0, position_m=np.array(
+    cells = place_means(row("a", "c", [1.0, 3.0, np.nan, 9.0], [0.0] * 4, offset_db=0.0, position_m=np.array(
         [[1.0, 1.0, 10.0], [19.0, 19.0, 30.0], [5.0, 5.0, 5.0], [-1.0, 1.0, 7.0]])), 20.0)  # fmt: skip
-    assert found == {(0, 0): (2.0, 20.0), (-1, 0): (9.0, 7.0)}
+    assert cells == {(0, 0): (2.0, 20.0), (-1, 0): (9.0, 7.0)}
 
 
 def test_flights_without_a_sample_that_counts_give_no_number_and_end_nothing(folder: Path) -> None:
     settings = {"as written": {}, "high": {"rss.minimum_height_m": 500}}
-    found = result(folder, "too_low", "--strict", settings=settings, calibration="all")
-    rows = [r for r in found["rss"] if r["setting"] == "high"]
+    campaign = result(folder, "too_low", "--strict", settings=settings, calibration="all")
+    rows = [r for r in campaign["rss"] if r["setting"] == "high"]
     assert [(r["n"], r["offset_db"], r["pooled_rmse_db"]) for r in rows] == [(0, None, None)] * 4
-    assert found["mean_rmse_db"]["high"] == {"first": None, "second": None}
-    assert found["mean_rmse_db"]["as written"]["first"] > 4.0
+    assert campaign["mean_rmse_db"]["high"] == {"first": None, "second": None}
+    assert campaign["mean_rmse_db"]["as written"]["first"] > 4.0
 
 
 def test_a_campaign_of_rank_flights(folder: Path) -> None:
@@ -381,16 +384,18 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
         settings["logs"] = [track, {"path": f"{name}/ri.csv", "reader": "quectel_ri", "node": "LW1"}]
         settings["rank"] = {"k": [10, 100], "advanced": {"bootstrap": 20}}
         simulate(write_yaml(folder / f"rank_{name}.yaml", settings))
-    found = result(folder, "ranks", "--export", "geojson", flights=["rank_first.yaml", "rank_second.yaml"])
+    campaign = result(folder, "ranks", "--export", "geojson", flights=["rank_first.yaml", "rank_second.yaml"])
     points = json.loads((folder / "ranks_out" / "exports" / "rank.geojson").read_text(encoding="utf-8"))["features"]
-    for row in found["rank"]:
+    for row in campaign["rank"]:
         ranks = [p["properties"] for p in points if p["properties"]["flight"] == row["flight"]]
         pairs = [(r["measured_rank"], r[f"simulated_rank_k{row['k']:g}"]) for r in ranks]
         alike = [a == b for a, b in pairs if a is not None and b]
         assert sum(alike) / len(alike) == pytest.approx(row["agreement"], abs=1e-9)
-    assert found["rss"] == []
-    assert {(r["flight"], r["k"]) for r in found["rank"]} == {(f"rank_{n}", k) for n in OFFSETS_DB for k in (10, 100)}
-    for transfer in found["rank_transfers"]:
+    assert campaign["rss"] == []
+    assert {(r["flight"], r["k"]) for r in campaign["rank"]} == {
+        (f"rank_{n}", k) for n in OFFSETS_DB for k in (10, 100)
+    }
+    for transfer in campaign["rank_transfers"]:
         assert transfer["k"] == 10  # the simulated modem's
         assert transfer["total_variation"] < 0.05
     assert {p.stem for p in (folder / "ranks_out" / "figures").glob("*.svg")} == {"rank_tv", "tracks"}
@@ -413,17 +418,17 @@ def real(name: str, folder: Path, **changes: Any) -> dict[str, Any]:
     write_yaml(folder / "campaign.yaml", entries)
     out = folder / "out"
     assert main(["campaign", str(folder / "campaign.yaml"), "-o", str(out), "--logs-root", str(REAL), "--strict"]) == 0
-    found: dict[str, Any] = json.loads((out / "campaign.json").read_text(encoding="utf-8"))
-    return found
+    campaign: dict[str, Any] = json.loads((out / "campaign.json").read_text(encoding="utf-8"))
+    return campaign
 
 
 @pytest.mark.field
 def test_two_real_flights(tmp_path: Path) -> None:
     """The measured patterns at the paper's azimuths, and what two flights differ by at the same places."""
-    found = real("dataset12", tmp_path)
+    campaign = real("dataset12", tmp_path)
     for name, rmse in (("dataset12_40m", (6.56 + 5.47) / 2), ("dataset12_70m", (7.14 + 6.30) / 2)):
-        assert found["mean_rmse_db"]["isotropic, line of sight"][name] == pytest.approx(rmse, abs=0.05)
-    for pair in found["repeatability"]["pairs"]:
+        assert campaign["mean_rmse_db"]["isotropic, line of sight"][name] == pytest.approx(rmse, abs=0.05)
+    for pair in campaign["repeatability"]["pairs"]:
         assert 3.0 < pair["rmse_db"] < 6.0
         assert pair["share"] < 0.25  # they meet on the way up and down only
         assert pair["height_difference_m"] == pytest.approx(30.0, abs=1.0)
@@ -431,8 +436,8 @@ def test_two_real_flights(tmp_path: Path) -> None:
 
 @pytest.mark.field
 def test_two_real_rank_flights_choose_one_k_when_slanted(tmp_path: Path) -> None:
-    found = real("nr_rank", tmp_path)
-    transferred = {(t["setting"], t["flight"]): t for t in found["rank_transfers"]}
+    campaign = real("nr_rank", tmp_path)
+    transferred = {(t["setting"], t["flight"]): t for t in campaign["rank_transfers"]}
     assert {t["k"] for (setting, _), t in transferred.items() if setting == "slanted"} == {10}
     for (setting, _), t in transferred.items():
         assert (t["total_variation"] < 0.11) == (setting == "slanted")
@@ -449,11 +454,11 @@ def test_a_dry_run_says_what_is_kept(folder: Path, capsys: pytest.CaptureFixture
     )
     capsys.readouterr()
     assert main(["campaign", str(path), "--dry-run", "--json", "--workers", "2"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert unlisted("campaign --dry-run", found) == []
-    assert (found["tasks"], found["kept"], found["failed"], found["to_do"]) == (4, 2, 0, 2)
-    assert {one["flight"] for one in found["to_do_tasks"]} == {"second"}
-    assert found["estimate_s"] > 0
+    forecast = json.loads(capsys.readouterr().out)
+    assert unlisted("campaign --dry-run", forecast) == []
+    assert (forecast["tasks"], forecast["kept"], forecast["failed"], forecast["to_do"]) == (4, 2, 0, 2)
+    assert {task["flight"] for task in forecast["to_do_tasks"]} == {"second"}
+    assert forecast["estimate_s"] > 0
     assert main(["campaign", "--dry-run", str(path)]) == 0
     text = capsys.readouterr().out
     assert "4 tasks, 2 kept" in text
@@ -468,8 +473,8 @@ def test_a_failed_task_leaves_its_traceback_in_a_file(folder: Path) -> None:
     broken["flight"] = {"name": "broken2"}
     broken["logs"][1]["path"] = "gone.txt"
     write_yaml(folder / "broken2.yaml", broken)
-    found = result(folder, "traced", flights=["broken2.yaml"], code=3)
-    assert "traceback" not in found["failures"][0]
+    campaign = result(folder, "traced", flights=["broken2.yaml"], code=3)
+    assert "traceback" not in campaign["failures"][0]
     text = (folder / "traced_out" / "failures" / "broken2__as_written.txt").read_text(encoding="utf-8")
     assert "there is no such log" in text
     assert "Traceback (most recent call last)" in text

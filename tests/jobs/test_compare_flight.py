@@ -72,25 +72,25 @@ def report_completes(path: Path, capsys: pytest.CaptureFixture[str], code: int =
 def test_all_out_of_coverage_has_no_numbers_but_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     at = np.arange(0, 60, 0.5)
     path = flight(tmp_path, rss={"USRP1": (at, np.full(len(at), FLOOR_DB))})
-    (one,) = compared_rss(path)
-    assert one.score.n == 0
-    assert one.score.n_out_of_coverage == len(at)
-    assert np.isnan(one.score.rmse_db)
-    assert np.isnan(one.score.offset_db)
-    assert any("no sample" in text for text in rss_warnings(one))
-    found = report_completes(path, capsys, code=1)["rss"]["LW1"]["USRP1"]  # nothing was compared: no success
-    assert found["rmse_db"] is None
-    assert found["n"] == 0
+    (series,) = compared_rss(path)
+    assert series.score.n == 0
+    assert series.score.n_out_of_coverage == len(at)
+    assert np.isnan(series.score.rmse_db)
+    assert np.isnan(series.score.offset_db)
+    assert any("no sample" in text for text in rss_warnings(series))
+    channel = report_completes(path, capsys, code=1)["rss"]["LW1"]["USRP1"]  # nothing was compared: no success
+    assert channel["rmse_db"] is None
+    assert channel["n"] == 0
     assert main(["report", str(path), "-o", str(tmp_path / "out"), "--strict"]) == 1
 
 
 def test_one_sample_fits_itself_and_claims_no_interval(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = flight(tmp_path, rss={"USRP1": ([20.0], [-70.0])})
-    (one,) = compared_rss(path)
-    assert one.score.n == 1
-    assert one.score.rmse_db <= 0.05 + 1e-9
-    assert np.isnan(one.score.correlation)
-    assert not np.isfinite(one.score.rmse_ci95_db).any()
+    (series,) = compared_rss(path)
+    assert series.score.n == 1
+    assert series.score.rmse_db <= 0.05 + 1e-9
+    assert np.isnan(series.score.correlation)
+    assert not np.isfinite(series.score.rmse_ci95_db).any()
     assert report_completes(path, capsys, code=1)["rss"]["LW1"]["USRP1"]["correlation"] is None
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "Nothing could be compared: no channel has 20 samples" in page
@@ -102,9 +102,9 @@ def test_one_wild_sample_is_flagged_kept_and_said_first(tmp_path: Path, capsys: 
     at = np.arange(0, 60, 0.5)
     level = free_space_db(at) + np.random.default_rng(3).normal(0, 2, len(at))
     path = flight(tmp_path, rss={"USRP1": (at, np.where(at == 20.0, 99.0, level))})
-    found = report_completes(path, capsys)["rss"]["LW1"]["USRP1"]
-    assert (found["n_outliers"], found["n"]) == (1, len(at))  # flagged, not dropped
-    assert found["rmse_without_outliers_db"] < 4.0 < 10.0 < found["rmse_db"]
+    channel = report_completes(path, capsys)["rss"]["LW1"]["USRP1"]
+    assert (channel["n_outliers"], channel["n"]) == (1, len(at))  # flagged, not dropped
+    assert channel["rmse_without_outliers_db"] < 4.0 < 10.0 < channel["rmse_db"]
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "1 outlying sample raises at LW1 USRP1 its RMSE" in page[: page.index("<main>")]
 
@@ -118,12 +118,12 @@ def test_duplicate_and_backward_stamps_give_the_numbers_of_the_sorted_log(tmp_pa
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     in_order = np.sort(twice)
-    (one,) = compared_rss(flight(tmp_path / "a", rss={"USRP1": (at[in_order], level[in_order])}))
-    (two,) = compared_rss(flight(tmp_path / "b", rss={"USRP1": (at[twice], level[twice])}))
-    assert one.score.n == two.score.n == len(twice)
-    assert two.score.rmse_db == pytest.approx(one.score.rmse_db, abs=1e-9)
-    assert two.score.offset_db == one.score.offset_db
-    assert two.score.rmse_ci95_db == pytest.approx(one.score.rmse_ci95_db, abs=0.2)
+    (ordered,) = compared_rss(flight(tmp_path / "a", rss={"USRP1": (at[in_order], level[in_order])}))
+    (disordered,) = compared_rss(flight(tmp_path / "b", rss={"USRP1": (at[twice], level[twice])}))
+    assert ordered.score.n == disordered.score.n == len(twice)
+    assert disordered.score.rmse_db == pytest.approx(ordered.score.rmse_db, abs=1e-9)
+    assert disordered.score.offset_db == ordered.score.offset_db
+    assert disordered.score.rmse_ci95_db == pytest.approx(ordered.score.rmse_ci95_db, abs=0.2)
 
 
 def test_nan_on_both_sides_is_censored_not_averaged(tmp_path: Path) -> None:
@@ -131,36 +131,36 @@ def test_nan_on_both_sides_is_censored_not_averaged(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.25)
     level = free_space_db(at) + rng.normal(0, 2, len(at))
     deaf = level < np.quantile(level, 0.3)
-    (whole,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, level)}))
-    (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, np.where(deaf, FLOOR_DB, level))}))
-    assert one.score.n == (~deaf).sum()
-    assert one.score.n_out_of_coverage == deaf.sum()
-    censored = one.further.censored
+    (complete,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, level)}))
+    (thinned,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, np.where(deaf, FLOOR_DB, level))}))
+    assert thinned.score.n == (~deaf).sum()
+    assert thinned.score.n_out_of_coverage == deaf.sum()
+    censored = thinned.further.censored
     assert censored.n_measured_below == deaf.sum()
     # losing the weak samples shifts the plain offset; the censored fit undoes most of that
-    assert abs(censored.offset_db - whole.score.offset_db) < abs(one.score.offset_db - whole.score.offset_db)
+    assert abs(censored.offset_db - complete.score.offset_db) < abs(thinned.score.offset_db - complete.score.offset_db)
 
 
 def test_an_optimum_at_the_edge_is_an_error_to_look_at(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.5)
     path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + 160)})
-    (one,) = compared_rss(path)
-    assert one.score.at_edge
-    assert any("edge" in text for text in rss_warnings(one))
+    (series,) = compared_rss(path)
+    assert series.score.at_edge
+    assert any("edge" in text for text in rss_warnings(series))
 
 
 def test_radio_samples_outside_the_telemetry_have_no_pose_and_are_not_out_of_coverage(tmp_path: Path) -> None:
     at = np.arange(40, 80, 0.5)
-    (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}))
-    assert one.further.n_no_pose == (at > 60).sum()
-    assert one.score.n == (at <= 60).sum()
-    assert one.score.n_out_of_coverage == 0
+    (series,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}))
+    assert series.further.n_no_pose == (at > 60).sum()
+    assert series.score.n == (at <= 60).sum()
+    assert series.score.n_out_of_coverage == 0
 
 
 def test_too_low_samples_are_counted_apart(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.5)
-    (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}))
-    assert one.further.n_too_low == 0
+    (series,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}))
+    assert series.further.n_too_low == 0
     (low,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}, rss_keys={"minimum_height_m": 50}))
     assert low.further.n_too_low == len(at)
     assert low.score.n == low.score.n_out_of_coverage == 0
@@ -178,8 +178,8 @@ def test_ri_only_ever_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         assert 0.0 <= at_k.agreement <= 1.0
         assert np.isnan(at_k.kappa) or at_k.kappa <= 1e-9  # a constant modem agrees by chance alone
         assert at_k.total_variation == pytest.approx(1.0 - at_k.histogram[1])
-    found = report_completes(path, capsys)["rank"]["LW1"]
-    assert found["measured"]["histogram"] == {"1": 0.0, "2": 1.0, "3": 0.0, "4": 0.0}
+    metrics = report_completes(path, capsys)["rank"]["LW1"]
+    assert metrics["measured"]["histogram"] == {"1": 0.0, "2": 1.0, "3": 0.0, "4": 0.0}
 
 
 def test_no_csi_is_never_a_rank(tmp_path: Path) -> None:
@@ -232,21 +232,21 @@ def test_opaque_crowns_reflect_in_the_flight(tmp_path: Path) -> None:
         return data, replay_rss(data)[0]
 
     bare_data, bare = replayed()
-    data, found = replayed(foliage="opaque")
+    data, bouncing = replayed(foliage="opaque")
     off_data, off = replayed(foliage="opaque", advanced={"crown_reflections": False})
-    bounced = int(found.replay.paths.off_crown.sum())
+    bounced = int(bouncing.replay.paths.off_crown.sum())
     assert bounced > 20
-    assert (found.replay.rss_dbm != off.replay.rss_dbm).any()
+    assert (bouncing.replay.rss_dbm != off.replay.rss_dbm).any()
     assert not off.replay.paths.off_crown.any()
     np.testing.assert_array_equal(off.replay.paths.faces, bare.replay.paths.faces)
-    for some, one, expected in (
-        (data, found, {"crown_reflections": True, "paths_off_crowns": bounced}),
+    for some, series, expected in (
+        (data, bouncing, {"crown_reflections": True, "paths_off_crowns": bounced}),
         (off_data, off, {"crown_reflections": False, "paths_off_crowns": 0}),
         (bare_data, bare, {}),
     ):
         rt = some.settings.rt.model_copy(update={"audit_links": 0})
         quiet = dataclasses.replace(some, settings=some.settings.model_copy(update={"rt": rt}))
-        settings = audit_replays(quiet, [one]).settings
+        settings = audit_replays(quiet, [series]).settings
         assert {k: v for k, v in settings.items() if "crown" in k} == expected
 
 
@@ -296,13 +296,13 @@ DIPOLES = {
 def test_same_footing_and_residual_tables_are_in_the_metrics(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     at = np.arange(0, 60, 0.25)
-    (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + rng.normal(0, 3, len(at)))}))
-    footing = one.further.averaged
-    assert footing["coherent"]["0 s"].rmse_db == pytest.approx(one.score.rmse_db)
+    (series,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + rng.normal(0, 3, len(at)))}))
+    footing = series.further.averaged
+    assert footing["coherent"]["0 s"].rmse_db == pytest.approx(series.score.rmse_db)
     assert footing["power_sum"]["4 s"].rmse_db < footing["power_sum"]["0 s"].rmse_db
-    tables = one.residual_by
+    tables = series.residual_by
     assert {"distance_m", "elevation_deg", "azimuth_deg", "uav_azimuth_deg", "heading_deg", "time_s"} <= set(tables)
-    assert tables["distance_m"].n.sum() == one.score.n
+    assert tables["distance_m"].n.sum() == series.score.n
 
 
 def test_the_track_of_a_rank_log_with_positions_of_its_own_is_the_logs(tmp_path: Path) -> None:
@@ -364,8 +364,8 @@ def without_one_row(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     lines = (folder / "USRP1.csv").read_text().splitlines()
     (folder / "USRP1.csv").write_text("\n".join(line for i, line in enumerate(lines) if i != 30) + "\n")
     assert main(["report", str(path), "-o", str(folder / "out")]) == 0
-    found: dict[str, Any] = json.loads((folder / "out" / "metrics.json").read_text())["rss"]["LW1"]["USRP1"]
-    return found
+    channel: dict[str, Any] = json.loads((folder / "out" / "metrics.json").read_text())["rss"]["LW1"]["USRP1"]
+    return channel
 
 
 @pytest.mark.parametrize("absurd", ["inf", "1e30", "500", "-inf", "1e308", "strong"])
@@ -378,16 +378,16 @@ def test_one_absurd_level_changes_no_number_and_is_told(
     lines[30] = lines[30].split(",")[0] + "," + absurd
     (tmp_path / "USRP1.csv").write_text("\n".join(lines) + "\n")
     metrics = report_completes(path, capsys)
-    found = metrics["rss"]["LW1"]["USRP1"]
+    channel = metrics["rss"]["LW1"]["USRP1"]
     if absurd == "-inf":  # of decibels: no signal
-        assert found["n_out_of_coverage"] == 1
+        assert channel["n_out_of_coverage"] == 1
     else:
         flag = "level_out_of_range" if absurd[0].isdigit() else "no_number"
-        assert found["n_flagged"] == {flag: 1}
+        assert channel["n_flagged"] == {flag: 1}
         assert any(f"1 row is flagged {flag}" in text for text in metrics["warnings"])
-        assert found["n_out_of_coverage"] == 0
+        assert channel["n_out_of_coverage"] == 0
     for key in ("offset_db", "rmse_db", "n", "at_search_edge"):
-        assert found[key] == pytest.approx(without_one_row[key]), key
+        assert channel[key] == pytest.approx(without_one_row[key]), key
 
 
 @pytest.mark.parametrize(
@@ -423,7 +423,7 @@ def rank_with_positions(folder: Path, origin: str = ORIGIN) -> Path:
 
 
 def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> None:
-    found = {}
+    by_mode = {}
     for mode in ("logged", "ignored"):
         folder = tmp_path / mode
         folder.mkdir()
@@ -431,12 +431,12 @@ def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> Non
         rt = data.settings.rt.model_copy(update={"attitude": mode})
         data = dataclasses.replace(data, settings=data.settings.model_copy(update={"rt": rt}))
         assert data.rank[0].position_m is not None
-        (found[mode],) = replay_rank(data)
-    assert np.array_equal(found["logged"].poses.position_m, found["ignored"].poses.position_m), "of the log itself"
-    turned = found["logged"].poses.rotation
+        (by_mode[mode],) = replay_rank(data)
+    assert np.array_equal(by_mode["logged"].poses.position_m, by_mode["ignored"].poses.position_m), "of the log itself"
+    turned = by_mode["logged"].poses.rotation
     assert np.allclose(turned, rotation_from_aircraft(np.zeros(58), np.zeros(58), np.full(58, 120.0)), atol=1e-6)
-    assert np.allclose(found["ignored"].poses.rotation, np.eye(3))
-    assert not np.allclose(found["logged"].replay.h, found["ignored"].replay.h, rtol=1e-3, atol=0)
+    assert np.allclose(by_mode["ignored"].poses.rotation, np.eye(3))
+    assert not np.allclose(by_mode["logged"].replay.h, by_mode["ignored"].replay.h, rtol=1e-3, atol=0)
 
 
 def test_an_attitude_that_cannot_act_is_the_first_warning(tmp_path: Path) -> None:
@@ -455,9 +455,9 @@ def test_positions_that_the_rank_log_lacks_come_from_the_track(tmp_path: Path) -
     (tmp_path / "ri.csv").write_text("\n".join(table) + "\n")
     data = gathered(path)
     assert np.isnan(data.rank[0].position_m[19]).all()
-    (found,) = replay_rank(data)
-    assert found.valid.all()
-    assert found.poses.position_m[19] == pytest.approx(found.poses.position_m[[18, 20]].mean(axis=0), abs=0.01)
+    (replayed,) = replay_rank(data)
+    assert replayed.valid.all()
+    assert replayed.poses.position_m[19] == pytest.approx(replayed.poses.position_m[[18, 20]].mean(axis=0), abs=0.01)
 
 
 def snr_flight(folder: Path, above_db: float, **link: float) -> RssResult:
@@ -469,12 +469,12 @@ def snr_flight(folder: Path, above_db: float, **link: float) -> RssResult:
 
 
 def test_an_snr_is_the_level_over_the_noise_that_is_given(tmp_path: Path) -> None:
-    one = snr_flight(tmp_path / "a", 2.5, bandwidth_hz=20e6, noise_figure_db=7)
-    found = one.further.snr
-    assert found.noise_dbm == pytest.approx(-93.96, abs=0.01)  # kTB of 20 MHz at 290 K and 7 dB
+    series = snr_flight(tmp_path / "a", 2.5, bandwidth_hz=20e6, noise_figure_db=7)
+    snr = series.further.snr
+    assert snr.noise_dbm == pytest.approx(-93.96, abs=0.01)  # kTB of 20 MHz at 290 K and 7 dB
     without_offset = snr_flight(tmp_path / "b", 0.0, bandwidth_hz=20e6, noise_figure_db=7).further.snr
-    assert found.mean_error_db - without_offset.mean_error_db == pytest.approx(2.5, abs=1e-9)
-    assert found.rmse_db == pytest.approx(np.hypot(one.further.snr.mean_error_db, one.score.rmse_db), abs=0.01)
+    assert snr.mean_error_db - without_offset.mean_error_db == pytest.approx(2.5, abs=1e-9)
+    assert snr.rmse_db == pytest.approx(np.hypot(series.further.snr.mean_error_db, series.score.rmse_db), abs=0.01)
     wider = snr_flight(tmp_path / "c", 0.0, bandwidth_hz=40e6, noise_figure_db=7).further.snr
     assert wider.mean_error_db - without_offset.mean_error_db == pytest.approx(10 * np.log10(2.0), abs=1e-6)
 

@@ -66,7 +66,7 @@ def test_every_mode_is_what_a_replay_with_its_loss_says(site):
     poses = Poses(position, np.broadcast_to(np.eye(3), (len(position), 3, 3)))
     line = linear_array(4, wavelength_m(CARRIER_HZ) / 2, 0.0)
     crowns = CrownIndex(site.trees)
-    found = {}
+    maps = {}
     for mode in mapping.FOLIAGE:
         model = mapping.foliage_model(mode, CARRIER_HZ)
 
@@ -74,21 +74,21 @@ def test_every_mode_is_what_a_replay_with_its_loss_says(site):
             return foliage_loss_db(source[paths.tower], paths.vertices_m, target[paths.pose], crowns, model)
 
         link = Link(CARRIER_HZ, dict.fromkeys(site.towers, line), line, 40.0, uav_transmits=False)
-        one = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
-        expected, siso = (replay(site, wanted, poses, field=Field(loss=loss)) for wanted in (link, one))
-        got = found[mode] = channels.of(mode)(position, ("A", "B"))
-        np.testing.assert_allclose(got.rss_siso_dbm, siso.rss_dbm, atol=1e-9)
+        single = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
+        expected, siso = (replay(site, wanted, poses, field=Field(loss=loss)) for wanted in (link, single))
+        mapped = maps[mode] = channels.of(mode)(position, ("A", "B"))
+        np.testing.assert_allclose(mapped.rss_siso_dbm, siso.rss_dbm, atol=1e-9)
         for k in (10.0, 1000.0):
             rank = channel_rank(expected.h, k)
-            np.testing.assert_array_equal(rank_of_singular_values(got.singular_values, [k])[..., 0], rank)
-        assert np.array_equal(np.isfinite(got.rss_siso_dbm), expected.has_path)
+            np.testing.assert_array_equal(rank_of_singular_values(mapped.singular_values, [k])[..., 0], rank)
+        assert np.array_equal(np.isfinite(mapped.rss_siso_dbm), expected.has_path)
         with np.errstate(divide="ignore"):
             beam = 40 + 10 * np.log10((np.abs(expected.h.sum(axis=-1)) ** 2 / 4).mean(axis=-1))
-        np.testing.assert_allclose(got.rss_mimo_dbm, np.where(expected.has_path, beam, np.nan), atol=1e-9)
-    shaded = np.isnan(found["opaque"].rss_siso_dbm) & np.isfinite(found["none"].rss_siso_dbm)
+        np.testing.assert_allclose(mapped.rss_mimo_dbm, np.where(expected.has_path, beam, np.nan), atol=1e-9)
+    shaded = np.isnan(maps["opaque"].rss_siso_dbm) & np.isfinite(maps["none"].rss_siso_dbm)
     assert 0.1 < shaded.mean() < 0.6
-    assert np.array_equal(np.isnan(found["attenuating"].rss_siso_dbm), np.isnan(found["none"].rss_siso_dbm))
-    assert (found["attenuating"].singular_values[shaded] > 0).any()
+    assert np.array_equal(np.isnan(maps["attenuating"].rss_siso_dbm), np.isnan(maps["none"].rss_siso_dbm))
+    assert (maps["attenuating"].singular_values[shaded] > 0).any()
 
 
 def test_opaque_crowns_reflect_as_a_replay_with_them_says(site):
@@ -101,24 +101,24 @@ def test_opaque_crowns_reflect_as_a_replay_with_them_says(site):
         return foliage_loss_db(*ends, crowns.index, Opaque(), paths.tree)
 
     line = linear_array(4, wavelength_m(CARRIER_HZ) / 2, 0.0)
-    found = {}
+    maps = {}
     for on in (True, False):
         channels = mapping.SiteChannels(site, settings(crown_reflections=on))
-        found[on] = {mode: channels.of(mode)(position, ("A", "B")) for mode in mapping.FOLIAGE}
+        maps[on] = {mode: channels.of(mode)(position, ("A", "B")) for mode in mapping.FOLIAGE}
         link = Link(CARRIER_HZ, dict.fromkeys(site.towers, line), line, 40.0, uav_transmits=False)
-        one = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
+        single = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
         many, siso = (
-            replay(site, w, poses, Search(crowns=crowns if on else None), Field(loss=loss)) for w in (link, one)
+            replay(site, w, poses, Search(crowns=crowns if on else None), Field(loss=loss)) for w in (link, single)
         )
-        np.testing.assert_allclose(found[on]["opaque"].rss_siso_dbm, siso.rss_dbm, atol=1e-9)
-        rank = rank_of_singular_values(found[on]["opaque"].singular_values, [100.0])[..., 0]
+        np.testing.assert_allclose(maps[on]["opaque"].rss_siso_dbm, siso.rss_dbm, atol=1e-9)
+        rank = rank_of_singular_values(maps[on]["opaque"].singular_values, [100.0])[..., 0]
         np.testing.assert_array_equal(rank, channel_rank(many.h, 100.0))
         assert channels.paths_off_crowns == siso.paths.off_crown.sum()
         assert (channels.paths_off_crowns > 20) == on
     for mode in ("none", "attenuating"):  # bit by bit
-        np.testing.assert_array_equal(found[True][mode].rss_siso_dbm, found[False][mode].rss_siso_dbm)
-        np.testing.assert_array_equal(found[True][mode].singular_values, found[False][mode].singular_values)
-    assert (found[True]["opaque"].rss_siso_dbm != found[False]["opaque"].rss_siso_dbm).any()
+        np.testing.assert_array_equal(maps[True][mode].rss_siso_dbm, maps[False][mode].rss_siso_dbm)
+        np.testing.assert_array_equal(maps[True][mode].singular_values, maps[False][mode].singular_values)
+    assert (maps[True]["opaque"].rss_siso_dbm != maps[False]["opaque"].rss_siso_dbm).any()
 
 
 def test_a_broadside_beam_gains_the_number_of_elements():
@@ -127,11 +127,13 @@ def test_a_broadside_beam_gains_the_number_of_elements():
     site = Site("air", SiteFrame(35.7, -78.7), {"A": tower("A", 0.0, 0.0)})
     channels = mapping.SiteChannels(site, settings(max_depth=0, foliage=("none",)))
     places = np.array([[3000.0, 0.0, 10.0], [0.0, 3000.0, 10.0]])
-    found = channels.of("none")(places, ("A",))
-    gain = found.rss_mimo_dbm[:, 0] - found.rss_siso_dbm[:, 0]
+    channels_there = channels.of("none")(places, ("A",))
+    gain = channels_there.rss_mimo_dbm[:, 0] - channels_there.rss_siso_dbm[:, 0]
     assert gain[0] == pytest.approx(10 * np.log10(4), abs=1e-3)
     assert gain[1] < -40
-    np.testing.assert_allclose(found.rss_siso_dbm[0], 40 - 20 * np.log10(4 * np.pi * 3000 / wavelength_m(CARRIER_HZ)))
+    np.testing.assert_allclose(
+        channels_there.rss_siso_dbm[0], 40 - 20 * np.log10(4 * np.pi * 3000 / wavelength_m(CARRIER_HZ))
+    )
 
 
 def test_modes_share_one_search_and_nothing_is_kept(site):
@@ -157,11 +159,11 @@ def test_heights_are_above_the_ground_of_the_elevation_model():
     line_of_sight = settings(max_depth=0, foliage=("none",))
     there = np.array([[500.0, 40.0, 30.0]])
     raised = there + np.array([0.0, 0.0, 5.0])  # 1 % over 500 m
-    found = mapping.SiteChannels(hilly, line_of_sight).of("none")(there, ("A",))
+    sloping = mapping.SiteChannels(hilly, line_of_sight).of("none")(there, ("A",))
     expected = mapping.SiteChannels(flat, line_of_sight).of("none")(raised, ("A",))
-    assert found.rss_siso_dbm[0, 0] == pytest.approx(expected.rss_siso_dbm[0, 0], abs=1e-9)
+    assert sloping.rss_siso_dbm[0, 0] == pytest.approx(expected.rss_siso_dbm[0, 0], abs=1e-9)
     level = mapping.SiteChannels(flat, line_of_sight).of("none")(there, ("A",))
-    assert abs(found.rss_siso_dbm[0, 0] - level.rss_siso_dbm[0, 0]) > 1e-4
+    assert abs(sloping.rss_siso_dbm[0, 0] - level.rss_siso_dbm[0, 0]) > 1e-4
 
 
 def test_a_threshold_puts_weak_positions_out_of_coverage(site):
@@ -215,8 +217,8 @@ def test_the_command_prints_one_object_that_is_the_metrics(made):
     assert {(m["antennas"], m["foliage"]) for m in printed["coverage"]} == {
         (a, f) for a in ("SISO", "MIMO") for f in ("none", "opaque")
     }
-    for one in printed["rank"]:
-        assert sum(one["share"].values()) == pytest.approx(1)
+    for entry in printed["rank"]:
+        assert sum(entry["share"].values()) == pytest.approx(1)
     assert set(printed["stages"]) >= {"maps_s", "leave one out_s", "export_s"}
 
 
@@ -311,10 +313,10 @@ def test_one_missing_library_costs_its_own_file_alone(site, tmp_path, monkeypatc
     chosen = settings(spacing_m=250.0, rank_altitudes_m=(30.0,), ks=(10.0,), foliage=("none",), study=False)
     outcome = mapping.make_maps(site, chosen, Stages())
     monkeypatch.setitem(sys.modules, module, None)
-    told = []
-    mapping.export_maps(outcome, tmp_path, lambda text, *_: told.append(text))
+    messages = []
+    mapping.export_maps(outcome, tmp_path, lambda text, *_: messages.append(text))
     assert {path.name for path in tmp_path.iterdir()} & {"maps.nc", "maps.tif"} == {left}
-    assert any(module in text and "aerpaw-cmp[geo]" in text for text in told)
+    assert any(module in text and "aerpaw-cmp[geo]" in text for text in messages)
 
 
 def test_geotiff_is_written_where_its_library_is(made):
@@ -377,12 +379,12 @@ def test_the_stated_curve_is_the_one_that_maps_are_held_against(made):
 def test_paths_of_infinite_loss_are_no_paths(site):
     behind = np.array([[180.0, 0.0, 3.0], [50.0, 0.0, 3.0]])  # behind the hedge; in front of it
     poses = Poses(behind, np.broadcast_to(np.eye(3), (2, 3, 3)))
-    one = Link(CARRIER_HZ, {"A": single_element()}, single_element(), 40.0)
+    link = Link(CARRIER_HZ, {"A": single_element()}, single_element(), 40.0)
 
     def loss(paths, source, target):
         return foliage_loss_db(source[paths.tower], paths.vertices_m, target[paths.pose], site.trees, Opaque())
 
-    result = replay(site, one, poses, field=Field(loss=loss))
+    result = replay(site, link, poses, field=Field(loss=loss))
     assert result.has_path[:, 0].tolist() == [False, True]
     assert np.isnan(result.rss_dbm[0, 0])
     assert np.isnan(result.rss_power_dbm[0, 0])

@@ -37,22 +37,24 @@ def test_terms_add_up_to_the_level_of_the_report(flown, tower):
     rows = table[table.tower == tower]
     seen = set()
     for row in rows.iloc[:: max(len(rows) // 5, 1)].itertuples():
-        found = run_explain(path, time=row.time_utc, tower=tower)
-        assert found.time_utc == row.time_utc
-        assert (found.position_m[0], found.position_m[2]) == pytest.approx((row.east_m, row.up_m), abs=1e-3)
-        assert found.measured_db == pytest.approx(row.measured_db, abs=1e-3)
-        assert found.level_dbm == pytest.approx(row.simulated_dbm, abs=1e-3)
+        explained = run_explain(path, time=row.time_utc, tower=tower)
+        assert explained.time_utc == row.time_utc
+        assert (explained.position_m[0], explained.position_m[2]) == pytest.approx((row.east_m, row.up_m), abs=1e-3)
+        assert explained.measured_db == pytest.approx(row.measured_db, abs=1e-3)
+        assert explained.level_dbm == pytest.approx(row.simulated_dbm, abs=1e-3)
         field = 0.0
-        for one in found.paths:
-            assert one.level_dbm == pytest.approx(found.transmit_power_dbm + sum(one.terms_db.values()), abs=1e-9)
-            assert one.length_m == pytest.approx(sum(one.segments_m))
-            assert one.delay_ns == pytest.approx(one.length_m / 0.299792458)
-            spreading = 20 * np.log10(299792458 / 3.3e9 / (4 * np.pi * one.length_m))
-            assert one.terms_db["spreading"] == pytest.approx(spreading, abs=1e-9)
-            assert one.terms_db["rough surfaces"] == -1.5 * one.depth
-            field += 10 ** (one.level_dbm / 20) * np.exp(1j * np.radians(one.phase_deg))
-            seen |= set(one.terms_db)
-            for bounce in one.bounces:  # what a reflection takes lies between its two coefficients
+        for path_ in explained.paths:
+            assert path_.level_dbm == pytest.approx(
+                explained.transmit_power_dbm + sum(path_.terms_db.values()), abs=1e-9
+            )
+            assert path_.length_m == pytest.approx(sum(path_.segments_m))
+            assert path_.delay_ns == pytest.approx(path_.length_m / 0.299792458)
+            spreading = 20 * np.log10(299792458 / 3.3e9 / (4 * np.pi * path_.length_m))
+            assert path_.terms_db["spreading"] == pytest.approx(spreading, abs=1e-9)
+            assert path_.terms_db["rough surfaces"] == -1.5 * path_.depth
+            field += 10 ** (path_.level_dbm / 20) * np.exp(1j * np.radians(path_.phase_deg))
+            seen |= set(path_.terms_db)
+            for bounce in path_.bounces:  # what a reflection takes lies between its two coefficients
                 least, most = sorted((-bounce.te_db, -bounce.tm_db))
                 assert least - 1e-9 <= bounce.loss_db <= most + 1e-9
         assert 20 * np.log10(abs(field)) == pytest.approx(row.simulated_dbm, abs=1e-3)
@@ -62,15 +64,15 @@ def test_terms_add_up_to_the_level_of_the_report(flown, tower):
 def test_command_line_and_json(flown, capsys):
     path, _ = flown
     assert main(["explain", str(path), "--time", "4", "--tower", "LW1", "--json", "--quiet"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert unlisted("explain", found) == []
-    assert found["tower"] == "LW1"
-    assert found["time_s"] == 4.0
-    assert found["paths"][0]["path"] == "line of sight"
+    explained = json.loads(capsys.readouterr().out)
+    assert unlisted("explain", explained) == []
+    assert explained["tower"] == "LW1"
+    assert explained["time_s"] == 4.0
+    assert explained["paths"][0]["path"] == "line of sight"
     assert main(["explain", str(path), "--time", "2025-06-01T10:00:04", "--tower", "LW1", "--quiet"]) == 0  # local time
-    said = capsys.readouterr().out
-    assert "line of sight" in said
-    assert "coherent sum" in said
+    text = capsys.readouterr().out
+    assert "line of sight" in text
+    assert "coherent sum" in text
 
 
 @pytest.mark.parametrize(

@@ -34,25 +34,25 @@ def rt(**more: object) -> RtSettings:
 
 @pytest.mark.parametrize("sigma", [0.0, 0.02, 0.1, 1.0, 9.0])
 def test_the_replay_is_the_two_ray_form_of_that_roughness(sigma):
-    found = replay_poses(BARE, rt(ground_roughness_m=sigma), LINK, POSES)
+    replayed = replay_poses(BARE, rt(ground_roughness_m=sigma), LINK, POSES)
     expected = two_ray_dbm(LW1[None], POSES.position_m, 3.4e9, 40.0, roughness_m=sigma)
-    np.testing.assert_allclose(found.rss_dbm, expected, atol=1e-6)
-    assert found.has_path.all()
+    np.testing.assert_allclose(replayed.rss_dbm, expected, atol=1e-6)
+    assert replayed.has_path.all()
 
 
 def test_roofs_and_walls_stay_smooth_and_the_second_implementation_agrees():
     settings = rt(ground_roughness_m=0.05, max_depth=2)
     few = Poses(POSES.position_m[::6], POSES.rotation[::6])
-    found = replay_poses(SITE, settings, LINK, few)
+    replayed = replay_poses(SITE, settings, LINK, few)
     rough = roughness_loss(SITE, settings, LINK.carrier_hz)
     assert rough is not None
-    loss = rough(found.paths, LW1[None], few.position_m)
-    ground = (found.faces.solid[found.paths.faces] < 0) & (found.paths.faces >= 0)
+    loss = rough(replayed.paths, LW1[None], few.position_m)
+    ground = (replayed.faces.solid[replayed.paths.faces] < 0) & (replayed.paths.faces >= 0)
     np.testing.assert_array_equal(loss > 0, ground.any(axis=1))
     expected = Expected.of(LINK, reference.ExpectedLoss(ground_roughness_m=0.05))
     second = reference.Reference(SITE, "LW1", expected.link, expected.loss)
-    for row in np.flatnonzero(ground.any(axis=1) & (found.paths.depth == 1)):
-        target = tuple(few.position_m[found.paths.pose[row]].tolist())
+    for row in np.flatnonzero(ground.any(axis=1) & (replayed.paths.depth == 1)):
+        target = tuple(few.position_m[replayed.paths.pose[row]].tolist())
         mirrors = [m for m in second.mirrors if m.solid < 0]
         assert second.loss_db(mirrors[:1], target) == pytest.approx(loss[row], rel=1e-9)
 

@@ -86,8 +86,8 @@ def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> N
         stated = settings.model_dump(mode="json", exclude_unset=True)
         stated["link"] = {"rss": {"carrier_hz": 3.3e9, "tower": {"antenna": {"model": "sphere", "file": "a.csv"}}}}
         (tmp_path / "learned.yaml").write_text(yaml.safe_dump(stated), encoding="utf-8")
-        found = run_flight(load_data(load_flight(tmp_path / "learned.yaml"), tmp_path), audit=False, ladder=True)
-        rows = {row.model: row for row in found.result.ladder}
+        outcome = run_flight(load_data(load_flight(tmp_path / "learned.yaml"), tmp_path), audit=False, ladder=True)
+        rows = {row.model: row for row in outcome.result.ladder}
         learned = {name: row for name, row in rows.items() if "learned sphere" in name or "as set" in name}
         assert len(learned) >= 2
         assert all(np.isfinite(row.rmse_heldout_db) == scored for row in learned.values())
@@ -166,13 +166,13 @@ def test_every_model_is_a_flight_file(model: Model, tmp_path: Path) -> None:
     antenna = {"model": "gain_grid", "file": "a.mat", "variable": "g"}
     stated["link"] = {"rss": {"carrier_hz": 3.3e9, "tower": {"antenna": antenna}, "uav": {"antenna": antenna}}}
     (tmp_path / "b.yaml").write_text(yaml.safe_dump(recommended_settings(stated, model)), encoding="utf-8")
-    found = load_flight(tmp_path / "b.yaml")
-    assert found.link.rss.uav.antenna.model == ("iso" if model.antennas == "isotropic" else "gain_grid")
-    assert found.site.without_buildings is not model.buildings
-    assert found.rt.attitude == model.attitude
-    assert (found.rt.max_depth > 0) is (model.ground != "none")
-    assert (found.rss.field == "power") is (model.ground == "power sum")
-    assert (found.rt.foliage == "none") is (model.trees == "none")
+    settings = load_flight(tmp_path / "b.yaml")
+    assert settings.link.rss.uav.antenna.model == ("iso" if model.antennas == "isotropic" else "gain_grid")
+    assert settings.site.without_buildings is not model.buildings
+    assert settings.rt.attitude == model.attitude
+    assert (settings.rt.max_depth > 0) is (model.ground != "none")
+    assert (settings.rss.field == "power") is (model.ground == "power sum")
+    assert (settings.rt.foliage == "none") is (model.trees == "none")
 
 
 def test_channels_that_share_a_replay_cost_it_once() -> None:

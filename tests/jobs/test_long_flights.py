@@ -26,11 +26,11 @@ def one_tower() -> FlightData:
 def test_a_clock_predicted_in_blocks_is_that_of_the_whole_flight(
     one_tower: FlightData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = replay_job.estimate_clocks(one_tower)
+    at_once = replay_job.estimate_clocks(one_tower)
     monkeypatch.setattr(replay_job, "BLOCK", 1500)
     monkeypatch.setattr(track_room, "AT_ONCE", 700)
     parts = replay_job.estimate_clocks(one_tower)
-    for a, b in zip(whole, parts, strict=True):
+    for a, b in zip(at_once, parts, strict=True):
         assert a is not None
         assert b is not None
         np.testing.assert_equal(dataclasses.asdict(b.result), dataclasses.asdict(a.result))  # to the last digit
@@ -42,12 +42,12 @@ def test_a_part_of_the_flight_turns_as_the_whole_does(one_tower: FlightData) -> 
     track = one_tower.track
     assert track is not None
     instants = np.arange(track.start_ns - 2 * 10**9, track.end_ns + 2 * 10**9, 370_000_000).astype("datetime64[ns]")
-    whole = track.pose_at(instants)
-    assert whole.valid.sum() > 100
+    poses = track.pose_at(instants)
+    assert poses.valid.sum() > 100
     for few in ([5], [40, 41], [3, 200], [0, 1, 2], list(range(100, 400, 7))):
         part = track.pose_at(instants[few])
-        np.testing.assert_allclose(part.rotation, whole.rotation[few], atol=1e-13)
-        np.testing.assert_array_equal(part.attitude_known, whole.attitude_known[few])
+        np.testing.assert_allclose(part.rotation, poses.rotation[few], atol=1e-13)
+        np.testing.assert_array_equal(part.attitude_known, poses.attitude_known[few])
 
 
 def test_a_replay_in_blocks_is_the_replay(one_tower: FlightData, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,16 +55,16 @@ def test_a_replay_in_blocks_is_the_replay(one_tower: FlightData, monkeypatch: py
     settings = one_tower.settings
     off = settings.model_copy(update={"rss": settings.rss.model_copy(update={"lag": "off"})})
     data = dataclasses.replace(one_tower, settings=off)
-    whole = replay_job.replay_rss(data)
+    at_once = replay_job.replay_rss(data)
     monkeypatch.setattr(replay_job, "BLOCK", 77)
     monkeypatch.setattr(track_room, "AT_ONCE", 31)
     asked: list[float] = []
     parts = replay_job.replay_rss(data, lambda _text, share=None, /: asked.append(share))
     assert len([s for s in asked if s is not None]) > 5
-    for one, two in zip(whole, parts, strict=True):
-        np.testing.assert_array_equal(two.replay.rss_dbm, one.replay.rss_dbm)
-        np.testing.assert_array_equal(two.replay.h, one.replay.h)
-        assert len(two.replay.paths) == len(one.replay.paths)
+    for single, in_blocks in zip(at_once, parts, strict=True):
+        np.testing.assert_array_equal(in_blocks.replay.rss_dbm, single.replay.rss_dbm)
+        np.testing.assert_array_equal(in_blocks.replay.h, single.replay.h)
+        assert len(in_blocks.replay.paths) == len(single.replay.paths)
         for name in ("pose", "tower", "depth", "faces", "vertices_m", "tree"):
-            np.testing.assert_array_equal(getattr(two.replay.paths, name), getattr(one.replay.paths, name))
-        assert two.replay.left_out == one.replay.left_out
+            np.testing.assert_array_equal(getattr(in_blocks.replay.paths, name), getattr(single.replay.paths, name))
+        assert in_blocks.replay.left_out == single.replay.left_out

@@ -36,21 +36,21 @@ link: {rss: {carrier_hz: 3.3e9, uav: {antenna: {model: file, file: antenna.csv}}
 
 
 def test_every_named_file_is_there_once_with_its_digest(folder: Path) -> None:
-    found = {entry.path: entry for entry in other_inputs(load_flight(folder / "flight.yaml"), folder / "flight.yaml")}
-    assert set(found) == {"flight.yaml", "own/site.yaml", "dem.tif", "antenna.csv"}
-    for name, entry in found.items():
+    entries = {entry.path: entry for entry in other_inputs(load_flight(folder / "flight.yaml"), folder / "flight.yaml")}
+    assert set(entries) == {"flight.yaml", "own/site.yaml", "dem.tif", "antenna.csv"}
+    for name, entry in entries.items():
         place = folder / ("own/dem.tif" if name == "dem.tif" else name)
         assert entry.sha256 == sha256(place.read_bytes()).hexdigest()
         assert entry.lines == entry.accepted + entry.rejected + entry.blank == 0
-    assert found["antenna.csv"].role == "link.rss.uav.antenna.file"
-    assert found["dem.tif"].role == "site: dem.path"
+    assert entries["antenna.csv"].role == "link.rss.uav.antenna.file"
+    assert entries["dem.tif"].role == "site: dem.path"
 
 
 def test_a_packaged_site_counts(folder: Path) -> None:
     text = (folder / "flight.yaml").read_text().replace("own/site.yaml", "lake_wheeler")
     (folder / "flight.yaml").write_text(text)
-    found = {entry.path: entry for entry in other_inputs(load_flight(folder / "flight.yaml"), folder / "flight.yaml")}
-    packaged = found["aerpaw_cmp/site/data/lake_wheeler.yaml"]
+    entries = {entry.path: entry for entry in other_inputs(load_flight(folder / "flight.yaml"), folder / "flight.yaml")}
+    packaged = entries["aerpaw_cmp/site/data/lake_wheeler.yaml"]
     assert packaged.sha256 == sha256(SITE.read_bytes()).hexdigest()
 
 

@@ -22,11 +22,11 @@ TILES = 28  # 17 x 33 positions in tiles of 5
 def environ() -> dict[str, str]:
     """TLS for scheduler, worker and client, as a user's configuration names it."""
     security = distributed.security.Security.temporary()
-    found = {"DASK_DISTRIBUTED__COMM__TLS__CA_FILE": security.tls_ca_file}
+    variables = {"DASK_DISTRIBUTED__COMM__TLS__CA_FILE": security.tls_ca_file}
     for role in ("client", "scheduler", "worker"):
         for kind in ("cert", "key"):
-            found[f"DASK_DISTRIBUTED__COMM__TLS__{role}__{kind}".upper()] = getattr(security, f"tls_{role}_{kind}")
-    return {**os.environ, **found}
+            variables[f"DASK_DISTRIBUTED__COMM__TLS__{role}__{kind}".upper()] = getattr(security, f"tls_{role}_{kind}")
+    return {**os.environ, **variables}
 
 
 def computed(store: Path) -> int:
@@ -57,16 +57,16 @@ def test_a_cluster_that_vanishes_costs_the_tiles_in_work(environ: dict[str, str]
     finally:
         scheduler.kill()
         scheduler.communicate()
-    _, told = run.communicate(timeout=120)
-    assert run.returncode == 3, told
-    assert "Traceback" not in told
-    assert told.count("the scheduler of the workers went away") == 1
-    kept = computed(tmp_path / "out.zarr")
-    assert 2 <= kept < TILES
+    _, messages = run.communicate(timeout=120)
+    assert run.returncode == 3, messages
+    assert "Traceback" not in messages
+    assert messages.count("the scheduler of the workers went away") == 1
+    count = computed(tmp_path / "out.zarr")
+    assert 2 <= count < TILES
     again = subprocess.run(
         [*command, "--json"], cwd=tmp_path, env=environ, capture_output=True, text=True, check=False, timeout=300
     )
     assert again.returncode == 0, again.stderr
-    assert f"{kept} of {TILES} tiles were computed before" in again.stderr
+    assert f"{count} of {TILES} tiles were computed before" in again.stderr
     assert json.loads(again.stdout)["tiles"]["tiles"] == TILES
     assert computed(tmp_path / "out.zarr") == TILES

@@ -38,18 +38,18 @@ def make(store, settings=SETTINGS, **more):
 
 
 @pytest.fixture(scope="module")
-def whole():
+def in_one_piece():
     return mapping.make_maps(load_site(SITE), replace(SETTINGS, tile_m=None), Stages(), name=SITE)
 
 
-def assert_like(outcome, whole):
-    assert (outcome.paths, outcome.paths_off_crowns) == (whole.paths, whole.paths_off_crowns)
-    for mode, one in outcome.maps.items():
+def assert_like(outcome, reference):
+    assert (outcome.paths, outcome.paths_off_crowns) == (reference.paths, reference.paths_off_crowns)
+    for mode, maps in outcome.maps.items():
         for name in PLANES:
-            expected = getattr(whole.maps[mode], name)
+            expected = getattr(reference.maps[mode], name)
             if name in ("spread_db", "condition_db"):
                 expected = np.minimum(expected, RATIO_LIMIT_DB)
-            np.testing.assert_allclose(getattr(one, name), expected, atol=0.00501, err_msg=f"{mode} {name}")
+            np.testing.assert_allclose(getattr(maps, name), expected, atol=0.00501, err_msg=f"{mode} {name}")
 
 
 class Watched(Here):
@@ -66,82 +66,82 @@ class Watched(Here):
             done(place, function(item))
 
 
-def test_a_store_holds_the_map_in_one_piece(tmp_path, whole):
+def test_a_store_holds_the_map_in_one_piece(tmp_path, in_one_piece):
     outcome = make(tmp_path / "map.zarr")
-    assert_like(outcome, whole)
+    assert_like(outcome, in_one_piece)
     assert outcome.tiles == {
         "store": str(tmp_path / "map.zarr"), "tiles": TILES, "positions": 153, "shown_every": 1,
     }  # fmt: skip
     with xarray.open_zarr(tmp_path / "map.zarr", consolidated=False) as data:
         at = data.isel(foliage=0, y=11, x=7)
-        level = whole.maps["none"].rss("siso", "LW2")[0, 11 * 9 + 7]
+        level = in_one_piece.maps["none"].rss("siso", "LW2")[0, 11 * 9 + 7]
         assert float(at["rss_siso"].sel(height=30.0)[1]) == pytest.approx(level, abs=0.006)
         assert data["rank"].dims == ("foliage", "tower", "k", "height_of_rank", "y", "x")
         assert data["rss_siso"].chunks[-1] == (5, 4)
         assert data.attrs["Conventions"] == "CF-1.11"
-        serving = whole.maps["none"].grid.raster(whole.maps["none"].serving)
+        serving = in_one_piece.maps["none"].grid.raster(in_one_piece.maps["none"].serving)
         np.testing.assert_array_equal(data["serving_tower"], serving)
 
 
-def test_every_so_many_positions_of_a_large_map_are_shown(tmp_path, whole, monkeypatch):
+def test_every_so_many_positions_of_a_large_map_are_shown(tmp_path, in_one_piece, monkeypatch):
     monkeypatch.setattr(mapping, "SHOWN_POSITIONS", 20)
     outcome = make(tmp_path / "map.zarr")
     assert outcome.tiles["shown_every"] == 3
     shown = outcome.maps["none"]
     assert shown.grid.shape == (6, 3)
-    every = whole.maps["none"].grid.raster(whole.maps["none"].rss_siso_dbm[0, 2])
+    every = in_one_piece.maps["none"].grid.raster(in_one_piece.maps["none"].rss_siso_dbm[0, 2])
     np.testing.assert_allclose(shown.grid.raster(shown.rss_siso_dbm[0, 2]), every[::3, ::3], atol=0.006)
     assert "one in 3" in " ".join(mapping._notes(outcome))
 
 
 def test_many_receivers_are_tiles_by_themselves_and_few_are_not():
-    one, grid = replace(SETTINGS, tile_m=None), Grid.over_area((0.0, 800.0, 0.0, 800.0), 1.0)
-    assert one.tile_cells(grid) == 128  # 640 000 positions at two heights
-    assert replace(one, rank_altitudes_m=(30.0,)).tile_cells(grid) is None
+    chosen, grid = replace(SETTINGS, tile_m=None), Grid.over_area((0.0, 800.0, 0.0, 800.0), 1.0)
+    assert chosen.tile_cells(grid) == 128  # 640 000 positions at two heights
+    assert replace(chosen, rank_altitudes_m=(30.0,)).tile_cells(grid) is None
     assert SETTINGS.tile_cells(grid) == 5
 
 
 @pytest.mark.parametrize(
     "ending", [InputError("the scheduler of the workers went away"), KeyboardInterrupt()], ids=["cluster", "interrupt"]
 )
-def test_a_half_written_store_is_gone_on_with(ending, tmp_path, whole):
+def test_a_half_written_store_is_gone_on_with(ending, tmp_path, in_one_piece):
     crew = Watched(ending, after=3)
     with pytest.raises(type(ending)):
         make(tmp_path / "map.zarr", workers=crew)
     rest = Watched()
-    assert_like(make(tmp_path / "map.zarr", workers=rest), whole)
+    assert_like(make(tmp_path / "map.zarr", workers=rest), in_one_piece)
     assert crew.numbers == [0, 1, 2]
     assert rest.numbers == [3, 4, 5, 6, 7]
     done = Watched()
-    assert_like(make(tmp_path / "map.zarr", workers=done), whole)
+    assert_like(make(tmp_path / "map.zarr", workers=done), in_one_piece)
     assert not done.numbers, "nothing is computed twice"
 
 
-def test_a_store_killed_as_it_was_made_is_made_anew(tmp_path, whole):
+def test_a_store_killed_as_it_was_made_is_made_anew(tmp_path, in_one_piece):
     half = tmp_path / ".map.zarr.aerpaw-part"
     half.mkdir()
     (half / "zarr.json").write_text('{"zarr_for')
-    assert_like(make(tmp_path / "map.zarr"), whole)
+    assert_like(make(tmp_path / "map.zarr"), in_one_piece)
     assert not half.exists()
 
 
-def test_a_tile_cut_short_before_its_entry_is_computed_again(tmp_path, whole):
+def test_a_tile_cut_short_before_its_entry_is_computed_again(tmp_path, in_one_piece):
     make(tmp_path / "map.zarr")
     (tmp_path / "map.zarr" / LEDGER / "c" / "1" / "0" / "0").unlink()
     (tmp_path / "map.zarr" / "rss_siso" / "c" / "0" / "0" / "0" / "1" / "0").write_bytes(b"cut")
     crew = Watched()
-    assert_like(make(tmp_path / "map.zarr", workers=crew), whole)
+    assert_like(make(tmp_path / "map.zarr", workers=crew), in_one_piece)
     assert crew.numbers == [2]
 
 
-def test_the_store_of_another_job_is_refused(tmp_path, whole):
+def test_the_store_of_another_job_is_refused(tmp_path, in_one_piece):
     store = tmp_path / "map.zarr"
     make(store, replace(SETTINGS, carrier_hz=2e9, max_depth=0))
     with pytest.raises(
         UsageError, match=r"another job: carrier_hz and 1 more differs \(2000000000.0, now 3400000000.0\)"
     ):
         make(store)
-    assert_like(make(store, force=True), whole)
+    assert_like(make(store, force=True), in_one_piece)
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "rss_siso/c/notes.txt", "rss_siso/c/link"])
@@ -174,7 +174,7 @@ def test_what_is_no_store_stays(content, tmp_path):
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
 
 
-def test_a_full_disk_is_one_message_and_the_run_goes_on_later(tmp_path, whole):
+def test_a_full_disk_is_one_message_and_the_run_goes_on_later(tmp_path, in_one_piece):
     store, soft, hard = tmp_path / "map.zarr", *resource.getrlimit(resource.RLIMIT_FSIZE)
     written, full = [], mapping.TileStore.write
 
@@ -192,7 +192,7 @@ def test_a_full_disk_is_one_message_and_the_run_goes_on_later(tmp_path, whole):
             make(store)
     assert caught.value.exit_code == 3
     crew = Watched()
-    assert_like(make(store, workers=crew), whole)
+    assert_like(make(store, workers=crew), in_one_piece)
     assert crew.numbers == [2, 3, 4, 5, 6, 7]
 
 
@@ -208,7 +208,7 @@ def kills_once(order):
 
 
 @pytest.mark.parametrize("always", [False, True], ids=["once", "always"])
-def test_a_killed_worker_costs_one_tile(always, tmp_path, whole, monkeypatch):
+def test_a_killed_worker_costs_one_tile(always, tmp_path, in_one_piece, monkeypatch):
     monkeypatch.setenv("TEST_MAP_STORE", str(tmp_path))
     if always:
         (tmp_path / "always").touch()
@@ -218,11 +218,11 @@ def test_a_killed_worker_costs_one_tile(always, tmp_path, whole, monkeypatch):
             with pytest.raises(InputError, match="1 of 8 tiles were lost: its worker process ended"):
                 make(tmp_path / "map.zarr", workers=Processes(2))
         else:
-            assert_like(make(tmp_path / "map.zarr", workers=Processes(2)), whole)
+            assert_like(make(tmp_path / "map.zarr", workers=Processes(2)), in_one_piece)
     tries = sorted(int(line) for line in (tmp_path / "tries").read_text().split())
     assert tries == sorted([*range(TILES), *[4] * (2 if always else 1)])
     crew = Watched()
-    assert_like(make(tmp_path / "map.zarr", workers=crew), whole)
+    assert_like(make(tmp_path / "map.zarr", workers=crew), in_one_piece)
     assert crew.numbers == ([4] if always else [])
 
 
@@ -238,8 +238,8 @@ def test_the_command_in_tiles(tmp_path):
     command = [sys.executable, "-m", "aerpaw_cmp", "map", SITE, "-o", "out", *words]
     first = subprocess.run([*command, "--json"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert first.returncode == 0, first.stderr
-    told = json.loads(first.stdout)["tiles"]
-    assert (told["store"], told["tiles"], told["shown_every"]) == ("out.zarr", 8, 1)
+    tiles = json.loads(first.stdout)["tiles"]
+    assert (tiles["store"], tiles["tiles"], tiles["shown_every"]) == ("out.zarr", 8, 1)
     assert (tmp_path / "out" / "map.html").is_file()
     other = subprocess.run([*command, "-k", "5"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert other.returncode == 2

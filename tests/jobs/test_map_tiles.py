@@ -49,12 +49,12 @@ def in_tiles(site, chosen, cells):
     """Maps by mode, and how many buildings each tile has."""
     channels = mapping.SiteChannels(site, chosen)
     tiling = Tiling(Grid.over_area(site.area_m, chosen.spacing_m), cells)
-    done, kept = [], []
+    done, buildings = [], []
     for number in range(len(tiling)):
         done.append(channels.tile(mapping.TileOrder(site="", settings=chosen, cells=cells, number=number)))
-        kept.append(len(channels.site.buildings))
+        buildings.append(len(channels.site.buildings))
     maps = {mode: tiling.joined({n: tile.maps[mode] for n, tile in enumerate(done)}) for mode in chosen.foliage}
-    return maps, kept, sum(tile.paths for tile in done)
+    return maps, buildings, sum(tile.paths for tile in done)
 
 
 def in_one_piece(site, chosen):
@@ -67,10 +67,10 @@ def in_one_piece(site, chosen):
 
 
 def assert_equal(maps, others):
-    for mode, one in maps.items():
+    for mode, plane_maps in maps.items():
         for name in PLANES:
             np.testing.assert_allclose(
-                getattr(one, name), getattr(others[mode], name), rtol=1e-9, err_msg=f"{mode} {name}"
+                getattr(plane_maps, name), getattr(others[mode], name), rtol=1e-9, err_msg=f"{mode} {name}"
             )
 
 
@@ -88,13 +88,13 @@ def assert_equal(maps, others):
 def test_tiles_are_the_map_in_one_piece(change):
     chosen = {key: value for key, value in change.items() if key not in ("trees", "buildings")}
     site = town(change.get("buildings", 80), trees=change.get("trees", 0))
-    whole, paths = in_one_piece(site, settings(**chosen))
-    maps, kept, of_tiles = in_tiles(site, settings(**chosen), 5 if chosen["max_depth"] < 2 else 4)
+    one_piece, paths = in_one_piece(site, settings(**chosen))
+    maps, counts, of_tiles = in_tiles(site, settings(**chosen), 5 if chosen["max_depth"] < 2 else 4)
     assert of_tiles == paths
-    assert_equal(maps, whole)
+    assert_equal(maps, one_piece)
     if chosen["max_depth"] < 2 and not change.get("trees"):
         left = {0: 0.4, 1: 0.9}[chosen["max_depth"]]
-        assert np.mean(kept) < left * len(site.buildings), "some are left out"
+        assert np.mean(counts) < left * len(site.buildings), "some are left out"
     assert (maps["none"].rank.max(axis=(0, 1, 2)) > 0).mean() > 0.5
 
 
@@ -121,12 +121,12 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_shortened_reach_is_seen(fault, monkeypatch):
     site, chosen = town(), settings()
-    whole, _ = in_one_piece(site, chosen)
+    one_piece, _ = in_one_piece(site, chosen)
     name, wrong = FAULTS[fault]
     monkeypatch.setattr(Reach, name, wrong(getattr(Reach, name)))
     maps, _, _ = in_tiles(site, chosen, 5)
     with pytest.raises(AssertionError):
-        assert_equal(maps, whole)
+        assert_equal(maps, one_piece)
 
 
 def test_a_tower_out_of_range_is_left_out_and_nothing_changes():
@@ -148,8 +148,8 @@ def test_a_tile_without_towers_is_out_of_coverage_at_once(monkeypatch):
     site = town(5)
     away = replace(site, area_m=tuple(side + 2e5 for side in site.area_m))
     monkeypatch.setattr(mapping, "replay", lambda *_: pytest.fail("nothing reaches there"))
-    maps, kept, paths = in_tiles(away, settings(spacing_m=100.0), 4)
-    assert (paths, set(kept)) == (0, {0})
+    maps, counts, paths = in_tiles(away, settings(spacing_m=100.0), 4)
+    assert (paths, set(counts)) == (0, {0})
     assert np.isnan(maps["none"].rss_siso_dbm).all()
     assert (maps["none"].rank == 0).all()
 
@@ -160,12 +160,12 @@ def test_solids_beside_segments_are_all_that_may_cut_them():
     rng = np.random.default_rng(5)
     start = np.array([-350.0, -300.0, 9.0]) + rng.uniform(0, 40, (300, 3))
     end = np.array([200.0, 330.0, 2.0]) + rng.uniform(0, 60, (300, 3))
-    beside = hiding._solids_near(start, end)
+    near = hiding._solids_near(start, end)
     met = hiding._boxes(start, end, np.arange(len(hiding.pieces))).any(axis=0)
-    assert set(np.flatnonzero(met)) <= set(beside.tolist())
-    assert len(beside) < 0.6 * len(hiding.pieces)
+    assert set(np.flatnonzero(met)) <= set(near.tolist())
+    assert len(near) < 0.6 * len(hiding.pieces)
     start[0] = np.nan  # a segment without a place hides none of the others
-    assert hiding._solids_near(start, end).tolist() == beside.tolist()
+    assert hiding._solids_near(start, end).tolist() == near.tolist()
 
 
 def _few():

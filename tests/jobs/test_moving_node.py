@@ -47,9 +47,9 @@ def flown(
 ) -> Path:
     """Logs whose level is the closed form of two rays between the two ends, less 20 dB."""
     t, at = np.arange(0.0, SECONDS + 1), np.arange(0.0, SECONDS, 0.5)
-    kept = t[(t <= gap[0]) | (t >= gap[1])]
+    logged = t[(t <= gap[0]) | (t >= gap[1])]
     level = [two_ray_dbm(r[None], u[None], 3.3e9, 40.0)[0, 0] for r, u in zip(rover(at), uav(at), strict=True)]
-    track = positions(folder / "rover.csv", kept + start, rover(kept)) | {"time_origin": origin}
+    track = positions(folder / "rover.csv", logged + start, rover(logged)) | {"time_origin": origin}
     return write_yaml(folder / "flight.yaml", {
         "flight": "rover", "site": {"file": "lake_wheeler", "without_buildings": True}, "timezone": "America/New_York",
         "towers": {"ROVER": {"track": {k: v for k, v in track.items() if v}, "antenna_height_m": 2}},
@@ -75,22 +75,22 @@ def case(tmp_path_factory):
 
 
 def test_the_closed_form_along_both_tracks(case):
-    _, data, (one,), _ = case
-    found = compare_rss_series(data, data.rss[0], one)
+    _, data, (replayed,), _ = case
+    compared = compare_rss_series(data, data.rss[0], replayed)
     t = np.arange(0.0, SECONDS, 0.5)
     lost = (t > 50) & (t < 60)
-    np.testing.assert_array_equal(found.posed, ~lost)  # a gap of the rover's log is no pose, as one of the UAV's
-    assert found.score.n == (~lost).sum()
-    error = found.measured_db - found.simulated_dbm
+    np.testing.assert_array_equal(compared.posed, ~lost)  # a gap of the rover's log is no pose, as one of the UAV's
+    assert compared.score.n == (~lost).sum()
+    error = compared.measured_db - compared.simulated_dbm
     # the track is linear between rows, and so is the way: what is left is the rounding of the coordinates
     assert np.nanmax(np.abs(error + 20.0)) < 0.02
-    assert found.score.rmse_db < 0.02
-    np.testing.assert_allclose(found.tower_m[~lost], rover(t)[~lost], atol=1e-3)
+    assert compared.score.rmse_db < 0.02
+    np.testing.assert_allclose(compared.tower_m[~lost], rover(t)[~lost], atol=1e-3)
     away = np.linalg.norm(uav(t) - rover(t), axis=1)
-    np.testing.assert_allclose(found.geometry["distance_m"][~lost], away[~lost], atol=2e-3)
-    assert found.baselines["two_ray"].rmse_db < 0.02
+    np.testing.assert_allclose(compared.geometry["distance_m"][~lost], away[~lost], atol=2e-3)
+    assert compared.baselines["two_ray"].rmse_db < 0.02
     # from the rover's middle the same levels are far off
-    assert found.baselines["free_space"].rmse_db > 0.5
+    assert compared.baselines["free_space"].rmse_db > 0.5
 
 
 def test_rank_and_ladder_have_the_place_of_each_sample(case):
@@ -105,27 +105,27 @@ def test_rank_and_ladder_have_the_place_of_each_sample(case):
 
 
 def test_explain_stands_where_the_rover_was(case):
-    path, _, (one,), _ = case
-    found = run_explain(path, time="30.0", tower="ROVER", channel="a")
-    assert found.level_dbm == pytest.approx(one.spread(one.replay.rss_dbm[:, 0])[60], abs=1e-9)
-    assert any("ROVER moves: it was at 15.0 m east, -16.0 m north, 2.0 m up" in note for note in found.notes)
+    path, _, (replayed,), _ = case
+    explained = run_explain(path, time="30.0", tower="ROVER", channel="a")
+    assert explained.level_dbm == pytest.approx(replayed.spread(replayed.replay.rss_dbm[:, 0])[60], abs=1e-9)
+    assert any("ROVER moves: it was at 15.0 m east, -16.0 m north, 2.0 m up" in note for note in explained.notes)
 
 
 def test_the_audit_takes_moments_at_which_the_rover_stands_where_it_was(case):
-    _, data, (one,), _ = case
-    moments = list(standing(data, [one]))
+    _, data, (replayed,), _ = case
+    moments = list(standing(data, [replayed]))
     assert len(moments) == 6
     for site, moment, _expected in moments:
-        at = int(np.argmin(np.linalg.norm(one.poses.position_m - moment.poses.position_m, axis=1)))
-        np.testing.assert_allclose(site.towers["ROVER"].position_m, one.tower_m[at], atol=1e-9)
+        at = int(np.argmin(np.linalg.norm(replayed.poses.position_m - moment.poses.position_m, axis=1)))
+        np.testing.assert_allclose(site.towers["ROVER"].position_m, replayed.tower_m[at], atol=1e-9)
         again = replay(site, moment.link, moment.poses, Search(max_depth=1))
         assert again.rss_dbm[0, 0] == pytest.approx(moment.replay.rss_dbm[0, 0], abs=1e-9)
         assert len(again.paths) == len(moment.replay.paths)
 
 
 def test_the_tables_carry_the_place(case):
-    _, data, (one,), (rank,) = case
-    rss = "".join(rss_csv([compare_rss_series(data, data.rss[0], one)])).splitlines()
+    _, data, (replayed,), (rank,) = case
+    rss = "".join(rss_csv([compare_rss_series(data, data.rss[0], replayed)])).splitlines()
     ranks = "".join(rank_csv([compare_rank_series(data, data.rank[0], rank)])).splitlines()
     for head, first, *_ in (rss, ranks):
         row = dict(zip(head.split(","), first.split(","), strict=True))
@@ -135,17 +135,17 @@ def test_the_tables_carry_the_place(case):
 
 def test_the_drawings_show_the_way(case):
     """The page's plan and the figures: where it stood at each sample, not its middle alone."""
-    _, data, (one,), (rank,) = case
-    rss = compare_rss_series(data, data.rss[0], one)
+    _, data, (replayed,), (rank,) = case
+    rss = compare_rss_series(data, data.rss[0], replayed)
     ranks = compare_rank_series(data, data.rank[0], rank)
     t = np.arange(0.0, SECONDS, 0.5)
     known = (t <= 50) | (t >= 60)
-    kept: list[np.ndarray] = []
-    arrays = SimpleNamespace(add=lambda values, *_: kept.append(values) or len(kept) - 1)
+    columns: list[np.ndarray] = []
+    arrays = SimpleNamespace(add=lambda values, *_: columns.append(values) or len(columns) - 1)
     drawn = explorer._place(rss, np.arange(0, len(t), 3), arrays)
-    found = np.stack([kept[drawn[f"tower_{axis}"]] for axis in ("east", "north", "up")], axis=1)
-    np.testing.assert_allclose(found[known[::3]], rover(t)[::3][known[::3]], atol=1e-3)
-    assert np.isnan(found[~known[::3]]).all()
+    places = np.stack([columns[drawn[f"tower_{axis}"]] for axis in ("east", "north", "up")], axis=1)
+    np.testing.assert_allclose(places[known[::3]], rover(t)[::3][known[::3]], atol=1e-3)
+    assert np.isnan(places[~known[::3]]).all()
     for result in (rss, ranks):
         assert np.nanmax(result.tower_m, axis=0)[:2] == pytest.approx([60.0, 56.0], abs=0.5)
 

@@ -36,14 +36,14 @@ def flown(floor_dbm: float | None = None, power_dbm: float = 0.0, loss_db: float
 def test_links_below_the_floor_have_no_level_no_channel_and_no_rank():
     expected = flown()[1]
     floor = 0.5 * (expected[1] + expected[2])
-    found, _ = flown(floor)
-    np.testing.assert_allclose(found.rss_dbm[:2, 0], expected[:2], atol=1e-6)
-    assert np.isnan(found.rss_dbm[2:]).all()
-    assert np.isnan(found.rss_power_dbm[2:]).all()
-    assert not found.has_path[2:].any()
-    assert found.has_path[:2].all()
-    assert not found.h[2:].any()
-    assert found.h[:2].all()
+    replayed, _ = flown(floor)
+    np.testing.assert_allclose(replayed.rss_dbm[:2, 0], expected[:2], atol=1e-6)
+    assert np.isnan(replayed.rss_dbm[2:]).all()
+    assert np.isnan(replayed.rss_power_dbm[2:]).all()
+    assert not replayed.has_path[2:].any()
+    assert replayed.has_path[:2].all()
+    assert not replayed.h[2:].any()
+    assert replayed.h[:2].all()
 
 
 def test_no_receiver_hears_beneath_the_thermal_noise_of_one_hertz():

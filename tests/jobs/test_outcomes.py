@@ -47,18 +47,18 @@ def track(number: float) -> Outcome:
     return Outcome(track=FlownTrack(flight=f"f{number:g}", time_s=np.arange(3.0), position_m=np.full((3, 3), number)))
 
 
-def equal(one: Outcome, two: Outcome) -> bool:
-    assert one.track is not None
-    assert two.track is not None
-    return one.track.flight == two.track.flight and np.array_equal(one.track.position_m, two.track.position_m)
+def equal(left: Outcome, right: Outcome) -> bool:
+    assert left.track is not None
+    assert right.track is not None
+    return left.track.flight == right.track.flight and np.array_equal(left.track.position_m, right.track.position_m)
 
 
 def test_an_outcome_comes_back_as_it_was(tmp_path: Path) -> None:
     store = OutcomeStore(tmp_path, Outcome)
     store.save("a", track(2.5))
-    found = store.load("a")
-    assert equal(found, track(2.5))
-    assert found.rss == ()
+    loaded = store.load("a")
+    assert equal(loaded, track(2.5))
+    assert loaded.rss == ()
     assert store.load("b") is None
 
 
@@ -76,11 +76,11 @@ def test_an_outcome_comes_back_as_it_was(tmp_path: Path) -> None:
 def test_arrays_of_every_kind_come_back(tmp_path: Path, array: np.ndarray) -> None:
     store = OutcomeStore(tmp_path, Outcome)
     store.save("a", Outcome(track=FlownTrack(flight="f", time_s=array, position_m=np.zeros((0, 3)))))
-    found = store.load("a").track
-    assert found.time_s.dtype == array.dtype
-    assert found.time_s.shape == array.shape
-    assert found.time_s.tobytes() == np.ascontiguousarray(array).tobytes()
-    assert found.position_m.shape == (0, 3)
+    loaded = store.load("a").track
+    assert loaded.time_s.dtype == array.dtype
+    assert loaded.time_s.shape == array.shape
+    assert loaded.time_s.tobytes() == np.ascontiguousarray(array).tobytes()
+    assert loaded.position_m.shape == (0, 3)
 
 
 @pytest.mark.parametrize("place", [0, 100, -1])
@@ -143,8 +143,8 @@ def test_equal_arrays_are_kept_and_held_once(tmp_path: Path) -> None:
     track = FlownTrack(flight="f", time_s=place, position_m=place.copy())
     store.save("a", Outcome(track=track))
     assert (tmp_path / "a.npz").stat().st_size < 1.5 * place.nbytes
-    found = store.load("a").track
-    assert found.time_s is found.position_m
+    loaded = store.load("a").track
+    assert loaded.time_s is loaded.position_m
 
 
 def key_of(settings: FlightFile, flight: Path) -> str:
@@ -166,7 +166,7 @@ def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path
     assert manifest["flight"] == "f"
     assert manifest["versions"]["aerpaw-cmp"]
     assert manifest["host"]
-    assert {one["role"] for one in manifest["inputs"]} >= {"log", "site file (packaged)"}
+    assert {entry["role"] for entry in manifest["inputs"]} >= {"log", "site file (packaged)"}
     assert manifest["settings"]["rss"]["advanced"]["lag_window_s"] == 10
     assert manifest["seconds"] > 0
 
@@ -196,13 +196,13 @@ def tasks_of(flight: Path, count: int = 4) -> list[Task]:
 def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
-    def one(task: Task) -> Outcome:
+    def compute_but_f3(task: Task) -> Outcome:
         asked.append(task.flight)
         if task.flight == "f3" and len(asked) < 6:
             return Outcome(failure=Failure(flight="f3", setting="as written", message="no luck", traceback="line 1"))
         return track(float(task.flight[1:]))
 
-    monkeypatch.setattr(campaign_tasks, "run_task", one)
+    monkeypatch.setattr(campaign_tasks, "run_task", compute_but_f3)
     tasks = tasks_of(flight)
     first = run_tasks(tasks, InProcess(), keep=tmp_path)
     assert asked == ["f0", "f1", "f2", "f3"]
@@ -230,9 +230,9 @@ def test_a_new_name_or_place_in_the_list_computes_nothing(
     monkeypatch.setattr(campaign_tasks, "run_task", lambda task: asked.append(task.setting) or track(1.0))
     run_tasks([Task(flight, "f", "a", {}, None, True)], InProcess(), keep=tmp_path)
     first = Task(flight, "g", "first", {"rss.advanced.lag_window_s": 3}, None, True)
-    found = run_tasks([first, Task(flight, "g", "b", {}, None, False)], InProcess(), keep=tmp_path)
+    outcomes = run_tasks([first, Task(flight, "g", "b", {}, None, False)], InProcess(), keep=tmp_path)
     assert asked == ["a", "first"]
-    assert [one.track.flight for one in found if one.track is not None] == ["g", "g"]
+    assert [outcome.track.flight for outcome in outcomes if outcome.track is not None] == ["g", "g"]
 
 
 def test_a_worker_that_sees_other_files_fails_the_task(flight: Path) -> None:
@@ -264,7 +264,7 @@ from aerpaw_cmp.jobs.tasks.workers import InProcess
 from aerpaw_cmp.report.campaign_data import FlownTrack
 import numpy as np
 
-def one(task):
+def compute_but_f2(task):
     if task.flight == "f2":
         os.kill(os.getpid(), signal.SIGKILL)
     number = float(task.flight[1:])
@@ -272,7 +272,7 @@ def one(task):
         track=FlownTrack(flight=task.flight, time_s=np.arange(3.0), position_m=np.full((3, 3), number))
     )
 
-campaign_tasks.run_task = one
+campaign_tasks.run_task = compute_but_f2
 flight = Path(sys.argv[1])
 tasks = [campaign_tasks.Task(flight, f"f{i}", "as written", {"rss.advanced.lag_window_s": 10.0 + i}, None) for i in range(4)]
 store = campaign_tasks.outcome_store(Path(sys.argv[2]))
@@ -290,9 +290,9 @@ def test_after_sigkill_only_what_is_missing_is_computed(
     monkeypatch.setattr(
         campaign_tasks, "run_task", lambda task: asked.append(task.flight) or track(float(task.flight[1:]))
     )
-    found = run_tasks(tasks_of(flight), InProcess(), keep=tmp_path)
+    outcomes = run_tasks(tasks_of(flight), InProcess(), keep=tmp_path)
     assert asked == ["f2", "f3"]
-    assert all(equal(one, track(float(i))) for i, one in enumerate(found))
+    assert all(equal(outcome, track(float(i))) for i, outcome in enumerate(outcomes))
 
 
 def lethal(order: Order) -> Done:
@@ -319,11 +319,13 @@ def test_a_lost_worker_costs_its_own_task_one_more_try(
     monkeypatch.setattr("aerpaw_cmp.jobs.campaigns.campaign_plan.carry_out", lethal)
     monkeypatch.setattr("aerpaw_cmp.jobs.tasks.workers.get_context", lambda _kind: multiprocessing.get_context("fork"))
     tasks = [*tasks_of(flight, 6), Task(flight, "poison", "as written", {}, None)]
-    found = run_tasks(tasks, Processes(2))
-    assert [one.failure is None for one in found] == [True] * 6 + [False]
-    assert found[-1].failure is not None
-    assert "worker process ended" in found[-1].failure.message
-    assert [one.track.flight for one in found[:6] if one.track is not None] == [f"f{i}" for i in range(6)]
+    outcomes = run_tasks(tasks, Processes(2))
+    assert [outcome.failure is None for outcome in outcomes] == [True] * 6 + [False]
+    assert outcomes[-1].failure is not None
+    assert "worker process ended" in outcomes[-1].failure.message
+    assert [outcome.track.flight for outcome in outcomes[:6] if outcome.track is not None] == [
+        f"f{i}" for i in range(6)
+    ]
 
 
 def test_a_fault_in_the_rows_of_a_flight_is_a_failure_of_that_flight(

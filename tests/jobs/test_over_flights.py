@@ -72,15 +72,15 @@ def test_many_settings_are_held_in_the_memory_of_one() -> None:
     held = [outcomes[number] for number in range(40)]
     arrays = {
         id(value): value.nbytes
-        for one in held
-        for record in (*one.rss, one.track)
+        for outcome in held
+        for record in (*outcome.rss, outcome.track)
         for value in (getattr(record, field.name) for field in dataclasses.fields(record))  # type: ignore[arg-type]
         if isinstance(value, np.ndarray)
     }
     assert sum(arrays.values()) < 16 * 8 * 5000  # of one setting: at most sixteen numbers a sample
-    done, groups = pool_offsets([one.rss[0] for one in held], "tower")
-    whole, same = pool_offsets(every, "tower")
-    for a, b in zip(done, whole, strict=True):
+    done, groups = pool_offsets([outcome.rss[0] for outcome in held], "tower")
+    pooled, same = pool_offsets(every, "tower")
+    for a, b in zip(done, pooled, strict=True):
         assert (a.pooled_offset_db, a.pooled_rmse_db) == (b.pooled_offset_db, b.pooled_rmse_db)
         difference = b.simulated_dbm - b.measured_db
         assert a.pooled_rmse_db == pytest.approx(np.sqrt(np.nanmean((difference - a.pooled_offset_db) ** 2)), rel=1e-12)

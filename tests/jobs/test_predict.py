@@ -79,7 +79,7 @@ def test_points_without_a_position_and_outside_are_flagged(prediction):
     assert (far > near).all()
     assert any("1 of 4 points have no position" in text for text in prediction.page.warnings)
     assert "67 % of the points lie outside" in prediction.page.verdict  # of three with a position
-    shares = [one["share_outside_flown"] for one in prediction_metrics(prediction.page)["series"].values()]
+    shares = [series["share_outside_flown"] for series in prediction_metrics(prediction.page)["series"].values()]
     np.testing.assert_allclose(shares, 2 / 3)
 
 
@@ -157,10 +157,10 @@ def test_files_agree_with_each_other(tmp_path, prediction):
 def said(small, tmp_path):
     """A prediction that is 2 dB above each level of LW1 USRP1 and states 3 dB, at the very poses of the flight."""
     data = load_data(load_flight(small / "a.yaml"), small)
-    one = next(o for o in observe([data])[0] if o.samples.antenna == "LW1.USRP1")
-    level = one.samples.residual_db + one.free_space_db + 2.0
-    place = dict(zip(("east_m", "north_m", "height_m"), one.samples.position_m.T, strict=True))
-    frame = pd.DataFrame({**place, "yaw_deg": one.heading_deg, "tower": "LW1", "channel": "USRP1", "level_db": level,
+    flown = next(o for o in observe([data])[0] if o.samples.antenna == "LW1.USRP1")
+    level = flown.samples.residual_db + flown.free_space_db + 2.0
+    place = dict(zip(("east_m", "north_m", "height_m"), flown.samples.position_m.T, strict=True))
+    frame = pd.DataFrame({**place, "yaw_deg": flown.heading_deg, "tower": "LW1", "channel": "USRP1", "level_db": level,
                           "sd_db": 3.0, "q05_db": level - 4.935, "q95_db": level + 4.935})  # fmt: skip
     frame.to_csv(tmp_path / "prediction.csv", index=False)
     (tmp_path / "metrics.json").write_text(json.dumps({"trained_on": ["0" * 64], "sentence": "s", "flights": ["x"]}))
@@ -262,10 +262,10 @@ def test_maps_of_a_grid_hold_levels_and_their_spread_height_by_height(prediction
     table = pd.DataFrame({"tower": "LW1", "channel": "USRP1", "level_db": level, "sd_db": sd})
     ranked = pd.DataFrame({"tower": ["LW1"], "channel": ["rank"]})
     page = dataclasses.replace(prediction.page, table=pd.concat([table, ranked], ignore_index=True))
-    one = dataclasses.replace(prediction, targets=targets, page=page)
-    files, said = write_maps(one, targets.grid, tmp_path)
+    on_grid = dataclasses.replace(prediction, targets=targets, page=page)
+    files, notes = write_maps(on_grid, targets.grid, tmp_path)
     assert [file.name for file in files] == ["prediction.kmz", "prediction.tif"]
-    assert said == []
+    assert notes == []
     with rasterio.open(tmp_path / "prediction.tif") as book:
         assert book.descriptions == tuple(
             f"{name}_h{height}m_LW1_USRP1" for height in ("030", "050") for name in ("level_db", "sd_db")
@@ -285,13 +285,13 @@ def test_a_planned_flight_faces_its_course():
 
 def test_corrected_levels_are_brought_to_the_raw_replay_by_the_planted_offset(prediction):
     targets = dataclasses.replace(prediction.targets, heights_m=(45.0,))
-    said = dataclasses.replace(prediction, targets=targets)
-    (one,) = corrected_map._levels(said, prediction.sources["LW1.USRP1"], len(targets))
+    on_grid = dataclasses.replace(prediction, targets=targets)
+    (levels,) = corrected_map._levels(on_grid, prediction.sources["LW1.USRP1"], len(targets))
     level = rows_of(prediction, "LW1", "USRP1")["level_db"].to_numpy()
-    np.testing.assert_allclose((one.corrected_dbm - level)[[0, 2, 3]], 12.3, atol=0.7)
+    np.testing.assert_allclose((levels.corrected_dbm - level)[[0, 2, 3]], 12.3, atol=0.7)
     raw = trace("lake_wheeler", Link(3.3e9, {"LW1": single_element()}, single_element()), [[-300.0, 150.0, 45.0]])
-    assert one.raw_dbm[0] == pytest.approx(raw.rss_dbm[0, 0], abs=1e-6)
-    maps = corrected_map.CorrectedMaps(levels=(one,), ranks={}, prediction=prediction.page)
+    assert levels.raw_dbm[0] == pytest.approx(raw.rss_dbm[0, 0], abs=1e-6)
+    maps = corrected_map.CorrectedMaps(levels=(levels,), ranks={}, prediction=prediction.page)
     assert [layer.name for layer in maps.layers()] == [
         f"rss_{kind}_h045m_LW1_USRP1" for kind in ("raw", "corrected", "sd")
     ]
@@ -331,17 +331,17 @@ def test_directions_are_evaluated_once_per_degree_over_all_parts(monkeypatch: py
         residual_db=np.zeros(4000),
     )  # fmt: skip
     predict = correction.by_degree(gain)
-    whole = predict(samples)
+    at_once = predict(samples)
     for part in (slice(0, 2000), slice(2000, 4000)):
         rows = np.arange(4000)[part]
         again = predict(samples.part(rows))
-        np.testing.assert_array_equal(again[0], whole[0][rows])
-        np.testing.assert_array_equal(again[1], whole[1][rows])
+        np.testing.assert_array_equal(again[0], at_once[0][rows])
+        np.testing.assert_array_equal(again[1], at_once[1][rows])
     assert len(asked) == 1
     assert asked[0] <= 1500  # degrees at either end, not samples
-    np.testing.assert_allclose(whole[0], gain(samples)[0], atol=0.3)
+    np.testing.assert_allclose(at_once[0], gain(samples)[0], atol=0.3)
     other = predict(dataclasses.replace(samples, channel="b", at_tower=-ray, at_uav=ray))
-    np.testing.assert_allclose(other[0], -whole[0], atol=0.6)
+    np.testing.assert_allclose(other[0], -at_once[0], atol=0.6)
 
 
 def test_a_heading_counts_for_points_without_one(tmp_path):

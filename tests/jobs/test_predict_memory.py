@@ -86,10 +86,10 @@ def test_an_unknown_heading_adds_the_spread_of_the_gain_over_headings(site: Path
     points.to_csv(site.parent / "open.csv", index=False)
     said = job.predict(site.parent / "open.csv", [], TargetOptions(site=str(site)))
     known = job.predict(site.parent / "p.csv", [], TargetOptions(site=str(site)))
-    one, other = (x.table[x.table["channel"] == "A"].iloc[0] for x in (said, known))
+    any_heading, one_heading = (x.table[x.table["channel"] == "A"].iloc[0] for x in (said, known))
     # eight headings: the cosine has mean 0 and variance 1/2
-    assert one["level_db"] - other["level_db"] == pytest.approx(2.0, abs=0.02)
-    assert one["slow_sd_db"] ** 2 - other["slow_sd_db"] ** 2 == pytest.approx(2.0**2 / 2, abs=0.05)
+    assert any_heading["level_db"] - one_heading["level_db"] == pytest.approx(2.0, abs=0.02)
+    assert any_heading["slow_sd_db"] ** 2 - one_heading["slow_sd_db"] ** 2 == pytest.approx(2.0**2 / 2, abs=0.05)
 
 
 def test_maps_are_corrected_by_the_memory_alone(site: Path) -> None:
@@ -148,5 +148,5 @@ def test_remembered_antennas_stand_beside_other_bases_but_not_on_their_own_fligh
 
 
 def test_a_calibration_file_names_its_flights(flown: Path) -> None:
-    paths = [one.path.name for one in named_flights([flown / "calibration.yaml", flown / "aside.yaml"])]
+    paths = [flight.path.name for flight in named_flights([flown / "calibration.yaml", flown / "aside.yaml"])]
     assert paths == ["first.yaml", "second.yaml", "aside.yaml"]

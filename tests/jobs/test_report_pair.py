@@ -57,11 +57,11 @@ def test_an_export_holds_the_samples_of_the_report(pair: tuple[Path, Path]) -> N
 def test_diff_of_two_runs_names_the_setting_and_the_levels(pair: tuple[Path, Path]) -> None:
     from aerpaw_cmp.jobs.diff_reports import run_diff
 
-    found = run_diff(*pair)
-    assert [(e.key, e.first, e.second) for e in found.settings] == [("rt.max_depth", 1, 0)]
-    assert [(e.role, e.what) for e in found.inputs] == [("flight file", "changed")]
-    assert found.versions == ()
-    (level,) = found.levels
+    difference = run_diff(*pair)
+    assert [(e.key, e.first, e.second) for e in difference.settings] == [("rt.max_depth", 1, 0)]
+    assert [(e.role, e.what) for e in difference.inputs] == [("flight file", "changed")]
+    assert difference.versions == ()
+    (level,) = difference.levels
     tables = [pd.read_csv(folder / "rss.csv") for folder in pair]
     moved = tables[1]["simulated_dbm"] - tables[0]["simulated_dbm"]
     assert level.simulated_max_db == pytest.approx(moved.abs().max())
@@ -70,6 +70,6 @@ def test_diff_of_two_runs_names_the_setting_and_the_levels(pair: tuple[Path, Pat
     # simulated with the ground ray: without it the replay is worse
     assert level.rmse.difference_db > 0
     assert level.rmse.other_rmse_db == pytest.approx(1.0, abs=0.3), "the fading of the plan"
-    assert found.pooled is not None
-    assert found.pooled.difference_db == pytest.approx(level.rmse.difference_db)
+    assert difference.pooled is not None
+    assert difference.pooled.difference_db == pytest.approx(level.rmse.difference_db)
     assert run_diff(pair[0], pair[0]).differences == ()

@@ -111,7 +111,7 @@ def test_reports_are_found_by_their_flight(tmp_path: Path):
         folder.mkdir(parents=True)
         (folder / "report.html").write_text("")
         (folder / "metrics.json").write_text(json.dumps({"flight": flight}) if flight else "[")
-    found = find_reports(
+    links = find_reports(
         ["first", "second", "third one", "bad", "absent"], tmp_path / "reports" / "season", [tmp_path / "reports"]
     )
-    assert found == {"first": "../first/report.html", "third one": "../third%20one/report.html"}
+    assert links == {"first": "../first/report.html", "third one": "../third%20one/report.html"}

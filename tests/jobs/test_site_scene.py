@@ -70,8 +70,8 @@ def test_what_a_scene_does_not_say_is_asked_for(room: Path, tmp_path: Path) -> N
     with pytest.raises(UsageError, match="--tower A"):
         run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2"]))
     assert not out.exists()
-    told = run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2,3"]))
-    assert any("no georeference" in line for line in told)
+    messages = run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2,3"]))
+    assert any("no georeference" in line for line in messages)
 
 
 def test_towers_of_a_base_site_are_kept(room: Path, tmp_path: Path) -> None:
@@ -86,9 +86,9 @@ def test_a_scene_that_changed_or_went_is_said(room: Path, tmp_path: Path) -> Non
     out = tmp_path / "site.yaml"
     run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2,3"]))
     room.write_text(ROOM.replace("marble", "brick"))
-    with pytest.raises(UsageError, match="they changed since the site was made") as told:
+    with pytest.raises(UsageError, match="they changed since the site was made") as refused:
         load_site(out)
-    assert told.value.exit_code == 2
+    assert refused.value.exit_code == 2
     room.unlink()
     assert main(["site", "show", str(out), "-o", str(tmp_path / "show")]) == 3
 
@@ -155,8 +155,8 @@ def test_a_report_of_a_scene_is_audited_and_its_paths_explained(
     """Sionna gets the same triangles: no path is missing or too many, and the fields are its own."""
     out = tmp_path / "out"
     assert main(["report", str(flown), "-o", str(out), "--figures", "none", "--strict", "--quiet"]) == 0
-    found = json.loads((out / "metrics.json").read_text())["rt"]
-    audit = found["audit"]
+    metrics = json.loads((out / "metrics.json").read_text())["rt"]
+    audit = metrics["audit"]
     assert (audit["reference"], audit["missing_paths"], audit["extra_paths"]) == ("sionna", 0, 0)
     assert audit["links"] == 3
     assert audit["field"]["paths"] > 3
@@ -164,9 +164,9 @@ def test_a_report_of_a_scene_is_audited_and_its_paths_explained(
     assert "the second implementation: it knows prisms, no scene of triangles" in audit["field"]["not_covered"]
     capsys.readouterr()
     assert main(["explain", str(flown), "--time", "4", "--tower", "T", "--json", "--quiet"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["paths"][0]["path"] == "line of sight"
-    assert len(told["paths"]) > 1
+    explained = json.loads(capsys.readouterr().out)
+    assert explained["paths"][0]["path"] == "line of sight"
+    assert len(explained["paths"]) > 1
 
 
 @pytest.mark.parametrize(

@@ -103,8 +103,8 @@ def test_a_copy_of_a_training_log_is_not_scored(folder: Path, copy: Callable[[Pa
     assert len(here["trained_on"]) == 1
     assert set(here["trained_on"]) < set(metrics["trained_on"])
     assert here["baselines"]["free_space"]["rmse_db"] > 1  # nothing of it was learned
-    inputs = [one for one in metrics["inputs"] if one.get("learned_on")]
-    assert {Path(one["path"]).suffix for one in inputs} == {".csv"}
+    inputs = [entry for entry in metrics["inputs"] if entry.get("learned_on")]
+    assert {Path(entry["path"]).suffix for entry in inputs} == {".csv"}
     rungs = [row for row in metrics["ladder"] if "learned" in row["model"]]
     assert len(rungs) >= 2
     assert all(row["rmse_heldout_db"] is None and not row["recommended"] for row in rungs)
@@ -151,10 +151,10 @@ def test_settings_that_were_learned_count_as_antennas_do(folder: Path) -> None:
 @pytest.mark.parametrize("copy", COPIES)
 def test_calibrate_counts_a_copy_once(folder: Path, copy: Callable[[Path], str]) -> None:
     flights = ["first.yaml", copy_of(folder, copy).name]
-    found, said = calibrated(write_yaml(folder / "twice.yaml", {"calibration": "twice", "flights": flights}))
-    assert [data.settings.flight.name for data in found.flights] == ["first"]
-    assert not any(found.scores.values())
-    assert "nobody_knows_me holds the same log as first (SHA-256 " in said[0]
+    calibration, notes = calibrated(write_yaml(folder / "twice.yaml", {"calibration": "twice", "flights": flights}))
+    assert [data.settings.flight.name for data in calibration.flights] == ["first"]
+    assert not any(calibration.scores.values())
+    assert "nobody_knows_me holds the same log as first (SHA-256 " in notes[0]
     three, _ = calibrated(
         write_yaml(folder / "three.yaml", {"calibration": "three", "flights": [*flights, "second.yaml"]})
     )
@@ -176,9 +176,9 @@ def test_half_of_a_training_log_in_another_layout_is_known_by_its_readings(folde
     assert metrics["rss"]["LW1"]["USRP1"]["rmse_db"] is None
     assert all(row["rmse_heldout_db"] is None for row in metrics["ladder"] if "learned" in row["model"])
     names = ["first.yaml", copy_of(folder, half).name, "second.yaml", "aside.yaml"]
-    kept, said = counted_once([load_data(load_flight(folder / name), folder) for name in names])
-    assert [data.settings.flight.name for data in kept] == ["first", "second", "aside"]
-    assert said == ["nobody_knows_me holds readings of first in another log: they are counted once"]
+    counted, notes = counted_once([load_data(load_flight(folder / name), folder) for name in names])
+    assert [data.settings.flight.name for data in counted] == ["first", "second", "aside"]
+    assert notes == ["nobody_knows_me holds readings of first in another log: they are counted once"]
 
 
 def test_two_logs_of_one_flight_in_two_flight_files(folder: Path) -> None:
@@ -186,18 +186,18 @@ def test_two_logs_of_one_flight_in_two_flight_files(folder: Path) -> None:
     both = settings("aside", {"model": "iso"})
     both["logs"].append({"path": LOG, "reader": "sounder_log", "node": "LW2", "channel": "USRP9"})
     flights = [load_data(load_flight(folder / "first.yaml"), folder)]
-    kept, said = counted_once([*flights, load_data(load_flight(write_yaml(folder / "both.yaml", both)), folder)])
-    assert [[(s.tower, s.channel) for s in data.rss] for data in kept] == [[("LW1", "USRP1")], [("LW1", "USRP1")]]
-    assert len(said) == 1
+    counted, notes = counted_once([*flights, load_data(load_flight(write_yaml(folder / "both.yaml", both)), folder)])
+    assert [[(s.tower, s.channel) for s in data.rss] for data in counted] == [[("LW1", "USRP1")], [("LW1", "USRP1")]]
+    assert len(notes) == 1
 
 
 def test_campaign_counts_a_copy_once(folder: Path, tmp_path: Path) -> None:
     flights = ["first.yaml", copy_of(folder, zipped_twice).name, "second.yaml"]
     path = write_yaml(folder / "campaign.yaml", {"campaign": "copies", "flights": flights})
     assert main(["campaign", str(path), "-o", str(tmp_path / "out"), "--fresh"]) == 0
-    found = json.loads((tmp_path / "out" / "campaign.json").read_text())
-    assert [row["flight"] for row in found["rss"]] == ["first", "second"]
-    (failure,) = found["failures"]
+    campaign = json.loads((tmp_path / "out" / "campaign.json").read_text())
+    assert [row["flight"] for row in campaign["rss"]] == ["first", "second"]
+    (failure,) = campaign["failures"]
     assert failure["flight"] == "nobody_knows_me"
     assert failure["message"].startswith("it holds the same log as first (SHA-256 ")
 
@@ -209,8 +209,8 @@ def test_campaign_scores_no_flight_that_its_antennas_were_learned_from(folder: P
         names.append(write_yaml(folder / f"l_{name}.yaml", settings(name, {"model": "iso"}, link=learned["link"])).name)
     path = write_yaml(folder / "campaign.yaml", {"campaign": "learned", "flights": names})
     assert main(["campaign", str(path), "-o", str(tmp_path / "out"), "--fresh"]) == 0
-    found = json.loads((tmp_path / "out" / "campaign.json").read_text())
-    errors = {row["flight"]: (row["rmse_db"], row["pooled_rmse_db"]) for row in found["rss"]}
+    campaign = json.loads((tmp_path / "out" / "campaign.json").read_text())
+    errors = {row["flight"]: (row["rmse_db"], row["pooled_rmse_db"]) for row in campaign["rss"]}
     assert set(errors) == {"nobody_knows_me", "aside", "second"}
     assert np.isfinite(errors.pop("aside")).all()
     assert set(errors.values()) == {(None, None)}
@@ -219,7 +219,7 @@ def test_campaign_scores_no_flight_that_its_antennas_were_learned_from(folder: P
 
 
 def test_a_receiver_knows_its_reports_by_content() -> None:
-    def one(flight: str, *logs: str) -> RankSamples:
+    def reports_of(flight: str, *logs: str) -> RankSamples:
         return RankSamples(
             flight=flight, tower="LW1", tower_m=np.zeros(3), poses=None, rank=np.zeros(0), link=None,  # type: ignore[arg-type]
             time_s=np.zeros(0), logs=logs,
@@ -229,9 +229,9 @@ def test_a_receiver_knows_its_reports_by_content() -> None:
         return FittedReceiver(tower="LW1", geometries=(), tied=1, flights=("a",), mixture=None, **more)  # type: ignore[arg-type]
 
     by_content = receiver(trained_on=("1" * 64,))
-    assert by_content.knows(one("b", "2" * 64, "1" * 64))
-    assert not by_content.knows(one("a", "2" * 64))
-    assert receiver().knows(one("a", "2" * 64))  # of 0.3: the name is all there is
+    assert by_content.knows(reports_of("b", "2" * 64, "1" * 64))
+    assert not by_content.knows(reports_of("a", "2" * 64))
+    assert receiver().knows(reports_of("a", "2" * 64))  # of 0.3: the name is all there is
 
 
 def ranks_of(rank: np.ndarray) -> RankSeries:

@@ -28,8 +28,8 @@ def seen() -> dict[str, Any]:
         [sys.executable, str(script)], env=environ, capture_output=True, text=True, check=False, timeout=300
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    scenarios: dict[str, Any] = json.loads(done.stdout)
+    return scenarios
 
 
 def test_workers_of_a_cluster_give_what_one_process_gives(seen: dict[str, Any]) -> None:
@@ -68,17 +68,17 @@ def listening(_number: int) -> list[str]:
         for link in Path(f"/proc/{process}/fd").iterdir():
             with contextlib.suppress(OSError):
                 mine.add(str(link.readlink()))
-    found = []
+    sockets = []
     for table in ("tcp", "tcp6", "udp", "udp6"):
         for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
             row = line.split()
             if f"socket:[{row[9]}]" in mine and (row[3] == "0A" or table.startswith("udp")):
-                found.append(f"{table} {row[1]}")
+                sockets.append(f"{table} {row[1]}")
     for line in Path("/proc/net/unix").read_text().splitlines()[1:]:
         row = line.split()
         if f"socket:[{row[6]}]" in mine and row[3] == "00010000":  # the flag of a socket that accepts
-            found.append(f"unix {row[-1]}")
-    return found
+            sockets.append(f"unix {row[-1]}")
+    return sockets
 
 
 def family(parent: int) -> list[int]:
@@ -88,16 +88,16 @@ def family(parent: int) -> list[int]:
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc lists sockets")
 def test_nothing_listens_while_workers_of_this_machine_work() -> None:
-    found: dict[int, Any] = {}
+    results: dict[int, Any] = {}
     with open_workers(2) as crew:
         assert crew.count == 2
-        crew.run(listening, list(range(4)), found.__setitem__)
-    assert found == {number: [] for number in range(4)}
+        crew.run(listening, list(range(4)), results.__setitem__)
+    assert results == {number: [] for number in range(4)}
     with socket.socket() as door:  # what the test would see
         door.bind(("127.0.0.1", 0))
         door.listen()
-        crew.run(listening, [0], found.__setitem__)
-    assert len(found[0]) == 1
+        crew.run(listening, [0], results.__setitem__)
+    assert len(results[0]) == 1
 
 
 def test_workers_end_with_their_parent_and_leave_nothing(tmp_path: Path) -> None:
@@ -139,11 +139,11 @@ class NoWorkers:
 
     status = "running"
 
-    def __init__(self, told: list[str]) -> None:
-        self._told = told
+    def __init__(self, messages: list[str]) -> None:
+        self._messages = messages
 
     def nthreads(self) -> dict[str, int]:
-        return {} if len(self._told) < 2 else {"tcp://one": 1}
+        return {} if len(self._messages) < 2 else {"tcp://one": 1}
 
     def submit(self, function: Any, item: Any, pure: bool) -> Any:
         assert not pure
@@ -172,10 +172,10 @@ def test_a_scheduler_without_workers_is_spoken_of(monkeypatch: pytest.MonkeyPatc
     """A season waited for half an hour without a word for workers that had given up while the machine was busy."""
     monkeypatch.setattr(workers, "NO_WORKER_S", 0.1)
     monkeypatch.setattr(workers, "LOOK_S", 0.05)
-    told: list[str] = []
-    crew = workers.Cluster(NoWorkers(told), lambda text, _share=None: told.append(text))
-    found: dict[int, Any] = {}
-    crew.run(abs, [-2, 3], found.__setitem__)
-    assert found == {0: 2, 1: 3}
-    assert len(told) == 2
-    assert "the scheduler has had no worker" in told[0]
+    messages: list[str] = []
+    crew = workers.Cluster(NoWorkers(messages), lambda text, _share=None: messages.append(text))
+    results: dict[int, Any] = {}
+    crew.run(abs, [-2, 3], results.__setitem__)
+    assert results == {0: 2, 1: 3}
+    assert len(messages) == 2
+    assert "the scheduler has had no worker" in messages[0]

@@ -21,11 +21,11 @@ def dies(item: tuple[int, str]) -> int:
 
 
 def collected(crew: Any, function: Any, items: list[Any]) -> list[Any]:
-    found: dict[int, Any] = {}
+    results: dict[int, Any] = {}
 
     def done(number: int, result: Any) -> None:
-        assert number not in found, "no task comes twice"
-        found[number] = result.message if isinstance(result, Lost) else result
+        assert number not in results, "no task comes twice"
+        results[number] = result.message if isinstance(result, Lost) else result
 
     crew.run(function, items, done)
-    return [found[i] for i in range(len(items))]
+    return [results[i] for i in range(len(items))]

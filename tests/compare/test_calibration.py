@@ -42,14 +42,14 @@ def observed(flight: str, offset_db: float = 0.0, seed: int = 0) -> Observed:
 
 def test_an_offset_of_one_flight_shows_only_where_offsets_are_shared() -> None:
     flights = [observed("a", seed=1), observed("b", seed=2), observed("c", offset_db=6.0, seed=3)]
-    found = {s.flight: s for s in flight_left_out(flights, RECIPE)}
-    assert all(s.rmse_db < 1.0 < 2.0 < s.free_space_rmse_db for s in found.values())
-    assert found["c"].rmse_shared_offset_db == pytest.approx(np.hypot(found["c"].rmse_db, 6.0), abs=0.3)
-    assert found["a"].rmse_shared_offset_db == pytest.approx(np.hypot(found["a"].rmse_db, 3.0), abs=0.3)
-    assert all(s.constant_rmse_db == pytest.approx(s.free_space_rmse_db) for s in found.values())  # one distance
-    assert all(np.isnan([s.inside_50, s.inside_95]).all() for s in found.values())  # what nobody asks is not computed
-    kept: dict[str, calibration.Learned] = {}
-    assert all(np.isfinite([s.inside_50, s.inside_95]).all() for s in flight_left_out(flights, RECIPE, kept))
+    scores = {s.flight: s for s in flight_left_out(flights, RECIPE)}
+    assert all(s.rmse_db < 1.0 < 2.0 < s.free_space_rmse_db for s in scores.values())
+    assert scores["c"].rmse_shared_offset_db == pytest.approx(np.hypot(scores["c"].rmse_db, 6.0), abs=0.3)
+    assert scores["a"].rmse_shared_offset_db == pytest.approx(np.hypot(scores["a"].rmse_db, 3.0), abs=0.3)
+    assert all(s.constant_rmse_db == pytest.approx(s.free_space_rmse_db) for s in scores.values())  # one distance
+    assert all(np.isnan([s.inside_50, s.inside_95]).all() for s in scores.values())  # what nobody asks is not computed
+    learned: dict[str, calibration.Learned] = {}
+    assert all(np.isfinite([s.inside_50, s.inside_95]).all() for s in flight_left_out(flights, RECIPE, learned))
     series = [o.samples for o in flights]
     assert (
         calibration.learn(series, RECIPE, MODEL).model == MODEL
@@ -69,9 +69,9 @@ def test_many_flights_are_left_out_in_groups_and_none_is_learned_from_itself(mon
         return really(series, *rest)
 
     monkeypatch.setattr(calibration, "learn", spied)
-    kept: dict[str, calibration.Learned] = {}
-    found = flight_left_out(flights, RECIPE, kept)
-    assert {s.flight for s in found} == set(kept) == set(flights_of(flights))
+    by_flight: dict[str, calibration.Learned] = {}
+    scores = flight_left_out(flights, RECIPE, by_flight)
+    assert {s.flight for s in scores} == set(by_flight) == set(flights_of(flights))
     assert len(learned_from) == 6
     groups = groups_of(flights_of(flights))
     for group, used in zip(groups, learned_from, strict=True):
@@ -145,21 +145,21 @@ def test_pattern_and_learned_gain_together_are_the_planted_gain(floor_db: float 
 def test_part_and_bins_keep_or_drop_what_belongs_to_samples() -> None:
     o = observed("a")
     samples = dataclasses.replace(o.samples, floor_db=np.arange(200.0))
-    whole = dataclasses.replace(o, samples=samples, locked=np.arange(200.0) % 2, sent_dbm=30.0)
-    some = whole.part(np.arange(0, 200, 3))
+    flown = dataclasses.replace(o, samples=samples, locked=np.arange(200.0) % 2, sent_dbm=30.0)
+    some = flown.part(np.arange(0, 200, 3))
     assert some.samples.floor_db is not None
     assert some.locked is not None
     np.testing.assert_array_equal(some.samples.floor_db, np.arange(0.0, 200.0, 3.0))
     np.testing.assert_array_equal(some.locked, np.arange(0, 200, 3) % 2)
     assert some.sent_dbm == 30.0
-    assert whole.samples.binned(4.0).floor_db is None
+    assert flown.samples.binned(4.0).floor_db is None
 
 
 def leaving(parts: Parts, flights: list[Observed]) -> tuple[calibration.Score, ...]:
     """Scores of a split by parts, each flight predicted from the other."""
-    kept: dict[str, calibration.Learned] = {}
-    flight_left_out(flights, RECIPE, kept)
-    return calibration.parts_left_out(flights, RECIPE, kept, parts, own_rest=False)
+    learned: dict[str, calibration.Learned] = {}
+    flight_left_out(flights, RECIPE, learned)
+    return calibration.parts_left_out(flights, RECIPE, learned, parts, own_rest=False)
 
 
 def planted(o: Observed, part: np.ndarray, fault_db: float) -> Observed:
@@ -186,8 +186,8 @@ def test_an_antenna_that_no_other_flight_has_is_not_scored() -> None:
     alone = dataclasses.replace(flights[0], samples=dataclasses.replace(flights[0].samples, channel="USRP2"))
     split = calibration.heading_parts
     assert [(s.flight, s.channel) for s in leaving(split, [*flights, alone])] == [("a", "USRP1"), ("b", "USRP1")]
-    kept = {"a": calibration.learn([flights[1].samples], RECIPE)}
-    assert calibration.parts_left_out(flights[:1], RECIPE, kept, split, own_rest=False) == ()
+    learned = {"a": calibration.learn([flights[1].samples], RECIPE)}
+    assert calibration.parts_left_out(flights[:1], RECIPE, learned, split, own_rest=False) == ()
 
 
 @pytest.mark.parametrize("split", ["altitude", "heading", "sector"])
@@ -216,7 +216,7 @@ def test_baselines_of_a_part_take_their_offset_from_outside_it_too(split: str) -
     flights = [circled("a", 1), circled("b", 2)]
     scores = leaving(getattr(calibration, f"{split}_parts"), flights)
     assert [s.flight for s in scores] == ["a", "b"]
-    for o, found in zip(flights, scores, strict=True):
+    for o, score in zip(flights, scores, strict=True):
         error = np.full(len(o.samples), np.nan)
         constant = error.copy()
         for inside, outside in getattr(calibration, f"{split}_parts")(o, o):
@@ -224,27 +224,27 @@ def test_baselines_of_a_part_take_their_offset_from_outside_it_too(split: str) -
             error[inside] = o.samples.residual_db[inside] - o.samples.residual_db[outside].mean()
             constant[inside] = level[inside] - level[outside].mean()
         assert np.isfinite(error).all()
-        assert found.free_space_rmse_db == pytest.approx(error.std(), abs=1e-9)
-        assert found.constant_rmse_db == pytest.approx(constant.std(), abs=1e-9)
-        assert found.free_space_rmse_db > o.samples.residual_db.std()  # the flight's own offset flatters
+        assert score.free_space_rmse_db == pytest.approx(error.std(), abs=1e-9)
+        assert score.constant_rmse_db == pytest.approx(constant.std(), abs=1e-9)
+        assert score.free_space_rmse_db > o.samples.residual_db.std()  # the flight's own offset flatters
 
 
 def test_a_line_over_distance_is_the_one_that_least_squares_finds_outside() -> None:
     """Slope and level of samples outside alone; whatever free space is relative to; 0 to STEEPEST."""
     rng = np.random.default_rng(12)
-    one = observed("a", seed=4)
-    outside = np.arange(len(one.samples)) < 120
+    base = observed("a", seed=4)
+    outside = np.arange(len(base.samples)) < 120
     free = rng.uniform(-80.0, -60.0, len(outside))
     for true_slope, expected in ((1.4, 1.4), (-2.0, 0.0), (9.0, 3.0)):
         measured = 7.0 + true_slope * free
         for shift_db in (0.0, 100.0):
-            samples = dataclasses.replace(one.samples, residual_db=measured - free - shift_db)
-            shown = dataclasses.replace(one, samples=samples, free_space_db=free + shift_db)
+            samples = dataclasses.replace(base.samples, residual_db=measured - free - shift_db)
+            shown = dataclasses.replace(base, samples=samples, free_space_db=free + shift_db)
             simple = calibration.Simple.unknown(len(free))
             simple.predict(shown, ~outside, outside)
             level = measured[outside].mean()
-            wanted = level + expected * (free[~outside] - free[outside].mean())
-            assert simple.line_db[~outside] == pytest.approx(wanted)
+            line = level + expected * (free[~outside] - free[outside].mean())
+            assert simple.line_db[~outside] == pytest.approx(line)
             assert simple.constant_db[~outside] == pytest.approx(level)
             assert simple.free_db[~outside] + shown.free_space_db[~outside] == pytest.approx(
                 free[~outside] + (measured - free)[outside].mean()
@@ -253,20 +253,20 @@ def test_a_line_over_distance_is_the_one_that_least_squares_finds_outside() -> N
 
 
 def test_a_stretch_left_out_is_learned_from_the_flight_twenty_seconds_away_and_from_others_whole() -> None:
-    one, same, other = observed("a"), observed("a").part(np.arange(3, 190)), observed("b")
-    parts = calibration.route_parts(one, same)
-    counted = np.zeros(len(one.samples), dtype=int)
+    flown, same, other = observed("a"), observed("a").part(np.arange(3, 190)), observed("b")
+    parts = calibration.route_parts(flown, same)
+    counted = np.zeros(len(flown.samples), dtype=int)
     for k, (inside, outside) in enumerate(parts):
         counted += inside
-        time, there = one.samples.time_s[inside], same.samples.time_s
+        time, times = flown.samples.time_s[inside], same.samples.time_s
         assert np.ptp(time) == pytest.approx(398.0 / 8, abs=2.1)
-        apart = np.maximum(time.min() - there, there - time.max())
+        apart = np.maximum(time.min() - times, times - time.max())
         assert (apart[outside] >= 20.0 - 2.0).all()  # a stretch ends between two samples of 2 s
         assert (apart[~outside] <= 20.0 + 2.0).all()
         assert time.min() == pytest.approx(k * 398.0 / 8, abs=2.0)
     assert (counted == 1).all()
-    for (inside, whole), (mine, _) in zip(calibration.route_parts(one, other), parts, strict=True):
-        assert whole.all()
+    for (inside, outside_other), (mine, _) in zip(calibration.route_parts(flown, other), parts, strict=True):
+        assert outside_other.all()
         assert np.array_equal(inside, mine)
 
 
@@ -291,8 +291,8 @@ def test_a_score_is_that_by_hand_and_wants_fifty_samples() -> None:
     o, rng = circled("a", 1), np.random.default_rng(6)
     gain = 3.0 * o.samples.at_tower[:, 0] + rng.normal(size=len(o.samples))
     gain[:7], o.samples.residual_db[9] = np.nan, np.nan
-    found, good = calibration.score(o, gain), np.isfinite(gain) & np.isfinite(o.samples.residual_db)
-    assert found is not None
+    score, good = calibration.score(o, gain), np.isfinite(gain) & np.isfinite(o.samples.residual_db)
+    assert score is not None
     left, measured = (o.samples.residual_db - gain)[good], (o.samples.residual_db + o.free_space_db)[good]
     line = log_distance_level_db(measured, 10.0 ** (-o.free_space_db[good] / 20.0), o.samples.position_m[good])
     time = o.samples.time_s[good]
@@ -302,8 +302,8 @@ def test_a_score_is_that_by_hand_and_wants_fifty_samples() -> None:
         "constant_rmse_db": measured.std(), "log_distance_rmse_db": (measured - line).std(), "rmse_4s_db": slow.std(),
     }  # fmt: skip
     for name, value in expected.items():
-        assert getattr(found, name) == pytest.approx(value), name
-    assert found.n == good.sum()
+        assert getattr(score, name) == pytest.approx(value), name
+    assert score.n == good.sum()
     few = np.where(np.cumsum(good) <= 50, gain, np.nan)
     assert calibration.score(o, few) is not None
     assert calibration.score(o, np.where(np.cumsum(good) <= 49, gain, np.nan)) is None
@@ -311,7 +311,7 @@ def test_a_score_is_that_by_hand_and_wants_fifty_samples() -> None:
 
 def test_parts_of_a_circle_and_of_the_heights_are_those_by_hand() -> None:
     """Six sectors of 60 degrees and eight headings of 45, a guard of ten; heights five metres from the usual one."""
-    one, other = circled("a", 1), circled("b", 2)
+    scored, second = circled("a", 1), circled("b", 2)
     for parts, count, angle in (
         (
             calibration.sector_parts,
@@ -320,36 +320,42 @@ def test_parts_of_a_circle_and_of_the_heights_are_those_by_hand() -> None:
         ),
         (calibration.heading_parts, 8, lambda o: o.heading_deg),
     ):
-        found = parts(one, other)
-        assert len(found) == count
-        for k, (inside, outside) in enumerate(found):
+        masks = parts(scored, second)
+        assert len(masks) == count
+        for k, (inside, outside) in enumerate(masks):
             first, last = 360.0 / count * k, 360.0 / count * (k + 1)
-            assert inside.tolist() == [first <= a % 360.0 <= last for a in angle(one)]
-            away = [min((a - last) % 360.0, (first - a) % 360.0) for a in angle(other)]
-            between = [(a - first) % 360.0 <= last - first for a in angle(other)]
-            assert outside.tolist() == [not here and far > 10.0 for here, far in zip(between, away, strict=True)]
+            assert inside.tolist() == [first <= a % 360.0 <= last for a in angle(scored)]
+            away = [min((a - last) % 360.0, (first - a) % 360.0) for a in angle(second)]
+            between = [(a - first) % 360.0 <= last - first for a in angle(second)]
+            assert outside.tolist() == [
+                not near_part and far > 10.0 for near_part, far in zip(between, away, strict=True)
+            ]
     for height, near in ((40.0, True), (44.9, True), (45.0, False), (35.0, False), (35.1, True)):
-        there = other.samples.position_m.copy()
-        there[:, 2] = height
-        shifted = dataclasses.replace(other, samples=dataclasses.replace(other.samples, position_m=there))
-        ((inside, outside),) = calibration.altitude_parts(one, shifted)
-        assert inside.tolist() == (one.samples.position_m[:, 2] == 40.0).tolist()
+        position_m = second.samples.position_m.copy()
+        position_m[:, 2] = height
+        shifted = dataclasses.replace(second, samples=dataclasses.replace(second.samples, position_m=position_m))
+        ((inside, outside),) = calibration.altitude_parts(scored, shifted)
+        assert inside.tolist() == (scored.samples.position_m[:, 2] == 40.0).tolist()
         assert (~outside).all() == near
         assert outside.any() != near
 
 
 def test_below_its_floor_a_receiver_has_what_the_fit_says_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """Levels 3 dB above the gain, a floor of -5 dB beside a pattern of 2 dB: by hand."""
-    gain, known = np.linspace(-20.0, 20.0, 200), np.full(200, 2.0)
-    heard = gain + 3.0 + known
+    gain, pattern_db = np.linspace(-20.0, 20.0, 200), np.full(200, 2.0)
+    level_db = gain + 3.0 + pattern_db
     base = observed("a").samples
-    samples = dataclasses.replace(base, residual_db=np.where(heard < -5.0, -21.0, heard), floor_db=np.full(200, -5.0))
+    samples = dataclasses.replace(
+        base, residual_db=np.where(level_db < -5.0, -21.0, level_db), floor_db=np.full(200, -5.0)
+    )
     monkeypatch.setattr(calibration, "_mean_along", lambda *_: gain)
     fit = calibration.learn([observed("a").samples, observed("b").samples], RECIPE).fit
     assert fit is not None
-    found = calibration._at_floor(samples, known, fit).residual_db
-    np.testing.assert_allclose(found, np.where(heard < -5.0, np.minimum(gain + 3.0, -7.0), gain + 3.0), atol=1e-9)
-    plain = calibration._at_floor(dataclasses.replace(samples, floor_db=None), known, fit).residual_db
+    residual_db = calibration._at_floor(samples, pattern_db, fit).residual_db
+    np.testing.assert_allclose(
+        residual_db, np.where(level_db < -5.0, np.minimum(gain + 3.0, -7.0), gain + 3.0), atol=1e-9
+    )
+    plain = calibration._at_floor(dataclasses.replace(samples, floor_db=None), pattern_db, fit).residual_db
     np.testing.assert_allclose(plain, samples.residual_db - 2.0)
 
 
@@ -357,13 +363,13 @@ def test_an_offset_of_others_adds_to_the_error_and_stated_spreads_are_asked() ->
     o = observed("a", offset_db=5.0, seed=1)
     learned = calibration.learn([observed("b", seed=2).samples, observed("c", seed=3).samples], RECIPE)
     offsets = calibration._offsets([observed(name, seed=k).samples for k, name in enumerate("bc", 2)], learned)
-    (found,) = calibration.score_with(learned, [o], [observed("b", seed=2), observed("c", seed=3)])
-    own = learned.mean_error(o.samples)
-    assert found.offset_db == pytest.approx(own)
-    assert found.rmse_shared_offset_db == pytest.approx(np.hypot(found.rmse_db, own - offsets["LW1.USRP1"]))
+    (score,) = calibration.score_with(learned, [o], [observed("b", seed=2), observed("c", seed=3)])
+    own_offset = learned.mean_error(o.samples)
+    assert score.offset_db == pytest.approx(own_offset)
+    assert score.rmse_shared_offset_db == pytest.approx(np.hypot(score.rmse_db, own_offset - offsets["LW1.USRP1"]))
     stated = StatedSpread(gain_sd_db=learned.predict(o.samples)[1], spread=learned.spread("LW1.USRP1"))
-    error = o.samples.residual_db - learned.mean(o.samples) - own
-    assert {name: getattr(found, name) for name in ("inside_50", "inside_90", "inside_95")} == inside_shares(
+    error = o.samples.residual_db - learned.mean(o.samples) - own_offset
+    assert {name: getattr(score, name) for name in ("inside_50", "inside_90", "inside_95")} == inside_shares(
         error, stated
     )
     fading = fading_of([s.samples for s in (observed("b", seed=2), observed("c", seed=3))], 4.0)

@@ -128,10 +128,12 @@ def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memory(columns: b
         coefficients = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ residual)
         left = residual - design @ coefficients
         variance = left @ inverse @ left / n
-        best = max(best, (multivariate_normal.logpdf(left, None, variance * cover), left), key=lambda one: one[0])
-    found = causes._fitted(residual, extra if columns else None)
-    assert found.log_likelihood == pytest.approx(best[0] + 0.5 * n * (np.log(2.0 * np.pi) + 1.0), abs=1e-6)
-    np.testing.assert_allclose(found.residual_db, best[1] - best[1].mean(), atol=1e-6)
+        best = max(
+            best, (multivariate_normal.logpdf(left, None, variance * cover), left), key=lambda candidate: candidate[0]
+        )
+    fit = causes._fitted(residual, extra if columns else None)
+    assert fit.log_likelihood == pytest.approx(best[0] + 0.5 * n * (np.log(2.0 * np.pi) + 1.0), abs=1e-6)
+    np.testing.assert_allclose(fit.residual_db, best[1] - best[1].mean(), atol=1e-6)
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.8])
@@ -157,21 +159,21 @@ def test_a_second_is_the_mean_of_its_samples_and_directions_turn_the_short_way()
     level = np.sin(time)
     level[5] = np.nan
     around = 180.0 + 20.0 * np.cos(5.0 * time)  # on both sides of where angles jump
-    whole = replace(
+    evidence = replace(
         _evidence(), time_s=time, measured_db=level, predicted_db=0.5 * time, uav_azimuth_deg=around,
         uav_elevation_deg=time, tower_azimuth_deg=around - 180.0, turned_db={10.0: level + 1.0}, other_towers_db={"B": -time},
     )  # fmt: skip
-    found = causes._binned(whole)
-    assert found is not None
+    seconds = causes._binned(evidence)
+    assert seconds is not None
     for second in range(90):
         some = [k for k in range(len(time)) if second <= time[k] < second + 1 and np.isfinite(level[k])]
-        assert found.measured_db[second] == pytest.approx(np.mean(level[some]))
-        assert found.predicted_db[second] == pytest.approx(np.mean(0.5 * time[some]))
-        assert found.other_towers_db["B"][second] == pytest.approx(-np.mean(time[some]))
-        assert _direction(found.uav_azimuth_deg[second]) == pytest.approx(np.mean(around[some]), abs=0.2)
-        assert found.tower_azimuth_deg[second] == pytest.approx(np.mean(around[some]) - 180.0, abs=0.2)
-    few = replace(whole, measured_db=np.where(time < 59, level, np.nan))
-    enough = replace(whole, measured_db=np.where(time < 60, level, np.nan))
+        assert seconds.measured_db[second] == pytest.approx(np.mean(level[some]))
+        assert seconds.predicted_db[second] == pytest.approx(np.mean(0.5 * time[some]))
+        assert seconds.other_towers_db["B"][second] == pytest.approx(-np.mean(time[some]))
+        assert _direction(seconds.uav_azimuth_deg[second]) == pytest.approx(np.mean(around[some]), abs=0.2)
+        assert seconds.tower_azimuth_deg[second] == pytest.approx(np.mean(around[some]) - 180.0, abs=0.2)
+    few = replace(evidence, measured_db=np.where(time < 59, level, np.nan))
+    enough = replace(evidence, measured_db=np.where(time < 60, level, np.nan))
     assert causes._binned(few) is None
     assert causes._binned(enough) is not None
 
@@ -237,8 +239,8 @@ def test_a_cause_gains_four_beyond_its_cost_and_takes_a_tenth_of_the_error(
         for more in (gain, gain - 1.0)
     )
     nothing = (np.nan, np.nan, np.nan)
-    found = [(2.0, "made", (2.0, 1.0, 4.0), "here", best), (2.0, "second", nothing, "", other)]
-    monkeypatch.setattr(causes, "_troubles", lambda _: iter(found))
+    troubles = [(2.0, "made", (2.0, 1.0, 4.0), "here", best), (2.0, "second", nothing, "", other)]
+    monkeypatch.setattr(causes, "_troubles", lambda _: iter(troubles))
     cause = likely_cause(_evidence())
     assert cause.name == ("made" if named else "none")
     if named:
@@ -252,9 +254,9 @@ def test_every_trouble_has_its_cost_and_is_the_best_of_what_is_tried(monkeypatch
     sound = causes._binned(_evidence())
     assert sound is not None
     residual, fitted = sound.measured_db - sound.predicted_db, causes._fitted
-    found = {(cost, name): rest for cost, name, *rest in causes._troubles(sound)}
+    troubles = {(cost, name): rest for cost, name, *rest in causes._troubles(sound)}
     names = ("clock", "heading", "pattern", "tower", "pattern", "blocked", "floor", "gain step")
-    assert list(found) == list(zip((1, 1, 4, 1, 3, 3, 2, 2), names, strict=True))
+    assert list(troubles) == list(zip((1, 1, 4, 1, 3, 3, 2, 2), names, strict=True))
     assert [name for _, name, *_ in causes._troubles(replace(sound, clock_confirmed=True))] == list(names[1:])
     bare = replace(sound, turned_db={}, other_towers_db={})
     assert [name for _, name, *_ in causes._troubles(bare)] == ["clock", "pattern", "blocked", "floor", "gain step"]
@@ -265,14 +267,14 @@ def test_every_trouble_has_its_cost_and_is_the_best_of_what_is_tried(monkeypatch
     turns = {angle: fitted(residual - turn) for angle, turn in sound.turned_db.items()}
     for name, fits in (("clock", lags), ("heading", turns)):
         _, estimate, _, fit = causes._profiled(name, fits)
-        assert found[1.0, name][0] == estimate
-        assert found[1.0, name][2].log_likelihood == fit.log_likelihood
-    turned = fitted(residual - sound.turned_db[found[1.0, "heading"][0][0]], causes._harmonics(sound))
-    assert found[4.0, "pattern"][2].log_likelihood == turned.log_likelihood
-    assert found[3.0, "pattern"][2].log_likelihood == fitted(residual, causes._harmonics(sound)).log_likelihood
+        assert troubles[1.0, name][0] == estimate
+        assert troubles[1.0, name][2].log_likelihood == fit.log_likelihood
+    turned = fitted(residual - sound.turned_db[troubles[1.0, "heading"][0][0]], causes._harmonics(sound))
+    assert troubles[4.0, "pattern"][2].log_likelihood == turned.log_likelihood
+    assert troubles[3.0, "pattern"][2].log_likelihood == fitted(residual, causes._harmonics(sound)).log_likelihood
     towers = {name: fitted(sound.measured_db - level).log_likelihood for name, level in sound.other_towers_db.items()}
-    assert found[1.0, "tower"][1] == max(towers, key=towers.__getitem__)
-    assert found[1.0, "tower"][2].log_likelihood == max(towers.values())
+    assert troubles[1.0, "tower"][1] == max(towers, key=towers.__getitem__)
+    assert troubles[1.0, "tower"][2].log_likelihood == max(towers.values())
     tried: list[float] = []
     monkeypatch.setattr(causes, "_above_floor", lambda _, floor: tried.append(floor) or fitted(residual))
     causes._floored(sound)
@@ -303,9 +305,12 @@ def test_every_trouble_has_its_cost_and_is_the_best_of_what_is_tried(monkeypatch
         mask = np.arange(len(residual)) >= at
         bounds = causes._bounded(residual, mask, shifted(mask, phi)[0], phi)
         steps.append((fitted(residual, 1.0 * mask[:, None]).log_likelihood, bounds, f"{sound.time_s[at]:.0f}"))
-    likelihood, bounds = max(sectors, key=lambda one: one[0])  # of equals, that of the shortest memory
-    assert found[3.0, "blocked"][0] == pytest.approx(bounds)
-    assert found[3.0, "blocked"][2].log_likelihood == pytest.approx(likelihood)
-    likelihood, bounds, where = max(steps, key=lambda one: one[0])
-    assert found[2.0, "gain step"][0] == pytest.approx(bounds)
-    assert (found[2.0, "gain step"][1], found[2.0, "gain step"][2].log_likelihood) == (where, pytest.approx(likelihood))
+    likelihood, bounds = max(sectors, key=lambda fit_of: fit_of[0])  # of equals, that of the shortest memory
+    assert troubles[3.0, "blocked"][0] == pytest.approx(bounds)
+    assert troubles[3.0, "blocked"][2].log_likelihood == pytest.approx(likelihood)
+    likelihood, bounds, where = max(steps, key=lambda fit_of: fit_of[0])
+    assert troubles[2.0, "gain step"][0] == pytest.approx(bounds)
+    assert (troubles[2.0, "gain step"][1], troubles[2.0, "gain step"][2].log_likelihood) == (
+        where,
+        pytest.approx(likelihood),
+    )

@@ -36,9 +36,9 @@ def flight(name: str, seed: int, channel: str = "A", field_db: float = 0.0) -> L
     return samples(name, wave + generator.normal(0, 3) + generator.normal(0.0, 1.0, 80), place, channel)
 
 
-def gain(one: LinkSamples) -> FloatArray:
+def gain(series: LinkSamples) -> FloatArray:
     """A base that is wrong by a slope over the east."""
-    return np.asarray(0.02 * one.position_m[:, 0])
+    return np.asarray(0.02 * series.position_m[:, 0])
 
 
 FEW = {OFF: correction._STARTS[OFF], "field": FieldModel(place_sd_db=2.5, length_m=50.0, height_m=40.0, turn=math.inf)}
@@ -80,8 +80,8 @@ def test_blocks_spread_by_their_means() -> None:
     rows = Rows.of(samples("a", np.zeros(5), place), 0)
     channel = Channel(rows=rows, left_db=np.array([1.0, 3.0, 5.0, -2.0, -4.0]), base_sd_db=np.zeros(5))
     assert correction.between_blocks_db(channel) == pytest.approx(np.std([2.0, 5.0, -3.0], ddof=1))
-    one = Channel(rows=rows.part(slice(0, 2)), left_db=channel.left_db[:2], base_sd_db=np.zeros(2))
-    assert correction.between_blocks_db(one) == 0.0
+    single = Channel(rows=rows.part(slice(0, 2)), left_db=channel.left_db[:2], base_sd_db=np.zeros(2))
+    assert correction.between_blocks_db(single) == 0.0
 
 
 def by_hand(series: Sequence[LinkSamples], base: Base, model: FieldModel) -> tuple[FloatArray, FloatArray]:
@@ -90,18 +90,18 @@ def by_hand(series: Sequence[LinkSamples], base: Base, model: FieldModel) -> tup
     for name in dict.fromkeys(s.flight for s in series):
         known, asked = [s for s in series if s.flight != name], [s for s in series if s.flight == name]
         predictor = base(known)
-        for one in asked:
-            same = [s for s in known if s.antenna == one.antenna]
+        for scored in asked:
+            same = [s for s in known if s.antenna == scored.antenna]
             if not same:
-                errors.append(np.full(len(one), np.nan))
-                sds.append(np.ones(len(one)))
+                errors.append(np.full(len(scored), np.nan))
+                sds.append(np.ones(len(scored)))
                 continue
             names = list(dict.fromkeys(s.flight for s in known))
             rows = Rows.joined([Rows.of(s, names.index(s.flight)) for s in same])
             left = np.concatenate([s.residual_db - predictor(s)[0] for s in same])
-            mean, sd = FieldFit(model, rows, left).predict(Rows.of(one, -1), ("place", "drift"))
-            level, level_sd = predictor(one)
-            error = one.residual_db - level - mean
+            mean, sd = FieldFit(model, rows, left).predict(Rows.of(scored, -1), ("place", "drift"))
+            level, level_sd = predictor(scored)
+            error = scored.residual_db - level - mean
             errors.append(error - error.mean())
             sds.append(np.sqrt(sd**2 + level_sd**2 + model.noise_sd_db**2))
     return np.concatenate(errors), np.concatenate(sds)
@@ -109,34 +109,34 @@ def by_hand(series: Sequence[LinkSamples], base: Base, model: FieldModel) -> tup
 
 def unsure(known: Sequence[LinkSamples]) -> object:
     del known
-    return lambda one: (gain(one), np.full(len(one), 1.5))
+    return lambda series: (gain(series), np.full(len(series), 1.5))
 
 
 @pytest.mark.parametrize("base", [fixed_base(gain), unsure])
 def test_what_is_left_out_is_scored_as_by_hand(base: Base) -> None:
     """Two flights share antenna A, the third alone has B: it is scored by nobody."""
     series = [flight("a", 1), flight("b", 2), flight("c", 3, "B")]
-    found = choose(series, {"made": base})
+    choice = choose(series, {"made": base})
     for title, model in FEW.items():
         assert model is not None
         error, bare = by_hand(series, base, model)
-        got, stated = found.held_out["made", title]
-        np.testing.assert_allclose(got, error, atol=1e-9)
+        held_error, stated = choice.held_out["made", title]
+        np.testing.assert_allclose(held_error, error, atol=1e-9)
         sd = bare * min(max(np.sqrt(np.nanmean((error / bare) ** 2)), 0.8), 1.6)
         np.testing.assert_allclose(stated, sd, rtol=1e-9)
         good = np.isfinite(error)
         assert good.sum() == 160
-        assert found.rmse_db["made", title] == pytest.approx(np.sqrt(np.mean(error[good] ** 2)))
+        assert choice.rmse_db["made", title] == pytest.approx(np.sqrt(np.mean(error[good] ** 2)))
         z = error[good] / sd[good]
         crps = sd[good] * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))
-        assert found.crps_db["made", title] == pytest.approx(crps.mean())
-    error, sd = by_hand(series, base, FEW[found.title])  # type: ignore[arg-type]
+        assert choice.crps_db["made", title] == pytest.approx(crps.mean())
+    error, sd = by_hand(series, base, FEW[choice.title])  # type: ignore[arg-type]
     ratio = np.sqrt(np.nanmean((error / sd) ** 2))
-    assert found.sd_factor == pytest.approx(min(max(ratio, 0.8), 1.6))
+    assert choice.sd_factor == pytest.approx(min(max(ratio, 0.8), 1.6))
 
 
 def test_a_field_is_added_where_one_was_planted_and_the_nearer_base_wins() -> None:
-    bases = {"wrong": fixed_base(gain), "none": fixed_base(lambda one: np.zeros(len(one)))}
+    bases = {"wrong": fixed_base(gain), "none": fixed_base(lambda series: np.zeros(len(series)))}
     plain = choose([flight(name, k) for k, name in enumerate("abc")], bases)
     waves = choose([flight(name, k, field_db=4.0) for k, name in enumerate("abc")], bases)
     assert (plain.base, plain.title, plain.on) == ("none", OFF, False)
@@ -161,27 +161,27 @@ def test_a_field_is_added_where_one_was_planted_and_the_nearer_base_wins() -> No
 
 def test_a_field_that_helps_by_chance_stays_off() -> None:
     """Weak waves: the difference by block means of 16 samples, whose interval is that of Student."""
-    nothing, lower = fixed_base(lambda one: np.zeros(len(one))), []
+    nothing, lower = fixed_base(lambda series: np.zeros(len(series))), []
     for seed in (0, 3, 9):
-        found = choose([flight(name, seed + k, field_db=1.5) for k, name in enumerate("abc")], {"made": nothing})
-        field, bare = (crps_normal(*found.held_out["made", title]) for title in ("field", OFF))
+        choice = choose([flight(name, seed + k, field_db=1.5) for k, name in enumerate("abc")], {"made": nothing})
+        field, bare = (crps_normal(*choice.held_out["made", title]) for title in ("field", OFF))
         means = (field - bare).reshape(-1, 16).mean(axis=1)
         reach = t.ppf(0.975, len(means) - 1) * means.std(ddof=1) / np.sqrt(len(means))
-        assert means.mean() + 0.6 * reach < 0.0 if found.on else means.mean() + 1.6 * reach > 0.0
-        lower.append((bool(means.mean() < 0.0), found.on))
+        assert means.mean() + 0.6 * reach < 0.0 if choice.on else means.mean() + 1.6 * reach > 0.0
+        lower.append((bool(means.mean() < 0.0), choice.on))
     assert set(lower) == {(True, True), (True, False)}
 
 
 def test_headings_that_count_alike_add_their_spread() -> None:
-    found = choose([flight(name, k) for k, name in enumerate("ab")], {"made": fixed_base(gain)})
+    choice = choose([flight(name, k) for k, name in enumerate("ab")], {"made": fixed_base(gain)})
     here = flight("n", 5)
     turned = dataclasses.replace(
         here, position_m=here.position_m + np.array([100.0, 0.0, 0.0])
     )  # a gain that is 2 dB higher
-    level, sd = found.over_headings([here, turned])
-    one, one_sd = found.predict(here)
-    np.testing.assert_allclose(level, one + 1.0, atol=1e-9)
-    np.testing.assert_allclose((sd / found.sd_factor) ** 2, (one_sd / found.sd_factor) ** 2 + 1.0, rtol=1e-9)
+    level, sd = choice.over_headings([here, turned])
+    here_db, here_sd = choice.predict(here)
+    np.testing.assert_allclose(level, here_db + 1.0, atol=1e-9)
+    np.testing.assert_allclose((sd / choice.sd_factor) ** 2, (here_sd / choice.sd_factor) ** 2 + 1.0, rtol=1e-9)
 
 
 def test_nothing_to_learn_from_is_one_message() -> None:
@@ -192,7 +192,7 @@ def test_nothing_to_learn_from_is_one_message() -> None:
 def test_a_single_flight_is_scored_block_by_block_with_its_own_offset() -> None:
     place = np.random.default_rng(1).uniform([0, 0, 30], [580, 280, 50], (120, 3))
     alone = samples("a", np.random.default_rng(2).normal(5.0, 2.0, 120), place)
-    found = choose([alone], {"made": fixed_base(gain)})
+    choice = choose([alone], {"made": fixed_base(gain)})
     west = place[:, 0] < 300.0
     fuller = west if west.sum() >= 60 else ~west
     for title, model in FEW.items():
@@ -203,8 +203,8 @@ def test_a_single_flight_is_scored_block_by_block_with_its_own_offset() -> None:
             mean, sd = FieldFit(model, rows.part(~inside), left[~inside]).predict(rows.part(inside), PARTS)
             errors.append((left[inside] - mean, np.hypot(sd, model.noise_sd_db)))
         error, sd = (np.concatenate(parts) for parts in zip(*errors, strict=True))
-        np.testing.assert_allclose(found.held_out["made", title][0], error, atol=1e-9)
-        np.testing.assert_allclose(found.held_out["made", title][1], found.sd_factor * sd, rtol=1e-9)
+        np.testing.assert_allclose(choice.held_out["made", title][0], error, atol=1e-9)
+        np.testing.assert_allclose(choice.held_out["made", title][1], choice.sd_factor * sd, rtol=1e-9)
 
 
 def test_of_many_flights_three_groups_of_six_are_scored_and_scales_are_learned_once(
@@ -214,17 +214,19 @@ def test_of_many_flights_three_groups_of_six_are_scored_and_scales_are_learned_o
     monkeypatch.setattr(correction, "fit_field", lambda *given: fits.append(1) or given[1])
     for count, scored, learned in ((6, 6, 7), (7, 4, 2), (12, 6, 2)):
         fits.clear()
-        found = choose([flight(str(k), k) for k in range(count)], {"made": fixed_base(gain)})
-        assert len(found.held_out["made", OFF][0]) == 80 * scored
+        choice = choose([flight(str(k), k) for k in range(count)], {"made": fixed_base(gain)})
+        assert len(choice.held_out["made", OFF][0]) == 80 * scored
         assert sum(fits) == (learned - 1) * len(FEW) + 1
 
 
 def test_gains_of_many_directions_are_asked_once_a_degree() -> None:
     calls: list[int] = []
 
-    def predictor(one: LinkSamples) -> tuple[FloatArray, FloatArray]:
-        calls.append(len(one))
-        return 5.0 * one.at_uav[:, 1] + 7.0 * one.at_tower[:, 2] + len(one.channel), 2.0 + one.at_tower[:, 0]
+    def predictor(series: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        calls.append(len(series))
+        return 5.0 * series.at_uav[:, 1] + 7.0 * series.at_tower[:, 2] + len(series.channel), 2.0 + series.at_tower[
+            :, 0
+        ]
 
     generator = np.random.default_rng(4)
     ray = generator.normal(size=(40, 3)).repeat(126, axis=0) + 1e-4 * generator.normal(size=(5040, 3))
@@ -236,9 +238,9 @@ def test_gains_of_many_directions_are_asked_once_a_degree() -> None:
     coarse, (level, sd) = by_degree(predictor), predictor(many)
     for again in range(2):
         calls.clear()
-        found, found_sd = coarse(many)
-        np.testing.assert_allclose(found, level, atol=0.25)
-        np.testing.assert_allclose(found_sd, sd, atol=0.05)
+        level_by_degree, sd_by_degree = coarse(many)
+        np.testing.assert_allclose(level_by_degree, level, atol=0.25)
+        np.testing.assert_allclose(sd_by_degree, sd, atol=0.05)
         assert sum(calls) <= (700, 0)[again]  # a direction on the border of a degree counts as up to four
     longer = dataclasses.replace(many, channel="AAA")
     np.testing.assert_allclose(coarse(longer)[0], level + 2.0, atol=0.25)

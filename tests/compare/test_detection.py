@@ -117,26 +117,26 @@ def test_every_score_is_that_by_hand(learned: bool) -> None:
     ok = np.isfinite(simulated) & np.isfinite(time)
     seen, level = detected[ok], simulated[ok]
     if learned:
-        said, constant = 1.0 / (1.0 + np.exp(-0.25 * (level + 56.0))), np.full(398, 0.4)
+        forecast_p, constant = 1.0 / (1.0 + np.exp(-0.25 * (level + 56.0))), np.full(398, 0.4)
     else:  # tenths of the time, each told by the others
         tenth = np.minimum((time[ok] - 5.0) / 39.9 * 10.0, 9.0).astype(int)
         p = out_of_group(level[:, None], seen.astype(int) + 1, tenth, 1.0)
-        said = p[:, 1] / (p[:, 0] + p[:, 1])
+        forecast_p = p[:, 1] / (p[:, 0] + p[:, 1])
         constant = np.array([constant_forecast(seen[tenth != t].astype(int) + 1, 2)[1] for t in tenth])
     for p, brier, log in (
-        (said, score.brier, score.log_score), (constant, score.constant_brier, score.constant_log_score)
+        (forecast_p, score.brier, score.log_score), (constant, score.constant_brier, score.constant_log_score)
     ):  # fmt: skip
         assert brier == pytest.approx(np.mean((p - seen) ** 2))
         assert log == pytest.approx(-np.mean(np.log(np.where(seen, p, 1.0 - p))))
-    heard = np.maximum(np.nan_to_num(measured[ok], nan=FLOOR), FLOOR)
-    error = heard - np.maximum(level - score.offset_db, FLOOR)
+    floored_db = np.maximum(np.nan_to_num(measured[ok], nan=FLOOR), FLOOR)
+    error = floored_db - np.maximum(level - score.offset_db, FLOOR)
     assert (score.rmse_db, score.detected_rmse_db) == pytest.approx(
         (np.sqrt(np.mean(error**2)), np.sqrt(np.mean(error[seen] ** 2)))
     )
-    assert score.free_space_rmse_db == pytest.approx(floored_fit(heard, free[ok], FLOOR).rmse_db)
-    fifths = [(said >= k / 5) & (said < (k + 1) / 5) for k in range(5)]
+    assert score.free_space_rmse_db == pytest.approx(floored_fit(floored_db, free[ok], FLOOR).rmse_db)
+    fifths = [(forecast_p >= k / 5) & (forecast_p < (k + 1) / 5) for k in range(5)]
     assert score.reliability == pytest.approx(
-        [pytest.approx((said[g].mean(), seen[g].mean(), g.sum())) for g in fifths if g.any()]
+        [pytest.approx((forecast_p[g].mean(), seen[g].mean(), g.sum())) for g in fifths if g.any()]
     )
 
 
@@ -160,11 +160,11 @@ def test_a_quality_ahead_of_its_power_is_taken_at_its_own_times(slow: float, by_
     own = 7.0 + BASE_S * np.arange(300)
     time = 7.0 + slow * (own - 7.0)
     power, quality = np.sin(time), np.sin(time if by_row else own)
-    found, shift = aligned_quality(time, power, quality)
+    aligned, shift = aligned_quality(time, power, quality)
     if by_row or slow == 1.1:  # rows agree, or are a second apart at most
         assert shift == 0.0
-        assert found is quality
+        assert aligned is quality
     else:
         assert shift == pytest.approx(0.4 * 0.032768 * 299)
-        np.testing.assert_allclose(found[time <= own[-1]], power[time <= own[-1]], atol=1e-3)
-        assert np.isnan(found[time > own[-1]]).all()
+        np.testing.assert_allclose(aligned[time <= own[-1]], power[time <= own[-1]], atol=1e-3)
+        assert np.isnan(aligned[time > own[-1]]).all()

@@ -82,8 +82,8 @@ def test_fit_equals_the_exact_gaussian_process(own_sd, noise_sd):
     weights = np.linalg.solve(kernel(body, mast, series, body, mast, series) + own, y)
     for i, test in enumerate(TEST):
         exact = kernel(test.at_uav, test.at_tower, np.full(len(test), i), body, mast, series) @ weights
-        found = fit.predict(test)[0]
-        assert np.abs((found - found.mean()) - (exact - exact.mean())).max() < 1e-6
+        predicted = fit.predict(test)[0]
+        assert np.abs((predicted - predicted.mean()) - (exact - exact.mean())).max() < 1e-6
 
 
 PAIR = Term("pair", "antenna", 0.5, 2.0)
@@ -96,26 +96,26 @@ def test_gain_towards_both_ends_equals_the_exact_gaussian_process():
     fit = fit_gain(train, model)
     test = dataclasses.replace(TEST[0].part(np.arange(0, 500, 7)), at_uav=TEST[0].at_uav[::7] * [-1.0, 1.0, 1.0])
 
-    def kernel(one, other):
-        body, mast = (cdist(getattr(one, k), getattr(other, k)) for k in ("at_uav", "at_tower"))
+    def kernel(left, right):
+        body, mast = (cdist(getattr(left, k), getattr(right, k)) for k in ("at_uav", "at_tower"))
         pair = PAIR.sd_db**2 * np.exp(-(body**2 + mast**2) / 0.5)
         return 2.5**2 * np.exp(-body / 0.5) + 3.0**2 * np.exp(-mast / 0.4) + pair
 
-    blocks = [[kernel(one, other) for other in train] for one in train]
-    whole = np.block(blocks)
+    blocks = [[kernel(left, right) for right in train] for left in train]
+    covariance = np.block(blocks)
     start = 0
     for s in train:
         at = slice(start, start + len(s))
-        whole[at, at] += np.exp(-cdist(s.position_m, s.position_m) / 20.0) + 1e4 + np.eye(len(s))
+        covariance[at, at] += np.exp(-cdist(s.position_m, s.position_m) / 20.0) + 1e4 + np.eye(len(s))
         start += len(s)
     y = np.concatenate([s.residual_db - s.residual_db.mean() for s in train])
     # predictions are about the mean over the training bins
     seen = np.concatenate([kernel(test, s) for s in train], axis=1)
     inside = np.block(blocks)
     centred = seen - inside.mean(axis=0)
-    exact = centred @ np.linalg.solve(whole, y)
+    exact = centred @ np.linalg.solve(covariance, y)
     variance = np.diag(kernel(test, test)) - 2.0 * seen.mean(axis=1) + inside.mean()
-    variance = variance - np.einsum("ij,ij->i", centred, np.linalg.solve(whole, centred.T).T)
+    variance = variance - np.einsum("ij,ij->i", centred, np.linalg.solve(covariance, centred.T).T)
     gain, sd = fit.predict(test)
     np.testing.assert_allclose(gain, exact, rtol=0, atol=1e-6)
     np.testing.assert_allclose(sd, np.sqrt(variance), rtol=0, atol=1e-6)
@@ -145,9 +145,9 @@ def test_planted_gains_lie_within_their_own_sd_where_flights_have_looked():
 
 def test_gain_is_a_guess_where_no_flight_has_looked():
     fit = fit_gain(TRAIN, MODEL)
-    below, beside = np.array([[0.0, 0.0, -1.0]]), fit.seen("mast", "LW1.A")[:50]
+    below, flown = np.array([[0.0, 0.0, -1.0]]), fit.seen("mast", "LW1.A")[:50]
     assert fit.gain("mast", "LW1.A", below)[1][0] > 2.5  # the prior's 3 dB
-    assert fit.gain("mast", "LW1.A", beside)[1].mean() < 1.5
+    assert fit.gain("mast", "LW1.A", flown)[1].mean() < 1.5
 
 
 def test_place_field_stays_apart_from_the_antennas():
@@ -156,8 +156,8 @@ def test_place_field_stays_apart_from_the_antennas():
     fit = fit_gain(flights, dataclasses.replace(MODEL, terms=(*TERMS, PLACE_TERM)))
     field = fit.predict(flights[0], ("place",))[0]
     assert np.corrcoef(field, places(flights[0].position_m))[0, 1] > 0.7
-    whole = fit.predict(flights[0])[0]
-    assert np.allclose(whole, field + fit.predict(flights[0], ("body", "mast"))[0], atol=1e-9)
+    total = fit.predict(flights[0])[0]
+    assert np.allclose(total, field + fit.predict(flights[0], ("body", "mast"))[0], atol=1e-9)
 
 
 @pytest.mark.parametrize(("planted_factor", "chosen"), [(1.0, 1.0), (0.3, 0.5)])
@@ -191,8 +191,8 @@ def test_mounts_are_found_together():
     truth = {"uav": 250.0, "A": 40.0, "B": 130.0}
     gains = {k: (lambda d, a=a: pattern(d @ turn(a, 0.0, 0.0))) for k, a in truth.items()}
     flights = [s for k in range(2) for s in planted(f"f{k}", 50 + k, gains)]
-    found = fit_mounts(flights, {"uav": pattern, "LW1.A": pattern, "LW1.B": pattern}, turn)
-    for name, fit in found.items():
+    mounts = fit_mounts(flights, {"uav": pattern, "LW1.A": pattern, "LW1.B": pattern}, turn)
+    for name, fit in mounts.items():
         true = truth[name.removeprefix("LW1.")]
         assert abs((fit.azimuth_deg - true + 180) % 360 - 180) <= 10
         assert fit.identified
@@ -205,7 +205,7 @@ def test_probabilities_of_mounts_by_trying_all_pairs():
     pattern = lambda d: 9.0 * d[:, 0] + 4.0 * d[:, 1] ** 2  # noqa: E731
 
     (flight,) = planted("f", 57, {"uav": pattern, "A": pattern}, n=60, channels=("A",))
-    found = fit_mounts([flight], {"uav": pattern, "LW1.A": pattern}, turn)
+    mounts = fit_mounts([flight], {"uav": pattern, "LW1.A": pattern}, turn)
     bins = flight.binned(4.0)
     centred = lambda x: x - x.mean()  # noqa: E731
     ends = [
@@ -218,10 +218,12 @@ def test_probabilities_of_mounts_by_trying_all_pairs():
     mast = np.exp(log - log.max(axis=1, keepdims=True))
     uav /= uav.sum()
     assert 0.05 < uav.max() < 0.95
-    np.testing.assert_allclose(found["uav"].probability, uav, atol=1e-9)
-    np.testing.assert_allclose(found["LW1.A"].probability, uav @ (mast / mast.sum(axis=1, keepdims=True)), atol=1e-9)
-    assert (found["uav"].azimuth_deg / 10, found["LW1.A"].azimuth_deg / 10) == np.unravel_index(log.argmax(), log.shape)
-    for fit in found.values():  # the circular standard deviation, and what is left beyond 45 degrees
+    np.testing.assert_allclose(mounts["uav"].probability, uav, atol=1e-9)
+    np.testing.assert_allclose(mounts["LW1.A"].probability, uav @ (mast / mast.sum(axis=1, keepdims=True)), atol=1e-9)
+    assert (mounts["uav"].azimuth_deg / 10, mounts["LW1.A"].azimuth_deg / 10) == np.unravel_index(
+        log.argmax(), log.shape
+    )
+    for fit in mounts.values():  # the circular standard deviation, and what is left beyond 45 degrees
         off = np.radians(fit.grid_deg - fit.azimuth_deg)
         length = np.hypot(fit.probability @ np.cos(off), fit.probability @ np.sin(off))
         assert fit.azimuth_sd_deg == pytest.approx(max(np.degrees(np.sqrt(-2 * np.log(length))), 10 / np.sqrt(12)))
@@ -233,26 +235,26 @@ def test_a_planted_tilt_is_fitted_at_the_best_azimuth_with_its_spread():
     pattern = lambda d: 8.0 * d[:, 0] + 6.0 * d[:, 1] * d[:, 2] + 9.0 * d[:, 2]  # noqa: E731
 
     flight = planted("f", 58, {"uav": lambda d: pattern(d @ turn(120, 15, -10)), "A": lambda _: 0.0}, channels="A")[0]
-    found = fit_mounts([flight], {"uav": pattern}, turn, tilt=True)["uav"]
-    assert abs(found.azimuth_deg - 120.0) <= 10.0
+    mount = fit_mounts([flight], {"uav": pattern}, turn, tilt=True)["uav"]
+    assert abs(mount.azimuth_deg - 120.0) <= 10.0
     tilts = np.array([(p, r) for p in range(-20, 21, 5) for r in range(-20, 21, 5)], dtype=float)
     bins = flight.binned(4.0)
-    gain = np.array([pattern(bins.at_uav @ turn(found.azimuth_deg, *tilt)) for tilt in tilts])
+    gain = np.array([pattern(bins.at_uav @ turn(mount.azimuth_deg, *tilt)) for tilt in tilts])
     error = bins.residual_db - bins.residual_db.mean() - gain + gain.mean(axis=1, keepdims=True)
     weight = np.exp(-0.5 * (error**2).sum(axis=1) / 10.0**2)
     weight /= weight.sum()
-    assert (found.pitch_deg, found.roll_deg) == tuple(tilts[weight.argmax()])
-    assert (found.pitch_deg, found.roll_deg) != (0.0, 0.0)
+    assert (mount.pitch_deg, mount.roll_deg) == tuple(tilts[weight.argmax()])
+    assert (mount.pitch_deg, mount.roll_deg) != (0.0, 0.0)
     spread = np.sqrt(weight @ ((tilts - weight @ tilts) ** 2).sum(axis=1) / 2)  # of one axis
-    assert found.tilt_sd_deg == pytest.approx(spread, abs=1e-9)
+    assert mount.tilt_sd_deg == pytest.approx(spread, abs=1e-9)
 
 
 def test_a_pattern_without_azimuth_leaves_its_mount_open():
     flat = lambda d: 5.0 * d[:, 2]  # noqa: E731
 
-    found = fit_mounts(TRAIN, {"uav": flat}, turn)["uav"]
-    assert not found.identified
-    assert np.allclose(found.probability, 1 / len(found.grid_deg), atol=1e-6)
+    mount = fit_mounts(TRAIN, {"uav": flat}, turn)["uav"]
+    assert not mount.identified
+    assert np.allclose(mount.probability, 1 / len(mount.grid_deg), atol=1e-6)
 
 
 def test_unknown_antenna_and_empty_flights_are_told():
@@ -278,18 +280,18 @@ def test_directions_that_are_not_known_are_not_predicted():
 
 def test_the_evidence_is_that_of_the_dense_covariance_at_any_noise():
     """The difference of two strengths against Gaussian densities of the whole covariance."""
-    found, dense = [], []
+    evidence, dense = [], []
     for own_sd, noise_sd in ((1.0, 1.0), (2.4, 1.7)):
         model = dataclasses.replace(MODEL, own_sd_db=own_sd, noise_sd_db=noise_sd)
-        found.append(fit_gain(TRAIN[:1], model).log_evidence)
+        evidence.append(fit_gain(TRAIN[:1], model).log_evidence)
         s = TRAIN[0].binned(model.bin_s)
-        whole = 2.5**2 * np.exp(-cdist(s.at_uav, s.at_uav) / 0.5)
-        whole += 3.0**2 * np.exp(-cdist(s.at_tower, s.at_tower) / 0.4)
-        whole += own_sd**2 * np.exp(-cdist(s.position_m, s.position_m) / 20.0) + (100.0 * noise_sd) ** 2
-        whole[np.diag_indices(len(s))] += noise_sd**2
+        covariance = 2.5**2 * np.exp(-cdist(s.at_uav, s.at_uav) / 0.5)
+        covariance += 3.0**2 * np.exp(-cdist(s.at_tower, s.at_tower) / 0.4)
+        covariance += own_sd**2 * np.exp(-cdist(s.position_m, s.position_m) / 20.0) + (100.0 * noise_sd) ** 2
+        covariance[np.diag_indices(len(s))] += noise_sd**2
         y = s.residual_db - s.residual_db.mean()
-        dense.append(-0.5 * (y @ np.linalg.solve(whole, y) + np.linalg.slogdet(whole)[1]))
-    assert found[1] - found[0] == pytest.approx(dense[1] - dense[0], abs=1e-6)
+        dense.append(-0.5 * (y @ np.linalg.solve(covariance, y) + np.linalg.slogdet(covariance)[1]))
+    assert evidence[1] - evidence[0] == pytest.approx(dense[1] - dense[0], abs=1e-6)
     assert abs(dense[1] - dense[0]) > 20.0
 
 
@@ -298,10 +300,10 @@ def test_antennas_without_a_shared_term_are_fits_of_their_own(terms):
     model = dataclasses.replace(MODEL, terms=terms)
     both = fit_gain(TRAIN, model)
     alone = [fit_gain([s for s in TRAIN if s.channel == channel], model) for channel in "AB"]
-    assert both.log_evidence == pytest.approx(sum(one.log_evidence for one in alone), rel=1e-9)
-    for one, samples in zip(alone, TEST, strict=True):
+    assert both.log_evidence == pytest.approx(sum(fit.log_evidence for fit in alone), rel=1e-9)
+    for fit, samples in zip(alone, TEST, strict=True):
         some = samples.part(np.arange(0, len(samples), 9))
-        np.testing.assert_allclose(both.predict(some), one.predict(some), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(both.predict(some), fit.predict(some), rtol=0, atol=1e-6)
         np.testing.assert_allclose(both.mean(some), both.predict(some)[0], rtol=0, atol=1e-6)
 
 
@@ -315,14 +317,14 @@ def test_before_anything_is_learned_gains_are_as_strong_and_as_smooth_as_they_we
         LinkSamples("a", "LW1", channel, np.zeros(len(k)), place[k], body[k], mast[k], np.zeros(len(k)))
         for channel, k in (("A", np.array([0, 1])), ("B", np.array([2])))
     ]
-    found = direction_gain._covariance_of_levels(GainModel(), rows)
+    covariance = direction_gain._covariance_of_levels(GainModel(), rows)
     of_body, of_mast = (np.linalg.norm(d[:, None] - d, axis=2) for d in (body, mast))
     same = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1.0]])
     expected = 3.2**2 * np.exp(-of_body / 1.0) + same * (
         3.4**2 * np.exp(-of_mast / 0.5) + 1.5**2 * np.exp(-(of_body**2 + of_mast**2) / (2 * 0.35**2))
         + 1.2**2 * np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / 20.0) + (100.0 * 1.5) ** 2
     ) + 1.5**2 * np.eye(3)  # fmt: skip
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-12)
     at_place = direction_gain._covariance([PLACE_TERM], rows, rows)
     np.testing.assert_allclose(
         at_place, same * 4.0 * np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / 60.0), rtol=1e-12
@@ -346,19 +348,19 @@ def test_bins_are_means_from_the_first_sample_on_and_directions_stay_of_length_o
     level[3] = np.nan
     ray_lost = ray.copy()
     ray_lost[5] = np.nan
-    one = LinkSamples("a", "LW1", "A", time, 100.0 * ray, ray_lost, -ray, level, floor_db=level)
-    found = one.binned(4.0)
-    assert found.floor_db is None
+    flown = LinkSamples("a", "LW1", "A", time, 100.0 * ray, ray_lost, -ray, level, floor_db=level)
+    bins = flown.binned(4.0)
+    assert bins.floor_db is None
     for k in range(5):
         some = [i for i in range(40) if 4 * k <= time[i] - time[0] < 4 * k + 4 and i not in (3, 5)]
-        assert found.residual_db[k] == pytest.approx(level[some].mean())
-        assert found.time_s[k] == pytest.approx(time[some].mean())
-        assert found.position_m[k] == pytest.approx(100.0 * ray[some].mean(axis=0))
+        assert bins.residual_db[k] == pytest.approx(level[some].mean())
+        assert bins.time_s[k] == pytest.approx(time[some].mean())
+        assert bins.position_m[k] == pytest.approx(100.0 * ray[some].mean(axis=0))
         for name, sign in (("at_uav", 1), ("at_tower", -1)):
             mean = sign * ray[some].mean(axis=0)
-            assert getattr(found, name)[k] == pytest.approx(mean / np.linalg.norm(mean))
-    assert len(found) == 5
-    assert len(one.part(np.isnan(level)).binned(4.0)) == 0
+            assert getattr(bins, name)[k] == pytest.approx(mean / np.linalg.norm(mean))
+    assert len(bins) == 5
+    assert len(flown.part(np.isnan(level)).binned(4.0)) == 0
 
 
 def test_planted_interaction_is_learned():

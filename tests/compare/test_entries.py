@@ -29,19 +29,19 @@ def test_the_crps_is_the_area_between_the_forecast_and_the_step(error: float) ->
 
 @pytest.mark.parametrize("own", [True, False])
 def test_scores_are_those_by_hand(own: bool) -> None:
-    one = dataclasses.replace(ONE, own_offset=own)
-    found, sd = level_scores([one]), ONE.sd_db
+    series = dataclasses.replace(ONE, own_offset=own)
+    scores, sd = level_scores([series]), ONE.sd_db
     assert sd is not None
     plain = ONE.measured_db - ONE.level_db
     error = plain - plain.mean() if own else plain
-    assert found["rmse_db"] == pytest.approx(np.sqrt(np.mean(error**2)))
-    assert found["bias_db"] == pytest.approx(abs(plain.mean()))
-    assert found["crps_db"] == pytest.approx(np.mean(crps_normal(error, sd)))
-    assert found["log_score"] == pytest.approx(-np.mean(norm.logpdf(error, 0.0, sd)))
-    assert found["coverage_90"] == pytest.approx(np.mean(np.abs(error) <= 1.644854 * sd))
-    assert found["n"] == 60.0
-    both = level_scores([one, TWO])
-    assert both["rmse_db"] == pytest.approx((found["rmse_db"] + TWO.error_db.std()) / 2)
+    assert scores["rmse_db"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert scores["bias_db"] == pytest.approx(abs(plain.mean()))
+    assert scores["crps_db"] == pytest.approx(np.mean(crps_normal(error, sd)))
+    assert scores["log_score"] == pytest.approx(-np.mean(norm.logpdf(error, 0.0, sd)))
+    assert scores["coverage_90"] == pytest.approx(np.mean(np.abs(error) <= 1.644854 * sd))
+    assert scores["n"] == 60.0
+    both = level_scores([series, TWO])
+    assert both["rmse_db"] == pytest.approx((scores["rmse_db"] + TWO.error_db.std()) / 2)
     assert both["n"] == 85.0
     assert np.isnan(both["crps_db"])
     fast = np.tile([3.0, -3.0], 400)  # a tenth of a second: gone in the mean of four seconds
@@ -57,10 +57,10 @@ def test_intervals_are_those_of_blocks_of_twenty_seconds() -> None:
     assert dataclasses.replace(ONE, time_s=np.zeros(60)).block == 1
     assert dataclasses.replace(ONE, time_s=np.arange(60) * 0.1).block == 60
     total = np.zeros(2000)
-    for one, block, own in ((ONE, 10, True), (TWO, 13, True)):
-        error = one.error_db
+    for series, block, own in ((ONE, 10, True), (TWO, 13, True)):
+        error = series.error_db
         drawn = bootstrap_means(
-            np.column_stack([error, error**2]), block, replicates=2000, seed=20240715 + (one is TWO)
+            np.column_stack([error, error**2]), block, replicates=2000, seed=20240715 + (series is TWO)
         )
         total += np.sqrt(drawn[:, 1] - own * drawn[:, 0] ** 2) / 2
     np.testing.assert_allclose(rmse_replicates([ONE, TWO]), total)
@@ -69,6 +69,6 @@ def test_intervals_are_those_of_blocks_of_twenty_seconds() -> None:
     drawn = bootstrap_means(error[:, None] ** 2, 10, replicates=2000, seed=20240715)[:, 0]
     np.testing.assert_allclose(rmse_replicates([free]), np.sqrt(drawn))
     worse = dataclasses.replace(ONE, level_db=ONE.measured_db + 2.0 * (ONE.level_db - ONE.measured_db))
-    found = intervals([worse], {"base": [ONE]})
-    assert found["rmse_ci95_db"] == pytest.approx(np.quantile(2.0 * rmse_replicates([ONE]), [0.025, 0.975]))
-    assert found["difference_to_base_ci95_db"] == pytest.approx(np.quantile(rmse_replicates([ONE]), [0.025, 0.975]))
+    ends = intervals([worse], {"base": [ONE]})
+    assert ends["rmse_ci95_db"] == pytest.approx(np.quantile(2.0 * rmse_replicates([ONE]), [0.025, 0.975]))
+    assert ends["difference_to_base_ci95_db"] == pytest.approx(np.quantile(rmse_replicates([ONE]), [0.025, 0.975]))

@@ -146,7 +146,7 @@ def test_targets_that_share_their_rows_are_as_near_to_the_exact_solution(heading
     exact, shared = fit.predict(targets, exact=True), fit.predict(targets, exact=False)
     monkeypatch.setattr(field_gp, "FEWEST_TOGETHER", 10**9)
     alone = fit.predict(targets, exact=False)
-    errors = [np.sqrt(np.mean((one[0] - exact[0]) ** 2)) for one in (shared, alone)]
+    errors = [np.sqrt(np.mean((prediction[0] - exact[0]) ** 2)) for prediction in (shared, alone)]
     assert errors[0] < 1.1 * errors[1]
     assert errors[0] < 0.15 * np.mean(exact[1])
     np.testing.assert_allclose(shared[1], exact[1], rtol=0.05)
@@ -158,11 +158,11 @@ def test_headings_that_count_alike_are_the_mean_of_single_headings_and_hold_thei
     yaw = np.radians(np.arange(8) * 45.0)
     nose = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(8)])
     place = np.column_stack([generator.uniform(0, 300, (40, 2)), np.full(40, 35.0)])
-    one = rows_at(place, flight=-1)
-    alike = dataclasses.replace(one, direction=np.tile(nose, (40, 1, 1)))
+    targets = rows_at(place, flight=-1)
+    alike = dataclasses.replace(targets, direction=np.tile(nose, (40, 1, 1)))
     value = drawn(generator, MOVING, rows)
     fit = FieldFit(MOVING, rows, value)
-    single = [fit.predict(dataclasses.replace(one, direction=np.tile(n, (40, 1)))) for n in nose]
+    single = [fit.predict(dataclasses.replace(targets, direction=np.tile(n, (40, 1)))) for n in nose]
     mean, sd = fit.predict(alike)
     np.testing.assert_allclose(mean, np.mean([m for m, _ in single], axis=0), atol=1e-9)
     # the variance of a heading drawn at random is, in expectation over fields, that of all headings together
@@ -171,7 +171,7 @@ def test_headings_that_count_alike_are_the_mean_of_single_headings_and_hold_thei
     for _ in range(60):
         again = FieldFit(MOVING, rows, drawn(generator, MOVING, rows))
         square += np.var(
-            [again.predict(dataclasses.replace(one, direction=np.tile(n, (40, 1))))[0] for n in nose], axis=0
+            [again.predict(dataclasses.replace(targets, direction=np.tile(n, (40, 1))))[0] for n in nose], axis=0
         )
     np.testing.assert_allclose(sd**2, together + square / 60, rtol=0.12)
     near = fit.predict(alike, exact=False)
@@ -203,14 +203,14 @@ def test_slope_of_the_likelihood_by_differences():
     value, apart = drawn(generator, MOVING, rows), field_gp._Apart.of(rows, rows)
     names = tuple(field_gp.BOUNDS)
     _, slope = field_gp._likelihood(MOVING, apart, value, names)
-    for name, one in zip(names, slope, strict=True):
+    for name, partial in zip(names, slope, strict=True):
         up, down = (
             field_gp._likelihood(
                 dataclasses.replace(MOVING, **{name: getattr(MOVING, name) * math.exp(e)}), apart, value, names
             )[0]
             for e in (1e-4, -1e-4)
         )
-        assert one == pytest.approx((up - down) / 2e-4, rel=1e-4, abs=1e-5), name
+        assert partial == pytest.approx((up - down) / 2e-4, rel=1e-4, abs=1e-5), name
 
 
 def test_planted_fields_are_recovered_with_intervals_that_hold():
@@ -271,9 +271,9 @@ def test_before_anything_is_learned_a_field_is_two_decibels_over_fifty_metres():
     pair = rows_at([[0, 0, 20], [24, 32, 29]], [0.0, 30.0], 0, [[1, 0, 0], [np.cos(turn), np.sin(turn), 0]])
     chord = 2.0 * np.sin(turn / 2)
     near = 4.0 * math.exp(-40 / 50 - 9 / 30 - chord**2 / (2 * 0.49))
-    found = field_gp.covariance(FieldModel(), pair, pair)
-    assert found[0, 1] == pytest.approx(100.0**2 + near + 1.5**2 + 1.5**2 * math.exp(-0.5), abs=1e-9)
-    assert found[0, 0] == pytest.approx(100.0**2 + 4.0 + 2 * 1.5**2)
+    covariance = field_gp.covariance(FieldModel(), pair, pair)
+    assert covariance[0, 1] == pytest.approx(100.0**2 + near + 1.5**2 + 1.5**2 * math.exp(-0.5), abs=1e-9)
+    assert covariance[0, 0] == pytest.approx(100.0**2 + 4.0 + 2 * 1.5**2)
     assert field_gp.prior_sd_db(FieldModel(), ("place", "drift")) == pytest.approx(2.5)
     assert field_gp._noisy(FieldModel(), np.zeros((2, 2)))[0].tolist() == [2.25, 0.0]
     other = rows_at([[0, 0, 20]], [0.0], 1)
@@ -290,12 +290,12 @@ def test_scales_are_sought_within_their_limits_from_the_usual_ones_on(monkeypatc
         lambda _, first, **how: asked.append((first, how["bounds"])) or SimpleNamespace(x=first),
     )
     rows = flights(np.random.default_rng(1), each=20)
-    found = fit_field([(rows, np.zeros(40))], FieldModel(length_m=900.0, noise_sd_db=0.01))
+    model = fit_field([(rows, np.zeros(40))], FieldModel(length_m=900.0, noise_sd_db=0.01))
     ((first, bounds),) = asked[:1]
     np.testing.assert_allclose(bounds, np.log(list(limits.values())))
     assert np.exp(first) == pytest.approx([2.0, 300.0, 30.0, 0.7, 1.5, 60.0, 0.2])
-    assert (found.length_m, found.noise_sd_db) == pytest.approx((300.0, 0.2))
-    assert found.offset_sd_db == pytest.approx(
+    assert (model.length_m, model.noise_sd_db) == pytest.approx((300.0, 0.2))
+    assert model.offset_sd_db == pytest.approx(
         1.5 * math.sqrt(2 / 3)
     )  # two flights without an offset, and two as usual
     with pytest.raises(InputError, match="fewer than three"):
@@ -317,6 +317,6 @@ def test_targets_of_a_quarter_of_a_scale_go_together_where_they_are_eight():
     parts = list(field_gp._cells(corner[cell] + rng.uniform(0.01, 0.24, (46, 3)), 20))
     assert sorted(i for part, _ in parts for i in part) == list(range(46))
     together = [cell[part] for part, shared in parts if shared]
-    assert sorted((int(one[0]), len(one)) for one in together) == [(1, 8), (2, 10), (2, 20)]
-    assert all(np.ptp(one) == 0 for one in together)
+    assert sorted((int(cells[0]), len(cells)) for cells in together) == [(1, 8), (2, 10), (2, 20)]
+    assert all(np.ptp(cells) == 0 for cells in together)
     assert sum(len(part) for part, shared in parts if not shared) == 8

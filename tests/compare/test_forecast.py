@@ -54,15 +54,15 @@ def test_every_interval_is_that_of_blocks_of_the_longest_memory():
     p = rng.dirichlet([2, 5, 3, 1], 600)
     p[::2] = p[1::2]
     choice, constant = np.where(rng.random(600) < 0.4, rank, p.argmax(axis=1) + 1), np.array([0.1, 0.4, 0.3, 0.2])
-    found = score_forecast(rank, p, choice, constant, replicates=200)
+    score = score_forecast(rank, p, choice, constant, replicates=200)
     row = np.arange(600)
     log, flat = -np.log(p[row, rank - 1]), -np.log(constant[rank - 1])
     right = (rank == choice).astype(float)
-    known = max((autocorrelation(c) for c in (right, log, log - flat)), key=lambda one: one.block_length)
-    assert known.block_length > 1
+    longest = max((autocorrelation(c) for c in (right, log, log - flat)), key=lambda memory: memory.block_length)
+    assert longest.block_length > 1
 
     def means(*columns):
-        return bootstrap_means(np.column_stack(columns), known.block_length, replicates=200)
+        return bootstrap_means(np.column_stack(columns), longest.block_length, replicates=200)
 
     share, expected = one_hot(rank).mean(axis=0), p.mean(axis=0)
     drawn_share, drawn_choice, drawn_p = means(one_hot(rank)), means(one_hot(choice)), means(p)
@@ -70,26 +70,26 @@ def test_every_interval_is_that_of_blocks_of_the_longest_memory():
     kappa = (means(right)[:, 0] - luck) / (1.0 - luck)
     chance = share @ one_hot(choice).mean(axis=0)
     values = {
-        "kappa": ((right.mean() - chance) / (1 - chance), kappa, (-1.0, 1.0), found.kappa_ci95),
-        "log_score": (log.mean(), means(log)[:, 0], (0.0, np.inf), found.log_score_ci95),
+        "kappa": ((right.mean() - chance) / (1 - chance), kappa, (-1.0, 1.0), score.kappa_ci95),
+        "log_score": (log.mean(), means(log)[:, 0], (0.0, np.inf), score.log_score_ci95),
         "total_variation_expected": (
             np.abs(share - expected).sum() / 2, np.abs(drawn_share - drawn_p).sum(axis=1) / 2, (0.0, 1.0),
-            found.total_variation_ci95,
+            score.total_variation_ci95,
         ),
     }  # fmt: skip
     for name, (value, drawn, bounds, ends) in values.items():
-        assert getattr(found, name) == pytest.approx(value), name
-        assert ends == pytest.approx(interval(value, drawn, known, bounds=bounds)), name
+        assert getattr(score, name) == pytest.approx(value), name
+        assert ends == pytest.approx(interval(value, drawn, longest, bounds=bounds)), name
     gain = (log - flat).mean()
-    assert found.log_score_difference_ci95 == pytest.approx(interval(gain, means(log - flat)[:, 0], known))
-    assert found.log_score_gain == pytest.approx(-gain / flat.mean())
+    assert score.log_score_difference_ci95 == pytest.approx(interval(gain, means(log - flat)[:, 0], longest))
+    assert score.log_score_gain == pytest.approx(-gain / flat.mean())
     for r in range(4):
-        assert found.expected_histogram_ci95[r] == pytest.approx(
-            interval(expected[r], drawn_p[:, r], known, bounds=(0.0, 1.0))
+        assert score.expected_histogram_ci95[r] == pytest.approx(
+            interval(expected[r], drawn_p[:, r], longest, bounds=(0.0, 1.0))
         )
-    assert found.constant_log_score == pytest.approx(flat.mean())
-    assert found.constant_brier_score == pytest.approx(((constant - one_hot(rank)) ** 2).sum(axis=1).mean())
-    assert found.constant_total_variation == pytest.approx(np.abs(share - constant).sum() / 2)
-    assert (found.majority_agreement, found.agreement) == pytest.approx((share.max(), right.mean()))
+    assert score.constant_log_score == pytest.approx(flat.mean())
+    assert score.constant_brier_score == pytest.approx(((constant - one_hot(rank)) ** 2).sum(axis=1).mean())
+    assert score.constant_total_variation == pytest.approx(np.abs(share - constant).sum() / 2)
+    assert (score.majority_agreement, score.agreement) == pytest.approx((share.max(), right.mean()))
     assert log_losses(np.array([[0.0, 1.0]]), np.array([1]))[0] == pytest.approx(-np.log(1e-6))
     assert constant_forecast([1.0, np.nan, 0.0, 3.0, 3.0]) == pytest.approx(np.array([2, 1, 3, 1]) / 7)

@@ -27,12 +27,12 @@ def test_points_are_means_of_explicit_fits_over_all_subsets():
     names = [f"f{k}" for k in range(4)]
     for point in points:
         errors = []
-        for one in series:
-            others = [n for n in names if n != one.samples.flight]
+        for scored in series:
+            others = [n for n in names if n != scored.samples.flight]
             each = []
             for subset in itertools.combinations(others, point.flights):
                 learned = learn([o.samples for o in series if o.samples.flight in subset], RECIPE)
-                each.append((one.samples.residual_db - learned.mean(one.samples)).std())
+                each.append((scored.samples.residual_db - learned.mean(scored.samples)).std())
             errors.append(np.mean(each))
         assert point.rmse_db == pytest.approx(np.mean(errors), rel=1e-6)
     assert points[0].rmse_db > points[2].rmse_db + 0.2

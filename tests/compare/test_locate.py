@@ -155,11 +155,11 @@ def test_levels_are_medians_of_four_seconds_and_at_most_120(length_s: float, win
     time = np.arange(50.0, 50.0 + length_s, 0.5)
     level, place = np.sin(time), np.column_stack([time, -time, 0 * time])
     shuffled = np.random.default_rng(6).permutation(len(time))
-    found = level_track(time[shuffled], place[shuffled], level[shuffled])
+    track = level_track(time[shuffled], place[shuffled], level[shuffled])
     groups = [(time >= a) & (time < a + window_s) for a in np.arange(50.0, 50.0 + length_s, window_s)]
-    assert found.level_db == pytest.approx([np.median(level[some]) for some in groups])
-    assert found.time_s == pytest.approx([time[some].mean() for some in groups])
-    np.testing.assert_allclose(found.position_m[:, 1], -found.time_s)
+    assert track.level_db == pytest.approx([np.median(level[some]) for some in groups])
+    assert track.time_s == pytest.approx([time[some].mean() for some in groups])
+    np.testing.assert_allclose(track.position_m[:, 1], -track.time_s)
     assert len(groups) <= 120
 
 
@@ -178,8 +178,8 @@ def test_the_grid_reaches_400_m_beyond_the_flight_and_the_region_a_tenth_of_the_
         ((0, -261), 1),
     ):
         assert locating._on_edge(np.array([*place, 1.5]), grid) == bool(edge)
-    one, far = np.array([1.0]), np.array([0.0, 500.0])
-    assert locating._radius(np.array([0.0]), one) == pytest.approx(20.0 * np.sqrt(-2.0 * np.log(0.1)), abs=0.1)
+    certain, far = np.array([1.0]), np.array([0.0, 500.0])
+    assert locating._radius(np.array([0.0]), certain) == pytest.approx(20.0 * np.sqrt(-2.0 * np.log(0.1)), abs=0.1)
     # five percent far away: of the rest 18 in 19 are within; twenty percent: half of those far away
     assert locating._radius(far, np.array([0.95, 0.05])) == pytest.approx(20 * np.sqrt(-2 * np.log(1 / 19)), abs=0.1)
     assert locating._radius(far, np.array([0.8, 0.2])) == pytest.approx(500.0, abs=1.0)
@@ -208,6 +208,6 @@ def test_odds_are_those_of_a_node_twenty_metres_about_the_candidate(monkeypatch:
     """Evidence that grows with the east and not with the north: the mean of its exponential over a normal, by Gauss."""
     track = LevelTrack(np.zeros(2), np.zeros((2, 3)), np.zeros(2))
     monkeypatch.setattr(locating, "fit_places", lambda _, at: locating.Fits(at[:, 0] / 50.0, at[:, 0], at[:, 0]))
-    found = locating._log_odds(track, np.array([[10.0, 5.0, 1.5], [-30.0, 9.0, 10.0]]), 2.0)
+    log_odds = locating._log_odds(track, np.array([[10.0, 5.0, 1.5], [-30.0, 9.0, 10.0]]), 2.0)
     mean = (4.0 + 2.0 * np.cosh(np.sqrt(3.0) * 20.0 / 50.0)) / 6.0
-    assert found == pytest.approx(np.array([10.0, -30.0]) / 50.0 + np.log(mean) - 2.0)
+    assert log_odds == pytest.approx(np.array([10.0, -30.0]) / 50.0 + np.log(mean) - 2.0)

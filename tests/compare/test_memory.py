@@ -40,7 +40,7 @@ def test_a_memory_whitens_its_terms_and_foretells_the_mean(share: int, rate: int
 
 def test_the_likelihood_is_that_of_a_normal_with_its_scale_integrated_out() -> None:
     slow, known = np.random.default_rng(1).normal(size=5), memories(5)
-    found, square = likelihoods(slow)
+    likelihood, square = likelihoods(slow)
     scales = np.exp(np.linspace(-8.0, 8.0, 4001))
     expected = []
     for whiten in known.whiten[[0, 20, 53]]:
@@ -49,8 +49,8 @@ def test_the_likelihood_is_that_of_a_normal_with_its_scale_integrated_out() -> N
         assert square[np.flatnonzero((known.whiten == whiten).all(axis=(1, 2)))[0]] == pytest.approx(
             slow @ np.linalg.solve(inner, slow)
         )
-    np.testing.assert_allclose(found[[0, 20, 53]] / found[0], np.array(expected) / expected[0], rtol=1e-6)
-    assert found.max() == 1.0
+    np.testing.assert_allclose(likelihood[[0, 20, 53]] / likelihood[0], np.array(expected) / expected[0], rtol=1e-6)
+    assert likelihood.max() == 1.0
 
 
 @pytest.mark.parametrize("kind", ["mean", "power", "ratio"])

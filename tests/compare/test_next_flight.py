@@ -29,54 +29,54 @@ def flight(name, seed, yaw_deg, *, n=80, reach=300.0):
 
 
 def joined(parts):
-    whole = {k: np.concatenate([getattr(p, k) for p in parts]) for k in ("position_m", "at_uav", "at_tower")}
-    count = len(whole["position_m"])
-    return LinkSamples("target", "T", "A", np.arange(float(count)), residual_db=np.zeros(count), **whole)
+    columns = {k: np.concatenate([getattr(p, k) for p in parts]) for k in ("position_m", "at_uav", "at_tower")}
+    count = len(columns["position_m"])
+    return LinkSamples("target", "T", "A", np.arange(float(count)), residual_db=np.zeros(count), **columns)
 
 
 TARGET = joined([flight("t", 70 + k, 90.0 * k, n=40) for k in range(4)])
 
 
-def gains(one, other):
-    body, mast = (cdist(getattr(one, k), getattr(other, k)) for k in ("at_uav", "at_tower"))
+def gains(left, right):
+    body, mast = (cdist(getattr(left, k), getattr(right, k)) for k in ("at_uav", "at_tower"))
     return 2.5**2 * np.exp(-body / 0.6) + 3.0**2 * np.exp(-mast / 0.5)
 
 
 def test_expected_deviation_is_the_dense_posterior_of_both_flights():
     known, route = flight("a", 1, 0.0), flight("b", 2, 90.0)
     field = FieldModel(place_sd_db=2.0, length_m=40.0, height_m=30.0, turn=0.5, offset_sd_db=0.1, drift_sd_db=0.1)
-    found = Known(series=[known], model=MODEL, field=field).sd_db([route], {"T.A": TARGET})["T.A"]
+    sd_db = Known(series=[known], model=MODEL, field=field).sd_db([route], {"T.A": TARGET})["T.A"]
     rows = [known, route]
     own = np.zeros((160, 160))
     for k, s in enumerate(rows):
         at = slice(80 * k, 80 * k + 80)
         own[at, at] = np.exp(-cdist(s.position_m, s.position_m) / 20.0) + 1e4 + np.eye(80)
-    whole = np.block([[gains(a, b) for b in rows] for a in rows]) + own
+    covariance = np.block([[gains(a, b) for b in rows] for a in rows]) + own
     across = np.concatenate([gains(TARGET, s) for s in rows], axis=1)
-    posterior = gains(TARGET, TARGET) - across @ np.linalg.solve(whole, across.T)
+    posterior = gains(TARGET, TARGET) - across @ np.linalg.solve(covariance, across.T)
     about = np.eye(len(TARGET)) - 1.0 / len(TARGET)
     gain = np.diag(about @ posterior @ about)
 
-    def place(one, other):
+    def place(left, right):
         d, up = (
-            cdist(one.position_m[:, :2], other.position_m[:, :2]),
-            cdist(one.position_m[:, 2:], other.position_m[:, 2:]),
+            cdist(left.position_m[:, :2], right.position_m[:, :2]),
+            cdist(left.position_m[:, 2:], right.position_m[:, 2:]),
         )
-        return 4.0 * np.exp(-d / 40.0 - up / 30.0 - cdist(one.at_uav, other.at_uav, "sqeuclidean") / 0.5)
+        return 4.0 * np.exp(-d / 40.0 - up / 30.0 - cdist(left.at_uav, right.at_uav, "sqeuclidean") / 0.5)
 
     both = joined(rows)
     same = np.kron(np.eye(2), np.ones((80, 80)))
     apart = np.abs(np.concatenate([s.time_s for s in rows])[:, None] - np.concatenate([s.time_s for s in rows])[None])
     rest = 1e4 + 0.01 * same + 0.01 * same * np.exp(-apart / 60.0) + 1.5**2 * np.eye(160)
-    beside = 4.0 - np.diag(place(TARGET, both) @ np.linalg.solve(place(both, both) + rest, place(both, TARGET)))
-    np.testing.assert_allclose(found, np.sqrt(gain + beside), atol=0.03)
+    field_variance = 4.0 - np.diag(place(TARGET, both) @ np.linalg.solve(place(both, both) + rest, place(both, TARGET)))
+    np.testing.assert_allclose(sd_db, np.sqrt(gain + field_variance), atol=0.03)
 
 
 def test_levels_of_the_route_and_of_known_flights_change_nothing():
     known, route = flight("a", 1, 0.0), flight("b", 2, 90.0)
     loud = dataclasses.replace(known, residual_db=np.linspace(-30, 30, 80))
-    one, two = (Known(series=[s], model=MODEL).sd_db([route], {"T.A": TARGET})["T.A"] for s in (known, loud))
-    np.testing.assert_array_equal(one, two)
+    quiet_sd, loud_sd = (Known(series=[s], model=MODEL).sd_db([route], {"T.A": TARGET})["T.A"] for s in (known, loud))
+    np.testing.assert_array_equal(quiet_sd, loud_sd)
 
 
 def test_nobody_has_flown_and_an_antenna_that_no_route_sees():

@@ -179,11 +179,11 @@ def test_the_trimmed_fit_is_that_of_the_smallest_residuals_at_every_offset(keep,
     rng = np.random.default_rng(seed)
     n = int(rng.integers(5, 40))
     measured, simulated = rng.normal(-60, 4, n), rng.normal(-57, 4, n) + 15 * (rng.random(n) < 0.2)
-    kept = math.ceil(keep * n - 1e-9)
+    count = math.ceil(keep * n - 1e-9)
     grid = np.arange(-100, 101) / 2
-    brute = [np.sqrt(np.mean(np.sort((measured + o - simulated) ** 2)[:kept])) for o in grid]
+    brute = [np.sqrt(np.mean(np.sort((measured + o - simulated) ** 2)[:count])) for o in grid]
     fit = trimmed_offset(measured, simulated, keep=keep, step_db=0.5)
-    assert fit.n == kept
+    assert fit.n == count
     assert fit.rmse_db == pytest.approx(min(brute), abs=1e-9)
     assert fit.offset_db == grid[int(np.argmin(brute))]
 

@@ -41,58 +41,58 @@ def season(seed: int = 0) -> list[Pass]:
     return passes
 
 
-def brute_force(one: Pass, two: Pass, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def brute_force(earlier: Pass, later: Pass, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Second minus first, by a table of all distances."""
-    i = np.flatnonzero(np.isfinite(first) & np.isfinite(one.position_m).all(axis=1))
-    j = np.flatnonzero(np.isfinite(second) & np.isfinite(two.position_m).all(axis=1))
-    distance = np.linalg.norm(one.position_m[i][:, None] - two.position_m[j][None], axis=2)
+    i = np.flatnonzero(np.isfinite(first) & np.isfinite(earlier.position_m).all(axis=1))
+    j = np.flatnonzero(np.isfinite(second) & np.isfinite(later.position_m).all(axis=1))
+    distance = np.linalg.norm(earlier.position_m[i][:, None] - later.position_m[j][None], axis=2)
     out = []
     for row, nearest in enumerate(distance.argmin(axis=1)):
         if distance[row, nearest] >= RADIUS_M:
             continue
-        if one.heading_deg is not None and two.heading_deg is not None:
-            turn = (two.heading_deg[j[nearest]] - one.heading_deg[i[row]] + 180.0) % 360.0 - 180.0
+        if earlier.heading_deg is not None and later.heading_deg is not None:
+            turn = (later.heading_deg[j[nearest]] - earlier.heading_deg[i[row]] + 180.0) % 360.0 - 180.0
             if abs(turn) > WITHIN_DEG:
                 continue
         out.append(second[j[nearest]] - first[i[row]])
     return np.array(out)
 
 
-def cells(one: Pass) -> dict[tuple[int, int], tuple[float, float]]:
-    found: dict[tuple[int, int], list[tuple[float, float]]] = {}
-    for place, residual in zip(one.position_m, one.residual_db, strict=True):
+def cells(flown: Pass) -> dict[tuple[int, int], tuple[float, float]]:
+    samples: dict[tuple[int, int], list[tuple[float, float]]] = {}
+    for place, residual in zip(flown.position_m, flown.residual_db, strict=True):
         if np.isfinite(residual) and np.isfinite(place).all():
             cell = (int(place[0] // CELL_M), int(place[1] // CELL_M))
-            found.setdefault(cell, []).append((float(residual), float(place[2])))
-    return {cell: tuple(np.mean(found[cell], axis=0)) for cell in sorted(found)}
+            samples.setdefault(cell, []).append((float(residual), float(place[2])))
+    return {cell: tuple(np.mean(samples[cell], axis=0)) for cell in sorted(samples)}
 
 
 def test_the_pairs_are_those_of_brute_force() -> None:
     """Numbers, not only counts: one wrong partner among the samples changes mean and deviation."""
     passes = season()
-    found = {
+    by_passes = {
         (p.first, p.second): p
         for p in PassTable(passes, CELL_M).pairs(radius_m=RADIUS_M, heading_within_deg=WITHIN_DEG)
     }
     expected = [
         (i, j)
-        for i, one in enumerate(passes)
-        for j, two in enumerate(passes)
-        if i < j and one.link == two.link and one.flight != two.flight
+        for i, earlier in enumerate(passes)
+        for j, later in enumerate(passes)
+        if i < j and earlier.link == later.link and earlier.flight != later.flight
     ]
-    assert sorted(found) == sorted(expected)
-    assert any(p.n == 0 for p in found.values())
-    assert sum(p.n > 50 for p in found.values()) > 10
-    for (i, j), pair in found.items():
-        one, two = passes[i], passes[j]
-        level = brute_force(one, two, one.level_db, two.level_db)
-        residual = brute_force(one, two, one.residual_db, two.residual_db)
+    assert sorted(by_passes) == sorted(expected)
+    assert any(p.n == 0 for p in by_passes.values())
+    assert sum(p.n > 50 for p in by_passes.values()) > 10
+    for (i, j), pair in by_passes.items():
+        earlier, later = passes[i], passes[j]
+        level = brute_force(earlier, later, earlier.level_db, later.level_db)
+        residual = brute_force(earlier, later, earlier.residual_db, later.residual_db)
         assert pair.n == len(level)
         if pair.n:
             assert (pair.rmse_db, pair.offset_db) == (level.std(), level.mean())
         if len(residual):
             assert pair.residual_rmse_db == residual.std()
-        here, there = cells(one), cells(two)
+        here, there = cells(earlier), cells(later)
         both = [c for c in here if c in there]
         assert pair.cells == len(both)
         table = np.array([(*here[c], *there[c]) for c in both])

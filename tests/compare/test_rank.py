@@ -233,13 +233,13 @@ def test_the_grid_of_k_holds_the_papers_values():
 def test_a_report_is_held_where_fewer_than_nine_tenths_of_the_rows_are_new(repeated, verdict):
     """A row is new where the rank or a number beside it changes, or where no number stands beside it."""
     other = np.cumsum(np.arange(100) % 100 >= repeated).astype(float)  # the first rows repeat each other
-    beside = {"sinr_db": other, "cqi": np.full(100, 7.0)}
-    seen = stale_reports(np.arange(100) * 0.5, np.where(np.arange(100) < 60, 2.0, 3.0), beside)
-    assert (seen.verdict, seen.n_reports) == (verdict, 101 - repeated)
-    assert seen.fresh.tolist() == [k == 0 or k >= repeated for k in range(100)]
-    assert seen.hold_s == pytest.approx(0.5)
-    gone = stale_reports(np.arange(100), np.full(100, 2.0), {"sinr_db": np.where(np.arange(100) < 40, np.nan, other)})
-    assert gone.fresh[:40].all()
+    numbers = {"sinr_db": other, "cqi": np.full(100, 7.0)}
+    reports = stale_reports(np.arange(100) * 0.5, np.where(np.arange(100) < 60, 2.0, 3.0), numbers)
+    assert (reports.verdict, reports.n_reports) == (verdict, 101 - repeated)
+    assert reports.fresh.tolist() == [k == 0 or k >= repeated for k in range(100)]
+    assert reports.hold_s == pytest.approx(0.5)
+    gaps = stale_reports(np.arange(100), np.full(100, 2.0), {"sinr_db": np.where(np.arange(100) < 40, np.nan, other)})
+    assert gaps.fresh[:40].all()
     late = stale_reports([0.0, 3.0, 10.0, 11.0], [2.0, np.nan, 3.0, 3.0], {"sinr_db": [1.0, 2.0, 2.0, 2.0]})
     assert (late.fresh.tolist(), late.hold_s, late.n_reports) == ([True, False, True, False], 10.0, 2)
 
@@ -253,8 +253,8 @@ def test_fewer_than_eight_changes_tell_no_period():
 
 
 def test_the_commonest_rank_is_the_forecast_that_needs_no_model():
-    found = commonest_rank([2.0] * 70 + [1.0] * 20 + [3.0] * 10 + [np.nan] * 5)
-    assert (found.rank, found.agreement) == (2, 0.7)
+    forecast = commonest_rank([2.0] * 70 + [1.0] * 20 + [3.0] * 10 + [np.nan] * 5)
+    assert (forecast.rank, forecast.agreement) == (2, 0.7)
     assert commonest_rank([np.nan]).rank == 0
 
 
@@ -303,10 +303,10 @@ def test_rank_intervals_hold_the_truth_of_a_known_process():
 def test_the_rules_beside_k_are_compared_where_an_sinr_is_known():
     rng = np.random.default_rng(2)
     h = with_profile(np.sort(rng.random((50, 4)))[:, ::-1])
-    found = compare_rank(channel_rank(h, 5).astype(float), h, replicates=50, sinr_db=rng.normal(10, 3, 50))
-    assert set(found.simulated) == {10.0, 100.0, 1000.0}
-    assert set(found.rules) == {"condition_number", "capacity"}
-    assert np.isfinite([rule.agreement for rule in found.rules.values()]).all()
+    comparison = compare_rank(channel_rank(h, 5).astype(float), h, replicates=50, sinr_db=rng.normal(10, 3, 50))
+    assert set(comparison.simulated) == {10.0, 100.0, 1000.0}
+    assert set(comparison.rules) == {"condition_number", "capacity"}
+    assert np.isfinite([rule.agreement for rule in comparison.rules.values()]).all()
 
 
 def test_repeat_kappa_of_two_passes():
@@ -319,8 +319,8 @@ def test_repeat_kappa_of_two_passes():
     assert same.kappa > 0.99
     assert repeat_rank(Visit(here, rank), Visit(there, rng.permutation(rank))).kappa == pytest.approx(0.0, abs=0.1)
     half = np.where(rng.random(900) < 0.5, rank[::-1], rng.permutation(rank))
-    found = repeat_rank(Visit(here, rank), Visit(there, half))
-    assert found.kappa_ci95[0] < 0.5 < found.kappa_ci95[1]
+    repeated = repeat_rank(Visit(here, rank), Visit(there, half))
+    assert repeated.kappa_ci95[0] < 0.5 < repeated.kappa_ci95[1]
     nowhere = repeat_rank(Visit(here, rank), Visit(there + 50.0, rank))
     assert nowhere.n == 0
     assert np.isnan(nowhere.kappa)
@@ -340,9 +340,9 @@ def test_a_period_is_taken_when_19_of_20_changes_fall_on_it():
 
 def test_each_interval_is_that_of_its_own_number():
     rng = np.random.default_rng(23)
-    one = slow_ranks(rng, 3000, 4).astype(float)
-    two = np.where(rng.random(3000) < 0.5, one, np.clip(one + 1, 1, 4))
-    fit = compare_ranks(one, two, replicates=200)
+    measured = slow_ranks(rng, 3000, 4).astype(float)
+    simulated = np.where(rng.random(3000) < 0.5, measured, np.clip(measured + 1, 1, 4))
+    fit = compare_ranks(measured, simulated, replicates=200)
     values = [fit.agreement, fit.kappa, fit.total_variation, fit.wasserstein]
     spans = [fit.agreement_ci95, fit.kappa_ci95, fit.total_variation_ci95, fit.wasserstein_ci95]
     for k, value in enumerate(values):
@@ -455,30 +455,30 @@ def test_sequences_that_agree_by_chance_alone_have_no_kappa_to_resample():
 def test_intervals_come_from_one_bootstrap_each_with_its_own_memory(pair):
     a, b = pair
     values = statistics_by_hand(a, b)
-    found = ranks._pair_intervals(a, b, values, 300)
+    intervals = ranks._pair_intervals(a, b, values, 300)
     equal, first, second = (a == b).astype(float), ranks.one_hot(a), ranks.one_hot(b)
     columns = np.column_stack([equal, first, second])
     for number, (influence, statistic, bounds) in enumerate(ranks._pair_statistics(equal, first, second)):
-        known = autocorrelation(influence)
-        drawn = statistic(bootstrap_means(columns, known.block_length, replicates=300))
+        memory = autocorrelation(influence)
+        drawn = statistic(bootstrap_means(columns, memory.block_length, replicates=300))
         if number == 0:
-            assert found[0] == share_interval(values[0], float(drawn.std()), known)  # a share keeps within 0 and 1
+            assert intervals[0] == share_interval(values[0], float(drawn.std()), memory)  # a share keeps within 0 and 1
         else:
-            assert found[number] == interval(values[number], drawn, known, bounds=bounds)
-    assert found[0] != interval(values[0], drawn, known, bounds=(0.0, 1.0))
+            assert intervals[number] == interval(values[number], drawn, memory, bounds=bounds)
+    assert intervals[0] != interval(values[0], drawn, memory, bounds=(0.0, 1.0))
     assert ranks._pair_intervals(a[:1], b[:1], values, 10) == [NO_INTERVAL] * 4
 
 
 def test_bars_of_a_histogram_have_wilsons_intervals(pair):
     measured = np.minimum(pair[0], 3).astype(float)
-    found = ranks._histogram_intervals(measured, 200)
-    assert len(found) == MAX_RANK
+    intervals = ranks._histogram_intervals(measured, 200)
+    assert len(intervals) == MAX_RANK
     for r in range(1, MAX_RANK + 1):
         bar = (measured == r).astype(float)
-        known = autocorrelation(bar) if 0 < bar.mean() < 1 else autocorrelation(measured)
-        drawn = bootstrap_means(bar[:, None], known.block_length, replicates=200)
-        assert found[r - 1] == share_interval(float(bar.mean()), float(drawn.std()), known)
-    assert found[-1][0] == 0.0 < found[-1][1]  # never seen, not impossible
+        memory = autocorrelation(bar) if 0 < bar.mean() < 1 else autocorrelation(measured)
+        drawn = bootstrap_means(bar[:, None], memory.block_length, replicates=200)
+        assert intervals[r - 1] == share_interval(float(bar.mean()), float(drawn.std()), memory)
+    assert intervals[-1][0] == 0.0 < intervals[-1][1]  # never seen, not impossible
     assert ranks._histogram_intervals(measured[:1], 10) == [NO_INTERVAL] * MAX_RANK
 
 
@@ -592,8 +592,8 @@ def test_the_middle_of_the_first_best_run():
 def test_an_interval_of_k_reaches_one_step_further(ratio, low, high, expected):
     """A value of the grid gets the next one; one between two of them the one after; never inside of what was drawn."""
     grid = ratio ** np.arange(5)
-    found = ranks._central(np.array([ratio**low, ratio**high] * 50), grid)
-    assert found == pytest.approx([ratio**end for end in expected])
+    ends = ranks._central(np.array([ratio**low, ratio**high] * 50), grid)
+    assert ends == pytest.approx([ratio**end for end in expected])
 
 
 def test_capacity_counts_bits_of_layers_with_equal_power():
@@ -636,9 +636,9 @@ def test_places_of_two_passes_are_the_same_within_two_metres():
     first = np.column_stack([along, np.zeros((200, 2))])
     rank = walk(200, 9)
     for away, n in ((1.99, 200), (2.5, 0)):
-        found = ranks.repeat_rank(Visit(first, rank), Visit(first + np.array([0.0, away, 0.0]), rank), replicates=20)
-        assert found.n == n
-        assert (found.agreement == 1.0) == bool(n)
+        repeated = ranks.repeat_rank(Visit(first, rank), Visit(first + np.array([0.0, away, 0.0]), rank), replicates=20)
+        assert repeated.n == n
+        assert (repeated.agreement == 1.0) == bool(n)
 
 
 def test_a_curve_without_a_pair_says_nothing():

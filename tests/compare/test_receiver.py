@@ -40,17 +40,17 @@ def fit(x, rank, groups, **how):
 
 def test_features_are_ratios_and_level_and_scale_only_moves_the_level():
     h = np.random.default_rng(0).normal(size=(5, 4, 4, 2)) @ [1, 1j]
-    one, two = (stream_features(np.linalg.svd(m, compute_uv=False)) for m in (h, 10.0 * h))
-    np.testing.assert_allclose(two - one, np.tile([0.0, 0.0, 0.0, 20.0], (5, 1)), atol=1e-9)
+    features, scaled = (stream_features(np.linalg.svd(m, compute_uv=False)) for m in (h, 10.0 * h))
+    np.testing.assert_allclose(scaled - features, np.tile([0.0, 0.0, 0.0, 20.0], (5, 1)), atol=1e-9)
     assert np.isnan(stream_features([[0.0, 0.0, 0.0, 0.0], [np.inf, 1.0, 0.0, 0.0], [np.nan] * 4])).all()
     assert stream_features([5.0, 0.5, 0.05, 1e-9]) == pytest.approx([-20.0, -40.0, -40.0, 20 * np.log10(5.0)])
 
 
 def test_probabilities_come_near_the_planted_ones():
     x, rank, truth, groups = planted(6000)
-    found = fit(x, rank, groups, penalties=(0.1,)).probabilities(x)
-    assert np.abs(found - truth).mean() < 0.02
-    assert found.sum(axis=1) == pytest.approx(1.0)
+    p = fit(x, rank, groups, penalties=(0.1,)).probabilities(x)
+    assert np.abs(p - truth).mean() < 0.02
+    assert p.sum(axis=1) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("penalty", "steep"), [(0.3, 1.0), (5.0, 1.0), (1e-3, 1.0), (0.1, 40.0)])
@@ -59,20 +59,20 @@ def test_no_step_lessens_the_penalised_loss(penalty, steep):
     x, rank, _, groups = planted(600)
     x[:, 1] = np.where(rank > 2, steep, -steep) * np.abs(x[:, 1])
     x[:, 3] = 7.0  # says nothing, has no spread
-    found = fit(x, rank, groups, penalties=(penalty,))
-    columns = np.column_stack([np.ones(600), (x - found.mean) / found.scale])
-    slope = (found.probabilities(x) - np.eye(4)[rank - 1]).T @ columns
-    slope += penalty * np.array([1e-3, 1, 1, 1, 1]) * found.coefficient
+    model = fit(x, rank, groups, penalties=(penalty,))
+    columns = np.column_stack([np.ones(600), (x - model.mean) / model.scale])
+    slope = (model.probabilities(x) - np.eye(4)[rank - 1]).T @ columns
+    slope += penalty * np.array([1e-3, 1, 1, 1, 1]) * model.coefficient
     assert np.abs(slope).max() < 1e-4
-    assert (found.scale[3], found.n, found.penalty) == (1.0, 600, penalty)
-    np.testing.assert_allclose(found.scale[:3], x.std(axis=0)[:3])
+    assert (model.scale[3], model.n, model.penalty) == (1.0, 600, penalty)
+    np.testing.assert_allclose(model.scale[:3], x.std(axis=0)[:3])
 
 
 def test_penalty_and_loss_are_those_of_sectors_left_out(monkeypatch):
     x, rank, _, groups = planted(400)
     both, row = np.stack([x, x[:, ::-1] ** 3]), np.arange(400)
     loss = [
-        -np.log(np.mean([out_of_group(one, rank, groups, p) for one in both], axis=0)[row, rank - 1]).mean()
+        -np.log(np.mean([out_of_group(features, rank, groups, p) for features in both], axis=0)[row, rank - 1]).mean()
         for p in (0.01, 3.0, 10.0, 1000.0)
     ]
     best = (0.01, 3.0, 10.0, 1000.0)[int(np.argmin(loss))]
@@ -101,8 +101,8 @@ def test_weights_of_the_decision_are_the_best_of_their_grid_and_the_smallest_of_
             tried[below, above] = cohen_kappa(rank, np.argmax(p * weight, axis=1) + 1)
     best = max(tried.values())
     nearest = min((abs(b), abs(a), b, a) for (b, a), kappa in tried.items() if kappa >= best - 1e-9)
-    found = receiving._kappa_weights(p, rank)
-    assert 10 * np.log(found) == pytest.approx([nearest[2], 0, nearest[3], nearest[3]], abs=1e-9)
+    weights = receiving._kappa_weights(p, rank)
+    assert 10 * np.log(weights) == pytest.approx([nearest[2], 0, nearest[3], nearest[3]], abs=1e-9)
 
 
 @pytest.mark.parametrize(("samples", "enough"), [(49, False), (50, True)])
@@ -126,19 +126,19 @@ def test_fifty_samples_in_two_sectors_are_enough(samples, enough):
 def test_regression_equals_the_one_of_scikit_learn():
     linear_model = pytest.importorskip("sklearn.linear_model")
     x, rank, _, groups = planted(600)
-    found = fit(x, rank, groups, penalties=(5.0,))
-    z = (x - found.mean) / found.scale
-    other = linear_model.LogisticRegression(C=1.0 / 5.0, tol=1e-10, max_iter=5000).fit(z, rank)
-    np.testing.assert_allclose(found.coefficient[:, 1:], other.coef_, atol=2e-4)
-    np.testing.assert_allclose(found.probabilities(x), other.predict_proba(z), atol=2e-4)
+    model = fit(x, rank, groups, penalties=(5.0,))
+    z = (x - model.mean) / model.scale
+    reference = linear_model.LogisticRegression(C=1.0 / 5.0, tol=1e-10, max_iter=5000).fit(z, rank)
+    np.testing.assert_allclose(model.coefficient[:, 1:], reference.coef_, atol=2e-4)
+    np.testing.assert_allclose(model.probabilities(x), reference.predict_proba(z), atol=2e-4)
 
 
 def test_what_is_left_out_has_no_part_in_its_forecast():
     x, rank, _, groups = planted(400)
     changed = np.where(groups == 3, 5 - rank, rank)
-    one, two = (out_of_group(x, r, groups, 3.0) for r in (rank, changed))
-    np.testing.assert_array_equal(one[groups == 3], two[groups == 3])
-    assert np.abs(one[groups != 3] - two[groups != 3]).max() > 0.01
+    before, after = (out_of_group(x, r, groups, 3.0) for r in (rank, changed))
+    np.testing.assert_array_equal(before[groups == 3], after[groups == 3])
+    assert np.abs(before[groups != 3] - after[groups != 3]).max() > 0.01
 
 
 def test_noise_is_told_as_the_constant_forecast():
@@ -185,8 +185,8 @@ def test_the_planted_geometry_is_found_and_its_double_is_told_as_tied():
 def test_mixture_is_the_mean_of_its_members():
     x, rank, _, groups = planted(300)
     mixture = fit_mixture(np.stack([x, x]), rank, groups, penalties=(3.0,))
-    one = fit(x, rank, groups, penalties=(3.0,))
-    np.testing.assert_allclose(mixture.probabilities(np.stack([x, x])), one.probabilities(x), atol=1e-9)
+    member = fit(x, rank, groups, penalties=(3.0,))
+    np.testing.assert_allclose(mixture.probabilities(np.stack([x, x])), member.probabilities(x), atol=1e-9)
     with pytest.raises(ValueError, match="geometries"):
         mixture.probabilities(x[None])
 
@@ -229,11 +229,11 @@ def test_means_in_time_are_those_of_a_loop() -> None:
     ends = time_means(power, rows, 0.0, 0.6)[0, :, 0]
     np.testing.assert_allclose(ends, [power[0, max(i - 3, 0) : i + 4, 0].mean() for i in range(80)])
     for shift, average in ((0.0, 0.0), (3.0, 8.0), (-4.0, 5.0)):
-        found = time_means(power[:, order], time[order], shift, average)
+        means = time_means(power[:, order], time[order], shift, average)
         for row, i in enumerate(order):
             near = np.abs(time - time[i] - shift) <= average / 2
             near = near if near.any() else np.arange(80) == np.abs(time - time[i] - shift).argmin()
-            np.testing.assert_allclose(found[:, row], power[:, near].mean(axis=1))
+            np.testing.assert_allclose(means[:, row], power[:, near].mean(axis=1))
 
 
 def test_a_batch_of_features_equals_one_after_the_other():

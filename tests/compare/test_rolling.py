@@ -95,8 +95,8 @@ def test_each_prediction_is_that_of_the_bins_by_hand(ripple_db):
     for number in range(4 * 26 + 1):
         now, here = 0.5 * number, np.array([4.0 * number / 2, 3.0, 30.0])
         level = -70.0 + 0.05 * here[0] + ripple_db * np.sin(now / 3.0) + rng.normal(0.0, 0.5 * ripple_db)
-        said = {"up": 0.05 * here[0], "down": -0.03 * here[0]}
-        found = ahead.add(now, here, level, said)
+        trend_db = {"up": 0.05 * here[0], "down": -0.03 * here[0]}
+        prediction = ahead.add(now, here, level, trend_db)
         if number % 4 == 0 and number:
             of = np.array(rows[-4:]).mean(axis=0)
             squares.append(((np.array(rows[-4:])[:, 4] - of[4]) ** 2).sum() / 3.0)
@@ -110,14 +110,16 @@ def test_each_prediction_is_that_of_the_bins_by_hand(ripple_db):
                         score = crps_normal(of[4] - of[column] - mean, sd)[0]
                         scores.setdefault((name, length), []).append(score)
             bins.append(of)
-            assert (found is None) == (len(bins) < 8)
-            if found is not None:
+            assert (prediction is None) == (len(bins) < 8)
+            if prediction is not None:
                 weight = 0.98 ** np.arange(100)
-                means = {key: np.average(one[::-1], weights=weight[: len(one)]) for key, one in scores.items()}
+                means = {
+                    key: np.average(history[::-1], weights=weight[: len(history)]) for key, history in scores.items()
+                }
                 trend, length = min(means, key=means.__getitem__, default=(NONE, 120.0))
-                assert found.trend == trend
-                assert found.index[0] == np.abs(line[:, 0] - here[0]).argmin()
-                past, rest = np.array(bins), line[found.index]
+                assert prediction.trend == trend
+                assert prediction.index[0] == np.abs(line[:, 0] - here[0]).argmin()
+                past, rest = np.array(bins), line[prediction.index]
                 later = (
                     past[-1, 0]
                     + np.cumsum([np.linalg.norm(rest[0] - here), *np.linalg.norm(np.diff(rest, axis=0), axis=1)]) / 8.0
@@ -125,10 +127,10 @@ def test_each_prediction_is_that_of_the_bins_by_hand(ripple_db):
                 own = {"up": 0.05 * rest[:, 0], "down": -0.03 * rest[:, 0], NONE: np.zeros(len(rest))}[trend]
                 column = {"up": 5, "down": 6, NONE: 7}[trend]
                 mean, sd = by_hand(length, past[:, 1:4], past[:, 0], past[:, 4] - past[:, column], rest, later)
-                np.testing.assert_allclose(found.level_db, own + mean, atol=1e-6)
-                np.testing.assert_allclose(found.sd_db, np.sqrt(sd**2 + np.mean(squares)), rtol=1e-6)
-                np.testing.assert_allclose(np.diff(found.interval_db, axis=0)[0], 2 * 1.645 * found.sd_db)
+                np.testing.assert_allclose(prediction.level_db, own + mean, atol=1e-6)
+                np.testing.assert_allclose(prediction.sd_db, np.sqrt(sd**2 + np.mean(squares)), rtol=1e-6)
+                np.testing.assert_allclose(np.diff(prediction.interval_db, axis=0)[0], 2 * 1.645 * prediction.sd_db)
         else:
-            assert found is None
-        rows.append((now, *here, level, said["up"], said["down"], 0.0))
+            assert prediction is None
+        rows.append((now, *here, level, trend_db["up"], trend_db["down"], 0.0))
     assert len(scores[NONE, 30.0]) == 8

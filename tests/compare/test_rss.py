@@ -39,31 +39,31 @@ def flight(n=600, seed=0, sigma=3.0):
 
 def test_a_planted_offset_comes_back():
     time, measured, simulated = flight(sigma=0.0)
-    found = compare_rss(time, measured, simulated)
-    assert found.offset_db == -30.0
-    assert found.rmse_db == pytest.approx(0.0, abs=1e-9)
-    assert found.correlation == pytest.approx(1.0)
-    np.testing.assert_allclose(found.residual_db, 0.0, atol=1e-9)
+    fit = compare_rss(time, measured, simulated)
+    assert fit.offset_db == -30.0
+    assert fit.rmse_db == pytest.approx(0.0, abs=1e-9)
+    assert fit.correlation == pytest.approx(1.0)
+    np.testing.assert_allclose(fit.residual_db, 0.0, atol=1e-9)
     time, measured, simulated = flight()
-    found = compare_rss(time, measured, simulated)
-    assert found.intervals.offset_db[0] < -30.0 < found.intervals.offset_db[1]
-    assert found.rmse_ci95_db[0] < 3.0 < found.rmse_ci95_db[1]
+    fit = compare_rss(time, measured, simulated)
+    assert fit.intervals.offset_db[0] < -30.0 < fit.intervals.offset_db[1]
+    assert fit.rmse_ci95_db[0] < 3.0 < fit.rmse_ci95_db[1]
 
 
-def numbers(found):
+def numbers(comparison):
     """Everything of a comparison but the residual, which has the order of the samples."""
-    return {name: value for name, value in json_safe(found).items() if name != "residual_db"}
+    return {name: value for name, value in json_safe(comparison).items() if name != "residual_db"}
 
 
 def test_baselines_have_offsets_of_their_own():
     time, measured, simulated = flight()
-    found = compare_rss(time, measured, simulated, baselines={"free_space": simulated + 1, "two_ray": 0 * simulated})
-    assert set(found.baselines) == {"free_space", "two_ray"}
-    assert found.baselines["free_space"].offset_db == pytest.approx(found.offset_db + 1)
-    assert found.baselines["two_ray"].rmse_db > found.rmse_db
-    assert np.isnan(found.lag_s)
-    assert found.fitted_on_scored == ("offset_db",)
-    json.dumps(json_safe(found), allow_nan=False)
+    fit = compare_rss(time, measured, simulated, baselines={"free_space": simulated + 1, "two_ray": 0 * simulated})
+    assert set(fit.baselines) == {"free_space", "two_ray"}
+    assert fit.baselines["free_space"].offset_db == pytest.approx(fit.offset_db + 1)
+    assert fit.baselines["two_ray"].rmse_db > fit.rmse_db
+    assert np.isnan(fit.lag_s)
+    assert fit.fitted_on_scored == ("offset_db",)
+    json.dumps(json_safe(fit), allow_nan=False)
 
 
 LEVEL = np.full(20, -60.0)
@@ -83,14 +83,14 @@ LEVEL = np.full(20, -60.0)
 )
 def test_a_series_without_variation_has_its_counts_and_no_correlation(measured, simulated, counts, offset_db, rmse_db):
     """No sample, a single one, one side out of coverage, constants, an offset beyond the span of the search."""
-    found = compare_rss(np.arange(float(len(measured))), measured, simulated, baselines={"free_space": simulated})
-    assert (found.n, found.n_simulated_out, found.n_measured_out) == counts
-    assert (found.offset_db, found.rmse_db) == pytest.approx((offset_db, rmse_db), nan_ok=True)
-    assert np.isnan(found.correlation)
-    assert found.at_edge == (offset_db == -50.0)
-    if found.n < 20:
-        assert json_safe(found.rmse_ci95_db) == [None, None]
-    json.dumps(json_safe(found), allow_nan=False)
+    fit = compare_rss(np.arange(float(len(measured))), measured, simulated, baselines={"free_space": simulated})
+    assert (fit.n, fit.n_simulated_out, fit.n_measured_out) == counts
+    assert (fit.offset_db, fit.rmse_db) == pytest.approx((offset_db, rmse_db), nan_ok=True)
+    assert np.isnan(fit.correlation)
+    assert fit.at_edge == (offset_db == -50.0)
+    if fit.n < 20:
+        assert json_safe(fit.rmse_ci95_db) == [None, None]
+    json.dumps(json_safe(fit), allow_nan=False)
 
 
 def test_a_sample_without_a_pose_is_not_out_of_coverage():
@@ -98,20 +98,20 @@ def test_a_sample_without_a_pose_is_not_out_of_coverage():
     simulated[:3] = NAN
     measured[5] = NAN
     posed = np.arange(10) >= 2
-    found = compare_rss(time, measured, simulated, posed=posed)
-    assert (found.n, found.n_no_pose, found.n_out_of_coverage) == (6, 2, 2)
-    assert (found.n_simulated_out, found.n_measured_out) == (1, 1)
+    fit = compare_rss(time, measured, simulated, posed=posed)
+    assert (fit.n, fit.n_no_pose, fit.n_out_of_coverage) == (6, 2, 2)
+    assert (fit.n_simulated_out, fit.n_measured_out) == (1, 1)
 
 
 def test_order_of_samples_does_not_matter():
     time, measured, simulated = flight()
     mixed = np.random.default_rng(1).permutation(len(time))
-    one = compare_rss(time, measured, simulated)
-    two = compare_rss(time[mixed], measured[mixed], simulated[mixed])
-    assert numbers(one) == numbers(two)
-    np.testing.assert_array_equal(one.residual_db[mixed], two.residual_db)
+    in_order = compare_rss(time, measured, simulated)
+    shuffled = compare_rss(time[mixed], measured[mixed], simulated[mixed])
+    assert numbers(in_order) == numbers(shuffled)
+    np.testing.assert_array_equal(in_order.residual_db[mixed], shuffled.residual_db)
     stamps = np.datetime64("2024-07-15T12:00") + (time * 1e9).astype("timedelta64[ns]")
-    assert numbers(compare_rss(stamps, measured, simulated)) == numbers(one)
+    assert numbers(compare_rss(stamps, measured, simulated)) == numbers(in_order)
 
 
 def test_lengths_must_agree():
@@ -153,10 +153,10 @@ def test_fading_averages_out_on_the_same_footing():
     mean = -70 + 8 * np.sin(time / 20)
     rayleigh = 10 * np.log10(rng.exponential(size=len(time)))
     averages = {"each": partial(local_mean_db, time, window_s=0.0), "4 s": partial(local_mean_db, time, window_s=4.0)}
-    found = averaged_fits(mean + rayleigh, {"local_mean": mean, "other": 0 * mean}, averages)
-    assert found["local_mean"]["each"].rmse_db == pytest.approx(5.57, abs=0.4)  # standard deviation of Rayleigh in dB
-    assert found["local_mean"]["4 s"].rmse_db < 1.0
-    assert found["other"]["4 s"].rmse_db > 4.0
+    fits = averaged_fits(mean + rayleigh, {"local_mean": mean, "other": 0 * mean}, averages)
+    assert fits["local_mean"]["each"].rmse_db == pytest.approx(5.57, abs=0.4)  # standard deviation of Rayleigh in dB
+    assert fits["local_mean"]["4 s"].rmse_db < 1.0
+    assert fits["other"]["4 s"].rmse_db > 4.0
 
 
 def test_a_stretch_counts_once_however_long_the_hover():
@@ -164,10 +164,10 @@ def test_a_stretch_counts_once_however_long_the_hover():
     position = np.column_stack([east, 0 * east, 0 * east + 40.0])
     level = np.where(east < 100.0, -60.0, np.where(east == 100.0, -50.0, -60.0))
     averages = {"path": partial(stretch_means_db, stretches(position, 10.0))}
-    found = averaged_fits(level, {"flat": np.full(len(east), -60.0)}, averages)["flat"]["path"]
-    assert found.n == 21
+    fit = averaged_fits(level, {"flat": np.full(len(east), -60.0)}, averages)["flat"]["path"]
+    assert fit.n == 21
     alone = 10.0  # one stretch of 21 is off by almost 10 dB
-    assert found.rmse_db == pytest.approx(alone * np.sqrt(20) / 21, rel=0.02)
+    assert fit.rmse_db == pytest.approx(alone * np.sqrt(20) / 21, rel=0.02)
 
 
 @given(st.lists(st.floats(0.0, 5.0), min_size=2, max_size=60), st.floats(0.5, 20.0))
@@ -205,15 +205,17 @@ def test_link_geometry_in_the_antenna_frames():
     rotation = rotation_from_aircraft(*rng.uniform(-30, 30, (3, 50)))
     mount = rotation_from_yaw_pitch_roll(np.radians(45.0), 0.0, 0.0)
     uav_mount = rotation_from_yaw_pitch_roll(np.radians(315.0), 0.0, np.radians(90.0))
-    found = link_geometry(tower, position, rotation, tower_mount=mount, uav_mount=uav_mount)
+    angles = link_geometry(tower, position, rotation, tower_mount=mount, uav_mount=uav_mount)
     # boresight 45 deg counter-clockwise from east is the bearing 45 deg: an azimuth of 0 in the antenna frame
-    bearing = (45.0 - found["azimuth_deg"] + 180) % 360 - 180
-    np.testing.assert_allclose(found["tower_azimuth_deg"], bearing, atol=1e-9)
-    np.testing.assert_allclose(found["tower_elevation_deg"], found["elevation_deg"], atol=1e-9)
+    bearing = (45.0 - angles["azimuth_deg"] + 180) % 360 - 180
+    np.testing.assert_allclose(angles["tower_azimuth_deg"], bearing, atol=1e-9)
+    np.testing.assert_allclose(angles["tower_elevation_deg"], angles["elevation_deg"], atol=1e-9)
     for i in range(50):  # one by one, from the definition v_site = R_body R_mount v_device
         device = (rotation[i] @ uav_mount).T @ (tower - position[i])
-        assert found["uav_azimuth_deg"][i] == pytest.approx(np.degrees(np.arctan2(device[1], device[0])))
-        assert found["uav_elevation_deg"][i] == pytest.approx(np.degrees(np.arcsin(device[2] / np.linalg.norm(device))))
+        assert angles["uav_azimuth_deg"][i] == pytest.approx(np.degrees(np.arctan2(device[1], device[0])))
+        assert angles["uav_elevation_deg"][i] == pytest.approx(
+            np.degrees(np.arcsin(device[2] / np.linalg.norm(device)))
+        )
     level = link_geometry(tower, position, rotation_from_aircraft(np.zeros(50), np.zeros(50), np.full(50, 30.0)))
     np.testing.assert_allclose(level["heading_deg"], 30.0)
 
@@ -222,8 +224,8 @@ def test_empty_and_constant_quantities():
     empty = bin_residual([NAN], [1.0])
     assert empty.n.sum() == 0
     assert np.isnan(empty.explained)
-    one = bin_residual([1.0, 2.0], [5.0, 5.0], 3)
-    assert one.n.sum() == 2
+    constant = bin_residual([1.0, 2.0], [5.0, 5.0], 3)
+    assert constant.n.sum() == 2
 
 
 @pytest.mark.field
@@ -237,12 +239,10 @@ def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
     flown = up > 20.0
     free_space = np.where(flown, -20 * np.log10(np.sqrt(east**2 + north**2 + (up - 10) ** 2)), NAN)
     for channel in ("mpower1", "mpower2"):
-        found = compare_rss(data["timestamp_power"], data[channel], free_space, span_db=(-100, 100))
-        assert 4.5 < found.rmse_db < 7.2
-        assert (
-            found.intervals.autocorrelation.n_effective < 0.05 * found.n
-        )  # 0.26 s apart: neighbours repeat each other
-        assert found.correlation > 0.5
+        fit = compare_rss(data["timestamp_power"], data[channel], free_space, span_db=(-100, 100))
+        assert 4.5 < fit.rmse_db < 7.2
+        assert fit.intervals.autocorrelation.n_effective < 0.05 * fit.n  # 0.26 s apart: neighbours repeat each other
+        assert fit.correlation > 0.5
 
 
 @pytest.mark.parametrize(
@@ -276,21 +276,21 @@ def test_bins_and_their_intervals_are_those_by_hand():
     residual[1:] += 0.6 * residual[:-1]
     quantity[:4] = 2.0, 4.0, 10.0, 11.0  # a border belongs to the bin above it, the last one to its own
     edges = np.array([0.0, 2.0, 4.0, 10.0])
-    found, inside = bin_residual(residual, quantity, edges), quantity <= 10.0
-    known = autocorrelation(residual[inside])
+    bins, inside = bin_residual(residual, quantity, edges), quantity <= 10.0
+    memory = autocorrelation(residual[inside])
     rest = 0.0
     for k, (low, high) in enumerate(itertools.pairwise(edges)):
         part = residual[(quantity >= low) & ((quantity < high) | ((quantity == 10.0) & (high == 10.0)))]
-        reach = 1.96 * part.std() / np.sqrt(len(part) * known.n_effective / known.n - 1.0)
-        assert found.n[k] == len(part)
-        assert (found.mean_db[k], found.rmse_db[k]) == pytest.approx((part.mean(), np.sqrt(np.mean(part**2))))
-        assert (found.low_db[k], found.high_db[k]) == pytest.approx(
+        reach = 1.96 * part.std() / np.sqrt(len(part) * memory.n_effective / memory.n - 1.0)
+        assert bins.n[k] == len(part)
+        assert (bins.mean_db[k], bins.rmse_db[k]) == pytest.approx((part.mean(), np.sqrt(np.mean(part**2))))
+        assert (bins.low_db[k], bins.high_db[k]) == pytest.approx(
             (part.mean() - reach, part.mean() + reach), nan_ok=True
         )
         rest += np.sum((part - part.mean()) ** 2)
-    assert np.isfinite(found.low_db).any()
+    assert np.isfinite(bins.low_db).any()
     total = np.sum((residual[inside] - residual[inside].mean()) ** 2)
-    assert found.explained == pytest.approx(1.0 - rest / total)
+    assert bins.explained == pytest.approx(1.0 - rest / total)
     assert bin_residual(residual, quantity).edges == pytest.approx(np.linspace(quantity.min(), 11.0, 13))
     assert bin_residual([1.0], [3.0], 2).edges.tolist() == [3.0, 3.5, 4.0]
     halves = bin_residual(residual, quantity > 5.0)  # a truth value has two bins
@@ -314,7 +314,7 @@ def test_spans_are_runs_of_smoothed_errors_of_one_sign():
     expected = [run for run in runs if sign[run[0]]]
     expected.sort(key=lambda run: -abs(residual[run].mean()) * np.sqrt(time[run[-1]] - time[run[0]] + 1e-3))
     mixed, around = rng.permutation(400), {"x": time, "foliage_m": 9.0 * (time % 40.0 > 20.0)}
-    found = error_spans(
+    spans = error_spans(
         time[mixed],
         residual[mixed],
         position_m=place[mixed],
@@ -323,23 +323,23 @@ def test_spans_are_runs_of_smoothed_errors_of_one_sign():
         largest=5,
     )
     assert len(expected) > 5
-    for span, run in zip(found, expected[:5], strict=True):
+    for span, run in zip(spans, expected[:5], strict=True):
         assert (span.start_s, span.end_s, span.n) == (time[run[0]], time[run[-1]], len(run))
         assert span.mean_db == pytest.approx(residual[run].mean())
         assert span.worst_db == residual[run][np.abs(residual[run]).argmax()]
         assert span.position_m == pytest.approx(place[run].mean(axis=0))
         assert span.geometry["x"] == pytest.approx(np.median(time[run]))
         assert span.cause == rss._likely_cause(around, slice(run[0], run[-1] + 1), span.mean_db)
-    json.dumps(json_safe(found), allow_nan=False)
+    json.dumps(json_safe(spans), allow_nan=False)
     assert error_spans(time, np.full(len(time), NAN)) == []
     assert len(error_spans(np.arange(600.0), np.tile(np.repeat([9.0, -9.0], 10), 30), threshold_db=1.0)) == 10
-    one, two = -60.0 + 12.0 * np.sin(time / 6.0), np.full(400, -62.0)
-    parted, apart = channel_difference(time, one, two), one - one.mean()
+    first, second = -60.0 + 12.0 * np.sin(time / 6.0), np.full(400, -62.0)
+    parted, apart = channel_difference(time, first, second), first - first.mean()
     assert parted.spans == error_spans(time, apart, window_s=1.0, threshold_db=10.0)
-    assert (parted.n, parted.mean_db, parted.std_db) == pytest.approx((400, (one - two).mean(), apart.std()))
+    assert (parted.n, parted.mean_db, parted.std_db) == pytest.approx((400, (first - second).mean(), apart.std()))
     assert parted.share_parted == pytest.approx(np.mean(np.abs(apart) > 10.0))
-    assert parted.interval_std_db == error_intervals(two, one).rmse_db
-    assert channel_difference(time, one, np.full(400, NAN)).n == 0
+    assert parted.interval_std_db == error_intervals(second, first).rmse_db
+    assert channel_difference(time, first, np.full(400, NAN)).n == 0
 
 
 @pytest.mark.parametrize(("spread_db", "reach_db"), [(10.0, 40.0), (1.0, 20.0)])
@@ -362,7 +362,7 @@ def test_a_span_is_large_from_one_and_a_half_times_the_rms_error(level, spans):
     rest = np.sqrt((400 * rms**2 - 100) / 300)
     quiet = residual == 0
     residual[quiet] = rest * np.where(np.arange(quiet.sum()) % 2, 1.0, -1.0)
-    found = error_spans(time, residual, window_s=10.0)
-    assert len(found) == spans
-    assert sorted(round(span.mean_db, 1) for span in found) == ([-1.0, 1.0] if spans else [])
+    runs = error_spans(time, residual, window_s=10.0)
+    assert len(runs) == spans
+    assert sorted(round(span.mean_db, 1) for span in runs) == ([-1.0, 1.0] if spans else [])
     assert len(error_spans(time, residual, window_s=10.0, threshold_db=0.9)) == 2

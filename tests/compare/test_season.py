@@ -13,11 +13,11 @@ from aerpaw_cmp.compare.statistics import autocorrelation
 def test_offset_of_the_others_is_the_search_over_their_samples():
     rng = np.random.default_rng(3)
     flights = [(rng.normal(-60, 5, n), rng.normal(-80, 5, n)) for n in (7, 30, 200, 1)]
-    found = left_out_offsets([len(m) for m, _ in flights], [float((s - m).mean()) for m, s in flights])
+    offsets = left_out_offsets([len(m) for m, _ in flights], [float((s - m).mean()) for m, s in flights])
     for i in range(len(flights)):
         rest = [f for j, f in enumerate(flights) if j != i]
         fit = grid_offset(np.concatenate([m for m, _ in rest]), np.concatenate([s for _, s in rest]))
-        assert found[i] == fit.offset_db
+        assert offsets[i] == fit.offset_db
 
 
 def test_a_flight_alone_or_without_samples():
@@ -37,10 +37,10 @@ def test_error_at_another_offset_is_the_error_of_the_samples_there():
 
 def test_few_flights_and_missing_ones():
     assert mean_of_flights([]).n == 0
-    two = mean_of_flights([1.0, np.nan, 3.0])
-    assert (two.n, two.mean) == (2, 2.0)
-    assert np.isnan(two.low)
-    assert verdict_of(two) == "no interval"
+    pair = mean_of_flights([1.0, np.nan, 3.0])
+    assert (pair.n, pair.mean) == (2, 2.0)
+    assert np.isnan(pair.low)
+    assert verdict_of(pair) == "no interval"
     assert verdict_of(mean_of_flights([1.0, 1.1, 0.9, 1.0])) == "worse"
     assert verdict_of(mean_of_flights([1.0, -1.0, 0.5, -0.5])) == "not significant"
     same = mean_of_flights(np.full(30, 0.25))
@@ -51,9 +51,9 @@ def test_few_flights_and_missing_ones():
 def test_intervals_and_slopes_are_those_of_students_t(n):
     """The slope by SciPy's regression; of twenty flights that drift, as many count as are independent."""
     values = np.arange(n) // 4 + np.sin(np.arange(n))
-    found, known = mean_of_flights(values), min(max(autocorrelation(values).n_effective, 3.0), n) if n >= 20 else n
-    reach = student.ppf(0.975, known - 1) * values.std(ddof=1) / np.sqrt(known)
-    assert (found.n, found.low, found.high) == pytest.approx((n, values.mean() - reach, values.mean() + reach))
+    mean, independent = mean_of_flights(values), min(max(autocorrelation(values).n_effective, 3.0), n) if n >= 20 else n
+    reach = student.ppf(0.975, independent - 1) * values.std(ddof=1) / np.sqrt(independent)
+    assert (mean.n, mean.low, mean.high) == pytest.approx((n, values.mean() - reach, values.mean() + reach))
     days = np.cumsum(1.0 + np.arange(n) % 3)
     line, fit = linregress(days / 30.0, values), trend([*days, 5.0], [*values, np.nan])
     reach = student.ppf(0.975, n - 2) * line.stderr
@@ -68,5 +68,5 @@ def test_intervals_and_slopes_are_those_of_students_t(n):
 
 @pytest.mark.parametrize("days", [[0.0, 1.0], [5.0, 5.0, 5.0], [np.nan, 1.0, np.nan]])
 def test_no_drift_without_dates(days):
-    found = trend(days, np.arange(float(len(days))))
-    assert np.isnan([found.slope, found.low, found.scatter]).all()
+    drift = trend(days, np.arange(float(len(days))))
+    assert np.isnan([drift.slope, drift.low, drift.scatter]).all()

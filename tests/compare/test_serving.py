@@ -24,20 +24,20 @@ def test_rows_of_the_confusion_count_the_served(served: list[int], random: objec
     rng = np.random.default_rng(random.randint(0, 2**31))  # type: ignore[attr-defined]
     level = rng.normal(size=(len(served), 3))
     level[rng.random(level.shape) < 0.3] = np.nan
-    found = compare_serving(served, level, ["a", "b", "c"])
-    assert found.confusion.sum(axis=1).tolist() == [served.count(i) for i in range(3)]
-    assert found.n == sum(one >= 0 for one in served)
+    comparison = compare_serving(served, level, ["a", "b", "c"])
+    assert comparison.confusion.sum(axis=1).tolist() == [served.count(i) for i in range(3)]
+    assert comparison.n == sum(tower >= 0 for tower in served)
     brute = sum(
-        one >= 0 and not np.isnan(row).all() and int(np.nanargmax(row)) == one
-        for one, row in zip(served, level, strict=True)
+        tower >= 0 and not np.isnan(row).all() and int(np.nanargmax(row)) == tower
+        for tower, row in zip(served, level, strict=True)
     )
-    assert found.n == 0 or found.hit_share == pytest.approx(brute / found.n)
+    assert comparison.n == 0 or comparison.hit_share == pytest.approx(brute / comparison.n)
 
 
 def test_no_prediction_is_a_column_of_its_own() -> None:
-    found = compare_serving([0, 1], [[np.nan, np.nan], [-70, -80]], ["a", "b"])
-    assert found.confusion.tolist() == [[0, 0, 1], [1, 0, 0]]
-    assert found.as_dict()["confusion"]["a"] == {"a": 0, "b": 0, "none": 1}
+    comparison = compare_serving([0, 1], [[np.nan, np.nan], [-70, -80]], ["a", "b"])
+    assert comparison.confusion.tolist() == [[0, 0, 1], [1, 0, 0]]
+    assert comparison.as_dict()["confusion"]["a"] == {"a": 0, "b": 0, "none": 1}
 
 
 def test_wrong_shapes_are_refused() -> None:

@@ -25,11 +25,11 @@ def test_fading_is_what_is_left_within_the_mean(freedom: float, kurtosis: float)
     random = np.random.default_rng(3)
     fading = random.normal(size=N) if np.isinf(freedom) else random.standard_t(freedom, N)
     slow = np.repeat(random.normal(0.0, 10.0, N // 40), 40)
-    sd, found = fading_of([samples(slow + 2.5 * fading / fading.std())], 4.0)
+    sd, excess = fading_of([samples(slow + 2.5 * fading / fading.std())], 4.0)
     assert sd == pytest.approx(2.5, rel=0.01)
-    assert found == pytest.approx(kurtosis, abs=0.25)
-    gone = np.full(N, np.nan)
-    assert fading_of([samples(gone)], 4.0) == (0.0, 0.0)
+    assert excess == pytest.approx(kurtosis, abs=0.25)
+    unmeasured = np.full(N, np.nan)
+    assert fading_of([samples(unmeasured)], 4.0) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("gone_db", [0.0, 3.0, 12.0])
@@ -66,13 +66,13 @@ def test_a_file_says_its_spread_and_one_of_another_kind_none() -> None:
 def test_fading_does_not_depend_on_the_zero_of_the_clock() -> None:
     """Bins begin with the first sample, whatever its time is called."""
     random = np.random.default_rng(8)
-    one = samples(random.normal(0.0, 3.0, 800) + np.repeat(random.normal(0.0, 8.0, 100), 8))
-    one = dataclasses.replace(
-        one, time_s=np.arange(800) / 8.0
+    flown = samples(random.normal(0.0, 3.0, 800) + np.repeat(random.normal(0.0, 8.0, 100), 8))
+    flown = dataclasses.replace(
+        flown, time_s=np.arange(800) / 8.0
     )  # exact in binary: no sample changes its bin by rounding
-    expected = fading_of([one], 1.0)
+    expected = fading_of([flown], 1.0)
     for shift_s in (0.375, 17.5, 1024.25):
-        assert fading_of([dataclasses.replace(one, time_s=one.time_s + shift_s)], 1.0) == pytest.approx(expected)
+        assert fading_of([dataclasses.replace(flown, time_s=flown.time_s + shift_s)], 1.0) == pytest.approx(expected)
 
 
 def test_the_kurtosis_counts_only_as_far_as_the_expansion_holds() -> None:
@@ -105,10 +105,10 @@ def test_fading_is_the_pooled_variance_about_the_means_of_bins() -> None:
     random = np.random.default_rng(9)
     bins = [random.normal(10.0 * k, 1.0 + k, size) for k, size in enumerate((2, 3, 2, 7, 1, 2))]
     time_s = np.concatenate([4.0 * k + np.linspace(0.5, 3.5, len(part)) for k, part in enumerate(bins)])
-    one = dataclasses.replace(samples(np.concatenate(bins)), time_s=time_s)
+    flown = dataclasses.replace(samples(np.concatenate(bins)), time_s=time_s)
     several = [part for part in bins if len(part) > 1]
     pooled = sum(len(part) * part.var(ddof=1) for part in several) / sum(map(len, several))
-    found = fading_of([samples(np.full(3, np.nan)), one, samples(np.zeros(1))], 4.0)
-    assert found[0] == pytest.approx(np.sqrt(pooled), rel=1e-12)
+    fading = fading_of([samples(np.full(3, np.nan)), flown, samples(np.zeros(1))], 4.0)
+    assert fading[0] == pytest.approx(np.sqrt(pooled), rel=1e-12)
     away = np.concatenate([(part - part.mean()) * np.sqrt(len(part) / (len(part) - 1)) for part in several])
-    assert found[1] == pytest.approx(np.mean(away**4) / pooled**2 - 3.0, rel=1e-12)
+    assert fading[1] == pytest.approx(np.mean(away**4) / pooled**2 - 3.0, rel=1e-12)

@@ -45,11 +45,11 @@ def test_effective_sample_size_of_a_known_process(n, correlation, noise):
     rng = np.random.default_rng(1)
     ratio = (1 + correlation) / (1 - correlation)
     expected = n * (1 + noise) / (ratio + noise)
-    found = []
+    sizes = []
     for _ in range(60 if n < 10_000 else 15):
         x = shadowing(rng, n, -1.0 / np.log(correlation), 1.0) + np.sqrt(noise) * rng.normal(size=n)
-        found.append(autocorrelation(x).n_effective)
-    assert np.median(found) == pytest.approx(expected, rel=0.2)
+        sizes.append(autocorrelation(x).n_effective)
+    assert np.median(sizes) == pytest.approx(expected, rel=0.2)
 
 
 def test_degenerate_sequences():
@@ -57,8 +57,8 @@ def test_degenerate_sequences():
     assert autocorrelation([1.0]).block_length == 1
     assert autocorrelation(np.zeros(100)).block_length == 1
     assert np.isnan(error_intervals(np.zeros(0), np.zeros(0)).rmse_db).all()
-    one = error_intervals(np.array([1.0]), np.array([2.0]))
-    assert np.isnan(one.offset_db).all()
+    single = error_intervals(np.array([1.0]), np.array([2.0]))
+    assert np.isnan(single.offset_db).all()
     constant = error_intervals(np.full(50, -60.0), np.full(50, -70.0))
     assert constant.offset_db == pytest.approx((-10.0, -10.0))
     assert np.isnan(constant.correlation).all()
@@ -102,12 +102,12 @@ def autocorrelation_by_loops(x):
 def test_memory_and_blocks_are_those_of_plain_loops(n, keep, noise):
     rng = np.random.default_rng(n)
     x = lfilter([1], [1, -keep], rng.normal(size=n)) + noise * rng.normal(size=n)
-    found = autocorrelation(x)
+    memory = autocorrelation(x)
     block, effective, factor = autocorrelation_by_loops(x)
-    assert found.block_length == pytest.approx(block, abs=0.02 * block)
-    assert (found.n_effective, found.variance_factor) == pytest.approx((effective, factor), rel=0.02)
+    assert memory.block_length == pytest.approx(block, abs=0.02 * block)
+    assert (memory.n_effective, memory.variance_factor) == pytest.approx((effective, factor), rel=0.02)
     unit = autocorrelation(1e-4 * x + 3.0)  # whatever the unit
-    assert (unit.block_length, unit.n_effective) == (found.block_length, pytest.approx(found.n_effective, rel=1e-6))
+    assert (unit.block_length, unit.n_effective) == (memory.block_length, pytest.approx(memory.n_effective, rel=1e-6))
     if n < 10:
         assert autocorrelation(x[:7]) == Autocorrelation(7, 1, 7.0, 1.0)  # too few to tell
 
@@ -140,17 +140,17 @@ def test_powers_of_a_pair_have_the_sum_of_the_larger_and_a_ratio_of_their_own(fi
     monkeypatch.setattr(statistics, "mean_draws", lambda values, kind: ratio + (kind != "ratio") + 1e-9 * values.sum())
     monkeypatch.setattr(statistics, "power_draws", lambda values: power * values.var())
     wave = np.tile([1.0, -1.0], 20)
-    one, two = statistics._power_pairs(first * wave, second * wave, first**2, second**2)
-    np.testing.assert_allclose(one / two, first**2 / second**2 * np.exp(ratio), rtol=1e-6)
-    np.testing.assert_allclose(one + two, power * (first**2 + second**2))
+    first_power, second_power = statistics._power_pairs(first * wave, second * wave, first**2, second**2)
+    np.testing.assert_allclose(first_power / second_power, first**2 / second**2 * np.exp(ratio), rtol=1e-6)
+    np.testing.assert_allclose(first_power + second_power, power * (first**2 + second**2))
 
 
 def test_nineteen_samples_are_too_few_for_an_interval_and_twenty_are_not():
     values = np.random.default_rng(8).normal(size=20)
     for n, some in ((19, False), (20, True)):
-        found = error_intervals(values[:n], 0.5 * values[:n][::-1])
+        fit = error_intervals(values[:n], 0.5 * values[:n][::-1])
         pair = paired_difference(values[:n], 0.5 * values[:n][::-1])
-        spans = [found.offset_db, found.rmse_db, found.correlation, pair.difference_ci95_db, pair.mean_square_ci95_db2]
+        spans = [fit.offset_db, fit.rmse_db, fit.correlation, pair.difference_ci95_db, pair.mean_square_ci95_db2]
         spans += [statistics.mean_interval(values[:n]), statistics.spread_interval(values[:n])]
         assert (np.isfinite(spans) == some).all()
         assert np.isfinite(pair.standard_error_db) == some
@@ -160,9 +160,9 @@ def test_nineteen_samples_are_too_few_for_an_interval_and_twenty_are_not():
 def test_resamples_do_not_depend_on_how_many_are_held_at_once(monkeypatch):
     for length in (2, 30):
         data = np.random.default_rng(length).normal(size=(60, 3))
-        whole = bootstrap_means(data, length, replicates=50)
+        at_once = bootstrap_means(data, length, replicates=50)
         monkeypatch.setattr(statistics, "_HELD", 400)
-        np.testing.assert_allclose(bootstrap_means(data, length, replicates=50), whole, atol=1e-14)
+        np.testing.assert_allclose(bootstrap_means(data, length, replicates=50), at_once, atol=1e-14)
         monkeypatch.undo()
 
 
@@ -173,13 +173,13 @@ def test_resamples_have_the_moments_of_the_circular_block_bootstrap(n, length, c
     drawn = bootstrap_means(data, length, replicates=4000)
     np.testing.assert_allclose(drawn.mean(axis=0), data.mean(axis=0), atol=0.05)
     # exact variance: independent whole blocks and one shorter one
-    whole, last = -(-n // length) - 1, n - (-(-n // length) - 1) * length
+    full_blocks, last = -(-n // length) - 1, n - (-(-n // length) - 1) * length
     ring = np.concatenate([data, data])
 
     def sums(size):
         return np.array([ring[s : s + size].sum(axis=0) for s in range(n)])
 
-    expected = (whole * sums(length).var(axis=0) + sums(last).var(axis=0)) / n**2
+    expected = (full_blocks * sums(length).var(axis=0) + sums(last).var(axis=0)) / n**2
     np.testing.assert_allclose(drawn.var(axis=0).mean(), expected.mean(), rtol=0.08, atol=1e-12)
 
 
@@ -191,16 +191,16 @@ def test_a_given_interval_holds_and_one_is_given(neighbours):
     t = np.linspace(0, 2 * np.pi, n)
     simulated = -80 + 8 * np.sin(3 * t) + 4 * np.cos(11 * t)
     truth = np.array([7.3, 4.0, np.sqrt(simulated.var() / (simulated.var() + 16.0)), 0.0])
-    held = np.zeros(4)
+    covered = np.zeros(4)
     for _ in range(runs):
         error, other = (shadowing(rng, n, -1 / np.log(max(neighbours, 1e-9)), 4.0) for _ in range(2))
-        found = error_intervals(simulated - 7.3 + error, simulated)
+        fit = error_intervals(simulated - 7.3 + error, simulated)
         pair = paired_difference(error, 0.5 * error + np.sqrt(0.75) * other)
-        bounds = np.array([found.offset_db, found.rmse_db, found.correlation, pair.difference_ci95_db])
+        bounds = np.array([fit.offset_db, fit.rmse_db, fit.correlation, pair.difference_ci95_db])
         assert np.isfinite(bounds).all()
-        held += (bounds[:, 0] <= truth) & (truth <= bounds[:, 1])
-    assert (held >= 0.90 * runs).all()  # 0.3: offset 49 %, RMSE 11 % of those given at 0.98
-    assert held[[0, 1, 3]].sum() < 3 * runs - 6  # and intervals that always hold say nothing
+        covered += (bounds[:, 0] <= truth) & (truth <= bounds[:, 1])
+    assert (covered >= 0.90 * runs).all()  # 0.3: offset 49 %, RMSE 11 % of those given at 0.98
+    assert covered[[0, 1, 3]].sum() < 3 * runs - 6  # and intervals that always hold say nothing
 
 
 def test_interval_of_independent_samples_is_that_of_the_textbook():
@@ -208,8 +208,8 @@ def test_interval_of_independent_samples_is_that_of_the_textbook():
     rng = np.random.default_rng(6)
     n, ends = 1000, []
     for _ in range(40):
-        found = error_intervals(rng.normal(0, 3, n), np.zeros(n))
-        ends.append([np.ptp(found.offset_db), np.ptp(found.rmse_db)])
+        fit = error_intervals(rng.normal(0, 3, n), np.zeros(n))
+        ends.append([np.ptp(fit.offset_db), np.ptp(fit.rmse_db)])
     offset, rmse = np.median(ends, axis=0)
     assert offset == pytest.approx(2 * 1.96 * 3 / np.sqrt(n), rel=0.2)
     assert rmse == pytest.approx(2 * 1.96 * 3 / np.sqrt(2 * n), rel=0.2)
@@ -223,13 +223,13 @@ def test_ends_are_those_of_the_central_95_percent_of_the_draws(monkeypatch):
     monkeypatch.setattr(statistics, "power_draws", lambda *_: (ramp.std() + normal) ** 2)
     monkeypatch.setattr(statistics, "_power_pairs", lambda *_: ((5.0 + normal) ** 2, np.full(len(normal), 9.0)))
     white = Autocorrelation(n=10_000, block_length=1, n_effective=10_000.0, variance_factor=1.0)
-    found = {
+    intervals = {
         "mean": (statistics.mean_interval(ramp), 0.0),
         "spread": (statistics.spread_interval(ramp), ramp.std()),
         "pair": (paired_difference(ramp, 2 * ramp).difference_ci95_db, 2.0),
         "resampled": (interval(0.0, normal, white), 0.0),
     }
-    for name, (ends, middle) in found.items():
+    for name, (ends, middle) in intervals.items():
         assert ends == pytest.approx((middle - 1.96, middle + 1.96), abs=0.01), name
     assert paired_difference(ramp, 2 * ramp).standard_error_db == pytest.approx(1.0, abs=0.001)
     low, high = share_interval(0.5, 0.01, white)
@@ -241,8 +241,8 @@ def test_a_significant_difference_of_a_flight_of_few_correlation_times_is_found(
     rng = np.random.default_rng(7)
     words = []
     for _ in range(60):
-        one, two = (shadowing(rng, 500, 25, 4.0) for _ in range(2))
-        words.append(paired_difference(2 * one, two).verdict)
+        first, second = (shadowing(rng, 500, 25, 4.0) for _ in range(2))
+        words.append(paired_difference(2 * first, second).verdict)
     assert set(words) <= {"worse", "not significant"}
     assert words.count("worse") > 20
 
@@ -287,35 +287,35 @@ def test_a_paired_difference_sees_what_two_intervals_of_their_own_hide():
     """Errors that share most of their shadowing: 4.0 and 4.2 dB, intervals that overlap widely, yet one is worse."""
     rng = np.random.default_rng(12)
     common = shadowing(rng, 4000, 15, 4.0)
-    one, two = common + rng.normal(0, 1.5, 4000), common
+    noisier, quieter = common + rng.normal(0, 1.5, 4000), common
     zeros = np.zeros(4000)
-    first, second = (error_intervals(zeros, -error).rmse_db for error in (one, two))
+    first, second = (error_intervals(zeros, -error).rmse_db for error in (noisier, quieter))
     assert first[0] < second[1]  # their own intervals overlap
-    found = paired_difference(one, two)
-    assert found.verdict == "worse"
+    pair = paired_difference(noisier, quieter)
+    assert pair.verdict == "worse"
     truth = np.sqrt(16 + 1.5**2) - 4
-    assert found.difference_ci95_db[0] < truth < found.difference_ci95_db[1]
-    assert found.in_words("free space").startswith("worse than free space by 0.3 dB [0.")
-    back = paired_difference(two, one)
+    assert pair.difference_ci95_db[0] < truth < pair.difference_ci95_db[1]
+    assert pair.in_words("free space").startswith("worse than free space by 0.3 dB [0.")
+    back = paired_difference(quieter, noisier)
     assert back.verdict == "better"
-    assert back.difference_ci95_db == pytest.approx((-found.difference_ci95_db[1], -found.difference_ci95_db[0]))
+    assert back.difference_ci95_db == pytest.approx((-pair.difference_ci95_db[1], -pair.difference_ci95_db[0]))
     assert back.in_words("b").startswith("better than b by 0.3 dB")
 
 
 def test_beside_a_model_without_error_the_whole_error_of_the_other_is_the_difference():
     error = shadowing(np.random.default_rng(14), 300, 5, 4.0)
     low, high = np.quantile(power_draws(error - error.mean()), [0.025, 0.975])
-    found, back = paired_difference(error, np.zeros(300)), paired_difference(np.zeros(300), error)
-    assert (found.verdict, back.verdict) == ("worse", "better")
-    assert found.mean_square_ci95_db2 == pytest.approx((low, high))
+    pair, back = paired_difference(error, np.zeros(300)), paired_difference(np.zeros(300), error)
+    assert (pair.verdict, back.verdict) == ("worse", "better")
+    assert pair.mean_square_ci95_db2 == pytest.approx((low, high))
     assert back.mean_square_ci95_db2 == pytest.approx((-high, -low))
     assert paired_difference(np.zeros(300), np.zeros(300)).difference_ci95_db == (0.0, 0.0)
 
 
 def test_errors_kept_out_of_a_fit_count_with_their_offset():
-    one, two = np.full(200, 3.0) + np.tile([1.0, -1.0], 100), np.tile([2.0, -2.0], 100)
-    assert paired_difference(one, two).difference_db == pytest.approx(-1.0)
-    kept_out = paired_difference(one, two, free_offset=False)
+    biased, centred = np.full(200, 3.0) + np.tile([1.0, -1.0], 100), np.tile([2.0, -2.0], 100)
+    assert paired_difference(biased, centred).difference_db == pytest.approx(-1.0)
+    kept_out = paired_difference(biased, centred, free_offset=False)
     assert kept_out.rmse_db == pytest.approx(np.sqrt(10.0))
     assert kept_out.verdict == "worse"
     assert kept_out.mean_square_difference_db2 == pytest.approx(6.0)
@@ -341,9 +341,9 @@ def test_repeatability_floor_of_two_passes():
     first = -60 + field + rng.normal(0, 2, 2000)
     second = -57 + field[::-1] + rng.normal(0, 2, 2000)
     first[:50] = np.nan
-    found = repeatability(Visit(here, first), Visit(there, second))
-    assert found.rmse_db == pytest.approx(np.sqrt(8.0), rel=0.1)
-    assert found.rmse_ci95_db[0] < np.sqrt(8.0) < found.rmse_ci95_db[1]
+    repeated = repeatability(Visit(here, first), Visit(there, second))
+    assert repeated.rmse_db == pytest.approx(np.sqrt(8.0), rel=0.1)
+    assert repeated.rmse_ci95_db[0] < np.sqrt(8.0) < repeated.rmse_ci95_db[1]
     north, south = np.zeros(2000), np.full(2000, 180.0)
     assert repeatability(Visit(here, first, north), Visit(there, second, south)).n == 0
     nowhere = repeatability(Visit(here, first), Visit(there + 100.0, second))
@@ -366,10 +366,10 @@ def test_models_of_equal_error_are_called_different_at_most_as_often_as_stated()
     wrong, truth_held = 0, 0
     for _ in range(150):
         common = shadowing(rng, 1500, 8, 3.0)
-        one, two = (common + shadowing(rng, 1500, 8, 2.0) + level for level in (5.0, -3.0))
-        found = paired_difference(one, two)
-        wrong += found.verdict in ("better", "worse")
-        low, high = found.difference_ci95_db
+        first, second = (common + shadowing(rng, 1500, 8, 2.0) + level for level in (5.0, -3.0))
+        pair = paired_difference(first, second)
+        wrong += pair.verdict in ("better", "worse")
+        low, high = pair.difference_ci95_db
         truth_held += low <= 0 <= high
     assert wrong <= 15  # 5 % of 150 is 7.5
     assert truth_held + wrong == 150

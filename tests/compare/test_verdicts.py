@@ -176,9 +176,9 @@ def test_few_flights_accuse_nobody_and_have_no_interval() -> None:
     flights = ["A", "B", "C"]
     lone = campaign_verdict(dict(zip(flights, (5.0, 5.1, 50.0), strict=True)), {}, flights)
     assert lone.cause == "none"
-    two = by_flight([("A", 3.0), ("B", 3.1)], [("A", 6.0), ("B", 6.2)])
-    assert two.cause == "no interval"
-    assert np.isnan(two.interval).all()
+    pair = by_flight([("A", 3.0), ("B", 3.1)], [("A", 6.0), ("B", 6.2)])
+    assert pair.cause == "no interval"
+    assert np.isnan(pair.interval).all()
     assert stated_errors(np.ones(10), np.ones(10)).cause == "no interval"
     assert coverage_verdict([]).cause == "none"
 
@@ -213,8 +213,8 @@ def test_chance_is_shared_by_all_that_is_tried_and_two_decibels_are_small(
     chances: tuple[float, ...], effect: float, cause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two false alarms in a hundred campaigns, whatever the number of shifts that are tried."""
-    found = [verdicts._Shift(chance, Verdict(cause="gain step", effect=effect)) for chance in chances]
-    monkeypatch.setattr(verdicts, "_shifts", lambda *_: iter(found))
+    shifts = [verdicts._Shift(chance, Verdict(cause="gain step", effect=effect)) for chance in chances]
+    monkeypatch.setattr(verdicts, "_shifts", lambda *_: iter(shifts))
     assert campaign_verdict({}, {}, []).cause == cause
 
 
@@ -225,15 +225,15 @@ def test_every_shift_of_a_campaign_is_tried() -> None:
         "LW1": dict(zip(names, (1.0, 2.0, 1.5, 4.0, 5.0, 4.5), strict=True)),
         "LW2": {"A": 1.0, "B": np.nan, "C": 2.0},
     }
-    tried = [one.verdict for one in verdicts._shifts(errors, links, names)]
-    assert [one.where for one in tried] == [*"ABCDE", *(f"LW1 from {name}" for name in "CDE"), *names]
+    tried = [shift.verdict for shift in verdicts._shifts(errors, links, names)]
+    assert [shift.where for shift in tried] == [*"ABCDE", *(f"LW1 from {name}" for name in "CDE"), *names]
     assert tried[3].effect == pytest.approx(8.0 / (2.0 * 2.2 * 1.9 * 2.1) ** 0.25)
     assert tried[3].interval[0] < tried[3].effect < tried[3].interval[1]
     assert tried[6].effect == pytest.approx(4.5 - 1.5)  # from D on
     a, c = (1.0 - 3.0 - 0.5) / 2, (1.5 - 3.0 + 0.5) / 2  # about the mean of each link, then of the links
     rest = (c - 1.0 + 1.0 + 2.0 + 1.5) / 5
     assert tried[8].effect == pytest.approx(a - rest)
-    low = [one.chance for one in verdicts._shifts(errors, {}, names)]
+    low = [shift.chance for shift in verdicts._shifts(errors, {}, names)]
     assert np.isnan(low).tolist() == [True, True, True, False, True]  # a small error accuses nobody
 
 
@@ -278,15 +278,15 @@ def test_the_worst_height_says_what_takes_its_coverage(
 
 
 @pytest.mark.parametrize(
-    ("causes", "said"),
+    ("causes", "verdict"),
     [("better better", "antenna"), ("better worse", "place"), ("not_significant", "not separable"),
      ("no_interval no_interval", "no interval"), ("better no_interval", "not separable")],
 )  # fmt: skip
-def test_an_antenna_beats_every_wrong_frame_and_a_place_loses_to_one(causes: str, said: str) -> None:
+def test_an_antenna_beats_every_wrong_frame_and_a_place_loses_to_one(causes: str, verdict: str) -> None:
     """The nearest rival stands: of those that win, where one does."""
     against = [Verdict(cause=c.replace("_", " "), effect=float(k - 2)) for k, c in enumerate(causes.split())]
-    found = antenna_or_place([*against, Verdict(cause="better")])
-    assert (found.cause, found.effect) == (said, float(len(against) - 3))
+    nearest = antenna_or_place([*against, Verdict(cause="better")])
+    assert (nearest.cause, nearest.effect) == (verdict, float(len(against) - 3))
     assert antenna_or_place([Verdict(cause="worse", effect=1.0), Verdict(cause="better", effect=9.0)]).effect == 1.0
 
 

@@ -77,12 +77,12 @@ def serious_findings(driver) -> dict[str, list[str]]:
         set_width(
             driver, 1440, driver.execute_script("scrollTo(0, 0); return document.documentElement.scrollHeight") + 100
         )
-        found = driver.execute_async_script("const done = arguments[0]; axe.run().then(done);")
+        audit = driver.execute_async_script("const done = arguments[0]; axe.run().then(done);")
     finally:
         usual_width(driver)
     return {
         v["id"]: [n["html"][:120] for n in v["nodes"]]
-        for v in found["violations"]
+        for v in audit["violations"]
         if v["impact"] in ("serious", "critical")
     }
 
@@ -114,16 +114,16 @@ def extents(driver, width: int, views: str) -> tuple[float, list[float]]:
 
 def papers(driver, canvas: str) -> list[list[int]]:
     """First pixel of a canvas in the light and in the dark scheme."""
-    found = []
+    pixels = []
     for scheme in ("light", "dark"):
         set_scheme(driver, scheme)
         frame(driver)
         script = (
             "return Array.from(document.getElementById(arguments[0]).getContext('2d').getImageData(1, 1, 1, 1).data)"
         )
-        found.append(driver.execute_script(script, canvas))
+        pixels.append(driver.execute_script(script, canvas))
     set_scheme(driver)
-    return found
+    return pixels
 
 
 def set_scheme(driver, *schemes: str) -> None:

@@ -77,9 +77,9 @@ def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> R
     mirrored = np.linalg.norm(position - t * [1, 1, -1], axis=1)
     free = 40 + 20 * np.log10(WAVELENGTH / (4 * np.pi * d))
     waves = (np.exp(-2j * np.pi * way / WAVELENGTH) / way for way in (d, mirrored))
-    two = 40 + 20 * np.log10(WAVELENGTH / (4 * np.pi) * np.abs(next(waves) - 0.6 * next(waves)))
+    two_ray = 40 + 20 * np.log10(WAVELENGTH / (4 * np.pi) * np.abs(next(waves) - 0.6 * next(waves)))
     azimuth = np.degrees(np.arctan2(track.north_m - t[1], track.east_m - t[0]))
-    simulated = two - 3.0 * np.cos(np.radians(azimuth - 40)) ** 2
+    simulated = two_ray - 3.0 * np.cos(np.radians(azimuth - 40)) ** 2
     truth = (
         simulated + np.convolve(rng.normal(0, 9.0, len(d)), np.ones(25) / 25, mode="same") + rng.normal(0, 2.0, len(d))
     )
@@ -88,7 +88,7 @@ def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> R
     simulated = np.where(blocked, np.nan, simulated)
     silent = (np.arange(len(d)) > 5900) & (tower == "LW4")
     measured = np.where(silent, np.nan, measured)
-    levels = {"measured": measured, "simulated": simulated, "free_space": free, "two_ray": two}
+    levels = {"measured": measured, "simulated": simulated, "free_space": free, "two_ray": two_ray}
     return rss_result(
         tower, channel, track.time, position, levels, line_of_sight=np.where(blocked, 0.0, 1.0),
         geometry={"distance_m": d, "azimuth_deg": azimuth, "elevation_deg": np.degrees(np.arcsin((track.up_m - t[2]) / d)), "altitude_m": track.up_m},

@@ -33,10 +33,10 @@ def page(small_report, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def driver(page):
-    found = start("--window-size=1440,1200")
-    open_page(found, page, "window.explorer")
-    yield found
-    found.quit()
+    browser = start("--window-size=1440,1200")
+    open_page(browser, page, "window.explorer")
+    yield browser
+    browser.quit()
 
 
 @pytest.fixture(autouse=True)
@@ -49,10 +49,10 @@ def test_numbers_of_the_whole_flight_are_those_of_the_report(driver, small_repor
     for panel in small_report.rss:
         choose(driver, "choose-series", panel.name)
         choose(driver, "choose-model", "ray tracing")
-        found = driver.execute_script("return explorer.statistics()")
+        shown = driver.execute_script("return explorer.statistics()")
         fit = grid_offset(panel.measured_db, panel.simulated_dbm)
-        assert (found["n"], round(found["offset"], 6)) == (fit.n, fit.offset_db)
-        assert found["rmse"] == pytest.approx(fit.rmse_db, abs=1e-4)
+        assert (shown["n"], round(shown["offset"], 6)) == (fit.n, fit.offset_db)
+        assert shown["rmse"] == pytest.approx(fit.rmse_db, abs=1e-4)
 
 
 def test_a_model_and_a_span_change_the_numbers(driver, small_report):
@@ -66,10 +66,10 @@ def test_a_model_and_a_span_change_the_numbers(driver, small_report):
     inside = (seconds >= first) & (seconds <= last)
     baseline = panel.baselines["free_space"]
     fit = grid_offset(panel.measured_db[inside], baseline.level_dbm[inside])
-    found = driver.execute_script("return explorer.statistics()")
-    assert found["n"] == fit.n
-    assert found["offset"] == pytest.approx(fit.offset_db, abs=1e-6)
-    assert found["rmse"] == pytest.approx(fit.rmse_db, abs=1e-4)
+    shown = driver.execute_script("return explorer.statistics()")
+    assert shown["n"] == fit.n
+    assert shown["offset"] == pytest.approx(fit.offset_db, abs=1e-6)
+    assert shown["rmse"] == pytest.approx(fit.rmse_db, abs=1e-4)
     frame(driver)
     assert f"{fit.rmse_db:.2f} dB" in driver.find_element("id", "span").text
 
@@ -97,14 +97,14 @@ def test_dragging_over_a_chart_chooses_a_span_and_escape_takes_it_back(driver):
     from selenium.webdriver import ActionChains, Keys
 
     over = driver.find_elements("css selector", ".u-over")[0]
-    whole = driver.execute_script("return explorer.statistics().n")
+    count = driver.execute_script("return explorer.statistics().n")
     ActionChains(driver).move_to_element_with_offset(over, -80, 0).click_and_hold().move_by_offset(
         120, 0
     ).release().perform()
     frame(driver)
-    assert 0 < driver.execute_script("return explorer.statistics().n") < whole
+    assert 0 < driver.execute_script("return explorer.statistics().n") < count
     driver.find_element("id", "map").send_keys(Keys.ESCAPE)
-    assert driver.execute_script("return explorer.statistics().n") == whole
+    assert driver.execute_script("return explorer.statistics().n") == count
 
 
 def test_the_keyboard_steps_through_the_poses(driver):
@@ -153,10 +153,10 @@ def test_the_readouts_stay_inside_a_small_window(driver):
                 place,
             )
             frame(driver)
-            found = driver.execute_script(
+            bottoms = driver.execute_script(
                 "return ['pose', 'span'].map(id => document.getElementById(id).getBoundingClientRect().bottom)"
             )
-            assert max(found) <= 900
+            assert max(bottoms) <= 900
     finally:
         usual_width(driver)
 
@@ -165,12 +165,12 @@ def test_readouts_lie_over_no_chart_until_a_pose_is_marked(driver, page):
     open_page(driver, page, "window.explorer")
     set_width(driver, 1440, 900)
     try:
-        found = driver.execute_script(
+        edges = driver.execute_script(
             "return [document.querySelector('#charts').getBoundingClientRect().bottom,"
             " document.querySelector('#span').getBoundingClientRect().top, document.body.classList.contains('pointed')]"
         )
-        assert found[2] is False
-        assert found[1] >= found[0] - 1
+        assert edges[2] is False
+        assert edges[1] >= edges[0] - 1
         driver.execute_script("explorer.choose(explorer.series(explorer.data.rss[0].time)[5])")
         frame(driver)
         assert driver.execute_script("return document.body.classList.contains('pointed')")
@@ -181,20 +181,20 @@ def test_readouts_lie_over_no_chart_until_a_pose_is_marked(driver, page):
 def test_on_a_telephone_no_readout_lies_over_a_chart(driver):
     set_width(driver, 390, 844)
     try:
-        found = driver.execute_script(
+        edges = driver.execute_script(
             "document.querySelector('#charts').scrollIntoView();"
             "return [document.querySelector('#charts'), document.querySelector('#span')].map(e => {"
             "  const r = e.getBoundingClientRect(); return [r.top, r.bottom]; })"
         )
-        assert found[1][0] >= found[0][1] - 1
+        assert edges[1][0] >= edges[0][1] - 1
     finally:
         usual_width(driver)
 
 
 def test_no_two_elements_share_an_identifier(driver):
-    found = driver.execute_script("return Array.from(document.querySelectorAll('[id]'), e => e.id)")
-    assert len(found) > 10
-    assert sorted({one for one in found if found.count(one) > 1}) == []
+    identifiers = driver.execute_script("return Array.from(document.querySelectorAll('[id]'), e => e.id)")
+    assert len(identifiers) > 10
+    assert sorted({identifier for identifier in identifiers if identifiers.count(identifier) > 1}) == []
 
 
 class TestPage(PageLaws):
@@ -240,7 +240,7 @@ def test_names_of_towers_stay_clear_of_the_key_of_the_edges_and_of_each_other(dr
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
         frame(driver)
-        kept = driver.execute_script(
+        towers = driver.execute_script(
             "const site = explorer.data.site, kept = site.towers, at = kept[0].at;"
             "site.towers = [kept[0], { ...kept[0], name: 'beside', at: [at[0] + 4, at[1], at[2]] }, ...kept.slice(1)];"
             "for (let k = 0; k < 40; k++) site.towers.push({ name: 'Tower ' + k, top: at[2] + 10,"
@@ -253,11 +253,11 @@ def test_names_of_towers_stay_clear_of_the_key_of_the_edges_and_of_each_other(dr
         )
         assert len(labels) > 8
         assert all(left >= 0 and right <= wide and top >= 0 and bottom <= key for left, top, right, bottom, _ in labels)
-        near = [one for one in labels if one[4] in ("beside", kept[0]["name"])]
+        near = [label for label in labels if label[4] in ("beside", towers[0]["name"])]
         assert len(near) == 2
         (a, b, c, d, _), (e, f, g, h, _) = near
         assert min(c, g) <= max(a, e) or min(d, h) <= max(b, f)
-        driver.execute_script("explorer.data.site.towers = arguments[0]; explorer.span(null)", kept)
+        driver.execute_script("explorer.data.site.towers = arguments[0]; explorer.span(null)", towers)
     finally:
         driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
@@ -266,15 +266,15 @@ def test_no_error_of_a_model_is_shown_on_the_flight_it_was_learned_from(small_re
     first, *rest = small_report.rss
     learned = with_numbers(first, trained_on=("0" * 64,))
     page = write.write_report(dataclasses.replace(small_report, rss=(learned, *rest)), tmp_path, drawn="page").files[0]
-    found = start("--window-size=1440,1200")
+    browser = start("--window-size=1440,1200")
     try:
-        open_page(found, page, "window.explorer")
-        choose(found, "choose-series", learned.name)
-        choose(found, "choose-model", "ray tracing")
-        shown = found.execute_script("return document.getElementById('span').textContent")
+        open_page(browser, page, "window.explorer")
+        choose(browser, "choose-series", learned.name)
+        choose(browser, "choose-model", "ray tracing")
+        shown = browser.execute_script("return document.getElementById('span').textContent")
         assert "n/a: learned from this flight" in shown
         assert "RMSE with" not in shown
-        choose(found, "choose-model", "free space")
-        assert "RMSE with" in found.execute_script("return document.getElementById('span').textContent")
+        choose(browser, "choose-model", "free space")
+        assert "RMSE with" in browser.execute_script("return document.getElementById('span').textContent")
     finally:
-        found.quit()
+        browser.quit()

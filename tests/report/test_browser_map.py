@@ -33,10 +33,10 @@ def data(maps_data):
 def driver(data, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.html"
     path.write_text(maps_html.maps_page(data, [], ["metrics.json"]), encoding="utf-8")
-    found = start("--window-size=1440,1300")
-    open_page(found, path, READY)
-    yield found
-    found.quit()
+    browser = start("--window-size=1440,1300")
+    open_page(browser, path, READY)
+    yield browser
+    browser.quit()
 
 
 @pytest.fixture(autouse=True)
@@ -80,8 +80,8 @@ def test_switches_show_the_layer_and_its_numbers(driver, data, tower, antennas, 
         foliage=foliage,
         height=f"{height:g} m",
     )
-    one = of(data, tower, antennas, foliage, height)
-    assert shown(driver, data) == pytest.approx(one.rss_dbm, abs=0.0051, nan_ok=True)
+    layer = of(data, tower, antennas, foliage, height)
+    assert shown(driver, data) == pytest.approx(layer.rss_dbm, abs=0.0051, nan_ok=True)
     numbers = driver.execute_script("return mapExplorer.statistics()")
     entry = next(
         n
@@ -149,12 +149,12 @@ def test_the_picture_lies_where_the_values_do(driver, data):
     )  # fmt: skip
     ramp = map_explorer.ramp("viridis")
     ends = driver.execute_script("return mapExplorer.limits()")
-    one = of(data, "LW4", "SISO", "none", 30.0)
-    for (east, north), found in zip([(-405, -630), (405, -630), (-405, 630), (405, 930)], colours, strict=True):
-        value = one.rss_dbm[np.abs(data.north_m - north).argmin(), np.abs(data.east_m - east).argmin()]
+    layer = of(data, "LW4", "SISO", "none", 30.0)
+    for (east, north), colour in zip([(-405, -630), (405, -630), (-405, 630), (405, 930)], colours, strict=True):
+        value = layer.rss_dbm[np.abs(data.north_m - north).argmin(), np.abs(data.east_m - east).argmin()]
         place = int(np.clip((value - ends[0]) / (ends[1] - ends[0]), 0, 0.9999) * 128)
         expected = [int(ramp[6 * place + k : 6 * place + k + 2], 16) for k in (0, 2, 4)]
-        assert np.abs(np.array(found) - expected).max() <= 8
+        assert np.abs(np.array(colour) - expected).max() <= 8
 
 
 def test_difference_is_a_minus_b(driver, data):
@@ -203,7 +203,7 @@ def test_a_line_is_dragged_and_its_profile_runs_along_it(driver, data):
     assert e1 > e0
     profile = driver.execute_script("return mapExplorer.profile()")
     assert profile[-1][0] == pytest.approx(np.hypot(e1 - e0, n1 - n0))
-    one = of(data, "LW1", "SISO", "none", 30.0).rss_dbm
+    level_dbm = of(data, "LW1", "SISO", "none", 30.0).rss_dbm
     for share in (0.0, 0.5, 1.0):
         distance, value = profile[round(share * (len(profile) - 1))]
         t = distance / profile[-1][0]
@@ -211,7 +211,7 @@ def test_a_line_is_dragged_and_its_profile_runs_along_it(driver, data):
             np.abs(data.east_m - (e0 + t * (e1 - e0))).argmin(),
             np.abs(data.north_m - (n0 + t * (n1 - n0))).argmin(),
         )
-        assert value == pytest.approx(one[row, column], abs=0.0051)
+        assert value == pytest.approx(level_dbm[row, column], abs=0.0051)
     driver.find_element("id", "map").send_keys(Keys.ESCAPE)
     assert driver.execute_script("return mapExplorer.state.line") is None
 

@@ -25,7 +25,7 @@ def written(report_data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("reports") / "first"
     with OutputFolder(folder, job="report") as output, output.filling() as place:
         write_report(report_data, place, drawn="none")
-        table = change_table(place, "rss", lambda whole: whole.iloc[::8])
+        table = change_table(place, "rss", lambda full: full.iloc[::8])
 
         def recount(metrics):
             for tower, channels in metrics["rss"].items():
@@ -37,7 +37,7 @@ def written(report_data, tmp_path_factory):
 
 
 @pytest.fixture
-def two(written, tmp_path):
+def pair(written, tmp_path):
     """The report twice; the second is for tests to change."""
     first, second = tmp_path / "first", tmp_path / "second"
     shutil.copytree(written, first)
@@ -64,43 +64,43 @@ def on(table, link=LINK):
     return (table["tower"] == link[0]) & (table["channel"] == link[1])
 
 
-def test_equal_reports_have_no_difference(two, capsys):
-    change_metrics(two[1], lambda m: m.update(generated="later", stages={"read_s": 99.0}))
-    found = run_diff(*two)
-    assert found.differences == ()
-    assert (found.settings, found.inputs, found.versions, found.numbers) == ((), (), (), ())
-    assert verdict(found).startswith("No difference: the numbers agree within 0.01 dB on 2")
-    assert {one.rmse.difference_db for one in found.levels} == {0.0}
-    assert {one.kappa.difference for one in found.ranks} == {0.0}
-    assert main(["diff", str(two[0]), str(two[1]), "--strict"]) == 0
+def test_equal_reports_have_no_difference(pair, capsys):
+    change_metrics(pair[1], lambda m: m.update(generated="later", stages={"read_s": 99.0}))
+    diff = run_diff(*pair)
+    assert diff.differences == ()
+    assert (diff.settings, diff.inputs, diff.versions, diff.numbers) == ((), (), (), ())
+    assert verdict(diff).startswith("No difference: the numbers agree within 0.01 dB on 2")
+    assert {row.rmse.difference_db for row in diff.levels} == {0.0}
+    assert {row.kappa.difference for row in diff.ranks} == {0.0}
+    assert main(["diff", str(pair[0]), str(pair[1]), "--strict"]) == 0
     assert "No difference" in capsys.readouterr().out
 
 
-def test_one_setting_is_named_by_its_key(two):
-    change_metrics(two[1], lambda m: m["settings"]["rt"].update(max_depth=1, engine=None))
-    change_metrics(two[1], lambda m: m["versions"].update(numpy="1.0"))
-    found = run_diff(*two)
-    assert [(e.key, e.first, e.second) for e in found.settings] == [("rt.max_depth", 2, 1), ("rt.engine", None, None)]
-    assert [e.key for e in found.versions] == ["numpy"]
-    assert found.differences == (), "a setting alone is no number"
-    assert "1 version" in verdict(found)
+def test_one_setting_is_named_by_its_key(pair):
+    change_metrics(pair[1], lambda m: m["settings"]["rt"].update(max_depth=1, engine=None))
+    change_metrics(pair[1], lambda m: m["versions"].update(numpy="1.0"))
+    diff = run_diff(*pair)
+    assert [(e.key, e.first, e.second) for e in diff.settings] == [("rt.max_depth", 2, 1), ("rt.engine", None, None)]
+    assert [e.key for e in diff.versions] == ["numpy"]
+    assert diff.differences == (), "a setting alone is no number"
+    assert "1 version" in verdict(diff)
 
 
-def test_inputs_are_compared_by_content(two):
+def test_inputs_are_compared_by_content(pair):
     def change(metrics):
-        one, other = metrics["inputs"][:2]
-        one.update(sha256="f" * 64, lines=one["lines"] + 1)
-        other["path"] = "elsewhere/" + other["path"]
-        metrics["inputs"].append({**one, "path": "new.txt", "sha256": "e" * 64})
+        first, second = metrics["inputs"][:2]
+        first.update(sha256="f" * 64, lines=first["lines"] + 1)
+        second["path"] = "elsewhere/" + second["path"]
+        metrics["inputs"].append({**first, "path": "new.txt", "sha256": "e" * 64})
 
-    change_metrics(two[1], change)
-    found = run_diff(*two)
-    assert [(e.path, e.what) for e in found.inputs] == [(found.inputs[0].path, "changed"), ("new.txt", "added")]
-    assert found.inputs[0].second_lines == found.inputs[0].first_lines + 1
+    change_metrics(pair[1], change)
+    diff = run_diff(*pair)
+    assert [(e.path, e.what) for e in diff.inputs] == [(diff.inputs[0].path, "changed"), ("new.txt", "added")]
+    assert diff.inputs[0].second_lines == diff.inputs[0].first_lines + 1
 
 
 @pytest.fixture
-def noisy(two):
+def noisy(pair):
     """1 dB of white noise on the replay of one link of the second report."""
     rng = np.random.default_rng(5)
 
@@ -108,14 +108,14 @@ def noisy(two):
         noise = np.where(on(table), rng.normal(0, 1.0, len(table)), 0.0)
         return table.assign(simulated_dbm=table["simulated_dbm"] + noise, residual_db=table["residual_db"] - noise)
 
-    tables = pd.read_csv(two[0] / "rss.csv"), change_table(two[1], "rss", change)
-    return two, tables
+    tables = pd.read_csv(pair[0] / "rss.csv"), change_table(pair[1], "rss", change)
+    return pair, tables
 
 
 def test_noise_on_one_link_is_found_there_and_sized(noisy):
-    two, tables = noisy
-    found = run_diff(*two)
-    by_link = {(one.tower, one.channel): one for one in found.levels}
+    pair, tables = noisy
+    diff = run_diff(*pair)
+    by_link = {(row.tower, row.channel): row for row in diff.levels}
     hit = by_link.pop(LINK)
     expected = [np.nanstd(table.loc[on(table), "residual_db"]) for table in tables]  # about its mean: the best offset
     assert (hit.rmse.other_rmse_db, hit.rmse.rmse_db) == pytest.approx(expected, abs=1e-9)
@@ -128,30 +128,30 @@ def test_noise_on_one_link_is_found_there_and_sized(noisy):
     assert hit.simulated_rms_db == pytest.approx(np.sqrt(np.nanmean(apart**2)))
     assert hit.simulated_max_db == pytest.approx(np.nanmax(np.abs(apart)))
     assert hit.measured_max_db == 0.0
-    assert {one.rmse.difference_db for one in by_link.values()} == {0.0}
-    assert "significantly worse: +" in verdict(found)
+    assert {row.rmse.difference_db for row in by_link.values()} == {0.0}
+    assert "significantly worse: +" in verdict(diff)
 
 
 def test_a_few_common_samples_are_named_and_links_without_interval_are_not_called_alike(noisy):
     (first, second), _ = noisy
     change_table(second, "rss", lambda table: table.groupby(["tower", "channel"]).head(4))
-    found = run_diff(first, second)
-    scored = [one for one in found.levels if one.rmse.n]
-    text = verdict(found)
+    diff = run_diff(first, second)
+    scored = [row for row in diff.levels if row.rmse.n]
+    text = verdict(diff)
     assert f"RSS over {4 * len(scored)} common samples of " in text
     assert f"Links: {len(scored)} no interval." in text
     assert "not significant" not in text
-    assert any("was changed after the report wrote it" in text for text in found.remarks)
+    assert any("was changed after the report wrote it" in text for text in diff.remarks)
 
 
 def test_the_other_way_round_has_the_other_sign(noisy):
     (first, second), _ = noisy
-    one, two = run_diff(first, second), run_diff(second, first)
-    for there, back in zip(one.levels, two.levels, strict=True):
+    forth, reverse = run_diff(first, second), run_diff(second, first)
+    for there, back in zip(forth.levels, reverse.levels, strict=True):
         assert there.rmse.difference_db == -back.rmse.difference_db
-    assert one.pooled.verdict == "worse"
-    assert two.pooled.verdict == "better"
-    assert "significantly better: -" in verdict(two)
+    assert forth.pooled.verdict == "worse"
+    assert reverse.pooled.verdict == "better"
+    assert "significantly better: -" in verdict(reverse)
 
 
 def test_the_tolerance_decides_what_counts(noisy, capsys):
@@ -163,18 +163,18 @@ def test_the_tolerance_decides_what_counts(noisy, capsys):
     assert "tolerance" in capsys.readouterr().err
 
 
-def test_a_replay_that_moved_without_harm_is_said_to_have_moved(two):
+def test_a_replay_that_moved_without_harm_is_said_to_have_moved(pair):
     """Measurement and replay of a link shifted together: the residual is the same."""
     change_table(
-        two[1],
+        pair[1],
         "rss",
         lambda t: t.assign(
             **{name: t[name] + 3.0 * on(t) for name in ("simulated_dbm", "calibrated_db", "measured_db")}
         ),
     )
-    found = run_diff(*two)
-    assert "errors agree on the common samples, though the replay moved by up to 3 dB" in verdict(found)
-    assert any("measured level by up to 3 dB" in text for text in found.differences)
+    diff = run_diff(*pair)
+    assert "errors agree on the common samples, though the replay moved by up to 3 dB" in verdict(diff)
+    assert any("measured level by up to 3 dB" in text for text in diff.differences)
 
 
 def test_links_are_pooled_by_what_each_adds_at_an_instant():
@@ -184,8 +184,8 @@ def test_links_are_pooled_by_what_each_adds_at_an_instant():
     for before, after in ((2.0, 3.0), (4.0, 3.5)):
         links.append((time, rng.normal(0, before, 3000), rng.normal(0, after, 3000)))
         truth.append(after**2 - before**2)
-    found = pooled_difference(links)
-    low, high = found.mean_square_ci95_db2
+    pooled = pooled_difference(links)
+    low, high = pooled.mean_square_ci95_db2
     assert low < np.mean(truth) < high
     # white noise: the variance of a mean square is 2 sigma^4 / n
     spread = np.sqrt(sum(2 * s**4 for s in (2.0, 3.0, 4.0, 3.5)) / 3000) / 2
@@ -194,30 +194,30 @@ def test_links_are_pooled_by_what_each_adds_at_an_instant():
     assert twice == pytest.approx(once, rel=0.2), "one link written down twice is worth no more"
 
 
-def test_samples_of_one_report_alone_are_counted_and_left_out(two):
-    change_table(two[1], "rss", lambda table: table[~(on(table) & (table["time_s"] > 900))])
-    found = next(one for one in run_diff(*two).levels if (one.tower, one.channel) == LINK)
-    table = pd.read_csv(two[0] / "rss.csv")
-    gone = int((on(table) & (table["time_s"] > 900)).sum())
-    assert gone > 0
-    assert (found.samples.only_first, found.samples.only_second) == (gone, 0)
-    assert found.samples.common == found.samples.first - gone
-    assert found.rmse.difference_db == 0.0
-    assert any(f"{gone} samples only in the first" in text for text in run_diff(*two).differences)
+def test_samples_of_one_report_alone_are_counted_and_left_out(pair):
+    change_table(pair[1], "rss", lambda table: table[~(on(table) & (table["time_s"] > 900))])
+    level = next(row for row in run_diff(*pair).levels if (row.tower, row.channel) == LINK)
+    table = pd.read_csv(pair[0] / "rss.csv")
+    dropped = int((on(table) & (table["time_s"] > 900)).sum())
+    assert dropped > 0
+    assert (level.samples.only_first, level.samples.only_second) == (dropped, 0)
+    assert level.samples.common == level.samples.first - dropped
+    assert level.rmse.difference_db == 0.0
+    assert any(f"{dropped} samples only in the first" in text for text in run_diff(*pair).differences)
 
 
-def test_samples_at_one_instant_pair_in_their_order(two):
-    for folder in two:
+def test_samples_at_one_instant_pair_in_their_order(pair):
+    for folder in pair:
         change_table(
             folder, "rss", lambda t: t.assign(time_utc=t["time_utc"].where(t["time_s"] > 5, t["time_utc"].iloc[0]))
         )
-    change_table(two[1], "rss", lambda t: t.iloc[1:])
-    found = run_diff(*two).levels[0]
-    assert found.samples.common == found.samples.first - 1
-    assert found.samples.only_second == 0
+    change_table(pair[1], "rss", lambda t: t.iloc[1:])
+    level = run_diff(*pair).levels[0]
+    assert level.samples.common == level.samples.first - 1
+    assert level.samples.only_second == 0
 
 
-def test_ranks_that_changed_are_counted_and_agreement_is_that_of_the_pairs(two):
+def test_ranks_that_changed_are_counted_and_agreement_is_that_of_the_pairs(pair):
     rng = np.random.default_rng(2)
 
     def change(table):
@@ -226,10 +226,10 @@ def test_ranks_that_changed_are_counted_and_agreement_is_that_of_the_pairs(two):
             simulated_rank_k10=table["simulated_rank_k10"].where(~turn, 5 - table["simulated_rank_k10"])
         )
 
-    first = pd.read_csv(two[0] / "rank.csv")
-    second = change_table(two[1], "rank", change)
-    found = {one.k: one for one in run_diff(*two).ranks}
-    hit = found["10"]
+    first = pd.read_csv(pair[0] / "rank.csv")
+    second = change_table(pair[1], "rank", change)
+    by_k = {row.k: row for row in run_diff(*pair).ranks}
+    hit = by_k["10"]
     assert hit.n_changed == int((first["simulated_rank_k10"] != second["simulated_rank_k10"]).sum()) > 50
     both = first["measured_rank"].notna() & (first["simulated_rank_k10"] > 0)
     agree = [float((t["measured_rank"] == t["simulated_rank_k10"])[both].mean()) for t in (first, second)]
@@ -244,8 +244,8 @@ def test_ranks_that_changed_are_counted_and_agreement_is_that_of_the_pairs(two):
         assert change.ci95[0] <= change.difference <= change.ci95[1]
         assert change.ci95[0] < change.ci95[1]
     assert hit.n_reported_changed == 0
-    assert found["100"].n_changed == 0
-    assert "simulated ranks differ" in verdict(run_diff(*two))
+    assert by_k["100"].n_changed == 0
+    assert "simulated ranks differ" in verdict(run_diff(*pair))
 
 
 # --- what cannot be compared -----------------------------------------------------------------------------------------
@@ -301,27 +301,27 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_is_no_report_is_one_message(name, two, capsys):
+def test_what_is_no_report_is_one_message(name, pair, capsys):
     damage, said, kind = BAD[name]
-    damage(two[1])
+    damage(pair[1])
     with pytest.raises(kind, match=said):
-        run_diff(*two)
-    assert main(["diff", str(two[0]), str(two[1]), "--json"]) == kind.exit_code
+        run_diff(*pair)
+    assert main(["diff", str(pair[0]), str(pair[1]), "--json"]) == kind.exit_code
     shown = capsys.readouterr()
     assert shown.out == ""
     assert len(shown.err.splitlines()) == 1
 
 
-def test_a_renamed_flight_with_the_same_logs_is_the_same(two):
-    change_metrics(two[1], lambda m: m.update(flight="renamed"))
-    assert run_diff(*two).differences == ()
+def test_a_renamed_flight_with_the_same_logs_is_the_same(pair):
+    change_metrics(pair[1], lambda m: m.update(flight="renamed"))
+    assert run_diff(*pair).differences == ()
 
 
-def test_links_of_one_report_alone_are_named(two):
-    change_metrics(two[1], lambda m: m["rss"].pop("LW4"))
-    found = run_diff(*two)
-    assert found.links_first_only == ("LW4 USRP1",)
-    assert "only the first report has LW4 USRP1" in found.differences
+def test_links_of_one_report_alone_are_named(pair):
+    change_metrics(pair[1], lambda m: m["rss"].pop("LW4"))
+    diff = run_diff(*pair)
+    assert diff.links_first_only == ("LW4 USRP1",)
+    assert "only the first report has LW4 USRP1" in diff.differences
 
 
 # --- what is written -------------------------------------------------------------------------------------------------

@@ -22,16 +22,16 @@ def array(content, number):
 
 def test_arrays_come_back_as_they_were(report_data):
     content = json.loads(explorer.as_json(explorer.payload(report_data)))
-    for one, panel in zip(content["rss"], report_data.rss, strict=True):
-        assert array(content, one["measured"]) == pytest.approx(panel.measured_db, nan_ok=True, rel=1e-6)
-        assert array(content, one["models"][0]["level"]) == pytest.approx(panel.simulated_dbm, nan_ok=True, rel=1e-6)
-        assert [m["name"] for m in one["models"][1:]] == ["free space", "two-ray ground"]
-        assert one["of"] == len(panel.time)
-        assert np.diff(array(content, one["time"])).min() >= 0
-    for one, rank in zip(content["rank"], report_data.rank, strict=True):
-        assert array(content, one["measured"]) == pytest.approx(rank.measured, nan_ok=True)
+    for series, panel in zip(content["rss"], report_data.rss, strict=True):
+        assert array(content, series["measured"]) == pytest.approx(panel.measured_db, nan_ok=True, rel=1e-6)
+        assert array(content, series["models"][0]["level"]) == pytest.approx(panel.simulated_dbm, nan_ok=True, rel=1e-6)
+        assert [m["name"] for m in series["models"][1:]] == ["free space", "two-ray ground"]
+        assert series["of"] == len(panel.time)
+        assert np.diff(array(content, series["time"])).min() >= 0
+    for series, rank in zip(content["rank"], report_data.rank, strict=True):
+        assert array(content, series["measured"]) == pytest.approx(rank.measured, nan_ok=True)
         distance = [fit.total_variation for fit in rank.score.simulated.values()]
-        assert distance[one["best"]] == min(distance)
+        assert distance[series["best"]] == min(distance)
 
 
 def test_equal_arrays_are_stored_once(report_data):
@@ -46,10 +46,10 @@ def test_a_sample_names_its_log_and_line(report_data):
     n = len(panel.time)
     source = Source(files=("a.txt", "b.txt"), file=np.arange(n) % 2, line=np.arange(n) + 7)
     content = explorer.payload(dataclasses.replace(report_data, rss=(panel,), sources={panel.name: source}))
-    one = content["rss"][0]
-    assert one["files"] == ["a.txt", "b.txt"]
-    assert array(content, one["line"])[3] == 10
-    assert array(content, one["file"])[3] == 1
+    series = content["rss"][0]
+    assert series["files"] == ["a.txt", "b.txt"]
+    assert array(content, series["line"])[3] == 10
+    assert array(content, series["file"])[3] == 1
 
 
 def test_long_series_are_thinned_with_their_extremes(report_data):
@@ -63,12 +63,12 @@ def test_long_series_are_thinned_with_their_extremes(report_data):
         simulated_dbm=np.resize(panel.simulated_dbm, n), position_m=np.resize(panel.position_m, (n, 3)),
     )  # fmt: skip
     content = explorer.payload(dataclasses.replace(report_data, rss=(long,), rank=()))
-    one = content["rss"][0]
-    kept = array(content, one["measured"])
-    assert one["of"] == n
-    assert 10_000 < len(kept) <= explorer.POINTS + 2
-    assert kept.max() == np.float32(-10.0)
-    assert kept.min() == np.float32(level.min())
+    series = content["rss"][0]
+    shown = array(content, series["measured"])
+    assert series["of"] == n
+    assert 10_000 < len(shown) <= explorer.POINTS + 2
+    assert shown.max() == np.float32(-10.0)
+    assert shown.min() == np.float32(level.min())
     assert len(explorer.as_json(content)) < 8e6
 
 
@@ -88,7 +88,7 @@ def test_a_pose_shows_the_probability_of_each_rank(report_data):
     panel = report_data.rank[0]
     share = np.linspace(0.0, 1.0, len(panel.time))
     ranked = dataclasses.replace(panel, probability=np.column_stack([1 - share, share, 0 * share, 0 * share]))
-    found = explorer.payload(dataclasses.replace(report_data, rank=(ranked,)))
-    _, one, *_ = found["rank"][0]["probability"]
-    assert one["name"] == "probability_rank2"
-    np.testing.assert_allclose(array(found, one["values"]), share, atol=1e-6)
+    content = explorer.payload(dataclasses.replace(report_data, rank=(ranked,)))
+    _, second_rank, *_ = content["rank"][0]["probability"]
+    assert second_rank["name"] == "probability_rank2"
+    np.testing.assert_allclose(array(content, second_rank["values"]), share, atol=1e-6)

@@ -23,15 +23,15 @@ def test_metrics_hold_the_contract(report_data):
     for key in ("flight", "versions", "inputs", "rss", "rank", "rt", "stages"):
         assert key in m
     assert {"path", "sha256", "reader", "lines", "accepted", "rejected"} <= set(m["inputs"][0])
-    one = m["rss"]["LW1"]["USRP2"]
+    channel = m["rss"]["LW1"]["USRP2"]
     panel = report_data.rss[1]
-    assert one["offset_db"] == panel.score.offset_db
-    assert one["rmse_ci95_db"] == list(panel.score.rmse_ci95_db)
-    assert one["baselines"]["two_ray"] == {
+    assert channel["offset_db"] == panel.score.offset_db
+    assert channel["rmse_ci95_db"] == list(panel.score.rmse_ci95_db)
+    assert channel["baselines"]["two_ray"] == {
         "offset_db": panel.baselines["two_ray"].offset_db,
         "rmse_db": panel.baselines["two_ray"].rmse_db,
     }
-    assert {"n", "n_out_of_coverage", "at_search_edge", "correlation", "lag_s"} <= set(one)
+    assert {"n", "n_out_of_coverage", "at_search_edge", "correlation", "lag_s"} <= set(channel)
     rank = m["rank"]["LW1"]
     assert list(rank["simulated"]) == ["10", "100", "1000"]
     assert list(rank["measured"]["histogram"]) == ["1", "2", "3", "4"]
@@ -57,14 +57,14 @@ def test_nan_is_null_and_extra_metrics_are_merged(report_data):
         extra_metrics={"rss": {"LW1": {"USRP1": {"repeat_db": np.float32(3.0)}}}, "new": {1: (np.int8(2), None)}},
     )
     m = json.loads(json.dumps(export.metrics(data), allow_nan=False))
-    one = m["rss"]["LW1"]["USRP1"]
-    assert one["rmse_db"] is None
-    assert one["correlation"] is None
-    assert one["rmse_ci95_db"] == [None, 1.0]
-    assert one["repeat_db"] == 3.0
-    assert one["n"] == bad.score.n, "merging must not drop what was there"
-    assert one["n_flagged"]["when"] == "2024-01-01"
-    assert one["n_flagged"]["mask"] == [True]
+    channel = m["rss"]["LW1"]["USRP1"]
+    assert channel["rmse_db"] is None
+    assert channel["correlation"] is None
+    assert channel["rmse_ci95_db"] == [None, 1.0]
+    assert channel["repeat_db"] == 3.0
+    assert channel["n"] == bad.score.n, "merging must not drop what was there"
+    assert channel["n_flagged"]["when"] == "2024-01-01"
+    assert channel["n_flagged"]["mask"] == [True]
     assert m["new"] == {"1": [2, None]}
 
 
@@ -108,13 +108,13 @@ def test_tables_written_in_pieces_are_the_tables(report_data, rows, monkeypatch)
 
     bare = [dataclasses.replace(few(p, 9), time=p.time[:9] - p.time[0]) for p in report_data.rss]
     for panels in ([], bare, [few(report_data.rss[0], 0), *bare], list(report_data.rss[:1]) if rows > 1 else bare):
-        whole = rss_frame(panels).to_csv(index=False, lineterminator="\n")
-        assert "".join(export.rss_csv(panels)) == whole
+        text = rss_frame(panels).to_csv(index=False, lineterminator="\n")
+        assert "".join(export.rss_csv(panels)) == text
     rank = report_data.rank[0]
-    one, two = few(rank, 11), dataclasses.replace(few(rank, 5), probability=np.full((5, 4), 0.25))
-    for ranks in ([], [one, two], [two, one]):
-        whole = rank_frame(ranks).to_csv(index=False, lineterminator="\n")
-        assert "".join(export.rank_csv(ranks)) == whole
+    longer, shorter = few(rank, 11), dataclasses.replace(few(rank, 5), probability=np.full((5, 4), 0.25))
+    for ranks in ([], [longer, shorter], [shorter, longer]):
+        text = rank_frame(ranks).to_csv(index=False, lineterminator="\n")
+        assert "".join(export.rank_csv(ranks)) == text
 
 
 def test_relative_times_are_no_times_of_day(report_data):

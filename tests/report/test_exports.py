@@ -56,14 +56,14 @@ def data(report_data):
 @pytest.fixture(scope="module")
 def frames(data, tmp_path_factory):
     """rss.csv and rank.csv as a user reads them, with where each sample is."""
-    found = {}
+    by_kind = {}
     for kind, tables in (("rss", export.rss_tables(data.rss)), ("rank", export.rank_tables(data.rank))):
         path = tmp_path_factory.mktemp("csv") / f"{kind}.csv"
         export.joined_tables(tables, ()).to_csv(path, index=False)
         table = pd.read_csv(path)
         table["time"] = pd.to_datetime(table["time_utc"]).astype("datetime64[ns, UTC]")
-        found[kind] = table
-    return found
+        by_kind[kind] = table
+    return by_kind
 
 
 FRAME = SiteFrame(35.7275, -78.6960)
@@ -103,12 +103,12 @@ def check_vector(path, kind, table, units):
     """GeoJSON through GDAL."""
     pyogrio = pytest.importorskip("pyogrio")
     meta, _, shapes, columns = pyogrio.raw.read(path)
-    found = dict(zip(meta["fields"], columns, strict=True))
+    fields = dict(zip(meta["fields"], columns, strict=True))
     assert meta["crs"] == "EPSG:4326"
     for name in COLUMNS[kind]:
-        same(table, name, found[name])
-    same_times(table, found["time"])
-    assert found["tower"].tolist() == table["tower"].tolist()
+        same(table, name, fields[name])
+    same_times(table, fields["time"])
+    assert fields["tower"].tolist() == table["tower"].tolist()
     places = np.array([np.frombuffer(s[5:21]) if s is not None else [np.nan, np.nan] for s in shapes])
     same_places(table, places[:, 1], places[:, 0])
     assert units["simulated_dbm" if kind == "rss" else "level_dbm"] == "dBm"
@@ -228,7 +228,7 @@ def test_an_independent_reader_finds_what_the_csvs_hold(name, data, frames, tmp_
 
 def changed(export, change):
     """An export with another table of each kind."""
-    sets = tuple(dataclasses.replace(one, table=change(one.table)) for one in export.sets)
+    sets = tuple(dataclasses.replace(samples, table=change(samples.table)) for samples in export.sets)
     return dataclasses.replace(export, sets=sets)
 
 
@@ -377,11 +377,11 @@ def test_a_missing_library_is_named_with_its_extra(data, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "netCDF4", None)
     with pytest.raises(UsageError, match=r"netCDF4.*aerpaw-cmp\[geo\]"):
         formats.chosen_formats(["netcdf"])
-    told = []
+    messages = []
     formats.write_exports(
-        points.of_report(data), tmp_path, formats.chosen_formats(["kmz", "all"]), lambda text, *_: told.append(text)
+        points.of_report(data), tmp_path, formats.chosen_formats(["kmz", "all"]), lambda text, *_: messages.append(text)
     )
-    assert any("netCDF4" in text and "aerpaw-cmp[geo]" in text for text in told)
+    assert any("netCDF4" in text and "aerpaw-cmp[geo]" in text for text in messages)
     assert not list((tmp_path / "exports").glob("*.nc"))
 
 

@@ -85,9 +85,9 @@ def test_svg_stays_small_however_long_the_flight(report_data):
 
 def test_svg_has_no_reference_to_elsewhere_and_is_the_same_twice(small_report):
     spec = next(p for p in figures.figure_specs(small_report) if p.name == "altitude")
-    one, two = canvas.render(spec), canvas.render(spec)
-    assert one.formats["svg"] == two.formats["svg"]
-    fetched = re.findall(rb'(?:href|src)="([^"]*)"', one.formats["svg"])
+    first, redrawn = canvas.render(spec), canvas.render(spec)
+    assert first.formats["svg"] == redrawn.formats["svg"]
+    fetched = re.findall(rb'(?:href|src)="([^"]*)"', first.formats["svg"])
     assert all(f.startswith((b"#", b"data:")) for f in fetched)
 
 
@@ -113,9 +113,9 @@ def no_csi(panel: RankResult) -> RankResult:
 
 
 def few_thresholds(panel: RankResult, most: int) -> RankResult:
-    kept = list(panel.rank)[:most]
-    simulated = {k: panel.score.simulated[k] for k in kept}
-    return with_numbers(panel, rank={k: panel.rank[k] for k in kept}, simulated=simulated)
+    thresholds = list(panel.rank)[:most]
+    simulated = {k: panel.score.simulated[k] for k in thresholds}
+    return with_numbers(panel, rank={k: panel.rank[k] for k in thresholds}, simulated=simulated)
 
 
 def still(track: Track) -> Track:
@@ -211,8 +211,10 @@ def test_drawing_without_the_unseen_pass_gives_the_same_picture(small_report):
         ours = canvas.save_as(spec.draw(), ("svg", "png"))["png"]
         theirs = io.BytesIO()
         spec.draw().savefig(theirs, format="png")
-    one, two = (np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) for png in (ours, theirs.getvalue()))
-    np.testing.assert_array_equal(one, two)
+    our_pixels, their_pixels = (
+        np.asarray(Image.open(io.BytesIO(png)).convert("RGB")) for png in (ours, theirs.getvalue())
+    )
+    np.testing.assert_array_equal(our_pixels, their_pixels)
 
 
 def relative(data: ReportData) -> ReportData:
@@ -343,7 +345,7 @@ def test_the_reliability_of_a_detection_is_drawn_where_it_was_scored(report_data
     assert not any("rss_detection" in spec.name for spec in figures.figure_specs(report_data))
     scored = with_numbers(panel, detection=score)
     data = dataclasses.replace(report_data, rss=(scored, *report_data.rss[1:]))
-    (spec,) = [one for one in figures.figure_specs(data) if "rss_detection" in one.name]
+    (spec,) = [candidate for candidate in figures.figure_specs(data) if "rss_detection" in candidate.name]
     assert "Brier score 0.110, constant forecast 0.200" in spec.caption
     assert "(learned on other flights)" in spec.caption
     points = spec.draw().axes[0].collections[0].get_offsets()

@@ -20,9 +20,11 @@ from benchmarks.fabricated import with_numbers
 
 def test_pooled_error_is_that_of_all_samples_together():
     rng = np.random.default_rng(2)
-    one, two = rng.normal(0, 3, 400), rng.normal(0, 7, 100)
-    parts = [np.sqrt((part**2).mean()) for part in (one, two)]
-    assert pooled_db(parts, [400, 100]) == pytest.approx(np.sqrt((np.concatenate([one, two]) ** 2).mean()))
+    long_error, short_error = rng.normal(0, 3, 400), rng.normal(0, 7, 100)
+    parts = [np.sqrt((part**2).mean()) for part in (long_error, short_error)]
+    assert pooled_db(parts, [400, 100]) == pytest.approx(
+        np.sqrt((np.concatenate([long_error, short_error]) ** 2).mean())
+    )
 
 
 def with_errors(data, rmse_db, baseline_db):
@@ -70,7 +72,7 @@ def test_the_first_sentence_follows_from_the_paired_intervals(report_data):
     )
     # it loses to the second-best baseline alone: that is what is said
     assert pretty(second) in verdict(judged_as(report_data, {second: "worse"}))[0]
-    cards = {one.label: one for one in headlines(judged_as(report_data, {second: "worse"}))}
+    cards = {card.label: card for card in headlines(judged_as(report_data, {second: "worse"}))}
     assert cards[f"Better than {pretty(second)}"].interval.startswith(
         f"worse: {n},"
     )  # the card has the sentence's model
@@ -163,9 +165,9 @@ def test_a_single_sample_is_no_result(report_data):
 
 
 def test_at_most_four_numbers_each_with_something_beside_it(report_data):
-    found = headlines(report_data)
-    assert 2 <= len(found) <= 4
-    assert all(one.value and one.reference for one in found)
+    cards = headlines(report_data)
+    assert 2 <= len(cards) <= 4
+    assert all(card.value and card.reference for card in cards)
 
 
 def test_doubts_are_said(report_data):
@@ -173,7 +175,7 @@ def test_doubts_are_said(report_data):
     broken = dataclasses.replace(engine.audit, fields=FieldAudit(failures=("power of a path",)))
     data = dataclasses.replace(report_data, synthetic=False, engine=dataclasses.replace(engine, audit=broken))
     assert "the audit of the field failed 1 times" in verdict(data)[1]
-    assert any(one.value == "1 failed" for one in headlines(data))
+    assert any(card.value == "1 failed" for card in headlines(data))
     none = dataclasses.replace(report_data, engine=dataclasses.replace(engine, audit=None))
     assert "no audit" in verdict(none)[1]
 
@@ -206,7 +208,7 @@ def test_a_rank_forecast_is_the_headline_where_there_is_one(report_data):
 def test_sentence_and_card_of_a_rank_show_the_same_digits(report_data):
     data = dataclasses.replace(report_data, rss=())
     sentence, *_ = verdict(data)
-    card = next(one for one in headlines(data) if one.label.startswith("Rank"))
+    card = next(headline for headline in headlines(data) if headline.label.startswith("Rank"))
     best = min(data.rank[0].score.simulated.values(), key=lambda at: at.total_variation)
     shown = f"{100 * best.total_variation:.0f} percentage points"
     assert shown in sentence

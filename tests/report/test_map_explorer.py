@@ -24,12 +24,12 @@ def arrays_of(packed):
 def values_of(content, quantity, **axes):
     """A layer of the page's data as (rows, columns), and its quantity."""
     arrays = arrays_of(content["packed"])
-    one = next(q for q in content["quantities"] if q["name"] == quantity)
-    key = ",".join(str(axis["values"].index(axes[axis["name"]])) for axis in one["axes"])
-    stored = arrays[one["layers"][key]]
+    entry = next(q for q in content["quantities"] if q["name"] == quantity)
+    key = ",".join(str(axis["values"].index(axes[axis["name"]])) for axis in entry["axes"])
+    stored = arrays[entry["layers"][key]]
     missing = NONE[{np.dtype("<i2"): "i2", np.dtype("u1"): "u1"}[stored.dtype]]
-    values = np.where(stored == missing, np.nan, stored * one["step"])
-    return values.reshape(len(arrays[content["north"]]), len(arrays[content["east"]])), one
+    values = np.where(stored == missing, np.nan, stored * entry["step"])
+    return values.reshape(len(arrays[content["north"]]), len(arrays[content["east"]])), entry
 
 
 def test_every_layer_comes_back_within_half_a_step(maps_data):
@@ -47,14 +47,14 @@ def test_every_layer_comes_back_within_half_a_step(maps_data):
 def test_numbers_of_a_layer_are_those_of_the_tables(maps_data):
     metrics = maps_html.maps_metrics(maps_data)
     numbers = [n for n in metrics["layers"] if n["quantity"] == "RSS"]
-    for one, entry, table in zip(maps_data.rss, numbers, metrics["coverage"], strict=True):
+    for layer, entry, table in zip(maps_data.rss, numbers, metrics["coverage"], strict=True):
         assert (entry["tower"], entry["antennas"], entry["height"]) == (
-            one.tower,
-            one.antennas,
-            f"{one.altitude_m:g} m",
+            layer.tower,
+            layer.antennas,
+            f"{layer.altitude_m:g} m",
         )
         assert entry["covered"] == table["coverage"]
-        assert entry["median"] == np.nanmedian(one.rss_dbm)
+        assert entry["median"] == np.nanmedian(layer.rss_dbm)
     ranks = [n for n in metrics["layers"] if n["quantity"] == "Rank"]
     for entry, table in zip(ranks, metrics["rank"], strict=True):
         assert entry["share"] == pytest.approx(table["share"])
@@ -82,8 +82,8 @@ def test_a_page_keeps_its_size_whatever_the_grid(maps_data):
         rank=tuple(dataclasses.replace(m, rank=np.kron(m.rank, np.ones((3, 3), int))) for m in maps_data.rank),
         layers=(), east_m=np.linspace(-535, 535, 108), north_m=np.linspace(-1060, 1060, 213),
     )  # fmt: skip
-    whole = map_explorer.payload(fine, 10**9)
-    size = len(whole["packed"]["data"])
+    complete = map_explorer.payload(fine, 10**9)
+    size = len(complete["packed"]["data"])
     without = map_explorer.payload(fine, size - 1)
     assert without["left_out"] == "layers of single towers"
     assert without["stride"] == 1
@@ -98,12 +98,12 @@ def test_a_page_keeps_its_size_whatever_the_grid(maps_data):
 @pytest.mark.parametrize(("latitude", "reach_m"), [(35.7, 1100.0), (-62.0, 5000.0), (0.0, 200.0)])
 def test_positions_in_degrees(latitude, reach_m):
     frame = SiteFrame(latitude, -78.7)
-    found = map_explorer.geographic(frame, np.linspace(-reach_m, reach_m, 5), np.linspace(0, 2 * reach_m, 9))
-    assert found["worst_m"] < 0.001
+    fit = map_explorer.geographic(frame, np.linspace(-reach_m, reach_m, 5), np.linspace(0, 2 * reach_m, 9))
+    assert fit["worst_m"] < 0.001
     e, n = 0.37 * reach_m, 1.234 * reach_m
-    u, v = (np.array([e, n]) - found["middle"]) / found["reach"]
-    lat = sum(c * u**p * v**q for c, (p, q) in zip(found["lat"], found["powers"], strict=True))
-    lon = sum(c * u**p * v**q for c, (p, q) in zip(found["lon"], found["powers"], strict=True))
+    u, v = (np.array([e, n]) - fit["middle"]) / fit["reach"]
+    lat = sum(c * u**p * v**q for c, (p, q) in zip(fit["lat"], fit["powers"], strict=True))
+    lon = sum(c * u**p * v**q for c, (p, q) in zip(fit["lon"], fit["powers"], strict=True))
     assert [lat, lon] == pytest.approx(np.array(frame.to_geographic(e, n)), abs=2e-8)
 
 

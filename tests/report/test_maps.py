@@ -72,8 +72,8 @@ def test_cdf_counts_positions_out_of_coverage_as_below(maps_data):
     with canvas.style():
         fig = maps_figures.cdfs(maps)
     lines = fig.axes[0].get_lines()
-    for line, one in zip(lines, maps, strict=False):
-        assert line.get_ydata()[0] == pytest.approx(1 - one.coverage, abs=2 / one.rss_dbm.size)
+    for line, layer in zip(lines, maps, strict=False):
+        assert line.get_ydata()[0] == pytest.approx(1 - layer.coverage, abs=2 / layer.rss_dbm.size)
         assert line.get_ydata()[-1] == 1.0
 
 

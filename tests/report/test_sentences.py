@@ -54,7 +54,7 @@ def _text(node: ast.Constant | ast.JoinedStr) -> str:
     if isinstance(node, ast.Constant):
         text = node.value if isinstance(node.value, str) else ""
     else:
-        text = "".join(str(one.value) if isinstance(one, ast.Constant) else GAP for one in node.values)
+        text = "".join(str(part.value) if isinstance(part, ast.Constant) else GAP for part in node.values)
     return " ".join(re.sub(r"(?<!\{)\{[^{}]*\}", GAP, text).split())
 
 
@@ -63,23 +63,23 @@ def _children(node: ast.AST) -> Iterator[tuple[ast.AST, str]]:
     if isinstance(node, (ast.If, ast.IfExp)):
         test = ast.unparse(node.test)
         body, other = ([node.body], [node.orelse]) if isinstance(node, ast.IfExp) else (node.body, node.orelse)
-        yield from ((one, test) for one in body)
-        yield from ((one, f"not ({test})") for one in other)
+        yield from ((part, test) for part in body)
+        yield from ((part, f"not ({test})") for part in other)
     elif isinstance(node, ast.Dict):
         for key, value in zip(node.keys, node.values, strict=True):
             yield value, ast.unparse(key) if key is not None else ""
-            yield from ((one, "") for one in [key] if one is not None)
+            yield from ((part, "") for part in [key] if part is not None)
     elif isinstance(node, ast.Tuple) and node.elts and isinstance(node.elts[0], ast.Lambda):
-        yield from ((one, ast.unparse(node.elts[0].body)) for one in node.elts[1:])
+        yield from ((part, ast.unparse(node.elts[0].body)) for part in node.elts[1:])
     elif isinstance(node, (ast.FunctionDef, ast.ClassDef, ast.Module)):
-        docstrings = [one for one in node.body if isinstance(one, ast.Expr) and isinstance(one.value, ast.Constant)]
+        docstrings = [part for part in node.body if isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant)]
         name = "" if isinstance(node, ast.Module) else node.name
-        yield from ((one, name) for one in node.body if one not in docstrings)
+        yield from ((part, name) for part in node.body if part not in docstrings)
     elif isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
         target = node.targets[0] if isinstance(node, ast.Assign) else node.target
         yield node.value, ast.unparse(target) if ast.unparse(target).isupper() else ""
     elif not isinstance(node, ast.Raise):
-        yield from ((one, "") for one in ast.iter_child_nodes(node))
+        yield from ((part, "") for part in ast.iter_child_nodes(node))
 
 
 def of_template(path: Path) -> Iterator[tuple[str, str]]:
@@ -120,12 +120,12 @@ def _block(text: str, condition: str) -> Iterator[tuple[str, str]]:
 @cache
 def pieces() -> list[tuple[str, str, str, str]]:
     """Page, source, condition and text, each once."""
-    found = []
+    entries = []
     for page, names in SOURCES.items():
         for name in names:
             parts = of_template if name.endswith(".jinja") else of_module
-            found += [(page, name, condition, text) for condition, text in parts(ROOT / name)]
-    return list(dict.fromkeys(found))
+            entries += [(page, name, condition, text) for condition, text in parts(ROOT / name)]
+    return list(dict.fromkeys(entries))
 
 
 def rows() -> list[tuple[str, str, str, str]]:

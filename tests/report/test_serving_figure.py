@@ -43,16 +43,16 @@ def test_many_cells_are_gathered_without_losing_a_sample():
     rng = np.random.default_rng(0)
     n, cells = 4000, 60
     served = np.minimum(rng.geometric(0.1, n) - 1, cells - 1)
-    whole = compare_serving(served, rng.normal(-80, 5, (n, cells)), [f"c{i}" for i in range(cells)])
-    names, table = shown_confusion(whole)
+    comparison = compare_serving(served, rng.normal(-80, 5, (n, cells)), [f"c{i}" for i in range(cells)])
+    names, table = shown_confusion(comparison)
     assert len(names) == 17
     assert names[-1] == "others"
     assert table.shape == (17, 18)
     assert table.sum() == n
-    kept = [int(name[1:]) for name in names[:-1]]
-    assert np.trace(table[:16, :16]) == sum(whole.confusion[i, i] for i in kept)
+    named = [int(name[1:]) for name in names[:-1]]
+    assert np.trace(table[:16, :16]) == sum(comparison.confusion[i, i] for i in named)
     with canvas.style():
-        assert len(confusion(whole).axes[0].patches) == 16  # "others" has no frame
+        assert len(confusion(comparison).axes[0].patches) == 16  # "others" has no frame
 
 
 def test_it_stands_in_the_report(report_data, serving):

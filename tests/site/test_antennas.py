@@ -79,15 +79,15 @@ def test_principal_cuts_equal_the_file(tmp_path: Path) -> None:
 
 def test_total_gain_without_polarisation(tmp_path: Path) -> None:
     path = write(tmp_path / "a.txt", rows_of(clockwise=True))
-    whole, total = read_pattern_text(path), read_pattern_text(path, polarised=False)
+    polarised, total = read_pattern_text(path), read_pattern_text(path, polarised=False)
     theta, phi = directions()
-    np.testing.assert_allclose(total.gain_dbi(theta, phi), whole.gain_dbi(theta, phi), atol=0.05)
+    np.testing.assert_allclose(total.gain_dbi(theta, phi), polarised.gain_dbi(theta, phi), atol=0.05)
     assert not total.field(theta, phi)[1].any()
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.floats(0, 2 * math.pi), st.floats(0, 2 * math.pi), st.sampled_from([0.0, math.pi]))
-def test_poles_and_wrap_have_no_seam(one: float, other: float, pole: float) -> None:
+def test_poles_and_wrap_have_no_seam(azimuth: float, second_azimuth: float, pole: float) -> None:
     theta, phi = (
         a.reshape(61, 120) for a in np.meshgrid(np.linspace(0, np.pi, 61), np.arange(120) * np.pi / 60, indexing="ij")
     )
@@ -101,10 +101,10 @@ def test_poles_and_wrap_have_no_seam(one: float, other: float, pole: float) -> N
         ct, st_, cp, sp = math.cos(theta), math.sin(theta), math.cos(phi), math.sin(phi)
         return a * np.array([ct * cp, ct * sp, -st_]) + b * np.array([-sp, cp, 0])
 
-    np.testing.assert_allclose(vector(pole, one), vector(pole, other), atol=1e-5)
+    np.testing.assert_allclose(vector(pole, azimuth), vector(pole, second_azimuth), atol=1e-5)
     near = abs(pole - 1e-6)
-    np.testing.assert_allclose(vector(near, one), vector(pole, other), atol=1e-4)
-    np.testing.assert_allclose(vector(1.3, one), vector(1.3, one + 2 * math.pi), atol=1e-12)
+    np.testing.assert_allclose(vector(near, azimuth), vector(pole, second_azimuth), atol=1e-4)
+    np.testing.assert_allclose(vector(1.3, azimuth), vector(1.3, azimuth + 2 * math.pi), atol=1e-12)
     np.testing.assert_allclose(vector(1.3, math.pi - 1e-9), vector(1.3, -math.pi + 1e-9), atol=1e-6)
 
 
@@ -307,10 +307,10 @@ def test_the_headers_of_one_lab_tell_one_antenna() -> None:
     (at_3500,) = gain[gain[:, 0] == 3.5e9, 1]
     assert read_pattern_file(folder / "SA-1400-5900_F3500.txt").peak_gain_dbi == pytest.approx(at_3500, abs=0.01)
     cut = read_pattern_file(folder / "SA-1400-5900_phi_0.txt", carrier_hz=3.31e9)
-    whole = read_pattern_file(folder / "SA-1400-5900_F3300.txt")
+    sphere = read_pattern_file(folder / "SA-1400-5900_F3300.txt")
     theta = np.radians(np.arange(20, 161, 10))
     for half in (0.0, np.pi):
         side = np.full(len(theta), half)
-        np.testing.assert_allclose(cut.gain_dbi(theta, side), whole.gain_dbi(theta, side), atol=0.25)
+        np.testing.assert_allclose(cut.gain_dbi(theta, side), sphere.gain_dbi(theta, side), atol=0.25)
     with pytest.raises(InputError, match="without directions"):
         read_pattern_file(folder / "SA-1400-5900_gain.txt")

@@ -87,8 +87,8 @@ def test_the_command_writes_a_site_and_refuses_canopies_that_are_none(
     assert [forest.height_m for forest in site.forests] == [18.0]
     assert site.forests[0].area.centroid.distance(Point(30, 0)) < 1.0
     assert len(yaml.safe_load(out.read_text())["trees"]["single"]) == len(site.trees) == 1
-    for height, found in ((canopy() - 3.0, "-2.6 m"), (canopy() + 150.0, "168.0 m")):
+    for height, stated in ((canopy() - 3.0, "-2.6 m"), (canopy() + 150.0, "168.0 m")):
         wrong = ascii_grid(tmp_path, "wrong.tif", height)
         assert main([*about, "--force", "--canopy", str(wrong)]) == 3
-        assert found in capsys.readouterr().err
+        assert stated in capsys.readouterr().err
     assert main(about) == 2

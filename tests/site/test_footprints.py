@@ -127,15 +127,15 @@ def village_geojson(path: Path) -> Path:
 
 @pytest.mark.parametrize("writer", [village_geojson, osm_xml, overpass, kml])
 def test_one_village_in_four_formats(tmp_path: Path, writer: object) -> None:
-    found = import_footprints([writer(tmp_path / "village")], FRAME)  # type: ignore[operator]
-    heights = {b.name: b.height_m for b in found.buildings}
+    outlines = import_footprints([writer(tmp_path / "village")], FRAME)  # type: ignore[operator]
+    heights = {b.name: b.height_m for b in outlines.buildings}
     assert heights == {"barn": pytest.approx(7.62), "yard": 6.0, "hut": 6.0}
-    areas = {b.name: b.footprint.area for b in found.buildings}
+    areas = {b.name: b.footprint.area for b in outlines.buildings}
     assert areas == pytest.approx({"barn": 400, "yard": 40**2 - 20**2, "hut": 36}, rel=1e-4)
-    barn = next(b for b in found.buildings if b.name == "barn")
+    barn = next(b for b in outlines.buildings if b.name == "barn")
     assert barn.footprint.symmetric_difference(box(0, 0, 20, 20)).area < 0.01
-    assert [(f.name, round(f.area.area)) for f in found.forests] == [("wood", 22500)]
-    assert not found.geofences
+    assert [(f.name, round(f.area.area)) for f in outlines.forests] == [("wood", 22500)]
+    assert not outlines.geofences
 
 
 def test_round_trip_through_site_yaml(tmp_path: Path) -> None:
@@ -146,8 +146,8 @@ def test_round_trip_through_site_yaml(tmp_path: Path) -> None:
     assert not any("illustrative" in note for note in site.notes)
     assert list(site.towers) == ["LW1", "LW2", "LW3", "LW4", "LW5"]
     assert [b.height_m for b in site.buildings] == [b.height_m for b in again.buildings]
-    for one, other in zip(site.buildings, again.buildings, strict=True):
-        assert one.footprint.equals_exact(other.footprint, 1e-3)
+    for first, second in zip(site.buildings, again.buildings, strict=True):
+        assert first.footprint.equals_exact(second.footprint, 1e-3)
     np.testing.assert_array_equal(site.trees.east_m, again.trees.east_m)
     assert len(site.trees) > 100
 
@@ -160,35 +160,35 @@ def test_geofence_and_untagged_areas(tmp_path: Path) -> None:
     fence = tmp_path / "fence.kml"
     fence.write_text(kml(fence).read_text().replace("<ExtendedData>", "<x>").replace("</ExtendedData>", "</x>"))
     fence.write_text(fence.read_text().replace('name="building', 'name="b').replace('name="natural', 'name="n'))
-    found = import_footprints([fence], FRAME)
-    assert (len(found.geofences), len(found.buildings)) == (4, 0)
+    outlines = import_footprints([fence], FRAME)
+    assert (len(outlines.geofences), len(outlines.buildings)) == (4, 0)
 
 
 def imported(tmp_path: Path, *features: tuple[list[Ring], dict[str, object]]) -> Footprints:
     return import_footprints([geojson(tmp_path / "a.json", *features)], FRAME)
 
 
-def said(found: Footprints, words: str) -> bool:
-    return any(words in action for action in found.actions)
+def said(outlines: Footprints, words: str) -> bool:
+    return any(words in action for action in outlines.actions)
 
 
 def test_self_crossing_ring_is_repaired(tmp_path: Path) -> None:
-    found = imported(tmp_path, ([[(0, 0), (20, 20), (20, 0), (0, 20)]], BARN))  # a bow tie
-    assert sum(b.footprint.area for b in found.buildings) == pytest.approx(200, rel=1e-3)
-    assert all(b.footprint.is_valid for b in found.buildings)
-    assert said(found, "self-crossing ring was repaired (self-intersection)")
+    outlines = imported(tmp_path, ([[(0, 0), (20, 20), (20, 0), (0, 20)]], BARN))  # a bow tie
+    assert sum(b.footprint.area for b in outlines.buildings) == pytest.approx(200, rel=1e-3)
+    assert all(b.footprint.is_valid for b in outlines.buildings)
+    assert said(outlines, "self-crossing ring was repaired (self-intersection)")
 
 
 def test_three_equal_points_are_left_out(tmp_path: Path) -> None:
-    found = imported(tmp_path, ([[(5, 5)] * 3], BARN), ([square(0, 0)], BARN))
-    assert len(found.buildings) == 1
-    assert said(found, "f0: left out, it has no area")
-    assert said(found, "fewer than 3 distinct points")
+    outlines = imported(tmp_path, ([[(5, 5)] * 3], BARN), ([square(0, 0)], BARN))
+    assert len(outlines.buildings) == 1
+    assert said(outlines, "f0: left out, it has no area")
+    assert said(outlines, "fewer than 3 distinct points")
 
 
 def test_duplicates_slivers_and_overlaps(tmp_path: Path) -> None:
     tall: dict[str, object] = {"building": "yes", "height": "20"}
-    found = imported(
+    outlines = imported(
         tmp_path,
         ([square(0, 0)], {"building": "yes"}),
         ([square(0.05, 0)], BARN),  # the same again, with a height
@@ -199,14 +199,14 @@ def test_duplicates_slivers_and_overlaps(tmp_path: Path) -> None:
         ([square(310, 0)], tall),  # overlaps a higher one
         ([square(315, 5, 5)], BARN),  # inside the higher one, over both
     )
-    assert said(found, "f1: left out, it repeats")
-    assert said(found, "sliver of 2.0 m2 was left out")
-    assert said(found, "they were merged")
-    assert said(found, "part under a higher building was cut away")
-    assert said(found, "lies inside buildings at least as high")
-    by_area = sorted((round(b.footprint.area), b.height_m) for b in found.buildings)
+    assert said(outlines, "f1: left out, it repeats")
+    assert said(outlines, "sliver of 2.0 m2 was left out")
+    assert said(outlines, "they were merged")
+    assert said(outlines, "part under a higher building was cut away")
+    assert said(outlines, "lies inside buildings at least as high")
+    by_area = sorted((round(b.footprint.area), b.height_m) for b in outlines.buildings)
     assert by_area == [(200, 7.5), (400, 7.5), (400, 20.0), (600, 7.5)]
-    shapes = [b.footprint for b in found.buildings]
+    shapes = [b.footprint for b in outlines.buildings]
     assert all(a.intersection(b).area < 0.01 for i, a in enumerate(shapes) for b in shapes[:i])
 
 
@@ -230,8 +230,8 @@ def test_rounding_for_the_file_breaks_no_outline(tmp_path: Path) -> None:
 
 def test_overlapping_forests_do_not_double_the_trees(tmp_path: Path) -> None:
     wood: dict[str, object] = {"landuse": "forest"}
-    found = imported(tmp_path, ([square(0, 0, 100)], wood), ([square(50, 0, 100)], wood))
-    assert sum(f.area.area for f in found.forests) == pytest.approx(15_000, rel=1e-3)
+    outlines = imported(tmp_path, ([square(0, 0, 100)], wood), ([square(50, 0, 100)], wood))
+    assert sum(f.area.area for f in outlines.forests) == pytest.approx(15_000, rel=1e-3)
 
 
 def test_hole_outside_and_multipolygon_keep_their_area(tmp_path: Path) -> None:
@@ -239,27 +239,27 @@ def test_hole_outside_and_multipolygon_keep_their_area(tmp_path: Path) -> None:
     parts = [[lonlat(square(0, 0, 40)), lonlat(square(10, 10))], [lonlat(square(100, 0))]]
     geometry = {"type": "MultiPolygon", "coordinates": parts}
     path.write_text(json.dumps({"type": "Feature", "properties": BARN, "geometry": geometry}))
-    found = import_footprints([path], FRAME)
-    assert sorted(round(b.footprint.area) for b in found.buildings) == [400, 1200]
-    assert len({b.name for b in found.buildings}) == 2
+    outlines = import_footprints([path], FRAME)
+    assert sorted(round(b.footprint.area) for b in outlines.buildings) == [400, 1200]
+    assert len({b.name for b in outlines.buildings}) == 2
 
 
 @pytest.mark.parametrize(
     ("written", "metres"), [("12", 12), ("12,5 m", 12.5), ("40 ft", 12.192), ("40'", 12.192), ("39'4\"", 11.9888)]
 )
 def test_heights_with_units(tmp_path: Path, written: str, metres: float) -> None:
-    found = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": written}))
-    assert found.buildings[0].height_m == pytest.approx(metres, abs=0.006)
+    outlines = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": written}))
+    assert outlines.buildings[0].height_m == pytest.approx(metres, abs=0.006)
 
 
 def test_heights_that_cannot_be_metres(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"2400 m high.*feet or centimetres"):
         imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "2400"}))
-    found = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "20", "building:levels": "2"}))
-    assert said(found, "warning: a.json: f0: 20 m for 2 levels; are these feet?")
-    found = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "tall", "building:levels": "2"}))
-    assert found.buildings[0].height_m == 6
-    assert said(found, "height 'tall' is not a length")
+    outlines = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "20", "building:levels": "2"}))
+    assert said(outlines, "warning: a.json: f0: 20 m for 2 levels; are these feet?")
+    outlines = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "tall", "building:levels": "2"}))
+    assert outlines.buildings[0].height_m == 6
+    assert said(outlines, "height 'tall' is not a length")
     high = [([square(100 * n, 0)], {"building": "yes", "height": "30"}) for n in range(4)]
     assert said(imported(tmp_path, *high), "warning: the median stated height")  # type: ignore[arg-type]
 
@@ -285,17 +285,17 @@ def test_swapped_far_and_antimeridian(tmp_path: Path) -> None:
 def test_site_on_the_antimeridian_is_whole(tmp_path: Path) -> None:
     frame = SiteFrame(-16.8, 180.0)
     path = raw(tmp_path / "d.json", *[(p[0], p[1]) for p in lonlat(square(-10, -10), frame)])
-    found = import_footprints([path], frame)
-    assert found.buildings[0].footprint.area == pytest.approx(400, rel=1e-4)
-    assert said(found, "crosses the antimeridian")
+    outlines = import_footprints([path], frame)
+    assert outlines.buildings[0].footprint.area == pytest.approx(400, rel=1e-4)
+    assert said(outlines, "crosses the antimeridian")
 
 
 def test_osm_with_missing_nodes_is_reported(tmp_path: Path) -> None:
     path = osm_xml(tmp_path / "a.osm")
     path.write_text(path.read_text().replace('<node id="2" ', '<node id="999" '))
-    found = import_footprints([path], FRAME)
-    assert said(found, "1 of 5 nodes are not in the file")
-    assert any(b.name == "barn" and b.footprint.area == pytest.approx(200, rel=1e-3) for b in found.buildings)
+    outlines = import_footprints([path], FRAME)
+    assert said(outlines, "1 of 5 nodes are not in the file")
+    assert any(b.name == "barn" and b.footprint.area == pytest.approx(200, rel=1e-3) for b in outlines.buildings)
 
 
 def test_single_trees_of_osm(tmp_path: Path) -> None:
@@ -345,10 +345,10 @@ def test_nothing_named() -> None:
 def test_geofence_of_the_field() -> None:
     path = REAL / "telemetry" / "AERPAW_Big_Geofence.kml"
     site = load_site("lake_wheeler")
-    found = import_footprints([path], site.frame)
-    assert (len(found.geofences), len(found.buildings), found.actions) == (1, 0, [])
-    assert 1e4 < found.geofences[0].area.area < 5e6
-    assert found.geofences[0].area.distance(shapely.Point(0, 0)) < 500  # the flights start near LW1
+    outlines = import_footprints([path], site.frame)
+    assert (len(outlines.geofences), len(outlines.buildings), outlines.actions) == (1, 0, [])
+    assert 1e4 < outlines.geofences[0].area.area < 5e6
+    assert outlines.geofences[0].area.distance(shapely.Point(0, 0)) < 500  # the flights start near LW1
 
 
 def test_a_number_that_is_no_degree_is_infinitely_far_and_overflows_nowhere():

@@ -66,17 +66,19 @@ def flight(folder: Path, antennas: dict[str, str], carrier_hz: float = CARRIER_H
     ],
 )
 def test_a_search_takes_the_airframe_of_other_flights_alone(folder, site, towers, series, log, fits) -> None:
-    found = searching_airframe(folder / site, towers, series, log)
-    assert (found is not None) == fits
-    assert found is None or found.gain_dbi(0.3, 0.4) == pytest.approx(0.0, abs=1e-6)
+    airframe = searching_airframe(folder / site, towers, series, log)
+    assert (airframe is not None) == fits
+    assert airframe is None or airframe.gain_dbi(0.3, 0.4) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:
     settings = load_flight(flight(folder, {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}))
     link = settings.link.channels["A"].build(["LW1", "LW2"], Path("/nowhere"))
     ends = [link.tower_arrays["LW1"].patterns[0], link.uav_array.patterns[0]]
-    assert all(isinstance(one, SpherePattern) for one in ends)
-    assert [float(one.gain_dbi(np.array(1.0), np.array(1.0))) for one in ends] == pytest.approx([3.0, 0.0], abs=1e-3)  # type: ignore[attr-defined]
+    assert all(isinstance(pattern, SpherePattern) for pattern in ends)
+    assert [float(pattern.gain_dbi(np.array(1.0), np.array(1.0))) for pattern in ends] == pytest.approx(
+        [3.0, 0.0], abs=1e-3
+    )  # type: ignore[attr-defined]
     assert not isinstance(link.tower_arrays["LW2"].patterns[0], SpherePattern)
     assert settings.flight.notes == []
 
@@ -125,7 +127,7 @@ def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: b
     assert note.endswith("isotropic in its place")
     link = settings.link.channels["A"].build(["LW1"], Path("/nowhere"))
     learned = {"LW1.A": link.tower_arrays["LW1"].patterns[0], "uav": link.uav_array.patterns[0]}
-    assert {name for name, one in learned.items() if isinstance(one, SpherePattern)} == {"LW1.A", "uav"} - {end}
+    assert {name for name, pattern in learned.items() if isinstance(pattern, SpherePattern)} == {"LW1.A", "uav"} - {end}
 
 
 @pytest.mark.parametrize(
@@ -138,11 +140,11 @@ def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: b
     ],
 )
 def test_a_damaged_receiver_is_left_out_and_said(folder: Path, content: bytes | None, said: str) -> None:
-    found = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=CARRIER_HZ, file="r.json.gz")
+    receiver = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=CARRIER_HZ, file="r.json.gz")
     remember(
         folder / "mine.yaml",
         "nr",
-        entry("A").model_copy(update={"series": [], "receivers": [found]}),
+        entry("A").model_copy(update={"series": [], "receivers": [receiver]}),
         {"r.json.gz": b"{}"},
     )
     path = flight(folder, {})
@@ -193,9 +195,9 @@ def test_a_second_entry_joins_the_first_and_one_of_the_same_name_replaces_it(fol
 
 def test_a_draft_takes_only_what_fits(folder: Path) -> None:
     known = read_learned(folder / "mine.yaml")
-    whole = propose(known, "mine", [("LW1", "A", "flight_mat")])
-    assert whole.antennas == {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}
-    assert whole.carrier_hz == CARRIER_HZ
+    complete = propose(known, "mine", [("LW1", "A", "flight_mat")])
+    assert complete.antennas == {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}
+    assert complete.carrier_hz == CARRIER_HZ
     elsewhere = propose(known, "mine", [("NODE", "A", "flight_mat")])
     assert elsewhere.antennas == {"uav": "mine/d12_uav"}
     assert elsewhere.antennas_about.startswith("the airframe alone fits")
@@ -206,11 +208,11 @@ def test_a_draft_takes_only_what_fits(folder: Path) -> None:
         (("NODE",), ("ROVER",), False),
     ):
         nodes = Nodes(placed=frozenset(known_place), fixed=at_site)
-        found = propose(rover, "mine", [("NODE", "A", "flight_mat")], nodes)
-        assert found.antennas == {"uav": "mine/r_uav"} | ({"NODE.A": "mine/r_ROVER.A"} if fits else {})
-        assert found.antennas_about.startswith("the airframe alone fits") is not fits
+        proposal = propose(rover, "mine", [("NODE", "A", "flight_mat")], nodes)
+        assert proposal.antennas == {"uav": "mine/r_uav"} | ({"NODE.A": "mine/r_ROVER.A"} if fits else {})
+        assert proposal.antennas_about.startswith("the airframe alone fits") is not fits
         own = propose(rover, "mine", [("NODE", "A", "sounder_log")], nodes)  # the same receiver's own log
-        assert own.antennas == (found.antennas if fits else {})
+        assert own.antennas == (proposal.antennas if fits else {})
     for other in (("LW1", "A", "sounder_log"), ("LW1", "B", "flight_mat"), ("LW1", "rank", "flight_mat")):
         assert propose(known, "mine", [other]).antennas == {}
     receiver = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=3.4e9, file="r.json.gz", kappa=0.4)
@@ -223,10 +225,10 @@ def test_the_packaged_memory_is_small_and_says_where_it_comes_from() -> None:
     known, place = read_learned("lake_wheeler"), folder_of("lake_wheeler")
     assert {"dataset12", "lte", "afar", "nr_rank"} <= set(known.entries)
     assert sum(p.stat().st_size for p in place.iterdir()) < 300_000
-    for one in known.entries.values():
-        assert len(one.trained_on) >= 2
-        assert one.command.startswith("aerpaw-cmp calibrate ")
-        assert one.source.title
+    for entry_ in known.entries.values():
+        assert len(entry_.trained_on) >= 2
+        assert entry_.command.startswith("aerpaw-cmp calibrate ")
+        assert entry_.source.title
     assert known.entries["dataset12"].source.doi == "10.5061/dryad.2z34tmpvv"
 
 
@@ -246,9 +248,9 @@ def test_packaged_antennas_predict_flights_left_out(name, rmse_db, rmse_4s_db, o
 def test_packaged_receiver_beats_a_constant_on_flights_left_out() -> None:
     receivers = read_learned("lake_wheeler").entries["nr_rank"].receivers
     assert receivers
-    for one in receivers:
-        assert one.kappa > 0.35
-        assert one.log_score < 0.85 * one.constant_log_score
+    for receiver in receivers:
+        assert receiver.kappa > 0.35
+        assert receiver.log_score < 0.85 * receiver.constant_log_score
 
 
 def test_packaged_lock_beats_a_constant_on_flights_left_out() -> None:

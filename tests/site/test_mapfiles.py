@@ -37,8 +37,8 @@ def read(tmp_path: Path, content: Any, name: str = "m.json", **options: Any) -> 
     return import_footprints([path], FRAME, **options)
 
 
-def said(found: Footprints, words: str) -> bool:
-    return any(words in action for action in found.actions)
+def said(footprints: Footprints, words: str) -> bool:
+    return any(words in action for action in footprints.actions)
 
 
 # ---------------------------------------------------------------- OSM
@@ -131,21 +131,21 @@ def test_trees_have_their_tagged_sizes(tmp_path: Path) -> None:
 def test_tree_rows_become_trees_along_the_line(tmp_path: Path) -> None:
     corners = [[*square(0, 0)[0]], [*square(60, 0)[0]], [*square(60, 40)[0]]]
     row = feature({"type": "LineString", "coordinates": corners}, natural="tree_row", height="9", diameter_crown="5")
-    found = read(tmp_path, collection(row))
-    east, north = (np.array([getattr(t, name) for t in found.trees]) for name in ("east_m", "north_m"))
+    footprints = read(tmp_path, collection(row))
+    east, north = (np.array([getattr(t, name) for t in footprints.trees]) for name in ("east_m", "north_m"))
     assert len(east) == 21
     assert shapely.LineString([(0, 0), (60, 0), (60, 40)]).distance(shapely.points(east, north)).max() < 0.02
     np.testing.assert_allclose(np.diff(east).sum() + np.diff(north).sum(), 100, atol=0.05)
-    assert {(t.height_m, t.crown_diameter_m) for t in found.trees} == {(9.0, 5.0)}
-    assert said(found, "21 trees were placed along the row, 5 m apart")
+    assert {(t.height_m, t.crown_diameter_m) for t in footprints.trees} == {(9.0, 5.0)}
+    assert said(footprints, "21 trees were placed along the row, 5 m apart")
 
 
 def test_a_tree_row_with_lost_nodes_says_so(tmp_path: Path) -> None:
     osm = Osm()
     osm.way(square(0, 0), natural="tree_row")
-    found = read(tmp_path, osm.xml(drop=(1,)), "a.osm")
-    assert found.trees
-    assert said(found, "way 100: 2 of 5 nodes are not in the file")
+    footprints = read(tmp_path, osm.xml(drop=(1,)), "a.osm")
+    assert footprints.trees
+    assert said(footprints, "way 100: 2 of 5 nodes are not in the file")
 
 
 def test_a_building_with_a_lost_first_node_or_an_open_line_is_kept(tmp_path: Path) -> None:
@@ -153,10 +153,10 @@ def test_a_building_with_a_lost_first_node_or_an_open_line_is_kept(tmp_path: Pat
     osm.way(square(0, 0), **BARN)
     osm.way(square(100, 0), **BARN)
     osm.ways[1] = (osm.ways[1][0], osm.ways[1][1][:-1], osm.ways[1][2])
-    found = read(tmp_path, osm.xml(drop=(1,)), "a.osm")
-    assert sorted(round(b.footprint.area) for b in found.buildings) == [200, 400]
-    assert said(found, "way 100: 2 of 5 nodes are not in the file")
-    assert said(found, "way 101: its line is not closed")
+    footprints = read(tmp_path, osm.xml(drop=(1,)), "a.osm")
+    assert sorted(round(b.footprint.area) for b in footprints.buildings) == [200, 400]
+    assert said(footprints, "way 100: 2 of 5 nodes are not in the file")
+    assert said(footprints, "way 101: its line is not closed")
 
 
 def test_osm_with_a_namespace_and_deleted_elements(tmp_path: Path) -> None:
@@ -164,8 +164,8 @@ def test_osm_with_a_namespace_and_deleted_elements(tmp_path: Path) -> None:
     osm.way(square(0, 0), **BARN)
     text = osm.xml(root='<osm xmlns="http://openstreetmap.org/osm/0.6" version="0.6">')
     text = text.replace("</osm>", '<node id="77" visible="false"/><way id="78" visible="false"/></osm>')
-    found = read(tmp_path, text, "a.osm")
-    assert (len(found.buildings), found.actions) == (1, [])
+    footprints = read(tmp_path, text, "a.osm")
+    assert (len(footprints.buildings), footprints.actions) == (1, [])
 
 
 def test_broken_relations(tmp_path: Path) -> None:
@@ -175,11 +175,11 @@ def test_broken_relations(tmp_path: Path) -> None:
     osm.relation([(way, "outer"), (999, "inner")], type="multipolygon", landuse="forest")
     osm.relation([(998, "outer")], type="multipolygon", landuse="forest")
     osm.relation([], type="route", landuse="forest")
-    found = read(tmp_path, osm.xml(), "a.osm")
-    assert [round(f.area.area, -2) for f in found.forests] == [40_000]
+    footprints = read(tmp_path, osm.xml(), "a.osm")
+    assert [round(f.area.area, -2) for f in footprints.forests] == [40_000]
     for words in ("relation 0: way 999 is not in the file", "relation 0: a ring is not closed",
                   "relation 1: left out, it has no area", "1 relations of type 'route'"):  # fmt: skip
-        assert said(found, words), words
+        assert said(footprints, words), words
 
 
 def overpass(*elements: Any, **more: Any) -> dict[str, Any]:
@@ -188,25 +188,25 @@ def overpass(*elements: Any, **more: Any) -> dict[str, Any]:
 
 def test_overpass_center_body_and_remark(tmp_path: Path) -> None:
     points = [{"lat": lat, "lon": lon} for lon, lat in square(0, 0)]
-    whole = {"type": "way", "id": 2, "tags": BARN, "geometry": points}
+    complete = {"type": "way", "id": 2, "tags": BARN, "geometry": points}
     centre = {"type": "way", "id": 1, "tags": BARN, "center": points[0]}
     with pytest.raises(InputError, match=r"no building.*way 1: it has no outline in the file.*'out geom;'"):
         read(tmp_path, overpass(centre))
-    cut = {**whole, "id": 3, "geometry": [*points[:3], None]}
+    cut = {**complete, "id": 3, "geometry": [*points[:3], None]}
     broken = {"type": "way", "id": 4, "tags": BARN, "geometry": [{"lat": 1}]}
-    found = read(tmp_path, overpass(centre, whole, cut, broken, "?", remark="runtime error: Query timed out"))
-    assert len(found.buildings) == 1
+    footprints = read(tmp_path, overpass(centre, complete, cut, broken, "?", remark="runtime error: Query timed out"))
+    assert len(footprints.buildings) == 1
     for words in ("way 1: left out", "way 3: 1 of 4 points are unknown", "Query timed out"):
-        assert said(found, words), words
+        assert said(footprints, words), words
     text = (tmp_path / "m.json").read_text().splitlines()
     line = text.index('   "id": 4,')  # the brace stands two lines above, and the index counts from 0
-    assert said(found, f"m.json, line {line - 1}: way 4 was left out"), found.actions
-    assert any(action.endswith("element 5 was left out: it is not as it should be") for action in found.actions)
+    assert said(footprints, f"m.json, line {line - 1}: way 4 was left out"), footprints.actions
+    assert any(action.endswith("element 5 was left out: it is not as it should be") for action in footprints.actions)
     # 'out body; >; out skel;' lists nodes without tags, and ways twice
     nodes = [{"type": "node", "id": n, **point} for n, point in enumerate(points[:-1])]
     body = {"type": "way", "id": 5, "tags": BARN, "nodes": [0, 1, 2, 3, 0]}
-    found = read(tmp_path, overpass(body, *nodes, {"type": "way", "id": 5, "nodes": [0, 1, 2, 3, 0]}))
-    assert (len(found.buildings), found.actions) == (1, [])
+    footprints = read(tmp_path, overpass(body, *nodes, {"type": "way", "id": 5, "nodes": [0, 1, 2, 3, 0]}))
+    assert (len(footprints.buildings), footprints.actions) == (1, [])
 
 
 # ---------------------------------------------------------------- GeoJSON
@@ -222,22 +222,22 @@ def test_one_bad_feature_does_not_lose_the_others(tmp_path: Path) -> None:
         feature({"type": "Circle", "coordinates": [1, 2]}, **BARN),
         feature(polygon(None), **BARN),
     ]
-    found = read(tmp_path, collection(*bad, good))
-    assert len(found.buildings) == 1
+    footprints = read(tmp_path, collection(*bad, good))
+    assert len(footprints.buildings) == 1
     lines = (tmp_path / "m.json").read_text().splitlines()
-    assert said(found, f"m.json, line {lines.index('  null,') + 1}: feature 1 was left out")
-    assert said(found, f"m.json, line {lines.index('  3,') + 1}: feature 2 was left out")
-    assert said(found, "feature 3 was left out: the position ['a', 1] is not longitude, latitude")
-    assert said(found, "feature 4 was left out: it is not as it should be: no 'geometries'")
-    assert said(found, "feature 5 was left out: it is not as it should be: a geometry of type 'Circle'")
-    assert said(found, "feature 6 was left out: it is not as it should be")
+    assert said(footprints, f"m.json, line {lines.index('  null,') + 1}: feature 1 was left out")
+    assert said(footprints, f"m.json, line {lines.index('  3,') + 1}: feature 2 was left out")
+    assert said(footprints, "feature 3 was left out: the position ['a', 1] is not longitude, latitude")
+    assert said(footprints, "feature 4 was left out: it is not as it should be: no 'geometries'")
+    assert said(footprints, "feature 5 was left out: it is not as it should be: a geometry of type 'Circle'")
+    assert said(footprints, "feature 6 was left out: it is not as it should be")
 
 
 def test_what_is_no_area_is_counted(tmp_path: Path) -> None:
     line = feature({"type": "LineString", "coordinates": square(0, 0)}, building="yes")
-    found = read(tmp_path, collection(feature(polygon(square(0, 0)), **BARN), feature(None, **BARN), line, line))
-    assert len(found.buildings) == 1
-    assert said(found, "left out, not areas: 2 LineString, 1 without geometry")
+    footprints = read(tmp_path, collection(feature(polygon(square(0, 0)), **BARN), feature(None, **BARN), line, line))
+    assert len(footprints.buildings) == 1
+    assert said(footprints, "left out, not areas: 2 LineString, 1 without geometry")
 
 
 @pytest.mark.parametrize(
@@ -253,25 +253,25 @@ def test_what_is_no_area_is_counted(tmp_path: Path) -> None:
     ],
 )
 def test_each_repair_is_said(tmp_path: Path, rings: list[Any], words: str, area: float) -> None:
-    found = read(tmp_path, collection(feature(polygon(*rings), **BARN), feature(polygon(square(300, 0)), **BARN)))
-    assert sum(b.footprint.area for b in found.buildings) == pytest.approx(area + 400, rel=1e-3)
-    assert bool(found.actions) == bool(words)
-    assert said(found, words) or not words
+    footprints = read(tmp_path, collection(feature(polygon(*rings), **BARN), feature(polygon(square(300, 0)), **BARN)))
+    assert sum(b.footprint.area for b in footprints.buildings) == pytest.approx(area + 400, rel=1e-3)
+    assert bool(footprints.actions) == bool(words)
+    assert said(footprints, words) or not words
 
 
 def test_parts_of_a_building_have_their_own_heights(tmp_path: Path) -> None:
     outline = feature(polygon(square(0, 0, 40)), building="yes", height="20")
     low = feature(polygon(square(0, 0, 20)), **{"building:part": "yes", "height": "6"})
     roof = feature(polygon(square(20, 20, 20)), **{"building:part": "roof", "height": "20", "min_height": "15"})
-    found = read(tmp_path, collection(outline, low, roof))
-    assert sorted((round(b.footprint.area), b.height_m) for b in found.buildings) == [
+    footprints = read(tmp_path, collection(outline, low, roof))
+    assert sorted((round(b.footprint.area), b.height_m) for b in footprints.buildings) == [
         (400, 6),
         (400, 20),
         (400, 20),
         (400, 20),
     ]
-    assert said(found, "feature 1: gives way to its mapped parts")
-    assert said(found, "feature 3: it begins above the ground")
+    assert said(footprints, "feature 1: gives way to its mapped parts")
+    assert said(footprints, "feature 3: it begins above the ground")
 
 
 @pytest.mark.parametrize(
@@ -292,9 +292,9 @@ def test_parts_of_a_building_have_their_own_heights(tmp_path: Path) -> None:
     ],
 )
 def test_unusual_heights_are_used_or_said(tmp_path: Path, tags: dict[str, Any], metres: float, words: str) -> None:
-    found = read(tmp_path, collection(feature(polygon(square(0, 0)), building="yes", **tags)))
-    assert found.buildings[0].height_m == pytest.approx(metres, abs=0.01)
-    assert said(found, words) if words else not found.actions
+    footprints = read(tmp_path, collection(feature(polygon(square(0, 0)), building="yes", **tags)))
+    assert footprints.buildings[0].height_m == pytest.approx(metres, abs=0.01)
+    assert said(footprints, words) if words else not footprints.actions
 
 
 def test_false_is_no_building_and_the_way_out_is_named(tmp_path: Path) -> None:
@@ -307,10 +307,10 @@ def test_false_is_no_building_and_the_way_out_is_named(tmp_path: Path) -> None:
 
 def test_forests_far_outside_the_site_are_cut_off(tmp_path: Path) -> None:
     wood = feature(polygon(square(200, 200, 9000)), natural="wood")
-    found = read(tmp_path, collection(wood), area_m=(-500.0, 500.0, -500.0, 500.0))
-    east, north = found.forests[0].area.bounds[2:]
+    footprints = read(tmp_path, collection(wood), area_m=(-500.0, 500.0, -500.0, 500.0))
+    east, north = footprints.forests[0].area.bounds[2:]
     assert (east, north) == pytest.approx((1500, 1500), abs=1)
-    assert said(found, "ha more than 1000 m outside the site's area were cut away")
+    assert said(footprints, "ha more than 1000 m outside the site's area were cut away")
 
 
 # ---------------------------------------------------------------- files
@@ -341,15 +341,15 @@ def test_kmz_and_kml_of_many_hands(tmp_path: Path) -> None:
         ("blanks.kml", kml(placemark(square(0, 0, 100), blank=" "))),
         ("old.kml", kml(placemark(square(0, 0, 100)), root="<kml>")),
     ):
-        found = read(tmp_path, content, name)
-        assert [round(g.area.area) for g in found.geofences] == [10_000], name
-        assert not found.actions
+        footprints = read(tmp_path, content, name)
+        assert [round(g.area.area) for g in footprints.geofences] == [10_000], name
+        assert not footprints.actions
     path = "<Placemark><LineString><coordinates>1,2 3,4</coordinates></LineString></Placemark>"
     odd = placemark(square(0, 0), "odd", blank="north")
-    found = read(tmp_path, kml(placemark(square(0, 0, 100)), path, odd), "b.kml")
-    assert len(found.geofences) == 1
-    assert said(found, "not areas: 1 LineString")
-    assert said(found, "b.kml, line 3: placemark 'odd' was left out: ")
+    footprints = read(tmp_path, kml(placemark(square(0, 0, 100)), path, odd), "b.kml")
+    assert len(footprints.geofences) == 1
+    assert said(footprints, "not areas: 1 LineString")
+    assert said(footprints, "b.kml, line 3: placemark 'odd' was left out: ")
 
 
 @pytest.mark.parametrize(
@@ -409,16 +409,16 @@ def test_a_kmz_with_any_byte_damaged_is_read_or_refused(tmp_path: Path) -> None:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("doc.kml", kml(placemark(square(0, 0)), placemark(square(40, 40), "other")))
-    whole, path = packed.getvalue(), tmp_path / "m.kmz"
+    intact, path = packed.getvalue(), tmp_path / "m.kmz"
     refused = 0
-    for at in range(len(whole)):
+    for at in range(len(intact)):
         for flip in (0x01, 0x80, 0xFF):
-            path.write_bytes(whole[:at] + bytes([whole[at] ^ flip]) + whole[at + 1 :])
+            path.write_bytes(intact[:at] + bytes([intact[at] ^ flip]) + intact[at + 1 :])
             try:
                 read_map_file(path)
             except InputError:
                 refused += 1
-    assert refused > len(whole)
+    assert refused > len(intact)
 
 
 def test_too_many_tags_are_refused_before_any_is_an_object(tmp_path: Path) -> None:
@@ -473,6 +473,6 @@ def test_a_ring_of_a_million_crossings_is_left_out_and_said(tmp_path: Path) -> N
     corners = np.random.default_rng(1).uniform(-0.001, 0.001, (4000, 2)) + np.array([-78.6959, 35.7275])
     ring = [*corners.tolist(), corners[0].tolist()]
     good = feature(polygon(square(0, 0)), building="yes")
-    found = read(tmp_path, collection(feature(polygon(ring), building="yes"), good))
-    assert len(found.buildings) == 1
-    assert said(found, "crosses itself at more than 1000 places was left out")
+    footprints = read(tmp_path, collection(feature(polygon(ring), building="yes"), good))
+    assert len(footprints.buildings) == 1
+    assert said(footprints, "crosses itself at more than 1000 places was left out")

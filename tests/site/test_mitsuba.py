@@ -172,9 +172,9 @@ def test_bad_scenes_are_one_message(body, bsdf, message, tmp_path):
     (folder / "index.ply").write_text(PLY_HEAD.format(2) + PLY_POINTS + "3 0 1 9\n3 0 2 3\n")
     (folder / "text.ply").write_text("solid\n")
     (folder / "bad.obj").write_text(SQUARE + "f 1 two 3\n")
-    with pytest.raises(AerpawCmpError, match=message) as told:
+    with pytest.raises(AerpawCmpError, match=message) as refused:
         read_scene(write(folder, body, bsdf))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])

@@ -110,9 +110,9 @@ def test_a_frequency_that_is_no_number_is_no_frequency(tmp_path: Path) -> None:
 
 def test_an_integer_beyond_all_floats_is_no_coordinate(tmp_path: Path) -> None:
     (tmp_path / "m.json").write_bytes(GEOJSON.replace(b'"coordinates": [-78.696', b'"coordinates": [' + b"1" * 400))
-    found = import_footprints([tmp_path / "m.json"], FRAME)
-    assert len(found.buildings) == 1
-    assert any("feature 2 was left out" in action for action in found.actions)
+    footprints = import_footprints([tmp_path / "m.json"], FRAME)
+    assert len(footprints.buildings) == 1
+    assert any("feature 2 was left out" in action for action in footprints.actions)
 
 
 @pytest.mark.parametrize("rows", [1, 9])

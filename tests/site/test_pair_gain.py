@@ -33,8 +33,8 @@ def pattern(pair: PairGain | None, trained_on: str) -> SpherePattern:
     return SpherePattern("a", np.zeros((19, 36)), np.full((19, 36), 2.0), trained_on=(trained_on,), notes=notes)
 
 
-def array(one: SpherePattern) -> Array:
-    return dataclasses.replace(single_element(), patterns=(one,))
+def array(sphere: SpherePattern) -> Array:
+    return dataclasses.replace(single_element(), patterns=(sphere,))
 
 
 def test_a_file_gives_back_what_was_written(tmp_path: Path) -> None:

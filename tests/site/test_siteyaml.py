@@ -32,16 +32,16 @@ def test_lake_wheeler_towers_are_where_the_sources_say() -> None:
     assert list(site.towers) == ["LW1", "LW2", "LW3", "LW4", "LW5"]
     pairs = itertools.combinations(site.towers.values(), 2)
     geodesic = [454, 466, 893, 666, 598, 1088, 1745, 1639, 2119, 1089]  # of source A, by pair
-    found = {(a.name, b.name): math.hypot(a.east_m - b.east_m, a.north_m - b.north_m) for a, b in pairs}
-    assert sorted(round(v) for v in found.values()) == pytest.approx(sorted(geodesic), abs=1)
+    distances = {(a.name, b.name): math.hypot(a.east_m - b.east_m, a.north_m - b.north_m) for a, b in pairs}
+    assert sorted(round(v) for v in distances.values()) == pytest.approx(sorted(geodesic), abs=1)
     assert [round(t.position_m[2], 6) for t in site.towers.values()] == [10.0] * 5
 
 
 def test_sources_differ_by_what_the_site_says() -> None:
     a, b = load_site("lake_wheeler"), load_site("lake_wheeler", coordinates="B")
     for name, stated in zip(a.towers, (6.6, 2.0, 2.6, 2.7, 2.5), strict=True):
-        one, other = a.towers[name], b.towers[name]
-        apart = Geod(ellps="WGS84").inv(one.longitude_deg, one.latitude_deg, other.longitude_deg, other.latitude_deg)[2]
+        of_a, of_b = a.towers[name], b.towers[name]
+        apart = Geod(ellps="WGS84").inv(of_a.longitude_deg, of_a.latitude_deg, of_b.longitude_deg, of_b.latitude_deg)[2]
         assert apart == pytest.approx(stated, abs=0.06)
         assert f"{name}: source B lies {apart:.1f} m from source A, which is used" in a.notes
         assert f"{name}: source A lies {apart:.1f} m from source B, which is used" in b.notes
@@ -106,8 +106,8 @@ def test_no_such_site(tmp_path: Path) -> None:
 def heights(tmp_path: Path, origin_ground: str, tower: str, ground: str = "offsets") -> tuple[float, float]:
     text = MINIMAL.replace("-78.696}\ntowers", f"-78.696, takeoff_ground_m: 1.5{origin_ground}}}\ntowers")
     text = text.replace("-78.696}\n", f"-78.696, {tower}}}\n") + f"tower_ground: {ground}\n"
-    found = load_site(site_file(tmp_path, text)).towers["T"]
-    return float(found.position_m[2]), found.ground_m
+    tower_ = load_site(site_file(tmp_path, text)).towers["T"]
+    return float(tower_.position_m[2]), tower_.ground_m
 
 
 def test_each_reference_gives_the_same_antenna(tmp_path: Path) -> None:
@@ -138,14 +138,14 @@ def test_mixing_is_refused(tmp_path: Path) -> None:
         heights(tmp_path, msl, "antenna: {height_m: 15, reference: sea_level}")
 
 
-@pytest.mark.parametrize("one", list(HeightReference))
-@pytest.mark.parametrize("other", list(HeightReference))
-def test_only_like_heights_subtract(one: HeightReference, other: HeightReference) -> None:
-    if one is other:
-        assert Height(5, one).minus(Height(2, other), "x") == 3
+@pytest.mark.parametrize("reference", list(HeightReference))
+@pytest.mark.parametrize("second", list(HeightReference))
+def test_only_like_heights_subtract(reference: HeightReference, second: HeightReference) -> None:
+    if reference is second:
+        assert Height(5, reference).minus(Height(2, second), "x") == 3
     else:
-        with pytest.raises(UsageError, match=f"{one.value} height 5 m cannot be compared with {other.value}"):
-            Height(5, one).minus(Height(2, other), "x")
+        with pytest.raises(UsageError, match=f"{reference.value} height 5 m cannot be compared with {second.value}"):
+            Height(5, reference).minus(Height(2, second), "x")
 
 
 def test_altitude_above_takeoff_of_a_flight() -> None:
@@ -236,6 +236,6 @@ def test_the_origins_ground_is_no_height_of_the_site_itself(tmp_path: Path) -> N
 
 
 def test_overlapping_buildings_are_told(tmp_path: Path) -> None:
-    one, two = (f"  - {{name: {n}, height_m: 4, polygon_m: {SQUARE}}}\n" for n in "ab")
-    (tmp_path / "s.yaml").write_text(BASE + "buildings:\n" + one + two)
+    first, second = (f"  - {{name: {n}, height_m: 4, polygon_m: {SQUARE}}}\n" for n in "ab")
+    (tmp_path / "s.yaml").write_text(BASE + "buildings:\n" + first + second)
     assert any("the buildings 'a' and 'b' overlap" in note for note in load_site(tmp_path / "s.yaml").notes)

@@ -37,11 +37,11 @@ def test_density_is_met_and_uniform() -> None:
 
 
 def test_same_seed_same_trees_and_forests_are_independent() -> None:
-    one, again, other = place_trees(SQUARE, seed=1), place_trees(SQUARE, seed=1), place_trees(SQUARE, seed=2)
-    np.testing.assert_array_equal(one.east_m, again.east_m)
-    assert not np.array_equal(one.east_m, other.east_m)
+    forest, again, other = place_trees(SQUARE, seed=1), place_trees(SQUARE, seed=1), place_trees(SQUARE, seed=2)
+    np.testing.assert_array_equal(forest.east_m, again.east_m)
+    assert not np.array_equal(forest.east_m, other.east_m)
     renamed = place_trees(Forest("grove", SQUARE.area, 100, 4.0), seed=1)
-    assert not np.array_equal(one.east_m, renamed.east_m)
+    assert not np.array_equal(forest.east_m, renamed.east_m)
 
 
 def test_a_full_forest_stops_at_random_packing() -> None:
@@ -52,11 +52,11 @@ def test_a_full_forest_stops_at_random_packing() -> None:
 
 def test_first_come_is_what_throwing_one_by_one_gives() -> None:
     points = np.random.default_rng(3).random((300, 2)) * 40
-    kept: list[int] = []
+    standing: list[int] = []
     for i, point in enumerate(points):
-        if all(np.hypot(*(point - points[j])) >= 3 for j in kept):
-            kept.append(i)
-    assert np.flatnonzero(_first_come(points, 3.0)).tolist() == kept
+        if all(np.hypot(*(point - points[j])) >= 3 for j in standing):
+            standing.append(i)
+    assert np.flatnonzero(_first_come(points, 3.0)).tolist() == standing
 
 
 def test_trunks_keep_clear() -> None:

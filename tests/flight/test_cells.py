@@ -62,7 +62,7 @@ def flight(folder: Path, cells: str) -> Path:
 
 def test_cells_go_to_the_towers_that_the_flight_file_names(phone: Path) -> None:
     data = load_data(load_flight(flight(phone, "cells: {1: LW1, 2: LW2}")), phone)
-    assert [(one.tower, one.channel) for one in data.rss] == [("LW1", "lte_pci1"), ("LW2", "lte_pci2")]
+    assert [(series.tower, series.channel) for series in data.rss] == [("LW1", "lte_pci1"), ("LW2", "lte_pci2")]
     assert any("1 cells that 'cells' does not name are left out" in text for text in data.warnings)
     first = data.rss[0].serving
     assert first is not None
@@ -85,16 +85,16 @@ def test_serving_cells_are_compared_with_the_strongest_predicted(phone: Path, ex
     right = [np.where(np.arange(100) < 50, -60.0, -70.0), np.where(np.arange(100) < 50, -70.0, -60.0)]
     levels = right[::-1] if exchanged else right
     results = [SimpleNamespace(simulated_dbm=level) for level in levels]
-    found = serving_of(data.rss, results)  # type: ignore[arg-type]
-    assert found is not None
-    assert (found.n, found.hit_share, found.majority_share) == (100, hits, 0.5)
+    serving = serving_of(data.rss, results)  # type: ignore[arg-type]
+    assert serving is not None
+    assert (serving.n, serving.hit_share, serving.majority_share) == (100, hits, 0.5)
     assert serving_of(data.rss[:1], results[:1]) is None, "one cell is no choice"  # type: ignore[arg-type]
 
 
 def test_the_report_of_a_phone_shows_the_matrix_of_metrics_json(phone: Path) -> None:
     path = flight(phone, "cells: {1: LW1, 2: LW2}")
-    found = run_flight(load_data(load_flight(path), phone), audit=False)
-    record = report_data(found.data, found.result)
+    outcome = run_flight(load_data(load_flight(path), phone), audit=False)
+    record = report_data(outcome.data, outcome.result)
     assert record.serving is not None
     entry = metrics(record)["serving"]
     (spec,) = (p for p in figures.figure_specs(record) if p.section == "serving")

@@ -122,18 +122,18 @@ def test_too_few_samples_and_gaps_of_the_telemetry():
     broken = dataclasses.replace(
         ALONG, distance_m=holes, directions=np.where(np.isnan(holes)[:, None], np.nan, ALONG.directions)
     )
-    whole, part = channel(2.0, 5), dataclasses.replace(channel(2.0, 5), along=broken)
-    assert judge_clock([part]).n == judge_clock([whole]).n - 70  # 40 s of gap, 15 s of lag on either side
+    complete, part = channel(2.0, 5), dataclasses.replace(channel(2.0, 5), along=broken)
+    assert judge_clock([part]).n == judge_clock([complete]).n - 70  # 40 s of gap, 15 s of lag on either side
     assert judge_clock([part]).verdict == SHIFTED
 
 
 def test_a_track_of_one_pose_and_a_level_that_never_changes_are_no_fault():
     """A table of one instant has no place at either side of any; a constant leaves nothing to explain."""
-    one = dataclasses.replace(
+    instant = dataclasses.replace(
         ALONG, distance_m=ALONG.distance_m[:1], directions=ALONG.directions[:1],
         predicted_db={name: level[:1] for name, level in ALONG.predicted_db.items()},
     )  # fmt: skip
-    assert judge_clock([dataclasses.replace(channel(), along=one)]).verdict == CANNOT_TELL
+    assert judge_clock([dataclasses.replace(channel(), along=instant)]).verdict == CANNOT_TELL
     flat = dataclasses.replace(channel(), measured_db=np.full(920, -50.0))
     with np.errstate(divide="raise", invalid="raise"):
         assert judge_clock([flat]).verdict == CANNOT_TELL
@@ -151,8 +151,8 @@ def test_the_model_that_explains_the_level_is_chosen():
     free = ALONG.predicted_db["free space"]
     known = along(wrong=free + 4.0 * np.sin(GRID / 2.1), right=free + ripple, none=free)
     levels = dataclasses.replace(channel(1.2, 7), along=known)
-    heard = levels.measured_db + np.interp(levels.time_s - 1.2, GRID, ripple)
-    clock = judge_clock([dataclasses.replace(levels, measured_db=heard)])
+    rippled = levels.measured_db + np.interp(levels.time_s - 1.2, GRID, ripple)
+    clock = judge_clock([dataclasses.replace(levels, measured_db=rippled)])
     assert clock.model == "right"
     assert abs(clock.radio_minus_telemetry_s - 1.2) < 0.25
 
@@ -213,8 +213,8 @@ def test_the_verdict_follows_from_the_lags_that_are_left(peaks, verdict):
 
 def test_means_of_many_samples_are_those_of_their_seconds():
     t = np.arange(40.0, 400.0, 1 / 30.0)
-    one = ClockChannel(name="one", time_s=t, measured_db=np.sin(t), along=ALONG)
-    bins = _Bins.of([one], ALONG.features(), 15.0)
+    sine = ClockChannel(name="one", time_s=t, measured_db=np.sin(t), along=ALONG)
+    bins = _Bins.of([sine], ALONG.features(), 15.0)
     assert bins is not None
     assert bins.n == 360
     np.testing.assert_allclose(bins.mean_db[7], np.sin(t[(t >= 47) & (t < 48)]).mean())
@@ -234,8 +234,8 @@ def test_channels_of_one_place_and_time_have_the_likelihoods_of_each_alone():
     parts = [[_Parts(5.0, 0.3, 1.0)], [_Parts(2.0, 0.1, 0.5), _Parts(15.0, 0.9, 2.0)], [_Parts(40.0, 0.3, 0.05)]]
     lags, both = np.arange(-9.0, 9.1, 0.5), _Bins.of(together, ALONG.features(), 15.0)
     assert both is not None
-    for one, its, expected in zip(channels, parts, both.likelihood(lags, parts), strict=True):
-        alone = _Bins.of([one], ALONG.features(), 15.0)
+    for single, its, expected in zip(channels, parts, both.likelihood(lags, parts), strict=True):
+        alone = _Bins.of([single], ALONG.features(), 15.0)
         assert alone is not None
         np.testing.assert_allclose(alone.likelihood(lags, [its])[0], expected, rtol=1e-9)
     missing = dataclasses.replace(channels[2], measured_db=np.where(np.arange(920) == 7, np.nan, 1.0))
@@ -249,8 +249,8 @@ def test_a_jittering_attitude_makes_no_sharp_optimum():
     jitter[:, 3:] += rng.normal(0.0, 0.1, (len(GRID), 3))
     shaken = dataclasses.replace(ALONG, directions=jitter)
     t = np.arange(20.0, 480.0, 1 / 30.0)
-    one = channel(0.0, 9, gain_db=12.0, memory_db=0.5, t=t, known=shaken)
-    bins = _Bins.of([one], shaken.features(), 15.0)
+    shaken_channel = channel(0.0, 9, gain_db=12.0, memory_db=0.5, t=t, known=shaken)
+    bins = _Bins.of([shaken_channel], shaken.features(), 15.0)
     assert bins is not None
     value = bins.likelihood(np.arange(-0.6, 0.61, 0.1), [[_Parts(5.0, 0.1, 1.0)]])[0, 0]
     assert value.max() - value[0] > 4.0  # the lag is seen
@@ -329,8 +329,8 @@ def small_bins(t: np.ndarray, window_s: float = 5.0, start_s: float = 0.0, rows:
     table = Along(
         start_s=start_s, step_s=0.1, predicted_db={"m": at}, distance_m=at + 1.0, directions=np.ones((rows, 6))
     )
-    one = ClockChannel(name="one", time_s=t, measured_db=np.sin(t), along=table)
-    return _Bins.of([one], np.column_stack([np.ones(rows), at]), window_s)
+    sine = ClockChannel(name="one", time_s=t, measured_db=np.sin(t), along=table)
+    return _Bins.of([sine], np.column_stack([np.ones(rows), at]), window_s)
 
 
 def test_bins_are_seconds_or_nine_hundredths_and_eight_instants_of_each_are_asked() -> None:
@@ -354,12 +354,12 @@ def test_bins_are_seconds_or_nine_hundredths_and_eight_instants_of_each_are_aske
     np.testing.assert_allclose(residual[:, 0], expected - expected.mean(), atol=1e-9)
 
 
-@pytest.mark.parametrize(("first", "last", "kept"), [(5.0, 75.0, 71), (4.9, 74.9, 70), (5.0, 93.0, 88)])
-def test_samples_whose_lags_the_telemetry_does_not_reach_take_no_part(first: float, last: float, kept: int) -> None:
+@pytest.mark.parametrize(("first", "last", "count"), [(5.0, 75.0, 71), (4.9, 74.9, 70), (5.0, 93.0, 88)])
+def test_samples_whose_lags_the_telemetry_does_not_reach_take_no_part(first: float, last: float, count: int) -> None:
     """Telemetry from 100 s to 197.9 s of its clock: a window of 5 s on either side lies within it, a row beyond it."""
     bins = small_bins(100.0 + np.arange(first, last + 0.01), start_s=100.0, rows=980)
     assert bins is not None
-    assert len(bins.at_s) == kept
+    assert len(bins.at_s) == count
 
 
 @pytest.mark.parametrize(("bend", "finest"), [(30.0, 0.02), (0.01, 0.5)])
@@ -381,17 +381,17 @@ def test_lags_are_tried_finely_where_one_stands_out(bend: float, finest: float) 
 
 
 def test_the_parts_of_a_likelihood_are_the_best_of_their_grid() -> None:
-    one = _Bins.of([channel(0.0, 5, t=np.arange(20.0, 120.0, 1.0))], ALONG.features(), 15.0)
-    assert one is not None
+    bins = _Bins.of([channel(0.0, 5, t=np.arange(20.0, 120.0, 1.0))], ALONG.features(), 15.0)
+    assert bins is not None
     columns, flat = (
-        one.systems(np.array([0.5])),
-        np.column_stack([np.ones(one.n), np.zeros(one.n), one.mean_db - one.mean_db.mean()]),
+        bins.systems(np.array([0.5])),
+        np.column_stack([np.ones(bins.n), np.zeros(bins.n), bins.mean_db - bins.mean_db.mean()]),
     )
     tried = {
-        (memory, white, gain): _likelihood(columns, one.mean_s, 1, [_Parts(memory, white, gain)])[0, 0, 0]
+        (memory, white, gain): _likelihood(columns, bins.mean_s, 1, [_Parts(memory, white, gain)])[0, 0, 0]
         for memory in (2.0, 5.0, 15.0, 40.0) for white in (0.1, 0.3, 0.9) for gain in (0.05, 0.5, 1.0, 2.0)
     }  # fmt: skip
-    assert one.fitted(np.array([0.5])) == [[_Parts(*max(tried, key=tried.__getitem__))]]
+    assert bins.fitted(np.array([0.5])) == [[_Parts(*max(tried, key=tried.__getitem__))]]
     memories = {key[:2] for key in tried}
-    constant = [_likelihood(flat[:, None], one.mean_s, 1, [_Parts(*key, 0.0)])[0, 0, 0] for key in memories]
-    assert one.constant() == pytest.approx(max(constant))
+    constant = [_likelihood(flat[:, None], bins.mean_s, 1, [_Parts(*key, 0.0)])[0, 0, 0] for key in memories]
+    assert bins.constant() == pytest.approx(max(constant))

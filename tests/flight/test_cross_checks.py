@@ -45,11 +45,11 @@ def _asked(file: IngestedFile, timezone: str | None = ZONE) -> list[str]:
     ],
 )
 def test_the_name_of_a_file_is_compared_with_its_start(name: str, start: str, asked: bool) -> None:
-    found = _asked(_log(name, start))
-    assert bool(found) is asked
+    remarks = _asked(_log(name, start))
+    assert bool(remarks) is asked
     if asked:
-        assert start.replace("T", " ")[:16] in found[0]
-        assert "the file's name says 20" in found[0]
+        assert start.replace("T", " ")[:16] in remarks[0]
+        assert "the file's name says 20" in remarks[0]
 
 
 @pytest.mark.parametrize(("start", "asked"), [("2024-02-09T22:20:56", False), ("2009-02-24T22:20:56", True)])
@@ -57,10 +57,10 @@ def test_a_nemo_summary_beside_a_log_is_compared_with_its_start(tmp_path: Path, 
     (tmp_path / "24Feb09_172055.1.csv").write_text("guid\nDevice ID;1\nMeasurement start;2024 Feb 09 17:20\n")
     (tmp_path / "other.csv").write_text("Measurement start;2001 Jan 01 17:20\n")
     (tmp_path / "24Feb09_172055.2.csv").mkdir()  # a folder holds no words
-    found = _asked(_log(tmp_path / "24Feb09_172055.1.gpx", start))
-    assert bool(found) is asked
+    remarks = _asked(_log(tmp_path / "24Feb09_172055.1.gpx", start))
+    assert bool(remarks) is asked
     if asked:
-        assert "Measurement start in 24Feb09_172055.1.csv says 2024-02-09 17:20" in found[0]
+        assert "Measurement start in 24Feb09_172055.1.csv says 2024-02-09 17:20" in remarks[0]
 
 
 def test_a_nemo_summary_in_the_zip_that_holds_the_log(tmp_path: Path) -> None:
@@ -75,10 +75,10 @@ def test_a_nemo_summary_in_the_zip_that_holds_the_log(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("low_m", "asked"), [(0.4, False), (-2.0, False), (24.3, True), (110.0, True), (-40.0, True)])
 def test_a_track_that_does_not_begin_on_the_ground_is_asked_about(low_m: float, asked: bool) -> None:
-    found = _asked(_log("plain.csv", "2024-07-02T15:00:00", low_m=low_m))
-    assert bool(found) is asked
+    remarks = _asked(_log("plain.csv", "2024-07-02T15:00:00", low_m=low_m))
+    assert bool(remarks) is asked
     if asked:
-        assert f"the lowest height is {low_m:.0f} m" in found[0]
+        assert f"the lowest height is {low_m:.0f} m" in remarks[0]
 
 
 def test_what_is_assumed_is_asked_and_what_is_written_is_not() -> None:

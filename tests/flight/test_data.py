@@ -39,18 +39,18 @@ def _halves(folder: Path, log: str) -> list[str]:
 
 def test_a_radio_started_anew_is_one_record(tmp_path: Path) -> None:
     log = "LW1/USRP1_power_log.txt"
-    (whole,) = _flight(tmp_path, f"path: {SAMPLE / log}, node: LW1, channel: USRP1").rss
+    (uncut,) = _flight(tmp_path, f"path: {SAMPLE / log}, node: LW1, channel: USRP1").rss
     parts = _flight(tmp_path, *(f"path: {p}, node: LW1, channel: USRP1" for p in _halves(tmp_path, log)))
     (joined,) = parts.rss
-    np.testing.assert_array_equal(joined.time, whole.time)
-    np.testing.assert_array_equal(joined.measured_db, whole.measured_db)
+    np.testing.assert_array_equal(joined.time, uncut.time)
+    np.testing.assert_array_equal(joined.measured_db, uncut.measured_db)
     assert len(parts.files) == 3
 
 
 def test_parts_of_which_one_says_no_serving_cell_are_one_record(tmp_path: Path) -> None:
     """A phone that changed its log: where a part says nothing of the serving cell, nothing is known, in either order."""
     halves = _halves(tmp_path, "LW1/USRP1_power_log.txt")
-    whole = _flight(tmp_path, *(f"path: {p}, node: LW1, channel: USRP1" for p in halves))
+    uncut = _flight(tmp_path, *(f"path: {p}, node: LW1, channel: USRP1" for p in halves))
     settings = load_flight(tmp_path / "flight.yaml")
     for spoken in range(2):
         files = read_logs(settings, tmp_path)
@@ -58,17 +58,17 @@ def test_parts_of_which_one_says_no_serving_cell_are_one_record(tmp_path: Path) 
         levels[spoken].frame["serving"] = 1.0
         (joined,) = gather(settings, tmp_path, files).rss
         assert joined.serving is not None
-        assert len(joined.serving) == len(joined.time) == len(whole.rss[0].time)
+        assert len(joined.serving) == len(joined.time) == len(uncut.rss[0].time)
         assert np.nansum(joined.serving) == np.isfinite(joined.serving).sum() > 100
         assert np.isnan(joined.serving).sum() > 100
 
 
 def test_a_rank_log_in_two_parts_is_one_record(tmp_path: Path) -> None:
     log = "UAV/modem_ri.csv"
-    (whole,) = _flight(tmp_path, f"path: {SAMPLE / log}").rank
+    (uncut,) = _flight(tmp_path, f"path: {SAMPLE / log}").rank
     (joined,) = _flight(tmp_path, *(f"path: {p}" for p in _halves(tmp_path, log))).rank
-    np.testing.assert_array_equal(joined.rank, whole.rank)
-    np.testing.assert_array_equal(joined.position_m, whole.position_m)
+    np.testing.assert_array_equal(joined.rank, uncut.rank)
+    np.testing.assert_array_equal(joined.position_m, uncut.position_m)
 
 
 def test_two_records_of_one_channel_are_refused(tmp_path: Path) -> None:
@@ -227,8 +227,8 @@ def test_a_ratio_becomes_a_level_where_its_noise_is_known(
         {"flight": "f", "logs": [{"path": "a"}], "link": {"rss": {"carrier_hz": 3e9} | given}}
     ).link.rss
     frame = pd.DataFrame({"rss_db": [1.0]})
-    found, left = data._noise(_stream("rss", "snr", frame), link)
-    assert found == (None if noise is None else pytest.approx(noise, abs=0.1))
+    noise_dbm, left = data._noise(_stream("rss", "snr", frame), link)
+    assert noise_dbm == (None if noise is None else pytest.approx(noise, abs=0.1))
     if noise is not None:
         assert (left.bandwidth_hz, left.noise_floor_dbm) == (None, floor)
     assert data._noise(_stream("rss", "quality", frame), link) == (None, link)

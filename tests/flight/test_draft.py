@@ -94,8 +94,8 @@ def test_a_radio_clock_in_utc_is_asked_about_and_compared(logs: Path) -> None:
     assert any("samples can be compared" in remark for remark in remarks)
     settings = parse_yaml(text, FlightFile)
     data = load_data(settings, logs)
-    one, other = (next(s for s in data.rss if (s.tower, s.channel) == ("LW1", c)) for c in ("USRP1", "USRP2"))
-    assert abs(one.time[0] - other.time[0]) < np.timedelta64(2, "s")
+    utc_series, other = (next(s for s in data.rss if (s.tower, s.channel) == ("LW1", c)) for c in ("USRP1", "USRP2"))
+    assert abs(utc_series.time[0] - other.time[0]) < np.timedelta64(2, "s")
 
 
 def test_what_a_draft_names_is_read_whatever_it_is_called(logs: Path) -> None:
@@ -208,15 +208,15 @@ def test_sparse_telemetry_is_named_as_the_reason_why_nothing_is_compared(
     rows = telemetry.read_text().splitlines(keepends=True)
     step_s = 14
     per_s = round((len(rows) - 1) / float(np.ptp([_seconds(row) for row in (rows[1], rows[-2])])))
-    thin = [row.replace(".000000,", ".313000,") for row in rows[:: step_s * per_s]]  # and no sample is at a fix
-    telemetry.write_text("".join(thin))
+    sparse = [row.replace(".000000,", ".313000,") for row in rows[:: step_s * per_s]]  # and no sample is at a fix
+    telemetry.write_text("".join(sparse))
     target = logs.parent / "flight.yaml"
     call = ["ingest", str(telemetry), str(logs / "LW1"), "--timezone", ZONE, "--draft", str(target)]
     assert main(call) == 0
-    said = capsys.readouterr().err
-    assert "no sample of this draft can be compared" in said
-    assert " samples lie within the telemetry: it has a fix every 14 s" in said
-    assert "time_origin" not in said
+    message = capsys.readouterr().err
+    assert "no sample of this draft can be compared" in message
+    assert " samples lie within the telemetry: it has a fix every 14 s" in message
+    assert "time_origin" not in message
     assert "No sample of this draft can be compared" in target.read_text()
 
 
@@ -400,21 +400,21 @@ def test_the_track_is_the_telemetry_that_most_logs_meet_then_the_longest() -> No
     def file(*streams: Any) -> Any:
         return SimpleNamespace(result=SimpleNamespace(streams=list(streams)))
 
-    def moved(one: Any, seconds: float) -> Any:
-        one.frame["time"] += np.timedelta64(round(1e9 * seconds), "ns")
-        return one
+    def moved(log: Any, seconds: float) -> Any:
+        log.frame["time"] += np.timedelta64(round(1e9 * seconds), "ns")
+        return log
 
     short, long = stream("telemetry", np.zeros(10)), moved(stream("telemetry", np.zeros(500)), 1000.0)
     level = stream("rss", np.zeros(3))
-    found = drafting._flown([file(long), file(short), file(level)])
-    assert found is not None
-    assert found[0] is short
-    found = drafting._flown([file(long), file(short)])
-    assert found is not None
-    assert found[0] is long
+    flown = drafting._flown([file(long), file(short), file(level)])
+    assert flown is not None
+    assert flown[0] is short
+    flown = drafting._flown([file(long), file(short)])
+    assert flown is not None
+    assert flown[0] is long
     assert drafting._flown([file(level)]) is None
     edge, after = moved(stream("rss", np.zeros(2)), 9.0), moved(stream("rss", np.zeros(2)), 9.5)
-    spans = [drafting.stream_span(one) for one in (short, edge, after)]
+    spans = [drafting.stream_span(log) for log in (short, edge, after)]
     assert drafting._meet(spans[0], spans[1])
     assert not drafting._meet(spans[0], spans[2])
     assert drafting._has_level([file(edge)], (short, spans[0]))

@@ -23,9 +23,9 @@ TRACK = SimpleNamespace(pose_at=np.asarray, why_not=lambda _: "most are after te
     ],
 )
 def test_a_loss_has_its_first_reason(counts: tuple[int, int, int], track: object, words: str) -> None:
-    found = dry_run._loss(SimpleNamespace(track=track), np.zeros(3), counts)  # type: ignore[arg-type]
-    assert found.startswith(words)
-    assert bool(found) == bool(words)
+    reason = dry_run._loss(SimpleNamespace(track=track), np.zeros(3), counts)  # type: ignore[arg-type]
+    assert reason.startswith(words)
+    assert bool(reason) == bool(words)
 
 
 def test_values_positions_and_heights_are_counted_one_after_the_other() -> None:

@@ -29,18 +29,18 @@ def rover(folder: Path, steps_deg: float) -> Path:
 
 def test_a_node_with_a_place_is_a_tower(tmp_path):
     site = load_site("lake_wheeler")
-    found, _ = ground_nodes(site, flight(latitude_deg=35.728, longitude_deg=-78.697, antenna_height_m=1.0), tmp_path)
+    placed, _ = ground_nodes(site, flight(latitude_deg=35.728, longitude_deg=-78.697, antenna_height_m=1.0), tmp_path)
     east, north = site.frame.to_local([35.728], [-78.697])
-    assert found.towers["ROVER"].position_m == pytest.approx([east[0], north[0], 1.0])
-    assert set(found.towers) == {*site.towers, "ROVER"}
+    assert placed.towers["ROVER"].position_m == pytest.approx([east[0], north[0], 1.0])
+    assert set(placed.towers) == {*site.towers, "ROVER"}
     assert "ROVER" not in site.towers
 
 
 def test_a_track_that_stays_is_a_place_and_one_that_moves_a_track(tmp_path):
     site = load_site("lake_wheeler")
     rover(tmp_path, 1e-7)  # 0.3 m in all
-    found, _ = ground_nodes(site, flight(track="rover.csv"), tmp_path)
-    assert found.towers["ROVER"].latitude_deg == pytest.approx(35.728, abs=3e-6)
+    still, _ = ground_nodes(site, flight(track="rover.csv"), tmp_path)
+    assert still.towers["ROVER"].latitude_deg == pytest.approx(35.728, abs=3e-6)
     rover(tmp_path, 1e-5)  # 32 m
     warnings: list[str] = []
     moved, nodes = ground_nodes(site, flight(track="rover.csv"), tmp_path, warnings)

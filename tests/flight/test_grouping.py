@@ -65,9 +65,9 @@ def test_two_flights_in_a_folder_give_two_drafts(tmp_path: Path, capsys: pytest.
 def test_two_aircraft_at_one_time_are_two_flights(tmp_path: Path) -> None:
     write_flight(tmp_path / "here", "2025-03-02T15:00:00")
     write_flight(tmp_path / "there", "2025-03-02T15:00:10", east_deg=-78.5)
-    found = flights(ingest(tmp_path, options=OPTIONS))
-    assert len(found) == 2
-    assert sorted(len(flight.files) for flight in found) in ([2, 2], [1, 3])
+    grouped = flights(ingest(tmp_path, options=OPTIONS))
+    assert len(grouped) == 2
+    assert sorted(len(flight.files) for flight in grouped) in ([2, 2], [1, 3])
 
 
 def test_relative_logs_find_the_flight_on_whose_track_they_lie(tmp_path: Path) -> None:
@@ -120,8 +120,8 @@ def test_radio_logs_of_two_days_without_any_track_are_two_drafts(tmp_path: Path)
 def test_a_phone_that_knows_no_date_goes_with_the_flight_in_its_folder(tmp_path: Path) -> None:
     write_flight(tmp_path / "day", "2025-03-02T15:00:00")
     _phone_without_date(tmp_path / "day" / "60m.csv", 10)
-    (found,) = flights(ingest(tmp_path, options=OPTIONS))
-    assert "60m.csv" in {Path(file.path).name for file in found.files}
+    (flight,) = flights(ingest(tmp_path, options=OPTIONS))
+    assert "60m.csv" in {Path(file.path).name for file in flight.files}
 
 
 def stream_of(frame: pd.DataFrame) -> Stream:
@@ -135,9 +135,9 @@ def test_the_origin_is_found_to_a_tenth_of_a_second(shift_s: float) -> None:
     log = flown.iloc[40:240].assign(time=lambda f: np.datetime64(0, "ns") + (f["time"].to_numpy() - origin))
     noise = np.random.default_rng(1).normal(0, 1e-5, (2, len(log)))
     log = log.assign(latitude_deg=log["latitude_deg"] + noise[0], longitude_deg=log["longitude_deg"] + noise[1])
-    found = origin_of(stream_of(log), stream_of(flown))
-    assert found is not None
-    assert abs(found.time - origin) <= np.timedelta64(150, "ms")
+    estimate = origin_of(stream_of(log), stream_of(flown))
+    assert estimate is not None
+    assert abs(estimate.time - origin) <= np.timedelta64(150, "ms")
 
 
 def test_no_origin_for_another_track_or_a_hover() -> None:
@@ -192,9 +192,9 @@ def test_no_origin_for_a_lap_of_a_route_that_is_flown_again() -> None:
     log = log.assign(time=np.datetime64(0, "ns") + np.arange(len(log)) * np.timedelta64(1, "s"))
     assert origin_of(stream_of(log), stream_of(flown)) is None
     once = flown.assign(longitude_deg=flown["longitude_deg"] + np.where(t < 200, 2e-5 * t, 4e-3))
-    found = origin_of(stream_of(log.assign(longitude_deg=once["longitude_deg"].to_numpy()[20:210])), stream_of(once))
-    assert found is not None
-    assert abs(found.time - (np.datetime64("2025-03-02T15:00:20", "ns"))) <= np.timedelta64(150, "ms")
+    estimate = origin_of(stream_of(log.assign(longitude_deg=once["longitude_deg"].to_numpy()[20:210])), stream_of(once))
+    assert estimate is not None
+    assert abs(estimate.time - (np.datetime64("2025-03-02T15:00:20", "ns"))) <= np.timedelta64(150, "ms")
 
 
 def test_a_log_that_goes_with_no_flight_is_said_once_beside_the_first(tmp_path: Path) -> None:
@@ -203,8 +203,8 @@ def test_a_log_that_goes_with_no_flight_is_said_once_beside_the_first(tmp_path: 
     times = np.datetime64("2025-03-09T15:00:00", "ns") + np.arange(50) * np.timedelta64(1, "s")
     (tmp_path / "LW2_power_log.txt").write_bytes(format_power_log(times, np.linspace(-40, -60, 50), ZONE))
     made = drafts(ingest(tmp_path, options=OPTIONS), tmp_path, timezone=ZONE)
-    assert len({one.name for one in made}) == len(made) == 2
-    said = [[text for text in one.remarks if "it goes with no flight here" in text] for one in made]
+    assert len({draft.name for draft in made}) == len(made) == 2
+    said = [[text for text in draft.remarks if "it goes with no flight here" in text] for draft in made]
     assert said == [["left out: LW2_power_log.txt: it goes with no flight here"], []]
 
 
@@ -215,11 +215,11 @@ def test_a_log_may_lie_twelve_metres_beside_the_track(aside_m: float, agrees: bo
     log = flown.iloc[40:240].assign(time=lambda f: np.datetime64(0, "ns") + (f["time"] - f["time"].iloc[0]).to_numpy())
     east = np.degrees(aside_m / (6378137.0 * np.cos(np.radians(flown["latitude_deg"].iloc[0]))))
     log = log.assign(longitude_deg=log["longitude_deg"] + east, altitude_m=log["altitude_m"] + 200.0)
-    found = origin_of(stream_of(log), stream_of(flown))
-    assert (found is not None) == agrees
-    if found is not None:
-        assert abs(found.time - flown["time"].iloc[40]) <= np.timedelta64(2500, "ms")
-        assert found.distance_m == pytest.approx(0.9 * aside_m, abs=0.3)
+    estimate = origin_of(stream_of(log), stream_of(flown))
+    assert (estimate is not None) == agrees
+    if estimate is not None:
+        assert abs(estimate.time - flown["time"].iloc[40]) <= np.timedelta64(2500, "ms")
+        assert estimate.distance_m == pytest.approx(0.9 * aside_m, abs=0.3)
     assert origin_of(stream_of(log.iloc[:19]), stream_of(flown)) is None
     assert origin_of(stream_of(flown.iloc[40:240]), stream_of(flown)) is None, "its times are times of a day"
 
@@ -235,11 +235,11 @@ def test_the_miss_is_the_median_distance_whatever_the_heights_count_from() -> No
     assert np.isnan(time_origin._median_distance(time - 5.5, here, time, way))
     frame = pd.DataFrame({"time": pd.to_datetime(np.arange(500.0), unit="s"), "latitude_deg": 35.0 + 1e-5 * np.arange(500.0),
                           "longitude_deg": -78.0, "altitude_m": np.nan})  # fmt: skip
-    thin = time_origin._points(frame.sample(frac=1.0, random_state=1), 240)
-    assert thin is not None
-    assert len(thin[0]) == 240
-    assert (thin[0][0], thin[0][-1]) == (np.datetime64(0, "s"), np.datetime64(499, "s"))
-    metres = time_origin._metres(thin[1], thin[1])
+    sampled = time_origin._points(frame.sample(frac=1.0, random_state=1), 240)
+    assert sampled is not None
+    assert len(sampled[0]) == 240
+    assert (sampled[0][0], sampled[0][-1]) == (np.datetime64(0, "s"), np.datetime64(499, "s"))
+    metres = time_origin._metres(sampled[1], sampled[1])
     assert metres[-1] == pytest.approx([0.0, 499 * 1.1132, 0.0])
     sixty_north = time_origin._metres(np.array([[60.0, 10.001, 7.0]]), np.array([[60.0, 10.0, 0.0]]))
     assert sixty_north[0] == pytest.approx([55.66, 0.0, 7.0], abs=1e-3)

@@ -43,8 +43,8 @@ def test_a_track_at_the_given_height_is_that_of_a_log_that_tells_it(tmp_path: Pa
     times = given.rss[0].time
     np.testing.assert_array_equal(given.track.pose_at(times).position_m, logged.track.pose_at(times).position_m)
     assert given.rss[0].measured_db.tolist() == logged.rss[0].measured_db.tolist()
-    told = [text for text in given.warnings if "30 m above take-off in all of it" in text]
-    assert len(told) == 1
+    notes = [text for text in given.warnings if "30 m above take-off in all of it" in text]
+    assert len(notes) == 1
     assert not [text for text in given.warnings if "give the track another log" in text]
     low = flight(tmp_path, ", height_m: 1.5")
     assert low.track is not None

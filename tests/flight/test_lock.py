@@ -32,40 +32,42 @@ def _quality(locked: FloatArray) -> FloatArray:
 def test_rows_lost_from_the_power_move_the_quality_back_to_its_own_times() -> None:
     time, level, locked = _flight()
     quality = _quality(locked)
-    kept = np.flatnonzero(np.random.default_rng(2).random(len(time)) > 0.1)  # rows that a merge with telemetry lost
-    power = _stream("power", time[kept], level[kept])
-    beside = _stream("quality", time[kept], quality[: len(kept)], "dB")  # and the quality did not: paired by row
-    found, said = lock_of(power, [beside])
-    assert found is not None
-    known = np.isfinite(found)
+    logged = np.flatnonzero(np.random.default_rng(2).random(len(time)) > 0.1)  # rows that a merge with telemetry lost
+    power = _stream("power", time[logged], level[logged])
+    quality_rows = _stream(
+        "quality", time[logged], quality[: len(logged)], "dB"
+    )  # and the quality did not: paired by row
+    lock, note = lock_of(power, [quality_rows])
+    assert lock is not None
+    known = np.isfinite(lock)
     assert known.mean() > 0.85
-    assert np.mean(found[known] == locked[kept][known]) > 0.98
-    assert np.mean((beside.frame["rss_db"] > 60.0).to_numpy() == locked[kept]) < 0.9, "as paired it is wrong"
-    assert "ahead" in said
-    assert "26 s" in said  # 8000 rows of 0.0328 s, a tenth of them lost
+    assert np.mean(lock[known] == locked[logged][known]) > 0.98
+    assert np.mean((quality_rows.frame["rss_db"] > 60.0).to_numpy() == locked[logged]) < 0.9, "as paired it is wrong"
+    assert "ahead" in note
+    assert "26 s" in note  # 8000 rows of 0.0328 s, a tenth of them lost
 
 
 def test_a_quality_paired_in_time_stays() -> None:
     time, level, locked = _flight()
-    found, said = lock_of(_stream("power", time, level), [_stream("quality", time, _quality(locked), "dB")])
-    assert found is not None
-    assert said == ""
-    assert np.array_equal(found == 1.0, locked)
+    lock, note = lock_of(_stream("power", time, level), [_stream("quality", time, _quality(locked), "dB")])
+    assert lock is not None
+    assert note == ""
+    assert np.array_equal(lock == 1.0, locked)
 
 
 def test_a_quality_of_another_log_is_taken_at_the_nearest_time() -> None:
     time, level, locked = _flight()
     late = _stream("quality", time[100:4000] + 0.004, _quality(locked)[100:4000], "dB")
-    found, _ = lock_of(_stream("power", time, level), [late])
-    assert found is not None
-    assert np.isnan(found[:90]).all()
-    assert np.isnan(found[4010:]).all()
-    assert np.array_equal(found[110:3990] == 1.0, locked[110:3990])
+    lock, _ = lock_of(_stream("power", time, level), [late])
+    assert lock is not None
+    assert np.isnan(lock[:90]).all()
+    assert np.isnan(lock[4010:]).all()
+    assert np.array_equal(lock[110:3990] == 1.0, locked[110:3990])
 
 
 @pytest.mark.parametrize(("middle", "lock"), [(72.2, True), (40.0, False), (90.0, False)])
 def test_a_quality_near_the_peak_of_a_locked_correlator_is_a_lock(middle: float, lock: bool) -> None:
     time = np.arange(40.0)
     assert may_lose_lock(_stream("quality", time, middle + 0.1 * (time % 3), "dB")) is lock
-    found, _ = lock_of(_stream("power", time, time), [_stream("quality", time, middle + 0.1 * (time % 3), "dB")])
-    assert (found is not None) is lock
+    states, _ = lock_of(_stream("power", time, time), [_stream("quality", time, middle + 0.1 * (time % 3), "dB")])
+    assert (states is not None) is lock

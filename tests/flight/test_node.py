@@ -132,28 +132,28 @@ def test_a_place_wants_odds_of_two_and_a_listed_one_as_many_as_any_tower(
     asked: list[FloatArray] = []
     monkeypatch.setattr(node, "locate", lambda _, places: asked.append(places) or estimate)
     track = level_track(4.0 * np.arange(20), np.zeros((20, 3)), np.zeros(20))
-    found = placer.propose(track)
-    assert found is not None
+    proposal = placer.propose(track)
+    assert proposal is not None
     assert len(asked[0]) == len(names) + len(listed)
     assert placer.propose(level_track(4.0 * np.arange(19), np.zeros((19, 3)), np.zeros(19))) is None
     if isinstance(said, int):
-        assert found.tower is not None
-        assert (found.node, found.tower["antenna_height_m"], found.radius_m) == ("NODE", 1.5, 0.0)
-        assert f"line {said}" in found.question
-        assert (f"line {15 - said}" in found.question) == (max(listed) - min(listed) < 3.0)
+        assert proposal.tower is not None
+        assert (proposal.node, proposal.tower["antenna_height_m"], proposal.radius_m) == ("NODE", 1.5, 0.0)
+        assert f"line {said}" in proposal.question
+        assert (f"line {15 - said}" in proposal.question) == (max(listed) - min(listed) < 3.0)
         np.testing.assert_allclose(asked[0][-2:], [[-100.0, 50.0, 1.5], [250.0, -90.0, 1.5]], atol=1e-3)
     elif said == "estimate":
-        assert found.tower is not None
-        east, north = SITE.frame.to_local(*(np.array([found.tower[f"{k}_deg"]]) for k in ("latitude", "longitude")))
+        assert proposal.tower is not None
+        east, north = SITE.frame.to_local(*(np.array([proposal.tower[f"{k}_deg"]]) for k in ("latitude", "longitude")))
         assert (east[0], north[0]) == pytest.approx(tuple(at[:2]), abs=0.02)
         near = [n for n, t in SITE.towers.items() if np.hypot(*(np.array(t.position_m) - at)[:2]) <= 77.0]
-        assert (f"({', '.join(near)} possible)" if near else "no tower fits") in found.question
-        assert (found.radius_m, found.tower["antenna_height_m"]) == (77.0, 10.0)
+        assert (f"({', '.join(near)} possible)" if near else "no tower fits") in proposal.question
+        assert (proposal.radius_m, proposal.tower["antenna_height_m"]) == (77.0, 10.0)
         again = placer.propose(track)
         assert again is not None
-        assert (again.node, again.tower) == (found.node, None)  # the same place has one name
+        assert (again.node, again.tower) == (proposal.node, None)  # the same place has one name
     else:
-        assert (found.node, found.tower) == (names[("LW1", "LW2").index(said)], None)
+        assert (proposal.node, proposal.tower) == (names[("LW1", "LW2").index(said)], None)
 
 
 def test_nodes_a_hundred_metres_apart_have_names_of_their_own() -> None:

@@ -26,7 +26,9 @@ def test_a_key_changes_itself_alone(settings: FlightFile) -> None:
     assert overridden(settings, {}) is settings
     assert overridden(settings, {"rt.maximum_gap_s": 7.0}).rt.advanced.maximum_gap_s == 7.0  # as 0.3 named it
     log = overridden(settings, {"logs.1.channel": "Z"})
-    assert [one.channel for one in log.logs] == ["Z" if k == 1 else one.channel for k, one in enumerate(settings.logs)]
+    assert [entry.channel for entry in log.logs] == [
+        "Z" if k == 1 else entry.channel for k, entry in enumerate(settings.logs)
+    ]
 
 
 def test_new_channels_and_towers_begin_as_copies_whatever_the_order(settings: FlightFile) -> None:

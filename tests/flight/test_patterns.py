@@ -50,9 +50,9 @@ def test_routes_stay_within_area_battery_and_away_from_towers(nose, shape, azimu
 def test_the_way_round_an_obstacle_is_the_shorter_one():
     ring = shapely.box(0, 0, 100, 100).difference(shapely.box(30, 20, 70, 70))
     way = path_within(ring, np.array([10.0, 30.0]), np.array([90.0, 30.0]))
-    whole = shapely.LineString([(10, 30), *way, (90, 30)])
-    assert ring.buffer(1.5).covers(whole)
-    assert whole.length == pytest.approx(80.0 + 2 * 10.0, abs=3.0)  # below, not above
+    route = shapely.LineString([(10, 30), *way, (90, 30)])
+    assert ring.buffer(1.5).covers(route)
+    assert route.length == pytest.approx(80.0 + 2 * 10.0, abs=3.0)  # below, not above
     assert path_within(ring, np.array([10.0, 10.0]), np.array([90.0, 10.0])) == []
     for begin, end in (((10.0, 60.0), (90.0, 60.0)), ((90.0, 60.0), (10.0, 60.0)), ((40.0, 10.0), (40.0, 90.0))):
         way = path_within(ring, np.array(begin), np.array(end))

@@ -139,12 +139,12 @@ def test_a_shuffled_log_is_the_log_in_order(order):
     seconds = np.arange(60.0)
     east = 40 * np.sin(seconds / 9)
     ordered = telemetry(seconds, east, 3 * seconds, 10, roll_deg=1, pitch_deg=seconds / 10, yaw_deg=seconds)
-    one, two = Track(ordered, FRAME), Track(ordered.iloc[order].reset_index(drop=True), FRAME)
+    in_order, shuffled = Track(ordered, FRAME), Track(ordered.iloc[order].reset_index(drop=True), FRAME)
     asked = at(np.arange(0, 59, 0.7))
-    np.testing.assert_array_equal(two.pose_at(asked).position_m, one.pose_at(asked).position_m)
-    np.testing.assert_array_equal(two.pose_at(asked).rotation, one.pose_at(asked).rotation)
-    assert (two.account.backward_time, one.account.steps_sorted) == (0, 0)
-    assert any("sorted by time" in text for text in two.account.warnings)
+    np.testing.assert_array_equal(shuffled.pose_at(asked).position_m, in_order.pose_at(asked).position_m)
+    np.testing.assert_array_equal(shuffled.pose_at(asked).rotation, in_order.pose_at(asked).rotation)
+    assert (shuffled.account.backward_time, in_order.account.steps_sorted) == (0, 0)
+    assert any("sorted by time" in text for text in shuffled.account.warnings)
 
 
 def test_poses_asked_twice_are_those_of_the_instants():
@@ -266,8 +266,8 @@ def test_velocities_that_no_log_holds_are_slopes_over_two_seconds_on_either_side
     np.testing.assert_allclose(
         east, [4 / 2, 9 / 3, 16 / 4, 24 / 4, 32 / 4, (53 - 9) / 4, (121 - 16) / 7, 85 / 5], atol=1e-3
     )
-    two = Track(telemetry([0.0, 2.0], [0.0, 6.0], 0, 10), FRAME)
-    np.testing.assert_allclose(two.pose_at(at([1.0])).velocity_mps, [[3.0, 0.0, 0.0]], atol=1e-4)
+    two_rows = Track(telemetry([0.0, 2.0], [0.0, 6.0], 0, 10), FRAME)
+    np.testing.assert_allclose(two_rows.pose_at(at([1.0])).velocity_mps, [[3.0, 0.0, 0.0]], atol=1e-4)
     slow = Track(telemetry([0.0, 1.0, 2.0], [0.0, 0.99, 1.98], 0, 10), FRAME)
     assert slow.pose_at(at([1.0])).heading_deg[0] == pytest.approx(0.0)  # below a metre a second nothing has a course
     fast = Track(telemetry([0.0, 1.0, 2.0], [0.0, 1.01, 2.02], 0, 10), FRAME)
@@ -277,18 +277,18 @@ def test_velocities_that_no_log_holds_are_slopes_over_two_seconds_on_either_side
 def test_long_series_of_instants_are_asked_in_parts(monkeypatch):
     track = Track(telemetry(np.arange(9.0), 5 * np.arange(9.0), 0, 10, roll_deg=1, pitch_deg=0, yaw_deg=20.0), FRAME)
     instants = at(np.linspace(-1.0, 9.0, 11))
-    whole = track.pose_at(instants)
+    at_once = track.pose_at(instants)
     monkeypatch.setattr(tracks, "AT_ONCE", 4)
     parts = track.pose_at(instants)
-    np.testing.assert_array_equal(parts.position_m, whole.position_m)
-    np.testing.assert_array_equal(parts.reason, whole.reason)
-    some = whole.pick(whole.valid)
+    np.testing.assert_array_equal(parts.position_m, at_once.position_m)
+    np.testing.assert_array_equal(parts.reason, at_once.reason)
+    some = at_once.pick(at_once.valid)
     assert len(some) == 9
     placed = some.where(np.arange(9) % 2 == 0)
     assert placed.valid.tolist() == [True, False] * 4 + [True]
     assert np.isnan(placed.position_m[1::2]).all()
     assert placed.reason[1] == "no position of the tower"
-    lost = whole.where(np.zeros(11, dtype=bool))
+    lost = at_once.where(np.zeros(11, dtype=bool))
     assert lost.reason.tolist() == ["before telemetry", *["no position of the tower"] * 9, "after telemetry"]
 
 

@@ -53,8 +53,8 @@ def test_an_archive_gives_what_its_folder_gives(tmp_path: Path, pack: object) ->
     archive.write_bytes(pack(CONTENT))  # type: ignore[operator]
     packed, plain = ingest(archive, options=OPTIONS), ingest(tmp_path / "folder" / "set", options=OPTIONS)
     assert [Path(f.path).name for f in packed] == [Path(f.path).name for f in plain]
-    for one, other in zip(packed, plain, strict=True):
-        assert one.result.streams[0].frame.equals(other.result.streams[0].frame)
+    for member, file in zip(packed, plain, strict=True):
+        assert member.result.streams[0].frame.equals(file.result.streams[0].frame)
     assert [s.reason for s in packed.skipped] == [s.reason for s in plain.skipped]
     assert "nmfs" in packed.skipped[0].path
     (again,) = ingest(archive / "set/LW1/x_power_log.txt", options=OPTIONS)
@@ -72,9 +72,9 @@ def test_a_missing_member_and_a_damaged_archive_are_messages(tmp_path: Path) -> 
     place.write_bytes(zipped(CONTENT)[:60] + zipped(CONTENT)[-100:])  # a directory that begins before the file does
     with pytest.raises(InputError, match="damaged archive"):
         ingest(place)
-    whole = zipped(CONTENT)
-    at = whole.index(b"x_vehicleOut.txt") + 40
-    place.write_bytes(whole[:at] + b"\xff\xff\xff" + whole[at + 3 :])
+    intact = zipped(CONTENT)
+    at = intact.index(b"x_vehicleOut.txt") + 40
+    place.write_bytes(intact[:at] + b"\xff\xff\xff" + intact[at + 3 :])
     assert any("damaged" in s.reason for s in ingest(place, options=OPTIONS).skipped)
 
 
@@ -86,9 +86,9 @@ def test_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     lied[at + 24 : at + 28] = struct.pack("<I", 4_000_000_000)
     place = tmp_path / "bomb.zip"
     place.write_bytes(bytes(lied))
-    found = ingest(place, options=OPTIONS)
-    assert [Path(f.path).name for f in found] == ["b_vehicleOut.txt"]
-    assert "unpacks to" in found.skipped[0].reason
+    ingested = ingest(place, options=OPTIONS)
+    assert [Path(f.path).name for f in ingested] == ["b_vehicleOut.txt"]
+    assert "unpacks to" in ingested.skipped[0].reason
     monkeypatch.setattr(archives, "MOST_MEMBERS", 1)
     with pytest.raises(InputError, match="holds 2 files"):
         ingest(place)
@@ -127,11 +127,11 @@ def test_what_the_first_bytes_show_to_be_no_log_is_not_unpacked(
 def test_names_of_members_stay_in_the_archive(tmp_path: Path) -> None:
     place = tmp_path / "a.zip"
     place.write_bytes(zipped({"/etc/x_vehicleOut.txt": VEHICLE_10, "../../y_vehicleOut.txt": VEHICLE_10}))
-    found = ingest(place, options=OPTIONS)
-    assert [f.path for f in found] == [str(place / "etc/x_vehicleOut.txt")]
-    assert "leads out of the archive" in found.skipped[0].reason
+    ingested = ingest(place, options=OPTIONS)
+    assert [f.path for f in ingested] == [str(place / "etc/x_vehicleOut.txt")]
+    assert "leads out of the archive" in ingested.skipped[0].reason
     (again,) = ingest(place / "etc/x_vehicleOut.txt", options=OPTIONS)
-    assert again.result.accepted == found[0].result.accepted
+    assert again.result.accepted == ingested[0].result.accepted
 
 
 def test_an_archive_in_an_archive_is_told(tmp_path: Path) -> None:
@@ -153,14 +153,14 @@ def test_a_folder_of_bursts_is_one_log(tmp_path: Path) -> None:
     assert stream.frame["rss_db"].tolist() == pytest.approx([-float(i) for i in range(30)], abs=1e-4)
     assert bursts.result.lines == bursts.result.accepted == 30
     assert track.result.reader == "vehicle_out"
-    (one,) = ingest(folder, options=OPTIONS)
-    assert one.sha256 == bursts.sha256
+    (again,) = ingest(folder, options=OPTIONS)
+    assert again.sha256 == bursts.sha256
 
 
 def test_a_single_burst_is_read_alone(tmp_path: Path) -> None:
     (tmp_path / IQ_NAME).write_bytes(iq_mat())
-    (one,) = ingest(tmp_path, options=OPTIONS)
-    assert one.path.endswith(IQ_NAME)
+    (burst,) = ingest(tmp_path, options=OPTIONS)
+    assert burst.path.endswith(IQ_NAME)
 
 
 def test_a_flight_file_gives_its_logs_back(tmp_path: Path) -> None:

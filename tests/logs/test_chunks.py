@@ -37,10 +37,10 @@ def test_pieces_of_any_size_are_one_piece(
 def test_a_file_is_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = b"\xef\xbb\xbf" + sounder_log(2000)
     (tmp_path / "x_power_log.txt").write_bytes(data)
-    (whole,) = ingest(tmp_path, options=OPTIONS)
+    (at_once,) = ingest(tmp_path, options=OPTIONS)
     monkeypatch.setattr(chunks, "PIECE_BYTES", 999)
     (file,) = ingest(tmp_path, options=OPTIONS)
-    assert_same_result(file.result, whole.result)
+    assert_same_result(file.result, at_once.result)
     assert file.sha256 == hashlib.sha256(data).hexdigest()
 
 
@@ -54,5 +54,5 @@ def test_of_many_rejected_lines_the_first_are_kept_and_all_are_counted() -> None
     octal, talk = result.reasons
     assert (octal.count, octal.first, octal.last) == (60 * lines, lines + 1, 61 * lines)
     assert (talk.count, talk.first, talk.last) == (5, 61 * lines + 1, 61 * lines + 5)
-    whole = by_name("aadm_snr").read(b"time,snr_lw1\n" + b"talk\n" * 5000, OPTIONS)
-    assert (len(whole.rejected), whole.rejected_count) == (KEPT_REJECTED, 5000)
+    table = by_name("aadm_snr").read(b"time,snr_lw1\n" + b"talk\n" * 5000, OPTIONS)
+    assert (len(table.rejected), table.rejected_count) == (KEPT_REJECTED, 5000)

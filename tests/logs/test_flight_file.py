@@ -75,9 +75,9 @@ def files(draw: st.DrawFn) -> IngestedFile:
     return IngestedFile(draw(TEXT), draw(TEXT), result)
 
 
-def assert_same(one: list[IngestedFile], other: list[IngestedFile]) -> None:
-    assert len(one) == len(other)
-    for a, b in zip(one, other, strict=True):
+def assert_same(left: list[IngestedFile], right: list[IngestedFile]) -> None:
+    assert len(left) == len(right)
+    for a, b in zip(left, right, strict=True):
         assert (a.path, a.sha256) == (b.path, b.sha256)
         for name in ("reader", "lines", "accepted", "blank", "rejected", "warnings"):
             assert getattr(a.result, name) == getattr(b.result, name)
@@ -308,9 +308,9 @@ def test_a_file_without_its_seal_is_read(tmp_path: Path) -> None:
     path = tmp_path / "flight.h5"
     files = all_samples_of_one(tmp_path)
     write_flight(path, files)
-    whole = read_flight(path)
+    with_seal = read_flight(path)
     path.write_bytes(path.read_bytes()[:-40])
-    assert [f.sha256 for f in read_flight(path)] == [f.sha256 for f in whole]
+    assert [f.sha256 for f in read_flight(path)] == [f.sha256 for f in with_seal]
 
 
 def test_other_programs_read_a_sealed_file(tmp_path: Path) -> None:

@@ -35,14 +35,14 @@ def test_every_reader_of_the_catalogue_is_a_target_with_seeds(known: dict) -> No
 
 @pytest.mark.filterwarnings("ignore")
 def test_a_short_part_of_the_run_has_no_violation(known: dict) -> None:
-    found, read = [], 0
+    violations, read = [], 0
     for name, target in known.items():
         for index in range(20):
             verdict, what, _ = fuzz.one_input(target, 7, index, bounded=False)
             read += verdict == "read"
             if verdict == "violation":
-                found.append(f"{name} {index}: {what}")
-    assert not found
+                violations.append(f"{name} {index}: {what}")
+    assert not violations
     assert read > 50, "most mutations must leave something to read, or nothing is tested behind the first check"
 
 
@@ -78,8 +78,8 @@ def eat(_data: bytes, index: int) -> bool:
 def test_planted_faults_are_seen_and_resumed_after(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fuzz, "LIMIT_S", 0.2)
     target = fuzz.Target("planted", (b"x",), eat)
-    told: list[str] = []
-    (row,) = fuzz.run([target], 8, 1, told.append)
+    messages: list[str] = []
+    (row,) = fuzz.run([target], 8, 1, messages.append)
     assert (row["inputs"], row["read"], row["refused"], row["violation"]) == (8, 2, 1, 5)
     for index, words in {
         1: "KeyError",
@@ -88,7 +88,7 @@ def test_planted_faults_are_seen_and_resumed_after(monkeypatch: pytest.MonkeyPat
         4: "process ended with 9",
         5: "no message",
     }.items():
-        assert any(text.startswith(f"planted {index}:") and words in text for text in told), (index, told)
+        assert any(text.startswith(f"planted {index}:") and words in text for text in messages), (index, messages)
 
 
 def test_a_reader_that_breaks_its_promises_is_seen() -> None:

@@ -33,17 +33,17 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_folder_gives_its_logs_in_order_and_reports_the_rest(folder: Path) -> None:
-    found = ingest(folder, options=OPTIONS)
-    assert [(Path(file.path).name, file.result.reader) for file in found] == [
+    ingested = ingest(folder, options=OPTIONS)
+    assert [(Path(file.path).name, file.result.reader) for file in ingested] == [
         ("a_power.txt", "sounder_log"), ("vehicle.txt", "vehicle_out"),
     ]  # fmt: skip
-    assert [Path(skipped.path).name for skipped in found.skipped] == ["empty.txt", "notes.md"]
-    assert "empty" in found.skipped[0].reason
+    assert [Path(skipped.path).name for skipped in ingested.skipped] == ["empty.txt", "notes.md"]
+    assert "empty" in ingested.skipped[0].reason
 
 
 def test_files_and_folders_together(folder: Path) -> None:
-    found = ingest([folder / "b", str(folder / "a_power.txt")], options=OPTIONS)
-    assert [file.result.reader for file in found] == ["vehicle_out", "sounder_log"]
+    ingested = ingest([folder / "b", str(folder / "a_power.txt")], options=OPTIONS)
+    assert [file.result.reader for file in ingested] == ["vehicle_out", "sounder_log"]
 
 
 def test_options_per_path(folder: Path) -> None:
@@ -57,17 +57,17 @@ def test_options_per_path(folder: Path) -> None:
 
 
 def test_summary_is_the_contract(folder: Path) -> None:
-    found = ingest(folder, options=OPTIONS)
-    answer = json.loads(json.dumps(summary(found), allow_nan=False))
+    ingested = ingest(folder, options=OPTIONS)
+    answer = json.loads(json.dumps(summary(ingested), allow_nan=False))
     assert set(answer) == {"files", "skipped", "warnings"}
     entry = answer["files"][1]
     assert {"path", "reader", "lines", "accepted", "rejected", "blank", "streams"} <= set(entry)
     assert (entry["lines"], entry["accepted"], entry["rejected"], entry["blank"]) == (3, 3, 0, 0)
-    (one,) = entry["streams"]
-    assert list(one) == ["kind", "name", "rows", "start", "end", "rate_hz"]
-    assert (one["kind"], one["name"], one["rows"]) == ("telemetry", "vehicle", 3)
-    assert pd.Timestamp(one["start"]) == pd.Timestamp("2025-03-02T15:00:00.25Z")
-    assert one["rate_hz"] == pytest.approx(1.0)
+    (stream,) = entry["streams"]
+    assert list(stream) == ["kind", "name", "rows", "start", "end", "rate_hz"]
+    assert (stream["kind"], stream["name"], stream["rows"]) == ("telemetry", "vehicle", 3)
+    assert pd.Timestamp(stream["start"]) == pd.Timestamp("2025-03-02T15:00:00.25Z")
+    assert stream["rate_hz"] == pytest.approx(1.0)
     assert any("no_fix" in text and "vehicle.txt" in text for text in answer["warnings"])
 
 
@@ -82,9 +82,9 @@ def test_the_account_for_people_names_lines_and_files(tmp_path: Path) -> None:
     folder, (first, second) = account_rows(account)
     assert folder == str(tmp_path)
     assert [first[0], second[0]] == ["a/vehicle.txt", "b/vehicle.txt"]
-    one = dict(zip(ACCOUNT, first, strict=True))
-    assert (one["lines"], one["accepted"], one["rejected"], one["blank"]) == ("3", "2", "1", "0")
-    assert (one["streams (rows)"], one["start UTC"], one["s"]) == ("telemetry: vehicle 2", "2025-03-02 15:00:00", "1.0")
+    row = dict(zip(ACCOUNT, first, strict=True))
+    assert (row["lines"], row["accepted"], row["rejected"], row["blank"]) == ("3", "2", "1", "0")
+    assert (row["streams (rows)"], row["start UTC"], row["s"]) == ("telemetry: vehicle 2", "2025-03-02 15:00:00", "1.0")
     notes = account_notes(account)
     assert any("a/vehicle.txt:2: rejected: " in note and "torn," in note for note in notes)
     assert any("notes.md: skipped: " in note for note in notes)
@@ -138,8 +138,8 @@ def test_a_log_is_known_by_its_content_however_it_is_packed(tmp_path: Path) -> N
     write_flight(tmp_path / "f.h5", ingest(tmp_path / "b.gz", options=OPTIONS))
     files = ingest([*sorted(tmp_path.glob("[a-e].*")), tmp_path / "f.h5"], options=OPTIONS)
     assert len(files) == 6
-    assert {one.sha256 for one in files} == {hashlib.sha256(VEHICLE).hexdigest()}
-    assert {one.result.accepted for one in files} == {3}
+    assert {file.sha256 for file in files} == {hashlib.sha256(VEHICLE).hexdigest()}
+    assert {file.result.accepted for file in files} == {3}
 
 
 def test_one_of_several_logs_under_a_path_is_named(tmp_path: Path) -> None:
@@ -246,11 +246,11 @@ def test_missing_zone_is_a_usage_error_even_in_a_folder(folder: Path) -> None:
 def test_files_that_are_no_logs_are_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "samples.iq").write_bytes(b"\x01\x00" * 500_000)
     (tmp_path / "vehicle.txt").write_bytes(VEHICLE)
-    whole = Path.read_bytes
+    read_bytes = Path.read_bytes
 
     def watch(self: Path) -> bytes:
         assert self.name != "samples.iq"
-        return whole(self)
+        return read_bytes(self)
 
     monkeypatch.setattr(Path, "read_bytes", watch)
     assert [skipped.reason for skipped in ingest(tmp_path, options=OPTIONS).skipped] == [
@@ -264,19 +264,19 @@ def test_a_log_of_a_named_reader_is_read_once(
 ) -> None:
     """What another reader would say of it takes its first bytes alone, however large the log is."""
     (tmp_path / "log").write_bytes(pack(VEHICLE * 2000))
-    whole = []
+    unlimited = []
     raw = room._raw
 
     def counted(place: Path, limit: int | None = None) -> bytes:
-        whole.append(limit is None)
+        unlimited.append(limit is None)
         return raw(place, limit)
 
     monkeypatch.setattr(room, "_raw", counted)
     assert read_log(tmp_path, "log", OPTIONS, reader="vehicle_out").result.accepted
-    assert sum(whole) == 1
+    assert sum(unlimited) == 1
     with pytest.raises(InputError, match="the content is that of vehicle_out"):
         read_log(tmp_path, "log", OPTIONS, reader="sounder_log")
-    assert sum(whole) == 1
+    assert sum(unlimited) == 1
 
 
 def test_reader_errors_name_the_file(tmp_path: Path) -> None:
@@ -311,8 +311,8 @@ def test_links_in_a_folder_are_told(tmp_path: Path) -> None:
     (logs / "gone.txt").symlink_to(far / "nowhere")
     (logs / "far").symlink_to(far)
     (logs / "round").symlink_to(logs)
-    found = ingest(logs, options=OPTIONS)
-    assert [Path(f.path).name for f in found] == ["a.txt", "b.txt"]
-    told = {Path(s.path).name: s.reason for s in found.skipped}
-    assert told.keys() == {"far", "gone.txt", "round"}
-    assert "link to a folder" in told["far"]
+    ingested = ingest(logs, options=OPTIONS)
+    assert [Path(f.path).name for f in ingested] == ["a.txt", "b.txt"]
+    reasons = {Path(s.path).name: s.reason for s in ingested.skipped}
+    assert reasons.keys() == {"far", "gone.txt", "round"}
+    assert "link to a folder" in reasons["far"]

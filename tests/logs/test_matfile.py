@@ -32,20 +32,20 @@ def saved(compressed: bool, **variables: object) -> bytes:
     compressed=st.booleans(),
 )
 def test_numeric_arrays_come_back(array: np.ndarray, compressed: bool) -> None:
-    found = read_arrays(saved(compressed, values=array, other=np.eye(2)), ["values"])
-    assert list(found) == ["values"]
-    assert found["values"].dtype == array.dtype
-    np.testing.assert_array_equal(found["values"], array)
+    arrays = read_arrays(saved(compressed, values=array, other=np.eye(2)), ["values"])
+    assert list(arrays) == ["values"]
+    assert arrays["values"].dtype == array.dtype
+    np.testing.assert_array_equal(arrays["values"], array)
 
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_text_and_what_is_left_out(compressed: bool) -> None:
     rows = np.array(["2024-07-15 11:48:16.776", "2024-07-15 11:48:17.1  "])
     data = saved(compressed, clock=rows, pair={"a": 1.0}, cells=np.array([[1, "x"]], dtype=object), z=np.array([[1j]]))
-    found = read_arrays(data, None)
-    assert set(found) == {"clock", "z"}, "structures and cells are left out"
-    assert found["z"].tolist() == [[1j]]
-    assert found["clock"].tolist() == ["2024-07-15 11:48:16.776", "2024-07-15 11:48:17.1"]
+    arrays = read_arrays(data, None)
+    assert set(arrays) == {"clock", "z"}, "structures and cells are left out"
+    assert arrays["z"].tolist() == [[1j]]
+    assert arrays["clock"].tolist() == ["2024-07-15 11:48:16.776", "2024-07-15 11:48:17.1"]
 
 
 def test_matlab_stores_small_integers_for_doubles_and_small_elements() -> None:

@@ -50,25 +50,25 @@ def test_a_packed_tar_is_a_folder(tmp_path: Path, pack: Pack) -> None:
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode="w") as book:
         for name, data in (("LW1/a_power_log.txt", LOG), ("LW2/b_power_log.txt.x", pack(LOG))):
-            one = tarfile.TarInfo(name)
-            one.size = len(data)
-            book.addfile(one, io.BytesIO(data))
+            member = tarfile.TarInfo(name)
+            member.size = len(data)
+            book.addfile(member, io.BytesIO(data))
     (tmp_path / "set.tar.packed").write_bytes(pack(out.getvalue()))
-    found = ingest(tmp_path / "set.tar.packed", options=OPTIONS)
-    assert [file.result.reader for file in found] == ["sounder_log"] * 2
-    assert_same_result(found[0].result, found[1].result)
+    ingested = ingest(tmp_path / "set.tar.packed", options=OPTIONS)
+    assert [file.result.reader for file in ingested] == ["sounder_log"] * 2
+    assert_same_result(ingested[0].result, ingested[1].result)
 
 
 @PACKERS
 def test_what_is_cut_damaged_or_a_bomb_is_one_message(tmp_path: Path, pack: Pack) -> None:
-    whole = pack(LOG)
+    intact = pack(LOG)
     place = tmp_path / "a_power_log.txt.packed"
     bomb = pack(b"0" * 3_000_000)
     rng = np.random.default_rng(2)
     damaged = []
-    for at in rng.integers(12, len(whole), 8).tolist():
-        damaged.append(whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :])
-    for content in (whole[:-9], whole[: len(whole) // 2], whole[:20], pack(b""), bomb, *damaged):
+    for at in rng.integers(12, len(intact), 8).tolist():
+        damaged.append(intact[:at] + bytes([intact[at] ^ 0x55]) + intact[at + 1 :])
+    for content in (intact[:-9], intact[: len(intact) // 2], intact[:20], pack(b""), bomb, *damaged):
         place.write_bytes(content)
         with pytest.raises(AerpawCmpError):
             ingest(place, options=OPTIONS)
@@ -76,7 +76,7 @@ def test_what_is_cut_damaged_or_a_bomb_is_one_message(tmp_path: Path, pack: Pack
     # deflate makes nothing so small: what a gzip file claims is read, and is no log
     with pytest.raises(InputError, match="no record" if pack is gzip.compress else "times its size"):
         ingest(place, options=OPTIONS, reader="sounder_log")
-    place.write_bytes(whole[:-9])
+    place.write_bytes(intact[:-9])
     with pytest.raises(InputError, match="ends too early"):
         ingest(place, options=OPTIONS, reader="sounder_log")
 

@@ -94,7 +94,7 @@ def test_sounder_needs_as_many_times_as_levels() -> None:
 def test_rank_csvs() -> None:
     frame = telemetry(6).assign(rank=[1.0, 2.0, np.nan, 4.0, 3.0, 2.0])
     modem = read(quectel_csv(frame["time"], frame["rank"], ZONE))
-    nr = next(one for one in modem.streams if one.name == "nr5g_csi").frame
+    nr = next(stream for stream in modem.streams if stream.name == "nr5g_csi").frame
     assert np.array_equal(nr["rank"], frame["rank"], equal_nan=True)
     assert modem.blank == 1, "the bare OK of the start script"
     table = read(logwriters.format_ri_csv(frame, ZONE)).streams[0].frame

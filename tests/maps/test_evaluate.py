@@ -113,7 +113,7 @@ def test_kriging_wins_where_its_model_holds_and_its_variance_is_honest():
         "kriging": model, "idw": InverseDistance(), "nearest": Nearest(), "spline": IndexInterpolation("spline", GRID),
         "makima": IndexInterpolation("makima", GRID), "tower": ServingTowerMean([[100.0, 100.0], [500.0, 400.0]]),
     }  # fmt: skip
-    table = {name: evaluate.leave_one_out(one, GRID.points_m, values) for name, one in models.items()}
+    table = {name: evaluate.leave_one_out(predictor, GRID.points_m, values) for name, predictor in models.items()}
     rmse = {name: float(s.rmse.mean()) for name, s in table.items()}
     assert min(rmse, key=lambda name: rmse[name]) == "kriging", rmse
     estimate, variance = evaluate.leave_one_out_estimate(model, GRID.points_m, values)

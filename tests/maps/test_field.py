@@ -33,8 +33,8 @@ def rss_flight():
 
 def fitted(points, values):
     """Curve through bins of 30 m; samples closer than half a bin share one fade and would hide the nugget."""
-    found = field_correlation(points, values, maximum_m=300.0)
-    return fit_biexponential(found.mean_distance_m[1:], found.correlation[1:], weights=found.pairs[1:])
+    bins = field_correlation(points, values, maximum_m=300.0)
+    return fit_biexponential(bins.mean_distance_m[1:], bins.correlation[1:], weights=bins.pairs[1:])
 
 
 @pytest.mark.parametrize(("first", "second"), [(1, 3), (3, 1)])

@@ -85,9 +85,9 @@ def test_every_change_of_server_on_the_grid_crosses_a_border():
     grid = Grid.over_area(AREA)
     server = grid.raster(serving_tower(grid.points_m, towers))
     pairs = {border.towers for border in voronoi_borders(towers, AREA)}
-    beside = np.stack([server[:, :-1].ravel(), server[:, 1:].ravel()], axis=1)
+    across = np.stack([server[:, :-1].ravel(), server[:, 1:].ravel()], axis=1)
     above = np.stack([server[:-1].ravel(), server[1:].ravel()], axis=1)
-    changes = {tuple(sorted(p)) for p in np.vstack([beside, above]).tolist() if p[0] != p[1]}
+    changes = {tuple(sorted(p)) for p in np.vstack([across, above]).tolist() if p[0] != p[1]}
     assert changes <= pairs
     assert len(pairs) >= 4
 

@@ -34,9 +34,9 @@ class Engine:
         d = np.linalg.norm(position_m[:, None] - towers[None], axis=-1)
         seen = d < self.range_m
         siso = np.where(seen, -40.0 - 20 * np.log10(d) - self.extra_loss_db, np.nan)
-        one = np.where(seen, 1.0 / d, np.nan)
+        largest = np.where(seen, 1.0 / d, np.nan)
         ratio = (20.0 / d) * (1 + 0.5 * np.sin(position_m[:, :1] / 40 + position_m[:, 2:] / 9))
-        sigma = np.stack([one, one * ratio, one * 1e-4, np.where(seen, 0.0, np.nan)], axis=-1)
+        sigma = np.stack([largest, largest * ratio, largest * 1e-4, np.where(seen, 0.0, np.nan)], axis=-1)
         return Evaluation(siso, siso + 12.0, 0 * siso, sigma)
 
 
@@ -118,9 +118,9 @@ def test_memory_grows_with_results_only():
 
     def peak(altitudes):
         tracemalloc.start()
-        found = map_job(GRID, TOWERS, Engine(), rss_altitudes_m=altitudes, rank_altitudes_m=altitudes, chunk=100)
+        maps = map_job(GRID, TOWERS, Engine(), rss_altitudes_m=altitudes, rank_altitudes_m=altitudes, chunk=100)
         size = sum(
-            getattr(found, n).nbytes
+            getattr(maps, n).nbytes
             for n in ("rss_siso_dbm", "rss_mimo_dbm", "level_sd_db", "rank", "spread_db", "condition_db")
         )
         top = tracemalloc.get_traced_memory()[1]
@@ -136,10 +136,10 @@ def test_foliage_difference():
     shaded = map_job(
         GRID, TOWERS, Engine(range_m=200.0, extra_loss_db=3.0), rss_altitudes_m=(30,), rank_altitudes_m=(30,)
     )
-    found = foliage_difference(clear, shaded)
-    assert np.nanmax(np.abs(found.rss_loss_db - 3.0)) < 1e-9
-    assert found.lost.sum() == np.isfinite(clear.rss()).sum() - np.isfinite(shaded.rss()).sum() > 0
-    assert (found.rank_change == 0).all()
+    difference = foliage_difference(clear, shaded)
+    assert np.nanmax(np.abs(difference.rss_loss_db - 3.0)) < 1e-9
+    assert difference.lost.sum() == np.isfinite(clear.rss()).sum() - np.isfinite(shaded.rss()).sum() > 0
+    assert (difference.rank_change == 0).all()
     with pytest.raises(UsageError, match="ks"):
         foliage_difference(
             clear, map_job(GRID, TOWERS, Engine(), rss_altitudes_m=(30,), rank_altitudes_m=(30,), ks=(7,))
@@ -157,10 +157,10 @@ def test_layers_are_named_once(result):
 
 def test_layer_names_take_any_altitude_k_and_tower():
     engine = Engine()
-    found = map_job(
+    maps = map_job(
         GRID, {"A": TOWERS["A"]}, engine, rss_altitudes_m=(0.5, 1.0), rank_altitudes_m=(2.5,), ks=(12.5, 1e6)
     )
-    names = {layer.name for layer in layers_of(found)}
+    names = {layer.name for layer in layers_of(maps)}
     assert {
         "rss_siso_h0p5m_joint",
         "rss_siso_h001m_joint",
@@ -175,8 +175,8 @@ def test_rank_study_runs_the_papers_comparison(result):
     assert heights == (30.0, 40.0, 50.0)
     assert rank.shape == (len(GRID), 3, 2)
     assert set(study.scores) == {"Kriging", "makima", "spline", "nearest", "inverse distance", "serving-tower mean"}
-    for found in study.scores.values():
-        assert found.mae.shape == (3, 2)
+    for scores in study.scores.values():
+        assert scores.mae.shape == (3, 2)
     assert (
         study.correlation.positions + study.correlation.excluded_constant + study.correlation.excluded_missing
         == len(GRID)
@@ -190,8 +190,8 @@ def test_rank_study_runs_the_papers_comparison(result):
 
 def test_rank_study_of_a_flat_map_says_so():
     def flat(position_m, names):
-        one = np.ones((len(position_m), len(names)))
-        return Evaluation(-one, -one, 0 * one, np.stack([one, 0 * one, 0 * one, 0 * one], axis=-1))
+        ones = np.ones((len(position_m), len(names)))
+        return Evaluation(-ones, -ones, 0 * ones, np.stack([ones, 0 * ones, 0 * ones, 0 * ones], axis=-1))
 
     made = map_job(GRID, TOWERS, flat, rss_altitudes_m=(), rank_altitudes_m=(30, 40))
     study = interpolation_study(GRID, rank_fields(made)[1], made.towers_m)
@@ -214,9 +214,9 @@ def test_wrong_engine_and_no_tower_are_named():
 
 def test_papers_variance_over_altitudes():
     values = np.array([[[1.0], [2.0], [3.0]], [[2.0], [2.0], [np.nan]], [[1.0], [np.nan], [np.nan]]])
-    found = altitude_variance(values)[:, 0]
-    assert found[:2].tolist() == [1.0, 0.0]
-    assert np.isnan(found[2])
+    variance = altitude_variance(values)[:, 0]
+    assert variance[:2].tolist() == [1.0, 0.0]
+    assert np.isnan(variance[2])
 
 
 def test_rss_is_studied_like_rank(result):
@@ -230,12 +230,12 @@ def test_honest_study_is_harder_than_leave_one_out(result):
     heights, rank = rank_fields(result)
     study = interpolation_study(GRID, rank, result.towers_m)
     flight = np.column_stack([np.linspace(-300, 300, 400), 50 * np.sin(np.linspace(0, 9, 400))])
-    found = held_out_study(GRID, heights, rank, study.fit, trajectory_m=flight, block_m=200.0)
-    assert found.learning_sizes == (25, 50, 100, 200)
-    assert found.learning_mae.shape == (4, 3, 2)
-    assert found.learning_mae[0].mean() > found.learning_mae[-1].mean()
-    assert found.blocked.mae.mean() > study.scores["Kriging"].mae.mean()
-    assert found.altitude_held_out.mae.shape == (3, 2)
-    assert found.altitude_held_out.unpredicted.sum() == 0
-    assert found.trajectory.n.max() < len(GRID)
-    assert found.vertical_scale > 1.0, "the engine's rank changes faster with height than along the ground"
+    held_out = held_out_study(GRID, heights, rank, study.fit, trajectory_m=flight, block_m=200.0)
+    assert held_out.learning_sizes == (25, 50, 100, 200)
+    assert held_out.learning_mae.shape == (4, 3, 2)
+    assert held_out.learning_mae[0].mean() > held_out.learning_mae[-1].mean()
+    assert held_out.blocked.mae.mean() > study.scores["Kriging"].mae.mean()
+    assert held_out.altitude_held_out.mae.shape == (3, 2)
+    assert held_out.altitude_held_out.unpredicted.sum() == 0
+    assert held_out.trajectory.n.max() < len(GRID)
+    assert held_out.vertical_scale > 1.0, "the engine's rank changes faster with height than along the ground"

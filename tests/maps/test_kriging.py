@@ -142,9 +142,9 @@ def test_coincident_samples_are_one_place_with_their_mean(correlation):
     targets = scattered(9, 18, 200.0)
     model = OrdinaryKriging(correlation, 6, 400.0, sill=1.0)
     expected = model.fit(points, merged).predict(targets)
-    found = model.fit(doubled, more).predict(targets)
-    np.testing.assert_array_equal(found[0], expected[0])
-    np.testing.assert_array_equal(found[1], expected[1])
+    predicted = model.fit(doubled, more).predict(targets)
+    np.testing.assert_array_equal(predicted[0], expected[0])
+    np.testing.assert_array_equal(predicted[1], expected[1])
     left_out, _ = model.leave_one_out()
     assert len(left_out) == 15
     assert left_out[0] == left_out[12], "leaving one out leaves out the place"
@@ -314,8 +314,10 @@ def test_a_correlation_above_one_counts_as_one():
     points = scattered(60, 38)
     values = np.random.default_rng(39).normal(size=60)
     high = OrdinaryKriging(lambda d: 2.2 * np.exp(-d / 55), 10, outside="nearest").fit(points, values)
-    one = OrdinaryKriging(lambda d: np.minimum(2.2 * np.exp(-d / 55), 1.0), 10, outside="nearest").fit(points, values)
-    np.testing.assert_array_equal(high.leave_one_out()[0], one.leave_one_out()[0])
+    clipped = OrdinaryKriging(lambda d: np.minimum(2.2 * np.exp(-d / 55), 1.0), 10, outside="nearest").fit(
+        points, values
+    )
+    np.testing.assert_array_equal(high.leave_one_out()[0], clipped.leave_one_out()[0])
     assert np.abs(high.leave_one_out()[0]).max() < 2 * np.abs(values).max()
 
 
@@ -328,11 +330,11 @@ def test_nugget_is_a_jump_unless_it_is_noise():
     at_sample, variance = OrdinaryKriging(noisy, sill=1.0).fit(points, values).predict(points)
     np.testing.assert_array_equal(at_sample, values)
     assert (variance == 0).all()
-    beside, variance = OrdinaryKriging(noisy, sill=1.0).fit(points, values).predict(points + 1e-3)
-    assert (np.abs(beside - values) > 1e-3).mean() > 0.9
+    near, variance = OrdinaryKriging(noisy, sill=1.0).fit(points, values).predict(points + 1e-3)
+    assert (np.abs(near - values) > 1e-3).mean() > 0.9
     assert (variance > 0.4).all()
     smooth, smooth_variance = OrdinaryKriging(noisy, sill=1.0, exact=False).fit(points, values).predict(points)
-    np.testing.assert_allclose(smooth, beside, atol=1e-3)
+    np.testing.assert_allclose(smooth, near, atol=1e-3)
     np.testing.assert_allclose(smooth_variance, variance, atol=1e-3)
 
 
@@ -344,10 +346,10 @@ def test_cells_without_coverage_take_no_part():
     estimate, _ = OrdinaryKriging(PAPER, 6, 80.0).fit(grid.points_m, values).leave_one_out()
     assert np.isnan(estimate[:, 2]).all()
     for field in (0, 1):
-        kept = np.isfinite(values[:, field])
-        alone = OrdinaryKriging(PAPER, 6, 80.0).fit(grid.points_m[kept], values[kept, field])
-        np.testing.assert_allclose(estimate[kept, field], alone.leave_one_out()[0], atol=1e-12)
-        np.testing.assert_allclose(estimate[~kept, field], alone.predict(grid.points_m[~kept])[0], atol=1e-12)
+        covered = np.isfinite(values[:, field])
+        alone = OrdinaryKriging(PAPER, 6, 80.0).fit(grid.points_m[covered], values[covered, field])
+        np.testing.assert_allclose(estimate[covered, field], alone.leave_one_out()[0], atol=1e-12)
+        np.testing.assert_allclose(estimate[~covered, field], alone.predict(grid.points_m[~covered])[0], atol=1e-12)
 
 
 def test_random_selection_is_seeded_within_the_radius_and_fair():
@@ -510,10 +512,10 @@ def test_every_target_is_that_of_its_own_system(case, seed):
     for i in (0, 7, 40):
         others = np.delete(np.arange(45), i)
         for field in range(2):
-            one = by_hand(
+            without_it = by_hand(
                 points[others], values[others, field], points[i], correlation=with_nugget, sill=sill[field], **rules
             )
-            assert (left[i, field], spread[i, field]) == pytest.approx(one, rel=1e-8, abs=1e-9, nan_ok=True)
+            assert (left[i, field], spread[i, field]) == pytest.approx(without_it, rel=1e-8, abs=1e-9, nan_ok=True)
 
 
 def test_what_is_not_said_is_twenty_neighbours_within_150_m_the_nearest_and_exact():
@@ -540,9 +542,9 @@ def test_what_is_not_said_is_twenty_neighbours_within_150_m_the_nearest_and_exac
 def test_a_sill_that_is_given_scales_the_variance_of_its_field():
     rng = np.random.default_rng(4)
     points, values = rng.uniform(0, 100, (12, 2)), rng.normal(size=(12, 2))
-    one = OrdinaryKriging(with_nugget, sill=1.0).fit(points, values).predict([[50.0, 50.0]])[1]
-    two = OrdinaryKriging(with_nugget, sill=[2.0, 0.0]).fit(points, values).predict([[50.0, 50.0]])[1]
-    np.testing.assert_allclose(two, one * [[2.0, 0.0]])
+    unit = OrdinaryKriging(with_nugget, sill=1.0).fit(points, values).predict([[50.0, 50.0]])[1]
+    scaled = OrdinaryKriging(with_nugget, sill=[2.0, 0.0]).fit(points, values).predict([[50.0, 50.0]])[1]
+    np.testing.assert_allclose(scaled, unit * [[2.0, 0.0]])
     with pytest.raises(UsageError, match=r"a sill of -1\.0"):
         OrdinaryKriging(with_nugget, sill=[1.0, -1.0]).fit(points, values)
 
@@ -603,9 +605,9 @@ def test_targets_with_neighbours_at_equal_offsets_are_told_from_others():
 def test_estimates_do_not_depend_on_how_many_are_made_at_once(monkeypatch):
     rng = np.random.default_rng(7)
     points, values, targets = rng.uniform(0, 100, (30, 2)), rng.normal(size=30), rng.uniform(0, 100, (50, 2))
-    whole = OrdinaryKriging(with_nugget, 6).fit(points, values).predict(targets)
+    at_once = OrdinaryKriging(with_nugget, 6).fit(points, values).predict(targets)
     monkeypatch.setattr(kriging, "CHUNK", 7)
-    for a, b in zip(whole, OrdinaryKriging(with_nugget, 6).fit(points, values).predict(targets), strict=True):
+    for a, b in zip(at_once, OrdinaryKriging(with_nugget, 6).fit(points, values).predict(targets), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
 
 

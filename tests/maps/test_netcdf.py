@@ -72,9 +72,9 @@ def check(path):
         assert data["spread"].attrs["units"] == "0.1 lg(re 1)"
         assert data.attrs["history"].startswith("2026-01-02")
         for mode, maps in MAPS.items():
-            one = data.sel(foliage=mode)
+            of_mode = data.sel(foliage=mode)
             for i, (east, north) in enumerate(GRID.points_m):
-                here = one.sel(x=east, y=north)
+                here = of_mode.sel(x=east, y=north)
                 assert FRAME.to_local(here["latitude"], here["longitude"]) == pytest.approx((east, north), abs=1e-3)
                 serves = maps.serving[i]
                 assert int(here["serving_tower"]) == serves
@@ -102,8 +102,8 @@ def check(path):
         assert there == pytest.approx(tuple(GRID.points_m[0]), abs=1e-3)
 
 
-def same(found, expected):
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+def same(values, expected):
+    np.testing.assert_allclose(values, expected, atol=1e-5)
 
 
 def test_every_value_is_found_by_its_coordinates(path):

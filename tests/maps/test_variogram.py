@@ -41,13 +41,13 @@ def small_blocks(monkeypatch):
     monkeypatch.setattr(variogram, "BLOCK", 7)
 
 
-def compare(found, sums, counts):
-    for n in range(len(found.pairs)):
-        assert found.pairs[n] == counts.get(n, 0)
+def compare(bins, sums, counts):
+    for n in range(len(bins.pairs)):
+        assert bins.pairs[n] == counts.get(n, 0)
         if n in sums:
-            assert found.correlation[n] == pytest.approx(sums[n] / counts[n], abs=1e-12)
+            assert bins.correlation[n] == pytest.approx(sums[n] / counts[n], abs=1e-12)
         else:
-            assert np.isnan(found.correlation[n])
+            assert np.isnan(bins.correlation[n])
 
 
 def test_vectors_equal_the_double_loop(small_blocks):
@@ -55,12 +55,12 @@ def test_vectors_equal_the_double_loop(small_blocks):
     vectors = RNG.integers(1, 4, (len(grid), 3, 4)).astype(float)
     vectors[5] = 2.0
     vectors[9] = 0.1  # 12 x 0.1: its mean is not 0.1 to the last bit
-    found = vector_correlation(grid.points_m, vectors, maximum_m=150.0)
-    assert found.excluded_constant == 2
-    assert found.positions == len(grid) - 2
-    assert found.distance_m.tolist() == [0, 30, 60, 90, 120, 150]
-    assert found.correlation[0] == pytest.approx(1.0, abs=1e-15)
-    compare(found, *double_loop(grid.points_m, vectors.reshape(len(grid), -1), 30.0, 150.0))
+    bins = vector_correlation(grid.points_m, vectors, maximum_m=150.0)
+    assert bins.excluded_constant == 2
+    assert bins.positions == len(grid) - 2
+    assert bins.distance_m.tolist() == [0, 30, 60, 90, 120, 150]
+    assert bins.correlation[0] == pytest.approx(1.0, abs=1e-15)
+    compare(bins, *double_loop(grid.points_m, vectors.reshape(len(grid), -1), 30.0, 150.0))
 
 
 def test_missing_components_drop_the_position_or_count_pairwise(small_blocks):
@@ -89,10 +89,10 @@ def test_bins_do_not_depend_on_rounding():
 
 
 def test_all_constant_gives_no_correlation_and_no_warning():
-    found = vector_correlation(RNG.uniform(0, 90, (5, 2)), np.ones((5, 6)))
-    assert found.excluded_constant == 5
-    assert found.positions == 0
-    assert np.isnan(found.correlation).all()
+    bins = vector_correlation(RNG.uniform(0, 90, (5, 2)), np.ones((5, 6)))
+    assert bins.excluded_constant == 5
+    assert bins.positions == 0
+    assert np.isnan(bins.correlation).all()
 
 
 def test_memory_is_bounded_by_the_block():
@@ -114,32 +114,32 @@ def test_field_correlation_of_a_known_field():
     noise = rng.normal(size=(n + length, 2))
     fields = np.apply_along_axis(lambda c: np.convolve(c, np.ones(length), "valid"), 0, noise)[:n]
     points = np.column_stack([np.zeros(n), 30.0 * np.arange(n)])
-    found = field_correlation(points, fields, maximum_m=300.0)
-    np.testing.assert_allclose(found.correlation, np.maximum(1 - np.arange(11) / length, 0), atol=0.06)
-    assert found.correlation[0] == pytest.approx(1.0, abs=1e-12)
+    bins = field_correlation(points, fields, maximum_m=300.0)
+    np.testing.assert_allclose(bins.correlation, np.maximum(1 - np.arange(11) / length, 0), atol=0.06)
+    assert bins.correlation[0] == pytest.approx(1.0, abs=1e-12)
 
 
 def test_field_correlation_by_fourier_transform():
     """A second route on a grid: autocorrelation of the standardised field (Wiener-Khinchin)."""
     grid = Grid.over_area((0.0, 360.0, 0.0, 450.0))
     fields = RNG.normal(size=(len(grid), 2))
-    found = field_correlation(grid.points_m, fields, maximum_m=40.0)
+    bins = field_correlation(grid.points_m, fields, maximum_m=40.0)
     rows, columns = grid.shape
     z = grid.raster((fields - fields.mean(axis=0)) / fields.std(axis=0))
     padded = (2 * rows, 2 * columns)
     product = sum(np.fft.irfft2(np.abs(np.fft.rfft2(z[..., k], padded)) ** 2, padded) for k in range(2)) / 2
     # 40 m leaves the diagonals (42 m) out of the bin of 30 m
     expected = (product[0, 1] + product[1, 0]) / (rows * (columns - 1) + (rows - 1) * columns)
-    assert found.correlation[1] == pytest.approx(expected, abs=1e-12)
+    assert bins.correlation[1] == pytest.approx(expected, abs=1e-12)
 
 
 def test_field_correlation_leaves_missing_values_out():
     points = np.array([[0.0, 0.0], [30.0, 0.0], [60.0, 0.0]])
     fields = np.array([[1.0, 2.0], [3.0, np.nan], [2.0, 6.0]])
-    found = field_correlation(points, fields, maximum_m=60.0)
+    bins = field_correlation(points, fields, maximum_m=60.0)
     z = (fields - np.nanmean(fields, axis=0)) / np.nanstd(fields, axis=0)
-    assert found.correlation[1] == pytest.approx((z[0, 0] * z[1, 0] + z[1, 0] * z[2, 0]) / 2)
-    assert found.correlation[2] == pytest.approx((z[0] * z[2]).mean())
+    assert bins.correlation[1] == pytest.approx((z[0, 0] * z[1, 0] + z[1, 0] * z[2, 0]) / 2)
+    assert bins.correlation[2] == pytest.approx((z[0] * z[2]).mean())
 
 
 def test_vertical_correlation_closed_form():
@@ -148,13 +148,13 @@ def test_vertical_correlation_closed_form():
     rng = np.random.default_rng(12)
     part = rng.normal(size=(3, n))
     maps = np.stack([part[0], part[0] + part[1], part[0] + part[1] + part[2], np.ones(n)])
-    found = vertical_correlation([30.0, 40.0, 50.0, 60.0], maps)
-    assert found.distance_m.tolist() == [0.0, 10.0, 20.0, 30.0]
-    assert found.correlation[0] == pytest.approx(1.0)
-    assert found.correlation[1] == pytest.approx((np.sqrt(1 / 2) + np.sqrt(2 / 3)) / 2, abs=0.01)
-    assert found.correlation[2] == pytest.approx(np.sqrt(1 / 3), abs=0.01)
-    assert found.pairs.tolist() == [3, 2, 1, 0]
-    assert found.excluded_constant == 1
+    bins = vertical_correlation([30.0, 40.0, 50.0, 60.0], maps)
+    assert bins.distance_m.tolist() == [0.0, 10.0, 20.0, 30.0]
+    assert bins.correlation[0] == pytest.approx(1.0)
+    assert bins.correlation[1] == pytest.approx((np.sqrt(1 / 2) + np.sqrt(2 / 3)) / 2, abs=0.01)
+    assert bins.correlation[2] == pytest.approx(np.sqrt(1 / 3), abs=0.01)
+    assert bins.pairs.tolist() == [3, 2, 1, 0]
+    assert bins.excluded_constant == 1
 
 
 def test_vertical_scale_comes_back():
@@ -260,10 +260,10 @@ def test_bounded_amplitudes_equal_a_quadratic_programme(seed, level):
 
     rng = np.random.default_rng(seed)
     basis, target = rng.uniform(0, 1, (9, 2)), rng.normal(level, 1, 9)
-    found = biexponential._candidate_amplitudes(basis, target)
-    cost = ((found @ basis.T - target) ** 2).sum(axis=-1)
-    assert (found >= -1e-12).all()
-    assert (found.sum(axis=-1) <= 1 + 1e-12).all()
+    amplitudes = biexponential._candidate_amplitudes(basis, target)
+    cost = ((amplitudes @ basis.T - target) ** 2).sum(axis=-1)
+    assert (amplitudes >= -1e-12).all()
+    assert (amplitudes.sum(axis=-1) <= 1 + 1e-12).all()
     peer = minimize(
         lambda c: ((basis @ c - target) ** 2).sum(), [0.25, 0.25], bounds=[(0, 1)] * 2, method="SLSQP",
         constraints={"type": "ineq", "fun": lambda c: 1 - c.sum()}, options={"ftol": 1e-14},
@@ -286,9 +286,9 @@ def test_few_points():
     assert fit.degenerate
     assert "cannot tell" in fit.message
     assert fit([0.0, 30.0]) == pytest.approx([1.0, 0.5], abs=1e-6)
-    two = fit_biexponential([0.0, 30.0, 30.0], [1.0, 0.5, 0.7])  # one curve cannot meet both
-    assert two.degenerate
-    assert two([0.0, 30.0]) == pytest.approx([1.0, 0.6], abs=1e-6)
-    assert two.rmse == pytest.approx(0.1 * np.sqrt(2 / 3))
+    underdetermined = fit_biexponential([0.0, 30.0, 30.0], [1.0, 0.5, 0.7])  # one curve cannot meet both
+    assert underdetermined.degenerate
+    assert underdetermined([0.0, 30.0]) == pytest.approx([1.0, 0.6], abs=1e-6)
+    assert underdetermined.rmse == pytest.approx(0.1 * np.sqrt(2 / 3))
     with pytest.raises(UsageError, match="usable points"):
         fit_biexponential([0.0], [1.0])

@@ -48,8 +48,8 @@ def test_a_mean_of_ranks_is_no_rank(
 def test_an_answer_without_the_time_of_the_others_is_the_one_that_is_rejected(utc: bytes) -> None:
     line = samples.AMARISOFT_JSON.splitlines(keepends=True)[0]
     data = line * 3 + line.replace(b'"utc"', utc) * 5
-    whole = read("amarisoft_json", data)
-    assert (whole.lines, whole.accepted, [one.number for one in whole.rejected]) == (8, 3, [4, 5, 6, 7, 8])
+    result = read("amarisoft_json", data)
+    assert (result.lines, result.accepted, [line_.number for line_ in result.rejected]) == (8, 3, [4, 5, 6, 7, 8])
     assert read("amarisoft_json", line.replace(b'"utc"', b'"time"') * 2).accepted == 2, "seconds of the program"
 
 
@@ -125,7 +125,7 @@ def test_our_own_exports_are_read_back() -> None:
     assert rank.attributes["clock"] == "relative"
     assert rank.frame["rank"].tolist()[0] == 2.0
     tap = read("own_csv", samples.TAP_EXPORT)
-    assert [(one.kind, one.name) for one in tap.streams] == [("rank", "nr5g"), ("rss", "nr5g_rsrp")]
+    assert [(stream.kind, stream.name) for stream in tap.streams] == [("rank", "nr5g"), ("rss", "nr5g_rsrp")]
 
 
 @pytest.mark.parametrize("rank", ["-1", "0", "9", "1.5", "1e30"])
@@ -140,7 +140,7 @@ def test_objects_over_several_lines_are_read_behind_any_number_of_damaged_ones()
     damaged = b'{"timestamp": 1740927600.25, "cells": ~}\n'
     good = json.dumps({"timestamp": 1740927601.25, "ue_list": []}, indent=2).encode() + b"\n"
     lines = _lines.split(40 * damaged + good)
-    found = _json.objects(lines)
-    assert [one["timestamp"] for one in found.values] == [1740927601.25]
-    assert len(found.rejected) == 40
-    assert found.row.tolist() == [40]
+    parsed = _json.objects(lines)
+    assert [entry["timestamp"] for entry in parsed.values] == [1740927601.25]
+    assert len(parsed.rejected) == 40
+    assert parsed.row.tolist() == [40]

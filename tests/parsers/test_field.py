@@ -24,7 +24,7 @@ def everything(field_logs: Ingested) -> Ingested:
 
 
 def test_every_known_log_is_read_to_the_last_line(everything: Ingested) -> None:
-    found = {str(Path(file.path).relative_to(REAL)): file.result for file in everything}
+    results = {str(Path(file.path).relative_to(REAL)): file.result for file in everything}
     expected = {
         "telemetry/2022-01-13_13_57_23_vehicleOut.txt": ("vehicle_out", 1089, 0),
         "telemetry/2022-06-10_19_52_44_vehicleOut.txt": ("vehicle_out", 1662, 0),
@@ -45,7 +45,7 @@ def test_every_known_log_is_read_to_the_last_line(everything: Ingested) -> None:
         "aadm/snr_log.csv": ("aadm_snr", 331, 0),
     }
     for path, account in expected.items():
-        result = found[path]
+        result = results[path]
         assert (result.reader, result.accepted, len(result.rejected)) == account, path
 
 
@@ -69,7 +69,7 @@ def test_other_files_are_not_taken_for_logs(everything: Ingested) -> None:
     skipped = {str(Path(file.path).relative_to(REAL)) for file in everything.skipped}
     assert {"telemetry/AERPAW_Big_Geofence.kml", "antennas/rad_pat.mat", "sounder/rover_positions.txt"} <= skipped
     (ue,) = [file for file in everything if file.path.endswith("2022-06-10_19_52_44_radio_log.txt")]
-    assert {one.kind for one in ue.result.streams} == {"rss", "kpi"}, "srsUE prints no rank"
+    assert {stream.kind for stream in ue.result.streams} == {"rss", "kpi"}, "srsUE prints no rank"
 
 
 def test_the_power_log_holds_the_merged_flight_exactly() -> None:
@@ -78,7 +78,7 @@ def test_the_power_log_holds_the_merged_flight_exactly() -> None:
     (log,) = ingest(folder / "2023-12-13_12_33_02_power_log.txt", options=OPTIONS)
     (mat,) = ingest(folder / "results_useful_ori_exp_288_loc_1.mat", options=OPTIONS)
     raw = log.result.streams[0].frame.set_index("time")["rss_db"]
-    merged = next(one for one in mat.result.streams if one.name == "power").frame
+    merged = next(stream for stream in mat.result.streams if stream.name == "power").frame
     joined = raw.reindex(merged["time"])
     assert len(merged) == 20_523
     table = scipy.io.loadmat(folder / "results_useful_ori_exp_288_loc_1.mat")
@@ -117,14 +117,14 @@ def test_vehicle_out_velocity_and_attitude() -> None:
 def test_the_two_nemo_formats_tell_the_same_ranks() -> None:
     (table,) = ingest(REAL / "nr_rank" / "july2_2024_flight3_nemo_nr.csv")
     (kml,) = ingest(REAL / "nr_rank" / "flight3_pdsch_rank.kml.gz")
-    one = table.result.streams[0].frame.dropna(subset="rank")
-    other = kml.result.streams[0].frame
-    assert one["rank"].tolist() == other["rank"].tolist()
-    assert set(one["rank"]) == {1.0, 2.0, 3.0, 4.0}
+    ranks = table.result.streams[0].frame.dropna(subset="rank")
+    places_of_kml = kml.result.streams[0].frame
+    assert ranks["rank"].tolist() == places_of_kml["rank"].tolist()
+    assert set(ranks["rank"]) == {1.0, 2.0, 3.0, 4.0}
     # a place belongs to a time in both; which time a rank belongs to differs by some four seconds between
     # the two exports (the table's times start again after nine rows), so nothing is claimed about that
-    places = one.drop_duplicates("time").set_index("time")["latitude_deg"]
-    others = other.set_index("time")["latitude_deg"]
+    places = ranks.drop_duplicates("time").set_index("time")["latitude_deg"]
+    others = places_of_kml.set_index("time")["latitude_deg"]
     both = places.index.intersection(others.index)
     assert len(both) > 1900
     assert (places[both] == others[both]).all()
@@ -133,8 +133,8 @@ def test_the_two_nemo_formats_tell_the_same_ranks() -> None:
 
 def test_controller_console_and_its_csv_agree() -> None:
     console, table = ingest([REAL / "aadm" / "controller_log.txt", REAL / "aadm" / "snr_log.csv"], options=OPTIONS)
-    spoken = next(one for one in console.result.streams if one.name == "LW1").frame["rss_db"]
-    written = next(one for one in table.result.streams if one.name == "LW1").frame["rss_db"]
+    spoken = next(stream for stream in console.result.streams if stream.name == "LW1").frame["rss_db"]
+    written = next(stream for stream in table.result.streams if stream.name == "LW1").frame["rss_db"]
     assert spoken.between(written.min() - 5, written.max() + 5).mean() > 0.9
 
 
@@ -160,8 +160,8 @@ def _json_cells(path: str) -> int:
     """Levels of all cells and NR legs of a PawPrints session."""
     count = 0
     for line in (REAL / path).read_text().splitlines():
-        one = json.loads(line)
-        for leg in [*one.get("cells", []), one.get("nr_signal_strength") or {}]:
+        entry = json.loads(line)
+        for leg in [*entry.get("cells", []), entry.get("nr_signal_strength") or {}]:
             count += re.fullmatch(r"-\d+", str(leg.get("rsrp", leg.get("ss_rsrp")))) is not None
     return count
 

@@ -19,7 +19,7 @@ def read(reader: str, data: bytes, options: ReadOptions = OPTIONS) -> ReadResult
 
 
 def stream(result: ReadResult, name: str) -> Stream:
-    return next(one for one in result.streams if one.name == name)
+    return next(candidate for candidate in result.streams if candidate.name == name)
 
 
 def utc(text: str) -> pd.Timestamp:
@@ -89,8 +89,8 @@ def test_limits_of_a_vehicles_position(longitude: str, latitude: str, altitude: 
     (stream,) = result.streams
     assert stream.frame["flag"].tolist() == [flag]
     assert np.isnan(stream.frame["altitude_m"][0]) == bool(flag)
-    told = [text for text in result.warnings if "no position fix" in text]
-    assert told == (
+    notes = [text for text in result.warnings if "no position fix" in text]
+    assert notes == (
         ["1 rows have no position fix; their positions are NaN, flagged no_fix"] if flag == "no_fix" else []
     )
 
@@ -282,9 +282,9 @@ def test_srsenb_layout_with_a_pci_column_reads_the_same_numbers() -> None:
 
 
 def test_generic_columns() -> None:
-    one = read("generic_csv", samples.GENERIC).streams[0]
-    assert one.frame["rss_db"].tolist() == [-81.5, -82.5]
-    assert one.frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5")
+    level = read("generic_csv", samples.GENERIC).streams[0]
+    assert level.frame["rss_db"].tolist() == [-81.5, -82.5]
+    assert level.frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5")
     epoch = read("generic_csv", b"Time,Level\n1740927600.5,-81.5\n", replace(OPTIONS, time_origin=None))
     assert epoch.streams[0].frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5")
     wall = read(

@@ -117,8 +117,8 @@ def test_line_ends_do_not_matter(reader: str, sample: str) -> None:
     assert unix is not None
     assert dos is not None
     assert (unix.accepted, unix.blank, unix.rejected) == (dos.accepted, dos.blank, dos.rejected)
-    for one, other in zip(unix.streams, dos.streams, strict=True):
-        assert one.frame.equals(other.frame)
+    for first, second in zip(unix.streams, dos.streams, strict=True):
+        assert first.frame.equals(second.frame)
 
 
 @pytest.mark.parametrize(("reader", "sample"), TEXT_CASES)

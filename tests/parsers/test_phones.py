@@ -21,21 +21,21 @@ def read(reader: str, data: bytes, options: ReadOptions = PLAIN) -> ReadResult:
 
 
 def stream(result: ReadResult, name: str) -> Stream:
-    return next(one for one in result.streams if one.name == name)
+    return next(candidate for candidate in result.streams if candidate.name == name)
 
 
 def test_neighbours_are_of_the_radio_access_that_the_table_names_alone() -> None:
     """A cell that was a neighbour and served later was two streams, ``pci6`` and ``lte_pci6``."""
     rows = b"2025-03-02 10:00:00,5,-90,6,-99\n2025-03-02 10:00:01,6,-91,5,-98\n"
-    one = read("drive_test", b"Time,LTEPCI,RSRP,N1 PCI,N1 RSRP\n" + rows)
-    assert {cell.name: cell.frame["rss_db"].tolist() for cell in one.streams} == {
+    lte = read("drive_test", b"Time,LTEPCI,RSRP,N1 PCI,N1 RSRP\n" + rows)
+    assert {cell.name: cell.frame["rss_db"].tolist() for cell in lte.streams} == {
         "lte_pci5": [-90.0, -98.0], "lte_pci6": [-99.0, -91.0],
     }  # fmt: skip
-    assert stream(one, "lte_pci6").frame["serving"].tolist() == [0.0, 1.0]
-    two = read(
+    assert stream(lte, "lte_pci6").frame["serving"].tolist() == [0.0, 1.0]
+    lte_and_nr = read(
         "drive_test", b"Time,LTE PCI,LTE RSRP,NR PCI,NR RSRP,N1 PCI,N1 RSRP\n2025-03-02 10:00:00,5,-90,6,-80,7,-99\n"
     )
-    assert {cell.name for cell in two.streams} == {"lte_pci5", "nr_pci6", "pci7"}, "of which of two, nobody says"
+    assert {cell.name for cell in lte_and_nr.streams} == {"lte_pci5", "nr_pci6", "pci7"}, "of which of two, nobody says"
 
 
 def test_a_bare_rank_beside_a_level_is_the_rank_of_the_channel() -> None:
@@ -82,21 +82,24 @@ def test_a_neighbour_that_nobody_names_is_no_level_of_the_serving_cell() -> None
 def test_values_are_in_the_unit_that_their_stream_says(name: str, unit: str, value: float) -> None:
     """A throughput in Mbit/s was given in bit/s and called mbit/s."""
     result = read("drive_test", f"Time,NetworkTech,NR-PCI,NR RSRP,{name}\n2025-03-02 10:00:00,LTE,1,-80,3\n".encode())
-    (one,) = (one for one in result.streams if "pci1" not in one.name)
-    assert (one.attributes["unit"], one.frame["value" if one.kind == "kpi" else "rss_db"][0]) == (unit, value)
+    (quantity,) = (quantity for quantity in result.streams if "pci1" not in quantity.name)
+    assert (quantity.attributes["unit"], quantity.frame["value" if quantity.kind == "kpi" else "rss_db"][0]) == (
+        unit,
+        value,
+    )
 
 
 @pytest.mark.parametrize(("written", "flag"), [("0", "no_csi"), ("9", "ri_out_of_range"), ("1,5", "rank_is_a_mean")])
 def test_a_rank_that_is_none_says_why(written: str, flag: str) -> None:
     result = read("drive_test", samples.XCAL.replace(b'"-81,5";"2"', b'"-81,5";"%s"' % written.encode()))
-    (rank,) = (one for one in result.streams if one.kind == "rank")
+    (rank,) = (series for series in result.streams if series.kind == "rank")
     assert rank.frame["rank"].isna().all()
     assert rank.frame["flag"].tolist() == [flag]
 
 
 def test_g_nettrack_neighbours_are_not_the_serving_cell() -> None:
     result = read("drive_test", samples.GNETTRACK)
-    serving = next(one for one in result.streams if one.attributes.get("pci") == 42)
+    serving = next(series for series in result.streams if series.attributes.get("pci") == 42)
     assert serving.frame["rss_db"].tolist() == [-95.0, -96.0]
     assert serving.frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00")
 
@@ -104,7 +107,7 @@ def test_g_nettrack_neighbours_are_not_the_serving_cell() -> None:
 def test_g_nettrack_pro_rssi_is_beside_its_level_and_steps_are_none() -> None:
     rows = samples.GNETTRACK_PRO.splitlines(keepends=True)
     result = read("drive_test", b"".join([*rows[:2], rows[1].replace(b"|-70|", b"|17|").replace(b"00.00|", b"00.02|")]))
-    (cell,) = (one for one in result.streams if one.name == "lte_pci42")
+    (cell,) = (series for series in result.streams if series.name == "lte_pci42")
     assert cell.frame["rssi_dbm"].tolist()[:1] == [-70.0]
     assert np.isnan(cell.frame["rssi_dbm"].to_numpy()[1:]).all(), "older phones: steps from 0, no level"
 
@@ -113,9 +116,9 @@ def test_g_nettrack_pro_rssi_is_beside_its_level_and_steps_are_none() -> None:
 def test_columns_in_any_order(columns: object) -> None:
     lines = [line.split(b",") for line in samples.NEMO_WIDE.strip().split(b"\n")[:-1]]
     turned = b"\n".join(b",".join(columns(line)) for line in lines) + b"\n"  # type: ignore[operator]
-    one, other = read("drive_test", samples.NEMO_WIDE), read("drive_test", turned)
+    usual, reordered = read("drive_test", samples.NEMO_WIDE), read("drive_test", turned)
     for name in ("lte_pci110", "lte_pci22", "phone"):
-        pd.testing.assert_frame_equal(stream(one, name).frame, stream(other, name).frame)
+        pd.testing.assert_frame_equal(stream(usual, name).frame, stream(reordered, name).frame)
 
 
 def test_the_same_pose_from_every_program() -> None:
@@ -160,9 +163,9 @@ def test_title_lines_in_front_of_a_table() -> None:
     ],
 )  # fmt: skip
 def test_names_of_quantities(name: str, quantity: str) -> None:
-    found = _quantities.quantity(name)
-    assert found is not None
-    assert found.name == quantity
+    known = _quantities.quantity(name)
+    assert known is not None
+    assert known.name == quantity
 
 
 @pytest.mark.parametrize("name", ["Longitude", "Grid", "Carrier", "Direction", "Priority", "Time", "Primary"])

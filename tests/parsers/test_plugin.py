@@ -13,9 +13,9 @@ GUIDE = Path(__file__).parents[2] / "docs" / "adding_a_reader.md"
 
 
 def block(language: str) -> str:
-    found = re.search(rf"```{language}\n(.*?)```", GUIDE.read_text(), re.DOTALL)
-    assert found
-    return found[1]
+    match = re.search(rf"```{language}\n(.*?)```", GUIDE.read_text(), re.DOTALL)
+    assert match
+    return match[1]
 
 
 @pytest.fixture

@@ -19,18 +19,18 @@ def read(data: bytes, clock: str = "epoch_s") -> _rows.Rows:
 def test_si_suffixes_scale_by_powers_of_a_thousand() -> None:
     cells = {b"5k": 5e3, b"5M": 5e6, b"5G": 5e9, b"5m": 5e-3, b"5u": 5e-6, b"5n": 5e-9, b"-4.5k": -4.5e3, b"7": 7.0}
     data = b"".join(b"1740927600.5 %s\n" % cell for cell in (*cells, b"nan", b"-"))
-    found = read(data).si("value")
-    np.testing.assert_allclose(found[:-2], list(cells.values()), rtol=1e-15)
-    assert np.isnan(found[-2:]).all()
+    scaled = read(data).si("value")
+    np.testing.assert_allclose(scaled[:-2], list(cells.values()), rtol=1e-15)
+    assert np.isnan(scaled[-2:]).all()
 
 
 @pytest.mark.parametrize("base", [0, 1])
 def test_ranks_1_to_8_are_ranks_whatever_the_base(base: int) -> None:
     written = np.array([base - 1.0, *np.arange(base, base + 8.0), base + 8.0, base + 0.5, np.nan])
     rows = read(b"".join(b"1740927600.5 x\n" for _ in written))
-    found = rows.rank(written, base=base)
-    np.testing.assert_array_equal(found["rank"], [np.nan, *range(1, 9), np.nan, np.nan, np.nan])
-    np.testing.assert_array_equal(found["ri_raw"], written)
+    columns = rows.rank(written, base=base)
+    np.testing.assert_array_equal(columns["rank"], [np.nan, *range(1, 9), np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(columns["ri_raw"], written)
     assert [flag for flag in rows.flag.tolist() if flag] == ["ri_out_of_range"] * 3 + ["no_csi"]
 
 

@@ -39,11 +39,11 @@ GOOD = [sample(3, 0o17, -20.5), sample(4, 0o7777777, 3.25), line(5, f"10000000 {
 
 
 def test_lines_of_od_are_read_at_once() -> None:
-    found, _ = sounder_log._fixed_layout(_lines.split("".join(GOOD).encode()))
-    assert found.line.tolist() == [0, 1, 2]
-    assert found.offset.tolist() == [0o17, 0o7777777, 0o10000000]
-    assert found.value.tolist() == [-20.5, 3.25, -788.5956]
-    assert np.diff(found.wall).tolist() == [10**9, 10**9]
+    layout, _ = sounder_log._fixed_layout(_lines.split("".join(GOOD).encode()))
+    assert layout.line.tolist() == [0, 1, 2]
+    assert layout.offset.tolist() == [0o17, 0o7777777, 0o10000000]
+    assert layout.value.tolist() == [-20.5, 3.25, -788.5956]
+    assert np.diff(layout.wall).tolist() == [10**9, 10**9]
 
 
 @pytest.mark.parametrize("row", [0, 2], ids=["seven digits", "eight digits"])
@@ -72,7 +72,7 @@ def test_why_lines_are_rejected() -> None:
     ]
     words = ["NUL bytes", "no '[time]' in front", "time stamp is incomplete", "neither 'offset value'", "no date"]
     result = read(*GOOD, *bad)
-    assert [word in one.reason for word, one in zip(words, result.rejected, strict=True)] == [True] * len(bad)
+    assert [word in reject.reason for word, reject in zip(words, result.rejected, strict=True)] == [True] * len(bad)
 
 
 @pytest.mark.parametrize(
@@ -114,13 +114,13 @@ def test_offsets_of_a_run_go_on_from_the_sample_before() -> None:
 def test_a_foot_bounds_the_last_run_by_its_offset_and_its_time(first: int) -> None:
     result = read(sample(0, first), star(1), line(3, f"{first + 12:07o}"))
     assert seconds(result) == [0, 1, 2]
-    assert [one.reason[:8] for one in result.rejected] == ["no value"], "the foot is no sample"
+    assert [reject.reason[:8] for reject in result.rejected] == ["no value"], "the foot is no sample"
 
 
 @pytest.mark.parametrize("offset", [0, 4])
 def test_a_foot_at_the_beginning_of_a_file_is_one(offset: int) -> None:
     result = read(line(0, f"{offset:07o}"), sample(1, offset), sample(2, offset + 4))
-    assert (result.accepted, [one.number for one in result.rejected]) == (2, [1])
+    assert (result.accepted, [reject.number for reject in result.rejected]) == (2, [1])
     assert "no value behind the offset" in result.rejected[0].reason
 
 
@@ -137,13 +137,13 @@ def test_a_foot_at_the_beginning_of_a_file_is_one(offset: int) -> None:
 )
 def test_stars_that_say_no_length(lines: list[str], number: int, words: str) -> None:
     result = read(*lines)
-    assert [(one.number, words in one.reason) for one in result.rejected] == [(number, True)]
+    assert [(reject.number, words in reject.reason) for reject in result.rejected] == [(number, True)]
     assert result.lines == result.accepted + result.blank + len(result.rejected)
 
 
 def test_a_foot_at_offset_zero_bounds_no_run() -> None:
     result = read(sample(0, 8), star(1), line(2, "0000000"))
-    assert "do not bound a run" in next(one.reason for one in result.rejected if one.number == 2)
+    assert "do not bound a run" in next(reject.reason for reject in result.rejected if reject.number == 2)
 
 
 def test_a_star_that_stands_for_no_sample_is_accepted() -> None:
@@ -174,14 +174,14 @@ def test_samples_of_both_ways_come_in_the_order_of_the_file() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "kept"), [("          2e-05", True), ("         2e-05", False), ("          2e-0", False)]
+    ("value", "counts"), [("          2e-05", True), ("         2e-05", False), ("          2e-0", False)]
 )
-def test_a_last_line_without_its_end_counts_where_it_has_its_whole_width(value: str, kept: bool) -> None:
+def test_a_last_line_without_its_end_counts_where_it_has_its_whole_width(value: str, counts: bool) -> None:
     """An exponent is not read at once; one character less may be a number cut short."""
     result = read(sample(1, 0), line(2, f"0000004 {value}").rstrip("\n"))
-    assert result.accepted == 1 + kept
-    assert [reject.number for reject in result.rejected] == ([] if kept else [2])
-    if kept:
+    assert result.accepted == 1 + counts
+    assert [reject.number for reject in result.rejected] == ([] if counts else [2])
+    if counts:
         assert result.streams[0].frame["flag"].tolist() == ["", _lines.UNTERMINATED]
 
 

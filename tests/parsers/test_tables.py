@@ -43,11 +43,11 @@ def test_quoted_cells_are_read_as_bare_ones(rows: list[tuple[str, str]], separat
         bare.append(separator.join(cells))
         quoted.append(separator.join(f'"{cell}"' for cell in cells))
     head = separator.join(("time", "lat", "lon"))
-    found = [
+    sheets = [
         _sheet.read(("\n".join([head, *lines]) + "\n").encode(), lambda names: "lat" in names)
         for lines in (bare, quoted)
     ]
-    quick, slow = found
+    quick, slow = sheets
     assert quick is not None
     assert slow is not None
     for column in range(3):
@@ -128,8 +128,8 @@ def test_every_reading_of_a_cell_is_a_record() -> None:
 
 def test_a_quality_that_has_rows_of_its_own_is_a_stream() -> None:
     rows = [phone(0, "7"), phone(1, "", "", "-12"), phone(2, "7", quality="")]
-    whole = read("drive_test", PHONE + b"".join(rows))
-    assert [(stream.name, len(stream.frame)) for stream in whole.streams if stream.kind == "kpi"] == [("rsrq", 2)]
+    result = read("drive_test", PHONE + b"".join(rows))
+    assert [(stream.name, len(stream.frame)) for stream in result.streams if stream.kind == "kpi"] == [("rsrq", 2)]
 
 
 def test_a_cell_serves_until_another_does() -> None:
@@ -142,9 +142,9 @@ def test_a_cell_serves_until_another_does() -> None:
 def test_exports_read_back_keep_the_order_of_the_table() -> None:
     head = b"time_utc,time_s,tower,channel,unit,measured_db\n"
     rows = [f"2025-03-02T15:00:{i:02d}Z,{i},LW{3 - i % 3},USRP1,{'dB' if i else 'dBm'},{-50 - i}\n" for i in range(7)]
-    whole = read("own_csv", head + "".join(rows).encode())
-    assert [stream.name for stream in whole.streams] == ["LW3_USRP1", "LW2_USRP1", "LW1_USRP1"]
-    assert [stream.attributes["unit"] for stream in whole.streams] == ["dBm", "dB", "dB"]
+    result = read("own_csv", head + "".join(rows).encode())
+    assert [stream.name for stream in result.streams] == ["LW3_USRP1", "LW2_USRP1", "LW1_USRP1"]
+    assert [stream.attributes["unit"] for stream in result.streams] == ["dBm", "dB", "dB"]
 
 
 @pytest.mark.parametrize("kind", ["rss", "rank"])

@@ -820,7 +820,7 @@ def test_every_format_at_every_kind_of_time(name: str, when: str) -> None:
         assert reader.name == name.split(",")[0]
         result = reader.read(data, options)
         (frame,) = (stream.frame for stream in result.streams if stream.name == form.stream)
-        assert frame["time"].tolist() == [pd.Timestamp(one) for one in instants]
+        assert frame["time"].tolist() == [pd.Timestamp(instant) for instant in instants]
         column, sign, above = COLUMNS.get(form.column, (form.column, 1, 0.0))
         assert (sign * frame[column] - above).tolist() == pytest.approx(VALUES)
         twice = when.startswith("the hour") and not form.utc
@@ -854,6 +854,6 @@ def test_a_stream_says_where_its_clock_height_and_identity_are_known_from(name: 
     (tmp_path / name).write_text(FILES[name])
     (file,) = ingest(tmp_path / name, options=LOCAL)
     stream, clock, height, identity = ORIGINS[name]
-    about = next(one.attributes for one in file.result.streams if one.name == stream)
+    about = next(candidate.attributes for candidate in file.result.streams if candidate.name == stream)
     assert (about["clock_from"], about.get("height_from"), about.get("identity_from")) == (clock, height, identity)
     assert clock == "written" or about["clock_source"]

@@ -67,22 +67,22 @@ def _cells(data: bytes) -> list[list[bytes]]:
     ids=["order", "decimal comma", "tabs", "title and more columns", "quoted", "capitals"],
 )
 def test_a_rank_table_in_another_dress_gives_the_same_ranks(change) -> None:  # type: ignore[no-untyped-def]
-    whole = by_name("nemo_csv").read(NEMO_CSV, OPTIONS).streams[0].frame
+    usual = by_name("nemo_csv").read(NEMO_CSV, OPTIONS).streams[0].frame
     data = change(_cells(NEMO_CSV))
     result = identify(data).read(data, OPTIONS)
     (rank,) = (stream.frame for stream in result.streams if stream.kind == "rank")
-    shown = whole[whole["rank"].notna()]
+    shown = usual[usual["rank"].notna()]
     assert rank["rank"].tolist() == shown["rank"].tolist()
     assert rank["time"].tolist() == shown["time"].tolist()
 
 
 def test_a_mapped_table_has_any_separator() -> None:
     options = replace(OPTIONS, kind="rss", columns={"time": "Time", "rss_db": "Level"})
-    whole = by_name("generic_csv").read(b"Time,Level\n2025-03-02T10:00:00.5,-81.5\n", options).streams[0].frame
+    usual = by_name("generic_csv").read(b"Time,Level\n2025-03-02T10:00:00.5,-81.5\n", options).streams[0].frame
     for data in (b"Time;Level\n2025-03-02T10:00:00.5;-81,5\n", b"Time\tLevel\n2025-03-02T10:00:00.5\t-81.5\n"):
         frame = by_name("generic_csv").read(data, options).streams[0].frame
-        assert frame["rss_db"].tolist() == whole["rss_db"].tolist()
-        assert frame["time"].tolist() == whole["time"].tolist()
+        assert frame["rss_db"].tolist() == usual["rss_db"].tolist()
+        assert frame["time"].tolist() == usual["time"].tolist()
 
 
 def test_what_fuzzing_found() -> None:
@@ -122,5 +122,5 @@ def test_an_offset_in_the_times_of_the_modem_logger_wins() -> None:
     usual = by_name("quectel_csv").read(data, OPTIONS)
     result = by_name("quectel_csv").read(zoned, replace(OPTIONS, timezone=None))
     assert result.accepted == usual.accepted
-    for one, other in zip(result.streams, usual.streams, strict=True):
-        pd.testing.assert_frame_equal(one.frame, other.frame)
+    for zoned_stream, usual_stream in zip(result.streams, usual.streams, strict=True):
+        pd.testing.assert_frame_equal(zoned_stream.frame, usual_stream.frame)

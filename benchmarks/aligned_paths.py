@@ -32,14 +32,14 @@ def wrong(rng: np.random.Generator, boxes: int) -> tuple[int, int, int, int, flo
     site = Site("integers", SiteFrame(35.7275, -78.696), {"LW1": tower}, buildings)
     faces = site_faces(site)
     targets = np.array(poses, dtype=float)
-    found = find_paths(
+    paths = find_paths(
         faces, Links(np.array([source], dtype=float), targets, excluded=inside_solids(site, targets)[None])
     )
     counts = np.zeros(4, dtype=int)
     started = time.perf_counter()
     for pose, target in enumerate(poses):
         expected = exact.paths(solids, source, target)
-        ours = exact.planes_found(found, faces, pose)
+        ours = exact.planes_found(paths, faces, pose)
         counts += [1, len(expected), len(ours - expected), len(expected - ours)]
     return (*counts.tolist(), time.perf_counter() - started)
 

@@ -147,24 +147,24 @@ def run_one(name: str, command: list[str]) -> dict[str, Any]:
     print(f"{name} ...", file=sys.stderr, flush=True)
     text, why = _run(command, LONG_S if name == "country" else LIMIT_S)
     seconds = round(time.perf_counter() - start, 1)
-    found: dict[str, Any] = {"seconds": seconds, "load_before": round(load, 2)}
+    row: dict[str, Any] = {"seconds": seconds, "load_before": round(load, 2)}
     try:
-        return {**found, "failed": why} if why else {**found, "result": json.loads(text[text.index("{") :])}
+        return {**row, "failed": why} if why else {**row, "result": json.loads(text[text.index("{") :])}
     except ValueError:
-        return {**found, "failed": "no JSON on standard output"}
+        return {**row, "failed": "no JSON on standard output"}
 
 
 def run_axes(command: list[str], axes: Sequence[str] = AXES) -> dict[str, Any]:
     """The scaling, one axis after the other: one that is not done in time costs no other."""
     parts = {axis: run_one(f"scaling of {axis}", [*command, axis]) for axis in axes}
-    found: dict[str, Any] = {
-        "seconds": round(sum(one["seconds"] for one in parts.values()), 1),
+    row: dict[str, Any] = {
+        "seconds": round(sum(part["seconds"] for part in parts.values()), 1),
         "load_before": parts[axes[0]]["load_before"],
-        "result": {axis: one["result"][axis] for axis, one in parts.items() if "result" in one},
+        "result": {axis: part["result"][axis] for axis, part in parts.items() if "result" in part},
     }
-    if missing := [f"{axis}: {one['failed']}" for axis, one in parts.items() if "failed" in one]:
-        found["failed"] = "; ".join(missing)
-    return found
+    if missing := [f"{axis}: {part['failed']}" for axis, part in parts.items() if "failed" in part]:
+        row["failed"] = "; ".join(missing)
+    return row
 
 
 def check(names: Sequence[str]) -> int:
@@ -210,9 +210,9 @@ def main() -> int:
         },
     }
     entry |= {"seconds": round(time.perf_counter() - start, 1), "load_after": round(os.getloadavg()[0], 2)}
-    failed = {name: one["failed"] for name, one in entry["benchmarks"].items() if "failed" in one}
-    for name, one in entry["benchmarks"].items():
-        print(f"{name:<12} {one['seconds']:6.1f} s  load before {one['load_before']:.1f}  {one.get('failed', 'done')}")
+    failed = {name: row["failed"] for name, row in entry["benchmarks"].items() if "failed" in row}
+    for name, row in entry["benchmarks"].items():
+        print(f"{name:<12} {row['seconds']:6.1f} s  load before {row['load_before']:.1f}  {row.get('failed', 'done')}")
     print(f"load {entry['load_before']} at the start, {entry['load_after']} at the end (this run alone makes 1 to 2)")
     print(f"{'all':<12} {entry['seconds']:6.1f} s on {entry['machine']['processor']}, {entry['machine']['cpus']} cpus")
     if not arguments.no_history:

@@ -78,14 +78,14 @@ def mapped(site: Path, receivers: float, workers: int, cells: int) -> dict[str, 
     if done.returncode:
         raise SystemExit(done.stderr)
     seconds = time.perf_counter() - started
-    told = json.loads(done.stdout)
+    answer = json.loads(done.stdout)
     usage = json.loads((folder / "usage.json").read_text(encoding="utf-8"))
     files = [path.stat().st_size for path in (folder / "out.zarr").rglob("*") if path.is_file()]
     here, there = usage["RUSAGE_SELF"], usage["RUSAGE_CHILDREN"]
-    count = told["tiles"]["positions"]
+    count = answer["tiles"]["positions"]
     return {
-        "receivers": count, "tiles": told["tiles"]["tiles"], "paths": told["paths"], "wall_s": seconds,
-        "maps_s": told["stages"]["maps_s"], "cpu_s": here[0] + there[0], "first_cpu_s": here[0],
+        "receivers": count, "tiles": answer["tiles"]["tiles"], "paths": answer["paths"], "wall_s": seconds,
+        "maps_s": answer["stages"]["maps_s"], "cpu_s": here[0] + there[0], "first_cpu_s": here[0],
         "receivers_per_s": count / seconds, "worker_mib": there[1] if workers > 1 else here[1], "first_mib": here[1],
         "store_mib": sum(files) / 2**20, "files": len(files),
     }  # fmt: skip

@@ -77,10 +77,10 @@ def rss_cell(flights: int, n: int, neighbours: float, noise_db: float) -> dict[s
     for row in ends:
         error = SHADOW_DB * shadowed(rng, n, neighbours) + rng.normal(0, noise_db, n)
         other = SHADOW_DB * shadowed(rng, n, neighbours) + rng.normal(0, noise_db, n)
-        found = error_intervals(simulated - OFFSET_DB + error, simulated)
+        intervals = error_intervals(simulated - OFFSET_DB + error, simulated)
         second = 0.5 * error + np.sqrt(0.75) * other
         pairs = [paired_difference(size * error, second).difference_ci95_db for size in (1.0, 1.5)]
-        row[:] = [found.offset_db, found.rmse_db, found.correlation, *pairs]
+        row[:] = [intervals.offset_db, intervals.rmse_db, intervals.correlation, *pairs]
     given = np.isfinite(ends[..., 0])
     held = (ends[..., 0] <= truth) & (truth <= ends[..., 1])
     width = np.nanmedian(np.ptp(ends, axis=2), axis=0) / np.sqrt(variance)
@@ -115,12 +115,14 @@ def rank_coverage(flights: int, n: int, memory: float, replicates: int) -> dict[
     truth = rank_truth(mix)
     hits = dict.fromkeys(truth, 0)
     for _ in range(flights):
-        one = remembering(rng, n, memory)
-        two = mix * one + np.sqrt(1 - mix**2) * remembering(rng, n, memory)
+        measured = remembering(rng, n, memory)
+        simulated = mix * measured + np.sqrt(1 - mix**2) * remembering(rng, n, memory)
         fit = compare_ranks(
-            np.searchsorted(CUTS, one) + 1.0, np.searchsorted(CUTS + 0.3, two) + 1.0, replicates=replicates
+            np.searchsorted(CUTS, measured) + 1.0, np.searchsorted(CUTS + 0.3, simulated) + 1.0, replicates=replicates
         )
-        swapped = compare_ranks(np.searchsorted(CUTS + 0.3, two) + 1.0, np.searchsorted(CUTS, one) + 1.0, replicates=20)
+        swapped = compare_ranks(
+            np.searchsorted(CUTS + 0.3, simulated) + 1.0, np.searchsorted(CUTS, measured) + 1.0, replicates=20
+        )
         ends = {
             "agreement": fit.agreement_ci95, "kappa": fit.kappa_ci95, "total_variation": fit.total_variation_ci95,
             "wasserstein": fit.wasserstein_ci95, "bar_1": swapped.histogram_ci95[0],

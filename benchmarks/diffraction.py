@@ -41,8 +41,8 @@ FIELD = Path(__file__).parents[1] / "tests" / "field"
 
 def timed(case: tuple[Site, Link, Poses], diffraction: str) -> tuple[Replay, float]:
     start = time.process_time()
-    found = replay(*case, Search(diffraction=diffraction), run=Run(threads=1))
-    return found, time.process_time() - start
+    replayed = replay(*case, Search(diffraction=diffraction), run=Run(threads=1))
+    return replayed, time.process_time() - start
 
 
 def boxes(poses: int, pairs: int) -> dict[str, float]:
@@ -73,10 +73,10 @@ def town(receivers: int = 200) -> dict[str, float]:
     row: dict[str, float] = {"receivers": receivers}
     for mode in ("none", "edges"):
         timed((site, link, few), mode)  # compiles, and merges the triangles
-        found, seconds = timed((site, link, poses), mode)
+        replayed, seconds = timed((site, link, poses), mode)
         street = targets[:, 2] < 2.0
-        row |= {f"{mode}_cpu_s": seconds, f"{mode}_silent_at_1.5_m": int((~found.has_path[street, 0]).sum())}
-    return row | {"edge_paths": len(found.edge_paths or ()), "street_receivers": int(street.sum())}
+        row |= {f"{mode}_cpu_s": seconds, f"{mode}_silent_at_1.5_m": int((~replayed.has_path[street, 0]).sum())}
+    return row | {"edge_paths": len(replayed.edge_paths or ()), "street_receivers": int(street.sum())}
 
 
 def flight(path: str, logs_root: str | None) -> list[str]:
@@ -88,8 +88,8 @@ def flight(path: str, logs_root: str | None) -> list[str]:
     without, edges = (scores.result for scores in results)
     lines = []
     for plain, bent in zip(without.rss, edges.rss, strict=True):
-        two = [np.where(s.posed, s.measured_db - s.simulated_dbm, np.nan) for s in (bent, plain)]
-        pair = paired_difference(*two)
+        errors_db = [np.where(s.posed, s.measured_db - s.simulated_dbm, np.nan) for s in (bent, plain)]
+        pair = paired_difference(*errors_db)
         low, high = pair.difference_ci95_db
         lines.append(
             f"{Path(path).stem} {plain.tower} {plain.channel}: RMSE {plain.score.rmse_db:.2f} dB,"

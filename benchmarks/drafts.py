@@ -38,7 +38,7 @@ def outcome(read: Callable[[], Sequence[IngestedFile]], timezone: str) -> tuple[
             made = drafts(files, Path(folder), timezone=timezone)
     except AerpawCmpError as error:
         return "refused", str(error)
-    words = [remark for one in made for remark in one.remarks if "can be compared" in remark]
+    words = [remark for draft in made for remark in draft.remarks if "can be compared" in remark]
     kind = "drafted" if any(not word.startswith("no sample") for word in words) else "silent"
     return kind, "; ".join(words)
 

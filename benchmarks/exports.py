@@ -37,7 +37,7 @@ def flight(samples: int):
     return Export(name="long", title="A long flight", site=site, sets=rss, lines=(), clock=True)
 
 
-def one(name: str, samples: int) -> None:
+def write_one(name: str, samples: int) -> None:
     """Write one format and print its numbers."""
     from aerpaw_cmp.report.exports.formats import write_exports
 
@@ -45,9 +45,9 @@ def one(name: str, samples: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         start = time.process_time()
         files = write_exports(export, Path(folder), [] if name == "none" else [name])
-        found = {"cpu_s": time.process_time() - start, "bytes": sum(path.stat().st_size for path in files)}
-    found["peak_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(json.dumps(found))
+        numbers = {"cpu_s": time.process_time() - start, "bytes": sum(path.stat().st_size for path in files)}
+    numbers["peak_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps(numbers))
 
 
 def main() -> None:
@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--one")
     given = parser.parse_args()
     if given.one:
-        one(given.one, given.samples)
+        write_one(given.one, given.samples)
         return
     print(
         f"{given.samples} samples of one link, six numbers each; Python {sys.version.split()[0]}, "
@@ -68,10 +68,10 @@ def main() -> None:
     base = None
     for name in ["none", *given.formats.split(",")]:
         command = [sys.executable, __file__, "--one", name, "--samples", str(given.samples)]
-        found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-        base = base or found["peak_mib"]
-        size, peak = found["bytes"] / 2**20, found["peak_mib"]
-        print(f"{name:11s} {found['cpu_s']:7.1f} s CPU {size:8.1f} MiB, peak {peak:6.0f} MiB ({peak - base:+.0f})")
+        numbers = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        base = base or numbers["peak_mib"]
+        size, peak = numbers["bytes"] / 2**20, numbers["peak_mib"]
+        print(f"{name:11s} {numbers['cpu_s']:7.1f} s CPU {size:8.1f} MiB, peak {peak:6.0f} MiB ({peak - base:+.0f})")
     print("in brackets: beyond a process that makes the samples and no file")
 
 

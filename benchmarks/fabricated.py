@@ -62,8 +62,8 @@ def season(flights: int = 200, settings: int = 20, towers: int = 5, channels: in
             for (tower, channel), offset in links.items():
                 level = -70 - 10 * rng.random(SAMPLES)
                 noise = rng.normal(0, setting_error_db(s) * (1 + f % 7 / 10), SAMPLES)
-                measured, kept = level - offset + noise + hill, s == 0
-                rows.append(_row((name, label, tower, channel), start, level, measured, position, kept))
+                measured, with_samples = level - offset + noise + hill, s == 0
+                rows.append(_row((name, label, tower, channel), start, level, measured, position, with_samples))
     data = CampaignData(
         name="season", title=f"A season that was never flown: {flights} flights, {settings} settings",
         generated="2026-11-21T00:00:00+00:00", versions={"numpy": np.__version__}, calibration="channel",
@@ -171,10 +171,12 @@ def rank_result(tower: str, time: Any, position_m: FloatArray, measured: FloatAr
 
 def with_numbers(result: Any, **values: Any) -> Any:
     """A result with other values of its fields, or of those of its score and of its further numbers, by name."""
-    own = {one.name: values.pop(one.name) for one in fields(result) if one.name in values}
+    own = {field.name: values.pop(field.name) for field in fields(result) if field.name in values}
     for name in ("score", "further"):
         part = own.get(name, getattr(result, name))
-        own[name] = replace(part, **{one.name: values.pop(one.name) for one in fields(part) if one.name in values})
+        own[name] = replace(
+            part, **{field.name: values.pop(field.name) for field in fields(part) if field.name in values}
+        )
     return replace(result, **own, **values)
 
 

@@ -108,20 +108,20 @@ def differences(before: Any, after: Any) -> dict[str, float]:
         print("cases differ:", sorted(set(before.files) ^ set(after.files)))
         worst["paths"] = np.inf
     for name in sorted(set(before.files) & set(after.files)):
-        one, other, key = before[name], after[name], name.rpartition("|")[2]
-        if one.shape != other.shape:
-            print(f"{name}: shape {one.shape} before, {other.shape} after")
+        old, new, key = before[name], after[name], name.rpartition("|")[2]
+        if old.shape != new.shape:
+            print(f"{name}: shape {old.shape} before, {new.shape} after")
             worst["paths"] = np.inf
             continue
         if key in ("pose", "tower", "depth", "faces", "tree", "ranks"):
-            count = float((one != other).sum())
+            count = float((old != new).sum())
             worst["ranks" if key == "ranks" else "paths"] += count
         elif key == "h":
-            size = np.abs(one).max(axis=(-2, -1), keepdims=True, initial=1e-300)
-            worst["h_relative"] = max(worst["h_relative"], float((np.abs(one - other) / size).max(initial=0.0)))
-            worst["bits"] += float((one != other).sum())
+            size = np.abs(old).max(axis=(-2, -1), keepdims=True, initial=1e-300)
+            worst["h_relative"] = max(worst["h_relative"], float((np.abs(old - new) / size).max(initial=0.0)))
+            worst["bits"] += float((old != new).sum())
         else:
-            apart = np.where(np.isnan(one) & np.isnan(other), 0.0, np.abs(one - other))
+            apart = np.where(np.isnan(old) & np.isnan(new), 0.0, np.abs(old - new))
             kind = "vertices_m" if key == "vertices_m" else "level_db"
             worst[kind] = max(worst[kind], float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0)))
     return worst

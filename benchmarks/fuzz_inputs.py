@@ -133,10 +133,10 @@ def _replace_one(
     pattern: re.Pattern[bytes], values: tuple[bytes, ...], data: bytes, chance: np.random.Generator
 ) -> bytes:
     start = int(chance.integers(0, len(data) + 1))
-    found = pattern.search(data, start) or pattern.search(data)
-    if found is None:
+    match = pattern.search(data, start) or pattern.search(data)
+    if match is None:
         return data
-    return data[: found.start()] + values[int(chance.integers(len(values)))] + data[found.end() :]
+    return data[: match.start()] + values[int(chance.integers(len(values)))] + data[match.end() :]
 
 
 def _bytes(data: bytes, chance: np.random.Generator) -> bytes:
@@ -282,8 +282,8 @@ def _check_frame(name: str, kind: str, frame: Any, lines: int) -> set[int]:
 def _read_log(reader: Reader, binary: bool, data: bytes, index: int) -> bool:
     if index % SNIFF_EVERY == 0:
         head = data[:HEAD_BYTES]
-        for one in catalogue():
-            one.sniff(head)
+        for candidate in catalogue():
+            candidate.sniff(head)
     options = OPTIONS[index % len(OPTIONS)]
     result = limits.check(reader.read(data, options))
     check_law(result, data, binary)
@@ -292,19 +292,19 @@ def _read_log(reader: Reader, binary: bool, data: bytes, index: int) -> bool:
     return result.accepted > 0
 
 
-def _read_in_pieces(reader: Reader, data: bytes, options: ReadOptions, whole: ReadResult, size: int) -> None:
+def _read_in_pieces(reader: Reader, data: bytes, options: ReadOptions, at_once: ReadResult, size: int) -> None:
     """The same result from pieces of a few lines."""
     assert reader.read_pieces is not None
     pieces = whole_lines(data[i : i + size] for i in range(0, len(data), size))
     parts = limits.check(reader.read_pieces(pieces, options))
     for name in ("lines", "accepted", "blank", "rejected", "reasons", "warnings"):
-        if getattr(parts, name) != getattr(whole, name):
+        if getattr(parts, name) != getattr(at_once, name):
             raise ViolationError(f"{name}: otherwise in pieces of {size} bytes")
-    for one, other in zip(parts.streams, whole.streams, strict=True):
-        if (one.name, dict(one.attributes)) != (other.name, dict(other.attributes)) or not one.frame.equals(
-            other.frame
+    for part, stream in zip(parts.streams, at_once.streams, strict=True):
+        if (part.name, dict(part.attributes)) != (stream.name, dict(stream.attributes)) or not part.frame.equals(
+            stream.frame
         ):
-            raise ViolationError(f"{one.name}: otherwise in pieces of {size} bytes")
+            raise ViolationError(f"{part.name}: otherwise in pieces of {size} bytes")
 
 
 # --- targets ---------------------------------------------------------------------------------------------------------
@@ -343,13 +343,13 @@ def _log_seeds() -> dict[str, list[bytes]]:
     """Pieces of real logs and of the samples, by the reader that knows them."""
     from tests.parsers.samples import NO_LOGS, SAMPLES, saved
 
-    found: dict[str, list[bytes]] = {r.name: [] for r in catalogue()}
+    by_reader: dict[str, list[bytes]] = {r.name: [] for r in catalogue()}
     for name, samples in SAMPLES.items():
-        found[name] += [data for data, *_ in samples.values()]
+        by_reader[name] += [data for data, *_ in samples.values()]
     for name, data in NO_LOGS.items():
-        found[name].append(data)
-    found["antenna_grid"].append(saved({"rad_pat": np.zeros((3, 4))}))
-    found["matlab_other"].append(saved({"other": np.ones((2, 2))}))
+        by_reader[name].append(data)
+    by_reader["antenna_grid"].append(saved({"rad_pat": np.zeros((3, 4))}))
+    by_reader["matlab_other"].append(saved({"other": np.ones((2, 2))}))
     for path in _log_files():
         data = path.read_bytes()
         if data.startswith(b"\x1f\x8b"):
@@ -361,12 +361,12 @@ def _log_seeds() -> dict[str, list[bytes]]:
             continue
         if data.startswith(b"MATLAB 5"):
             try:
-                found[readers[0].name].append(_small_mat(data))
+                by_reader[readers[0].name].append(_small_mat(data))
             except (ValueError, IndexError, TypeError, NotImplementedError):
                 continue
         elif b"\0" not in data[:1000]:
-            found[readers[0].name] += [p for p in _pieces(data) if len(p) <= MEDIUM_BYTES]
-    return {name: [s for s in dict.fromkeys(seeds) if len(s) <= 40_000] for name, seeds in found.items() if seeds}
+            by_reader[readers[0].name] += [p for p in _pieces(data) if len(p) <= MEDIUM_BYTES]
+    return {name: [s for s in dict.fromkeys(seeds) if len(s) <= 40_000] for name, seeds in by_reader.items() if seeds}
 
 
 @contextmanager
@@ -696,12 +696,12 @@ def run_block(target: Target, seed: int, start: int, stop: int) -> dict[str, Any
         except EOFError:
             worker.join()
             (at,) = struct.unpack("q", place[:8])
-            told = {"index": at, "what": f"the process ended with {worker.exitcode}"}
+            violation = {"index": at, "what": f"the process ended with {worker.exitcode}"}
             # the account of the inputs before it went with the process: they are run again, up to the bad one
             if at > start:
                 parts.append(run_block(target, seed, start, at))
             parts.append(
-                {"read": 0, "refused": 0, "violation": 1, "violations": [told], "slowest_ms": 0, "reading_s": 0}
+                {"read": 0, "refused": 0, "violation": 1, "violations": [violation], "slowest_ms": 0, "reading_s": 0}
             )
             start = at + 1
     return {

@@ -122,10 +122,10 @@ def contest(who: str, what: str, place: Path) -> dict[str, float]:
     run(what, small)  # imports and first-call costs do not count
     before = peak_mib()
     start, began = time.process_time(), time.perf_counter()
-    kept = run(what, place)
+    columns = run(what, place)
     spent, passed = time.process_time() - start, time.perf_counter() - began
     peak = peak_mib()
-    records = sum(column.nbytes for column in kept) / 2**20
+    records = sum(column.nbytes for column in columns) / 2**20
     return {"cpu_s": spent, "wall_s": passed, "peak_mib": peak - before, "records_mib": records}
 
 
@@ -186,18 +186,18 @@ def scale(lines: int, formats: list[str], contestants: list[str], folder: str | 
             place = Path(folder_) / name
             write(place, lines)
             print(f"{what}: {lines} lines, {place.stat().st_size / 1e6:.0f} MB")
-            found: dict[str, Any] = {}
+            rows: dict[str, Any] = {}
             for who in contestants:
                 command = [sys.executable, __file__, "--contest", who, what, str(place)]
                 answer = subprocess.run(command, capture_output=True, text=True, check=False)
                 if answer.returncode:
                     print(f"  {who:8} not run: {(answer.stderr.strip().splitlines() or ['?'])[-1][:90]}")
                     continue
-                found[who] = one = json.loads(answer.stdout)
-                ours = found.get("ours", {"cpu_s": np.nan, "wall_s": np.nan})
-                ratio, by_wall = ours["cpu_s"] / one["cpu_s"], ours["wall_s"] / one["wall_s"]
-                spent = f"{one['cpu_s']:8.2f} s CPU {one['wall_s']:8.2f} s wall"
-                memory = f"peak {one['peak_mib']:7.0f} MiB, of which records {one['records_mib']:5.0f}"
+                rows[who] = row = json.loads(answer.stdout)
+                ours = rows.get("ours", {"cpu_s": np.nan, "wall_s": np.nan})
+                ratio, by_wall = ours["cpu_s"] / row["cpu_s"], ours["wall_s"] / row["wall_s"]
+                spent = f"{row['cpu_s']:8.2f} s CPU {row['wall_s']:8.2f} s wall"
+                memory = f"peak {row['peak_mib']:7.0f} MiB, of which records {row['records_mib']:5.0f}"
                 print(
                     f"  {who:8} {spent}   {memory}   ours takes {ratio:.2f} x its CPU, {by_wall:.2f} x its wall",
                     flush=True,

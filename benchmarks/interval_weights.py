@@ -85,11 +85,11 @@ def loss(log_weight: FloatArray, made: list[Cell]) -> tuple[float, FloatArray]:
         share /= share.sum(axis=1, keepdims=True)
         chance = np.clip((share * below).sum(axis=1), 1e-7, 1 - 1e-7)
         over, under = (expit(STEEP * (sign * logit(chance) - logit(TAIL))) for sign in (1.0, -1.0))
-        miss = (over * under).mean() - COVERAGE
+        excess = (over * under).mean() - COVERAGE
         slope = STEEP * over * under * (under - over) / (chance * (1.0 - chance)) / len(chance)
         size = (share * width).sum(axis=1)
-        total += weight * (miss**2 + 0.5 * WIDTH * np.log(size).mean())
-        gradient += weight * ((2.0 * miss * slope)[:, None] * share * (below - chance[:, None])).sum(axis=0)
+        total += weight * (excess**2 + 0.5 * WIDTH * np.log(size).mean())
+        gradient += weight * ((2.0 * excess * slope)[:, None] * share * (below - chance[:, None])).sum(axis=0)
         gradient += weight * 0.5 * WIDTH * (share * (width - size[:, None]) / size[:, None]).mean(axis=0)
     table = log_weight.reshape(SHAPE)
     bend, away = np.diff(table, 2, axis=1), table - table.mean()
@@ -107,16 +107,16 @@ def main() -> None:
     arguments = parser.parse_args()
     made = cells(arguments.kind, arguments.sequences)
     start = np.where(np.array(WHITE_SHARES) > 0.0, -2.0, 0.0)[:, None] + 0.3 * np.log(RATES)
-    found = minimize(
+    best = minimize(
         lambda p: (lambda value: (1e3 * value[0], 1e3 * value[1]))(loss(p, made)), start.ravel(), jac=True,
         method="L-BFGS-B", options={"maxiter": 150},
     )  # fmt: skip
-    prior = np.exp(found.x - found.x.max())
+    prior = np.exp(best.x - best.x.max())
     for likelihood, below, *_ in made:
         chance = (likelihood * prior * below).sum(axis=1) / (likelihood * prior).sum(axis=1)
         print(f"{100 * ((chance > TAIL) & (chance < 1 - TAIL)).mean():.1f}", end=" ")
     print()
-    for row in np.round(10 * found.x.reshape(SHAPE)).astype(int).tolist():
+    for row in np.round(10 * best.x.reshape(SHAPE)).astype(int).tolist():
         print(row)
 
 

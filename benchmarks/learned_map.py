@@ -112,7 +112,7 @@ def flights(bench: Bench, *, quick: bool) -> None:
     for name in DATASET12[: 1 if quick else None]:
         train, asked = ([o for o in every if (o.samples.flight == name) == mine] for mine in (False, True))
         model = learned_antennas([o.samples for o in train])
-        scores = [one for o in asked if (one := score(o, model.mean(o.samples)))]
+        scores = [result for o in asked if (result := score(o, model.mean(o.samples)))]
         title, alone, chosen = both([o.samples for o in train], [o.samples for o in asked])
         rows.append([*(np.mean([getattr(s, key) for s in scores]) for key in ("rmse_db", "rmse_4s_db")),
                      rms(alone), held(alone), rms(chosen), held(chosen)])  # fmt: skip
@@ -147,21 +147,21 @@ def block_errors(
     bench.manifest.tasks["block"] = Task(title="", split="blocks", train=list(known), test=[test])
     extra = [o.samples for o in samples_of(bench, antennas)]
     asked = list(questions(bench, "block", test))[::every]
-    found = [both([o.samples for o in q.train], [o.samples for o in q.targets], extra) for q in asked]
+    answers = [both([o.samples for o in q.train], [o.samples for o in q.targets], extra) for q in asked]
     row = []
     for k in (1, 2):  # blocks of one series are one series again
-        series = zip(*(one[k] for one in found), strict=True)
+        series = zip(*(answer[k] for answer in answers), strict=True)
         parts = [(np.concatenate(error), np.concatenate(sd)) for error, sd in (zip(*s, strict=True) for s in series)]
         row += [rms(parts), rms([(error - error.mean(), sd) for error, sd in parts]), held(parts)]
-    return [*row, 100.0 * float(np.mean([one[0] != OFF for one in found]))]
+    return [*row, 100.0 * float(np.mean([answer[0] != OFF for answer in answers]))]
 
 
 def at_height(bench: Bench, name: str) -> Observed:
     """The series of a flight at one height, from its first sample there to its last."""
-    (one,) = bench.observed(name)
-    up = one.samples.position_m[:, 2]
+    (flown,) = bench.observed(name)
+    up = flown.samples.position_m[:, 2]
     high = np.flatnonzero(up > np.median(up) - 0.5)
-    return one.part(np.arange(high[0], high[-1] + 1))
+    return flown.part(np.arange(high[0], high[-1] + 1))
 
 
 def lte_height(bench: Bench, name: str, other: str, *, repeats: int) -> dict[str, tuple[float, ...]]:
@@ -243,8 +243,8 @@ def folds(bench: Bench, names: Sequence[str]) -> Iterator[tuple[list[LinkSamples
     for name in names:
         others = [other for other in names if other != name]
         bench.manifest.tasks["fold"] = Task(title="", split=split, train=others, test=[name])
-        for one in questions(bench, "fold", name):
-            yield [o.samples for o in one.train], [o.samples for o in one.targets]
+        for question in questions(bench, "fold", name):
+            yield [o.samples for o in question.train], [o.samples for o in question.targets]
 
 
 def crps(bench: Bench, *, quick: bool) -> None:
@@ -255,13 +255,13 @@ def crps(bench: Bench, *, quick: bool) -> None:
             "NR RSRP": ("nr_rsrp",)}  # fmt: skip
     for name, names in list(sets.items())[:: 4 if quick else 1]:
         every = list(folds(bench, names))[:: 1 if len(names) > 1 else 2]  # of the eighths every second
-        found = [both(*fold) for fold in every[: 1 if quick else None]]
-        parts = [[part for one in found for part in one[k]] for k in (1, 2)]
+        answers = [both(*fold) for fold in every[: 1 if quick else None]]
+        parts = [[part for answer in answers for part in answer[k]] for k in (1, 2)]
         values = [np.mean(np.concatenate([crps_normal(*part) for part in each])) for each in parts]
-        on = [one[0] for one in found if one[0] != OFF]
+        on = [answer[0] for answer in answers if answer[0] != OFF]
         print(f"{name}: CRPS {values[0]:.3f} learned, {values[1]:.3f} as chosen; RMSE {rms(parts[0]):.2f}, "
               f"{rms(parts[1]):.2f}; 90 % holds {held(parts[0]):.0f}, {held(parts[1]):.0f} %; field on in {len(on)} of "
-              f"{len(found)}", flush=True)  # fmt: skip
+              f"{len(answers)}", flush=True)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -285,8 +285,10 @@ class Reports:
 
     def lost(self, known: Reports, terms: Sequence[tuple[float, float]]) -> FloatArray:
         """Log loss (n,) with a field learned on other reports."""
-        own, cross = (sum(strength**2 * np.exp(-cdist(one.place, known.place) / length) for length, strength in terms)
-                      for one in (known, self))  # fmt: skip
+        own, cross = (
+            sum(strength**2 * np.exp(-cdist(reports.place, known.place) / length) for length, strength in terms)
+            for reports in (known, self)
+        )
         shifted = self.logit + cross @ logistic(own, known.logit, known.was)
         return np.asarray(-(self.was * log_softmax(shifted, axis=1)).sum(axis=1))
 
@@ -295,8 +297,11 @@ def rank_parts(own: Reports, taught: Reports) -> dict[str, list[tuple[Reports, R
     """Reports that are asked for and those that are known, by what is known, in time order."""
     step = np.append(0.0, np.linalg.norm(np.diff(own.place, axis=0), axis=1))
     block = np.floor(np.cumsum(step) / 300.0)
-    rest = [(own.part(block == one), own.part(np.abs(own.time[:, None] - own.time[block == one]).min(axis=1) > GUARD_S))
-            for one in np.unique(block)]  # fmt: skip
+    rest = []
+    for number in np.unique(block):
+        inside = block == number
+        apart_s = np.abs(own.time[:, None] - own.time[inside]).min(axis=1)
+        rest.append((own.part(inside), own.part(apart_s > GUARD_S)))
     ahead = [(own.part((own.time > start) & (own.time <= start + AHEAD_S)), own.part(own.time <= start))
              for start in np.arange(own.time[0] + FIRST_S, own.time[-1], AHEAD_S)]  # fmt: skip
     return {
@@ -311,7 +316,7 @@ def ranks(bench: Bench, *, quick: bool) -> None:
     for test, train in (names, names[::-1])[: 1 if quick else None]:
         (teacher,), (item,) = bench.ranks(train), bench.ranks(test)
         receiver = Tried.of([teacher], RankFitSettings()).fit([0])
-        own, taught = (Reports.of(one, receiver, 20 if quick else 2) for one in (item, teacher))
+        own, taught = (Reports.of(reports, receiver, 20 if quick else 2) for reports in (item, teacher))
         for title, parts in rank_parts(own, taught).items():
             alone = np.concatenate([-(asked.was * asked.logit).sum(axis=1) for asked, _ in parts])
             print(f"ranks of {test}, receiver of {train}, {title}: log score {alone.mean():.3f} alone", flush=True)

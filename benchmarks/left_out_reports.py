@@ -58,13 +58,13 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
     observed, _ = observe(flights)
     chosen = recipe_of(settings, observed, field)
     scores: dict[str, tuple[Score, ...]] = dict.fromkeys(SPLITS, ())
-    kept: dict[str, Learned] = {}
+    learned: dict[str, Learned] = {}
     if len(flights_of(observed)) > 1:  # the errors to expect; the other splits and the controls are not read
-        scores["flight_left_out"] = flight_left_out(observed, chosen, kept)
+        scores["flight_left_out"] = flight_left_out(observed, chosen, learned)
     calibration = Calibration(
         settings=settings, flights=tuple(flights), observed=tuple(observed), place=None, scores=scores, controls={},
         learned=learn([o.samples for o in observed], chosen), ground=None, curve=(), warnings=(), words=(),
-        locks=learned_locks(observed, chosen, kept),
+        locks=learned_locks(observed, chosen, learned),
     )  # fmt: skip
     remember(site, recipe.stem, *site_entry(calibration, "left out"))
     return site
@@ -86,18 +86,18 @@ def reported(log: Path, site: Path, folder: Path) -> tuple[str, dict[str, Any]]:
 def rows(metrics: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, float]]]:
     """Numbers of each series of a report."""
     for tower, channels in metrics.get("rss", {}).items():
-        for channel, one in channels.items():
-            numbers = {"RMSE": one["rmse_db"], "free space": one["baselines"]["free_space"]["rmse_db"]}
+        for channel, entry in channels.items():
+            numbers = {"RMSE": entry["rmse_db"], "free space": entry["baselines"]["free_space"]["rmse_db"]}
             with contextlib.suppress(KeyError):
-                numbers["4 s"] = one["averaged"]["power_sum"]["4 s"]["rmse_db"]
-            numbers["inside 90 %"] = (one.get("error_bars") or {}).get("inside_90")
-            if lock := one.get("detection"):
+                numbers["4 s"] = entry["averaged"]["power_sum"]["4 s"]["rmse_db"]
+            numbers["inside 90 %"] = (entry.get("error_bars") or {}).get("inside_90")
+            if lock := entry.get("detection"):
                 numbers |= {"floor": lock["rmse_db"], "floor, free space": lock["free_space_rmse_db"]}
                 numbers |= {f"P(detected) {name}": lock[name] for name in
                             ("brier", "constant_brier", "log_score", "constant_log_score")}  # fmt: skip
             yield f"{tower} {channel}", {name: value for name, value in numbers.items() if value is not None}
-    for tower, one in metrics.get("rank", {}).items():
-        score = one.get("receiver") or {}
+    for tower, entry in metrics.get("rank", {}).items():
+        score = entry.get("receiver") or {}
         names = ("kappa", "log_score", "constant_log_score", "total_variation_expected")
         yield f"rank {tower}", {name: score[name] for name in names if score.get(name) is not None}
 
@@ -129,7 +129,7 @@ def main() -> int:
                     print(f"    {name}: " + ", ".join(f"{key} {value:.3g}" for key, value in numbers.items()))
                     for key, value in numbers.items():
                         means.setdefault(key, []).append(value)
-                clocks = [f"{name} {one['verdict']}" for name, one in metrics.get("clock", {}).items()]
+                clocks = [f"{name} {clock['verdict']}" for name, clock in metrics.get("clock", {}).items()]
                 print(f"    clock: {', '.join(clocks) or 'none'}", flush=True)
             if means:
                 text = ", ".join(f"{key} {sum(each) / len(each):.3f}" for key, each in means.items())

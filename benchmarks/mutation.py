@@ -173,7 +173,7 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
 
 def of_code(tree: ast.Module) -> list[ast.AST]:
     """Nodes that run when a function is called, or make a constant: no annotations, messages, decorators."""
-    kept: list[ast.AST] = []
+    nodes: list[ast.AST] = []
 
     def visit(node: ast.AST) -> None:
         for name, value in ast.iter_fields(node):
@@ -181,22 +181,22 @@ def of_code(tree: ast.Module) -> list[ast.AST]:
                 continue
             for child in value if isinstance(value, list) else [value]:
                 if isinstance(child, ast.AST) and not isinstance(child, (ast.Raise, ast.JoinedStr, ast.Assert)):
-                    kept.append(child)
+                    nodes.append(child)
                     visit(child)
 
     visit(tree)
-    return kept
+    return nodes
 
 
 def mutants(path: str) -> list[Mutant]:
     """All mutants of a module."""
-    found = []
+    every = []
     for position, node in enumerate(of_code(ast.parse((ROOT / path).read_text(encoding="utf-8")))):
         for number, other in enumerate(changes(node)):
             was, now = (_short(n) for n in (node, other))
             if was != now:
-                found.append(Mutant(path, getattr(node, "lineno", 0), was, now, position, number))
-    return found
+                every.append(Mutant(path, getattr(node, "lineno", 0), was, now, position, number))
+    return every
 
 
 def _replace(tree: ast.Module, target: ast.AST, other: ast.AST) -> None:
@@ -345,7 +345,7 @@ class Recorder:
             self.failed.append(item.nodeid)
         if all(r.passed for r in reports):
             mine = getattr(getattr(item, "_fixtureinfo", None), "name2fixturedefs", {}).values()
-            lines = self._lines.union(*(self._fixtures.get(one, set()) for those in mine for one in those))
+            lines = self._lines.union(*(self._fixtures.get(fixture, set()) for those in mine for fixture in those))
             self.reach[item.nodeid] = {"seconds": round(seconds, 2), "file": str(item.path), "lines": lines}
         return True
 
@@ -374,16 +374,16 @@ class Recorder:
     def result(self) -> Reach:
         """The tests of a file that keeps what its helpers gave share what they reached."""
         for file in self.kept_of_tests:
-            together = [one for one in self.reach.values() if one["file"] == file]
-            lines = set().union(*(one["lines"] for one in together))
-            for one in together:
-                one["lines"] = lines
+            together = [reached for reached in self.reach.values() if reached["file"] == file]
+            lines = set().union(*(reached["lines"] for reached in together))
+            for reached in together:
+                reached["lines"] = lines
         out: Reach = {}
-        for name, one in self.reach.items():
+        for name, reached in self.reach.items():
             by_module: dict[str, list[int]] = {}
-            for path, number in sorted(one["lines"]):
+            for path, number in sorted(reached["lines"]):
                 by_module.setdefault(path, []).append(number)
-            out[name] = {"seconds": one["seconds"], "lines": by_module}
+            out[name] = {"seconds": reached["seconds"], "lines": by_module}
         return out
 
 
@@ -419,12 +419,12 @@ class Trials:
             limit = 30 + 10 * sum(self.reach[name]["seconds"] for name in near)
             if place is None or not near or mutant.path in COMPILED:
                 tests = COMPILED.get(mutant.path) or tuple(near_tests(self.reach, mutant.path, None)[:MOST_ANEW])
-                kind = in_child(lambda one=mutant, those=tests: planted(one, one.source, those), limit + 300)
+                kind = in_child(lambda change=mutant, those=tests: planted(change, change.source, those), limit + 300)
                 source = (ROOT / mutant.path).read_text(encoding="utf-8")
                 control, what = partial(planted, mutant, source, tests), (mutant.path, *tests)
             else:
                 those = [items[name] for name in near if name in items]
-                kind = in_child(lambda one=mutant, at=place, tests=those: self._fails(tests, one, at), limit)
+                kind = in_child(lambda change=mutant, at=place, tests=those: self._fails(tests, change, at), limit)
                 what = tuple(name for name in near if kind == f"killed by {name}")
                 control = partial(self._fails, [items[name] for name in what])
             if kind.startswith("killed by") and not kind.endswith(("crash", "import")):
@@ -457,10 +457,10 @@ MOST_ANEW = 120
 def near_tests(reach: Reach, path: str, lines: tuple[int, int] | None) -> list[str]:
     """Tests that reach lines of a module (None: any): the shortest case of each test first, then the second ..."""
     met = []
-    for name, one in reach.items():
-        reached = one["lines"].get(path, ())
+    for name, entry in reach.items():
+        reached = entry["lines"].get(path, ())
         if any(lines is None or lines[0] <= number <= lines[1] for number in reached):
-            met.append((one["seconds"], name))
+            met.append((entry["seconds"], name))
     cases: Counter[str] = Counter()
     order = []
     for seconds, name in sorted(met):
@@ -590,16 +590,16 @@ def record(target: Path, tests: tuple[str, ...]) -> None:
     known: Reach = json.loads(target.read_text(encoding="utf-8")) if target.is_file() else {}
     new = recorder.result()
     files = {name.partition("::")[0] for name in new}
-    known = {name: one for name, one in known.items() if name.partition("::")[0] not in files}
+    known = {name: entry for name, entry in known.items() if name.partition("::")[0] not in files}
     target.write_text(json.dumps(known | new), encoding="utf-8")
-    print(f"{len(new)} tests recorded, {sum(one['seconds'] for one in new.values()):.0f} CPU s")
+    print(f"{len(new)} tests recorded, {sum(entry['seconds'] for entry in new.values()):.0f} CPU s")
     for name in recorder.failed:
         print(f"fails without any change: {name}")
 
 
 def drawn(count: int, seed: int, only: list[str], part: str) -> list[Mutant]:
     """Mutants at random over the modules, each mutant as likely as any other."""
-    every = [one for path in modules() if any(some in path for some in only) for one in mutants(path)]
+    every = [mutant for path in modules() if any(some in path for some in only) for mutant in mutants(path)]
     chosen = random.Random(seed).sample(every, min(count, len(every)))
     number, parts = (int(text) for text in part.split("/"))
     return chosen[number - 1 :: parts]
@@ -611,7 +611,7 @@ def draw(chosen: list[Mutant], reach: Reach, account: Path | None, budget_s: flo
     counts: dict[str, dict[str, int]] = {}
 
     def answer(mutant: Mutant, outcome: str, took: float) -> None:
-        kind = next((one for one in ("killed", "survived") if outcome.startswith(one)), "unclear")
+        kind = next((name for name in ("killed", "survived") if outcome.startswith(name)), "unclear")
         if kind == "survived" and change_of(mutant) in known:
             kind = "equivalent"
         room = counts.setdefault(mutant.path.split("/")[1], dict.fromkeys(KINDS, 0))
@@ -643,8 +643,8 @@ def main() -> None:
     of_draw.add_argument("--only", nargs="+", default=["/"], help="modules whose path holds one of these")
     of_draw.add_argument("--budget", type=float, default=40.0, help="of tests for one mutant [s of the processor]")
     of_draw.add_argument("--account", type=Path, help="a line of JSON per mutant is added here")
-    for one in (of_map, of_draw):
-        one.add_argument("map", type=Path)
+    for command in (of_map, of_draw):
+        command.add_argument("map", type=Path)
     arguments = parser.parse_args()
     os.chdir(ROOT)
     os.environ["CI"] = "1"  # hypothesis draws the same examples every time

@@ -60,7 +60,7 @@ class Job:
 
 
 @dataclass(slots=True)
-class Found:
+class Tally:
     """Counts of one job."""
 
     calls: int = 0
@@ -270,7 +270,7 @@ class Runs:
                 self.reset()
                 self.clean(variant)
                 seen.append(self.content())
-            self.stable[variant] = {name: one for name, one in seen[0].items() if seen[1].get(name) == one}
+            self.stable[variant] = {name: digest for name, digest in seen[0].items() if seen[1].get(name) == digest}
         both = self.stable[VARIANTS[0]].items() & self.stable[VARIANTS[1]].items()
         for name, _ in both:
             for variant in VARIANTS:
@@ -285,30 +285,30 @@ class Runs:
 
     def wrong(self, before: bool) -> str | None:
         """What is not whole or not of one run, or None."""
-        found = self.content()
-        if not os.path.lexists(self.target) or not found:
+        digests = self.content()
+        if not os.path.lexists(self.target) or not digests:
             return "the output that was there is gone" if before else None
         variants = [
-            v for v in VARIANTS if all(found[n] == d for n, d in self.stable[v].items() if n in found)
+            v for v in VARIANTS if all(digests[n] == d for n, d in self.stable[v].items() if n in digests)
         ]  # fmt: skip
         if not variants:
             return "files of two runs"
-        return self._wrong_file() if self.job.kind == "file" else self._wrong_folder(found)
+        return self._wrong_file() if self.job.kind == "file" else self._wrong_folder(digests)
 
     def _wrong_file(self) -> str | None:
         from aerpaw_cmp.common.outputs import is_sealed
         from aerpaw_cmp.logs.flight_file import is_flight_file
 
-        whole = is_flight_file if self.job.name == "ingest" else is_sealed
-        return None if whole(self.target) else "the file is not whole"
+        complete = is_flight_file if self.job.name == "ingest" else is_sealed
+        return None if complete(self.target) else "the file is not whole"
 
-    def _wrong_folder(self, found: dict[str, str]) -> str | None:
+    def _wrong_folder(self, digests: dict[str, str]) -> str | None:
         from aerpaw_cmp.common.outputs import SUMS, read_sums
 
         sums = read_sums(self.target)
         if sums is None:
             return "the folder has no list"
-        if sums != {name: digest for name, digest in found.items() if name != SUMS}:
+        if sums != {name: digest for name, digest in digests.items() if name != SUMS}:
             return "the folder is not what its list says"
         return None
 
@@ -326,70 +326,70 @@ def _tree(folder: Path) -> dict[str, str]:
 
 def try_job(
     job: Job, inputs: Path, work: Path, shim: ctypes.CDLL, kills: int, chance: random.Random, *, errors: bool = True
-) -> Found:
+) -> Tally:
     """All faults of one job; without ``errors`` kills only."""
-    runs, found = Runs(job, work / "root", shim), Found()
+    runs, tally = Runs(job, work / "root", shim), Tally()
     original = _tree(inputs)
     runs.learn()
     runs.reset()
     runs.clean("a")
     start = time.perf_counter()
-    found.calls = runs.clean("b")
-    found.seconds = time.perf_counter() - start
+    tally.calls = runs.clean("b")
+    tally.seconds = time.perf_counter() - start
 
     def check(what: str, before: bool) -> None:
-        found.done[what.split()[0]] += 1
+        tally.done[what.split()[0]] += 1
         wrong = runs.wrong(before)
         if wrong is None and _tree(inputs) != original:
             wrong = "an input was changed"
         if wrong is not None:
-            found.violations.append(f"{job.name}: {what}: {wrong}")
+            tally.violations.append(f"{job.name}: {what}: {wrong}")
             runs.reset()
 
     for number in range(kills):
         if number % 25 == 0:
-            _next_run_clears(runs, found, absent=number % 50 == 0)
+            _next_run_clears(runs, tally, absent=number % 50 == 0)
         before = os.path.lexists(runs.target)
         variant = VARIANTS[number % 2]
         if number % 5 < 4:
-            at, kind = 1 + number * found.calls // kills, (BEFORE, AFTER)[number // 2 % 2]
+            at, kind = 1 + number * tally.calls // kills, (BEFORE, AFTER)[number // 2 % 2]
             child, what = runs.start(variant, (at, kind, 0, 0, "")), f"kill {kind} at call {at}"
         else:
-            moment = chance.uniform(0.0, found.seconds)
+            moment = chance.uniform(0.0, tally.seconds)
             child, what = runs.start(variant), f"kill after {moment:.4f} s"
             time.sleep(moment)
             with contextlib.suppress(ProcessLookupError):
                 os.kill(child, signal.SIGKILL)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        found.done["killed"] += code == -signal.SIGKILL
+        tally.done["killed"] += code == -signal.SIGKILL
         check(what, before)
 
-    _next_run_clears(runs, found, absent=False)
-    for what, variant, fault, limit in _errors(runs, found.calls) if errors else ():
+    _next_run_clears(runs, tally, absent=False)
+    for what, variant, fault, limit in _errors(runs, tally.calls) if errors else ():
         if not os.path.lexists(runs.target):
-            _next_run_clears(runs, found, absent=False)
+            _next_run_clears(runs, tally, absent=False)
         before = os.path.lexists(runs.target)
         code = os.waitstatus_to_exitcode(os.waitpid(runs.start(variant, fault, limit), 0)[1])
         check(what, before and not what.startswith("removed"))
         said = [line for line in runs.said().splitlines() if line.startswith("aerpaw-cmp: ")]
-        told = code == 0 or (code == 3 and len(said) == 1 and str(runs.folder) in said[0])
-        if not told:
-            found.violations.append(f"{job.name}: {what}: exit {code}, said {said}")
+        reported = code == 0 or (code == 3 and len(said) == 1 and str(runs.folder) in said[0])
+        if not reported:
+            tally.violations.append(f"{job.name}: {what}: exit {code}, said {said}")
         if rest := runs.litter():
             if code:
-                found.violations.append(f"{job.name}: {what}: left {rest}")
-            found.done["left for the next run"] += 1
-            _next_run_clears(runs, found, absent=False)
-        found.done["told"] += code == 3
-    _next_run_clears(runs, found, absent=False)
-    return found
+                tally.violations.append(f"{job.name}: {what}: left {rest}")
+            tally.done["left for the next run"] += 1
+            _next_run_clears(runs, tally, absent=False)
+        tally.done["told"] += code == 3
+    _next_run_clears(runs, tally, absent=False)
+    return tally
 
 
-def _next_run_clears(runs: Runs, found: Found, *, absent: bool) -> None:
+def _next_run_clears(runs: Runs, tally: Tally, *, absent: bool) -> None:
     """A clean run after faults succeeds and leaves the target and nothing else; then perhaps nothing is there."""
     runs.clean("a")
     if rest := runs.litter():
-        found.violations.append(f"{runs.job.name}: after a clean run there is {rest}")
+        tally.violations.append(f"{runs.job.name}: after a clean run there is {rest}")
         runs.reset()
     if absent:
         runs.reset()
@@ -483,16 +483,16 @@ def main() -> int:
     chance, total, everything = random.Random(arguments.seed), collections.Counter[str](), {}
     violations: list[str] = []
     for name, job in jobs.items():
-        found = try_job(job, inputs, work, shim, arguments.kills, chance)
+        tally = try_job(job, inputs, work, shim, arguments.kills, chance)
         everything[name] = {
-            "calls": found.calls, "seconds_of_a_run": round(found.seconds, 3), **found.done,
-            "violations": len(found.violations),
+            "calls": tally.calls, "seconds_of_a_run": round(tally.seconds, 3), **tally.done,
+            "violations": len(tally.violations),
         }  # fmt: skip
         if job.name in ("ingest", "report"):
             everything[name]["full_tmpfs"] = try_full_tmpfs(job, work, shim)
         print(name, json.dumps(everything[name]), file=sys.stderr, flush=True)
-        total += found.done
-        violations += found.violations
+        total += tally.done
+        violations += tally.violations
     plant()
     planted = try_job(next(iter(jobs.values())), inputs, work, shim, 14, chance, errors=False)
     conditions = {"kills_per_command": arguments.kills, "seed": arguments.seed, "python": sys.version.split()[0]}

@@ -120,7 +120,7 @@ def main() -> int:
         shutil.copy(ROOT / "pyproject.toml", copy)
         clean = json.loads(python(copy, "benchmarks/outside_faults.py", "--audit-here").stdout)
         part, parts = (int(text) for text in options.part.split("/"))
-        for fault in [one for one in FAULTS if options.only in one.name][part - 1 :: parts]:
+        for fault in [entry for entry in FAULTS if options.only in entry.name][part - 1 :: parts]:
             file = copy / fault.file
             right = file.read_text(encoding="utf-8")
             file.write_text(right.replace(fault.old, fault.new), encoding="utf-8")

@@ -109,14 +109,14 @@ def opened(page: Path, repeats: int) -> dict[str, float]:
                 f"const done = arguments[0]; const wait = () => ({ready}) ? requestAnimationFrame(() => "
                 "requestAnimationFrame(() => done(performance.now()))) : setTimeout(wait, 5); wait()"
             )
-            found = {m["name"]: m["value"] for m in driver.execute_cdp_cmd("Performance.getMetrics", {})["metrics"]}
+            measures = {m["name"]: m["value"] for m in driver.execute_cdp_cmd("Performance.getMetrics", {})["metrics"]}
             said = complaints(driver)
         finally:
             driver.quit()
         if said:
             raise SystemExit(f"{page}: {said}")
         wall.append(usable / 1000)
-        thread.append(found["TaskDuration"])
+        thread.append(measures["TaskDuration"])
     return {"usable_s": statistics.median(wall), "main_thread_s": statistics.median(thread)}
 
 

@@ -46,7 +46,7 @@ def runs(history: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines if line.strip()]
 
 
-def last_whole(found: list[dict[str, Any]]) -> dict[str, Any]:
+def last_whole(history: list[dict[str, Any]]) -> dict[str, Any]:
     """The last run that has the scaling of at least one axis.
 
     Raises
@@ -54,10 +54,10 @@ def last_whole(found: list[dict[str, Any]]) -> dict[str, Any]:
     SystemExit
         None has.
     """
-    whole = [run for run in found if run["benchmarks"].get("scaling", {}).get("result")]
-    if not whole:
+    with_scaling = [run for run in history if run["benchmarks"].get("scaling", {}).get("result")]
+    if not with_scaling:
         raise SystemExit("no run with scaling in the history: python benchmarks/all.py first")
-    return whole[-1]
+    return with_scaling[-1]
 
 
 def size_of(row: dict[str, Any]) -> float:
@@ -115,25 +115,25 @@ def season(scaling: dict[str, Any]) -> list[str]:
     rows = measured(scaling, "flights")
     if len(rows) < 2:
         return []
-    one = (rows[-1]["cpu_s"] - rows[0]["cpu_s"]) / (rows[-1]["size"] - rows[0]["size"]) / 2.0  # two settings
+    task_s = (rows[-1]["cpu_s"] - rows[0]["cpu_s"]) / (rows[-1]["size"] - rows[0]["size"]) / 2.0  # two settings
     tasks = SEASON["flights"] * SEASON["settings"]
-    hours = one * SEASON["towers"] * tasks / 3600.0
+    hours = task_s * SEASON["towers"] * tasks / 3600.0
     first, later, *_ = (*measured(scaling, "workers"), None, None)
     shared = f" Two workers took {later['wall_s'] / first['wall_s']:.2f} of one's wall time." if later else ""
     return [
-        f"- **A season**: {SEASON['flights']} flights x {SEASON['settings']} settings = {number(tasks)} tasks. A task "
-        f"of one tower (two channels, 130 s, 260 samples each) costs {one:.2f} s of processor; with {SEASON['towers']} "
-        f"towers, each as dear, that is {hours:.1f} h of one core. It assumes that tasks cost alike "
+        f"- **A season**: {SEASON['flights']} flights x {SEASON['settings']} settings = {number(tasks)} tasks. A "
+        f"task of one tower (two channels, 130 s, 260 samples each) costs {task_s:.2f} s of processor; with "
+        f"{SEASON['towers']} towers, each as dear, that is {hours:.1f} h of one core. It assumes that tasks cost alike "
         f"(the campaign grew with power {power(scaling['flights']['power_cpu'])} in flights).{shared}"
     ]
 
 
 def city(scaling: dict[str, Any]) -> list[str]:
     """A city by the growth with faces."""
-    found = extrapolated(scaling, "faces", CITY["faces"])
-    if found is None:
+    estimate = extrapolated(scaling, "faces", CITY["faces"])
+    if estimate is None:
         return []
-    seconds, beyond = found
+    seconds, beyond = estimate
     return [
         f"- **A city**: {number(CITY['faces'])} faces (10 000 buildings), 100 poses of one tower, depth 2: "
         f"{number(seconds)} s of processor, if the power {power(scaling['faces']['power_cpu'])} holds "
@@ -143,10 +143,10 @@ def city(scaling: dict[str, Any]) -> list[str]:
 
 def long_flight(scaling: dict[str, Any]) -> list[str]:
     """A day by the growth of a report with samples."""
-    found = extrapolated(scaling, "report", 2_000_000)
-    if found is None:
+    estimate = extrapolated(scaling, "report", 2_000_000)
+    if estimate is None:
         return []
-    seconds, beyond = found
+    seconds, beyond = estimate
     return [
         f"- **A flight of ten hours** (1 000 000 samples of two channels): {number(seconds)} s of processor, "
         f"{beyond:.0f} times beyond what was measured here; "
@@ -154,10 +154,10 @@ def long_flight(scaling: dict[str, Any]) -> list[str]:
     ]
 
 
-def peers(found: list[dict[str, Any]]) -> list[str]:
+def peers(history: list[dict[str, Any]]) -> list[str]:
     """Ratios to the peers in every run of the history that has them."""
-    results = {run["date"]: run["benchmarks"].get("peers", {}).get("result") for run in found}
-    having = [run for run in found if results[run["date"]]][-8:]
+    results = {run["date"]: run["benchmarks"].get("peers", {}).get("result") for run in history}
+    having = [run for run in history if results[run["date"]]][-8:]
     if not having:
         return []
     # until 2026-11-23 the ratios stood alone
@@ -186,18 +186,18 @@ def peers(found: list[dict[str, Any]]) -> list[str]:
     return [*out, ""]
 
 
-def last_result(found: list[dict[str, Any]], name: str) -> tuple[str, dict[str, Any]]:
+def last_result(history: list[dict[str, Any]], name: str) -> tuple[str, dict[str, Any]]:
     """The last result of a benchmark, and when and at what load it was measured; empty where there is none."""
-    for run in reversed(found):
-        one = run["benchmarks"].get(name, {})
-        if result := one.get("result"):
-            return f"{run['date'][:10]}, {run['version']}, load {one['load_before']} before", result
+    for run in reversed(history):
+        entry = run["benchmarks"].get(name, {})
+        if result := entry.get("result"):
+            return f"{run['date'][:10]}, {run['version']}, load {entry['load_before']} before", result
     return "", {}
 
 
-def town(found: list[dict[str, Any]]) -> list[str]:
+def town(history: list[dict[str, Any]]) -> list[str]:
     """The path search of a town, beside that of the bench scene: our search, and PathSolver on the same triangles."""
-    when, result = last_result(found, "town")
+    when, result = last_result(history, "town")
     rows = [row for row in result.get("rows", []) if "failed" not in row]
     ours = {row["depth"]: row["search_s"][1] for row in rows if row["kind"] == "image"}
     if not rows:
@@ -224,9 +224,9 @@ COUNTRY = (
 )  # fmt: skip
 
 
-def country(found: list[dict[str, Any]]) -> list[str]:
+def country(history: list[dict[str, Any]]) -> list[str]:
     """A map in tiles by its receivers, and what larger ones would take."""
-    when, result = last_result(found, "country")
+    when, result = last_result(history, "country")
     if not result:
         return []
     out = [
@@ -254,9 +254,9 @@ def country(found: list[dict[str, Any]]) -> list[str]:
     ]  # fmt: skip
 
 
-def kriging(found: list[dict[str, Any]]) -> list[str]:
+def kriging(history: list[dict[str, Any]]) -> list[str]:
     """Kriging in totals and by the marginal cost of a target, set-up apart."""
-    when, result = last_result(found, "kriging")
+    when, result = last_result(history, "kriging")
     row = result.get("moving_window", {})
     if "compiled_100000_s" not in row:  # a quick run: too few targets for a slope
         return []
@@ -298,11 +298,11 @@ def reports(run: dict[str, Any]) -> list[str]:
         return []
     rows = [("with `--audit none`, " + name, result["later"][key]) for key, name in WHEN.items()]
     rows = [("as it comes, " + name, result["now"][key]) for key, name in WHEN.items() if "now" in result] + rows
-    one, sample, later = result["two_channels"], result["sample"], result["sample_later"]
+    short, sample, later = result["two_channels"], result["sample"], result["sample_later"]
     return [
         "## A report", "",
-        f"Two channels ({one['flight']}), as processes, by processor time, against `import sionna.rt, "
-        f"matplotlib.pyplot, pandas` and against those without Sionna (medians{imports_of(one)}). The first report "
+        f"Two channels ({short['flight']}), as processes, by processor time, against `import sionna.rt, "
+        f"matplotlib.pyplot, pandas` and against those without Sionna (medians{imports_of(short)}). The first report "
         "finds no kernel, path, font list or tried LLVM on the disk; only bytecode is compiled:", "",
         "| | seconds | x imports | x imports without Sionna | peak MiB |", "| --- | ---: | ---: | ---: | ---: |",
         *(
@@ -310,8 +310,8 @@ def reports(run: dict[str, Any]) -> list[str]:
             for name, row in rows
         ),
         "",
-        f"With its audit and the caches of this machine: {one['ratio_cpu']:.2f} x the imports, "
-        f"{one['peak_mib']:.0f} MiB.",
+        f"With its audit and the caches of this machine: {short['ratio_cpu']:.2f} x the imports, "
+        f"{short['peak_mib']:.0f} MiB.",
         "", "The sample flight (five towers, ten channels):", "",
         *(
             f"- {name}: {row['cpu_s']:.1f} s of processor, {row['wall_s']:.1f} s on the wall, {row['peak_mib']:.0f} MiB"
@@ -320,11 +320,11 @@ def reports(run: dict[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
-def page(found: list[dict[str, Any]]) -> str:
+def page(history: list[dict[str, Any]]) -> str:
     """The text of docs/performance.md."""
-    run = last_whole(found)
+    run = last_whole(history)
     machine, scaling = run["machine"], run["benchmarks"]["scaling"]["result"]
-    beside = [f"{name}: {one['failed']}" for name, one in run["benchmarks"].items() if "failed" in one]
+    unmeasured = [f"{name}: {entry['failed']}" for name, entry in run["benchmarks"].items() if "failed" in entry]
     lines = [
         "# Performance", "",
         "Made by `make bench-all` (`python benchmarks/all.py` measures and appends to `benchmarks/history.jsonl`,",
@@ -335,14 +335,14 @@ def page(found: list[dict[str, Any]]) -> str:
         f"{machine['memory_gib']} GiB, {machine['system']}, Python {machine['python']}; load {run['load_before']} "
         f"before, {run.get('load_after', '-')} after (the run alone makes 1 to 2), {run['seconds'] / 60:.1f} min in "
         f"all.{' Kernels of replays were compiled before the first row.' * ('load_after' in run)}", "",
-        *([f"Not measured: {'; '.join(beside)}.", ""] if beside else []),
+        *([f"Not measured: {'; '.join(unmeasured)}.", ""] if unmeasured else []),
         *reports(run),
         "## Cost against size", "",
         f"![Processor time and memory against size](images/{FIGURE})", "",
         *scaling_tables(scaling),
         "## Extrapolated", "",
         *long_flight(scaling), *season(scaling), *city(scaling), "",
-        *country(found), *peers(found), *town(found), *kriging(found),
+        *country(history), *peers(history), *town(history), *kriging(history),
     ]  # fmt: skip
     return "\n".join(lines).rstrip() + "\n"
 
@@ -381,12 +381,12 @@ def main() -> None:
     parser.add_argument("--history", type=Path, default=HISTORY)
     parser.add_argument("--docs", type=Path, default=ROOT / "docs")
     arguments = parser.parse_args()
-    found = runs(arguments.history)
-    text = page(found)
+    history = runs(arguments.history)
+    text = page(history)
     (arguments.docs / "images").mkdir(parents=True, exist_ok=True)
-    draw(last_whole(found)["benchmarks"]["scaling"]["result"], arguments.docs / "images" / FIGURE)
+    draw(last_whole(history)["benchmarks"]["scaling"]["result"], arguments.docs / "images" / FIGURE)
     (arguments.docs / "performance.md").write_text(text, encoding="utf-8")
-    print(*reports(last_whole(found)), *peers(found), *town(found), *kriging(found), sep="\n")
+    print(*reports(last_whole(history)), *peers(history), *town(history), *kriging(history), sep="\n")
     print(arguments.docs / "performance.md")
 
 

@@ -90,15 +90,15 @@ def _drawn(trouble: str, generator: np.random.Generator) -> tuple[LevelEvidence,
     elif trouble == "gain step":
         at = generator.uniform(0.2, 0.8) * time_s[-1]
         measured = predicted + sign * generator.uniform(3, 10) * (time_s > at)
-    whole = measured + noise
+    noisy = measured + noise
     if trouble == "floor":
-        floor = np.quantile(whole, generator.uniform(0.2, 0.5))
+        floor = np.quantile(noisy, generator.uniform(0.2, 0.5))
         measured = np.maximum(measured, floor)
-        whole = np.maximum(whole, floor) + generator.normal(0.0, 0.3, len(whole))
+        noisy = np.maximum(noisy, floor) + generator.normal(0.0, 0.3, len(noisy))
     away = -away
     evidence = LevelEvidence(
         time_s=time_s,
-        measured_db=whole - 40.0,
+        measured_db=noisy - 40.0,
         predicted_db=predicted,
         uav_azimuth_deg=np.degrees(np.arctan2(away[:, 0], away[:, 1]) - heading),
         uav_elevation_deg=np.degrees(np.arctan2(away[:, 2], np.hypot(away[:, 0], away[:, 1]))),

@@ -200,8 +200,8 @@ def sample_flight(every: int = 40) -> Any:
     )
     settings = settings.model_copy(update={"rt": rt, "rss": settings.rss.model_copy(update={"lag": "off"})})
     data = gather(settings, file.parent, read_logs(settings, file.parent, None), None)
-    kept = [s for s in data.rss if (s.tower, s.channel) in {("LW1", "USRP2"), ("LW3", "USRP1"), ("LW4", "USRP2")}]
-    thin = [dataclasses.replace(s, time=s.time[::every], measured_db=s.measured_db[::every]) for s in kept]
+    chosen = [s for s in data.rss if (s.tower, s.channel) in {("LW1", "USRP2"), ("LW3", "USRP1"), ("LW4", "USRP2")}]
+    sparse = [dataclasses.replace(s, time=s.time[::every], measured_db=s.measured_db[::every]) for s in chosen]
     rank = [
         dataclasses.replace(
             s,
@@ -212,8 +212,8 @@ def sample_flight(every: int = 40) -> Any:
         )
         for s in data.rank
     ]
-    site = dataclasses.replace(data.site, trees=_stand([data.site.towers[s.tower] for s in kept]))
-    return dataclasses.replace(data, site=site, rss=tuple(thin), rank=tuple(rank))
+    site = dataclasses.replace(data.site, trees=_stand([data.site.towers[s.tower] for s in chosen]))
+    return dataclasses.replace(data, site=site, rss=tuple(sparse), rank=tuple(rank))
 
 
 def _stand(towers: list[Any]) -> Any:
@@ -251,14 +251,14 @@ def ranks_of(replays: Any) -> list[Any]:
     """Ranks at K = 10 of each replay, by the package's own count."""
     from aerpaw_cmp.compare.rank import channel_rank
 
-    return [channel_rank(one.replay.h, 10.0) for one in replays]
+    return [channel_rank(replayed.replay.h, 10.0) for replayed in replays]
 
 
 def change(clean: Any, faulty: Any, clean_ranks: list[Any], faulty_ranks: list[Any]) -> Change:
     """Of the faulty replay from the clean one."""
     rss = phase = 0.0
-    for one, two in zip(clean, faulty, strict=True):
-        a, b = one.replay, two.replay
+    for before, after in zip(clean, faulty, strict=True):
+        a, b = before.replay, after.replay
         covered = np.isfinite(a.rss_dbm) != np.isfinite(b.rss_dbm)
         both = np.isfinite(a.rss_dbm) & np.isfinite(b.rss_dbm)
         rss = max(rss, np.inf if covered.any() else 0.0, np.abs(a.rss_dbm - b.rss_dbm)[both].max(initial=0.0))
@@ -277,11 +277,11 @@ def failures(data: Any, replays: Any, *, sionna: bool = True) -> list[str]:
     from aerpaw_cmp.jobs.reporting import audit_flight
 
     if sionna:
-        found = audit_flight.audit_replays(data, replays).audit
-        assert found is not None
-        assert found.fields is not None
-        lost = [f"the engine misses {found.missing_paths} paths"] if found.missing_paths else []
-        return [*lost, *found.fields.failures]
+        audit = audit_flight.audit_replays(data, replays).audit
+        assert audit is not None
+        assert audit.fields is not None
+        lost = [f"the engine misses {audit.missing_paths} paths"] if audit.missing_paths else []
+        return [*lost, *audit.fields.failures]
     return list(reference_only(data, replays).failures)
 
 
@@ -291,10 +291,16 @@ def reference_only(data: Any, replays: Any) -> Any:
     from aerpaw_cmp.propagation.check.field_audit import against_reference, spread_over_paths
 
     total = attitude_checked(data, replays)
-    for one, expected in zip(replays, expectations(data, replays), strict=True):
-        chosen = spread_over_paths(one.replay, np.arange(0, len(one.poses), 2), 4)
+    for replayed, expected in zip(replays, expectations(data, replays), strict=True):
+        chosen = spread_over_paths(replayed.replay, np.arange(0, len(replayed.poses), 2), 4)
         total += against_reference(
-            data.site, one.poses, one.replay, chosen, expected, ks=(10.0,), max_depth=data.settings.rt.max_depth
+            data.site,
+            replayed.poses,
+            replayed.replay,
+            chosen,
+            expected,
+            ks=(10.0,),
+            max_depth=data.settings.rt.max_depth,
         )
     return total
 
@@ -344,11 +350,11 @@ def main() -> int:
     for fault in (f for f in FAULTS if options.only in f.name):
         with planted(fault):
             faulty = replays_of(data)
-            found = failures(data, faulty, sionna=not options.no_sionna)
+            named = failures(data, faulty, sionna=not options.no_sionna)
             faulty_ranks = ranks_of(faulty)
         effect = change(clean, faulty, clean_ranks, faulty_ranks)
-        rows.append({"fault": fault.name, **dataclasses.asdict(effect), "counts": effect.counts, "caught": bool(found),
-                     "failures": len(found), "first": found[0] if found else ""})  # fmt: skip
+        rows.append({"fault": fault.name, **dataclasses.asdict(effect), "counts": effect.counts, "caught": bool(named),
+                     "failures": len(named), "first": named[0] if named else ""})  # fmt: skip
         print(rows[-1], file=sys.stderr)
     result = {
         "false_alarms": false_alarms,

@@ -95,7 +95,7 @@ def measured(folder: Path, flights: int, heading: float | None) -> dict:
     wall, used = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
     metrics = json.loads(done.stdout)
     return {
-        "points": sum(one["points"] for one in metrics["series"].values()),
+        "points": sum(series["points"] for series in metrics["series"].values()),
         "flights": flights,
         "wall_s": wall,
         "cpu_s": used.ru_utime + used.ru_stime,

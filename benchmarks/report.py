@@ -91,16 +91,18 @@ def two_channels(folder: Path) -> tuple[Path, list[str], str]:
 
 def cold_and_warm(flight: Path, options: list[str], folder: Path, repeats: int) -> dict[str, dict[str, float]]:
     """First (cold) and next (warm) report, medians; the processor time of imports before and after each."""
-    found: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
+    by_state: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
     for number in range(repeats):
-        kept = folder / f"kept{number}"
-        empty = {key: str(kept / key) for key in ("HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR", "AERPAW_CMP_CACHE")}
-        kept.mkdir(parents=True)  # Dr.Jit keeps its kernels in the home folder
-        for name, rows in found.items():
+        caches = folder / f"kept{number}"
+        empty = {key: str(caches / key) for key in ("HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR", "AERPAW_CMP_CACHE")}
+        caches.mkdir(parents=True)  # Dr.Jit keeps its kernels in the home folder
+        for name, rows in by_state.items():
             IMPORTED.take()
             rows.append(run(report(flight, folder / f"{name}{number}", *options), **empty))
             IMPORTED.take()
-    return {name: {key: statistics.median(row[key] for row in rows) for key in rows[0]} for name, rows in found.items()}
+    return {
+        name: {key: statistics.median(row[key] for row in rows) for key in rows[0]} for name, rows in by_state.items()
+    }
 
 
 def main() -> None:
@@ -141,12 +143,12 @@ def main() -> None:
     if arguments.json:
         print(json.dumps(result, indent=1))
         return
-    one, two = result["two_channels"], result["sample"]
+    short, whole_sample = result["two_channels"], result["sample"]
     print(
-        f"report of {one['flight']}: {one['report_s']:.1f} s, {one['ratio_cpu']:.2f} x the imports of "
-        f"{statistics.median(one['imports_cpu_s']):.2f} s in processor time ({len(one['imports_cpu_s'])} times)"
+        f"report of {short['flight']}: {short['report_s']:.1f} s, {short['ratio_cpu']:.2f} x the imports of "
+        f"{statistics.median(short['imports_cpu_s']):.2f} s in processor time ({len(short['imports_cpu_s'])} times)"
     )
-    print(f"sample flight: {two['wall_s']:.1f} s, peak memory {two['peak_mib']:.0f} MiB")
+    print(f"sample flight: {whole_sample['wall_s']:.1f} s, peak memory {whole_sample['peak_mib']:.0f} MiB")
     print(f"sample flight without audit: {sample_later['cpu_s']:.1f} s of processor, "
           f"{sample_later['wall_s']:.1f} s, {sample_later['peak_mib']:.0f} MiB")  # fmt: skip
     for name, row in {**now, **{f"{key}, --audit none": row for key, row in later.items()}}.items():

@@ -49,7 +49,7 @@ SIZES: dict[str, tuple[list[float], list[float]]] = {
 def spent() -> float:
     """Processor seconds of this process and of those it waited for."""
     both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in both)
+    return sum(usage.ru_utime + usage.ru_stime for usage in both)
 
 
 def timed(action: Callable[[], Any]) -> dict[str, float]:
@@ -101,8 +101,8 @@ def faces(count: int) -> dict[str, float]:
             built.append(Building(f"building {number}", shape, float(height)))
     position = some.position_m * [side / 600.0, side / 600.0, 1.0]
     scene = change(site, buildings=tuple(built))
-    found = warm_timed(lambda: replay(scene, link, Poses(position, some.rotation), Search(max_depth=2)))
-    return {**found, "faces": 1 + 5 * len(built)}
+    cost = warm_timed(lambda: replay(scene, link, Poses(position, some.rotation), Search(max_depth=2)))
+    return {**cost, "faces": 1 + 5 * len(built)}
 
 
 def samples(count: int) -> dict[str, float]:
@@ -218,22 +218,22 @@ def power(rows: list[dict[str, Any]], key: str = "cpu_s") -> float | None:
     good = [(r.get("samples", r.get("faces", r["size"])), r[key]) for r in rows if key in r]
     if len(good) < 2 or min(good[-1][1], good[-2][1]) <= 0:
         return None
-    (a, one), (b, two) = good[-2:]
-    return math.log(two / one) / math.log(b / a)
+    (a, cost_a), (b, cost_b) = good[-2:]
+    return math.log(cost_b / cost_a) / math.log(b / a)
 
 
 def run(axes: list[str], *, large: bool = False, seconds: float = 240.0) -> dict[str, Any]:
     """All sizes of the axes asked for."""
-    found = {}
+    by_axis = {}
     for axis in axes:
         rows = [measure(axis, size, seconds) for size in SIZES[axis][1 if large else 0]]
-        found[axis] = {"rows": rows, "power_cpu": power(rows), "power_memory": power(rows, "peak_mib")}
-    return found
+        by_axis[axis] = {"rows": rows, "power_cpu": power(rows), "power_memory": power(rows, "peak_mib")}
+    return by_axis
 
 
-def show(found: dict[str, Any]) -> None:
+def show(by_axis: dict[str, Any]) -> None:
     """A table per axis."""
-    for axis, result in found.items():
+    for axis, result in by_axis.items():
         fitted = result["power_cpu"]
         print(f"{axis}" + ("" if fitted is None else f": processor time grows with power {fitted:.2f} at the end"))
         for row in result["rows"]:
@@ -259,8 +259,8 @@ def main() -> None:
         print(json.dumps(MEASURES[axis](float(size))))
         return
     print(f"{os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}", file=sys.stderr)
-    found = run(arguments.axes, large=arguments.large, seconds=arguments.seconds)
-    print(json.dumps(found, indent=1)) if arguments.json else show(found)
+    by_axis = run(arguments.axes, large=arguments.large, seconds=arguments.seconds)
+    print(json.dumps(by_axis, indent=1)) if arguments.json else show(by_axis)
 
 
 if __name__ == "__main__":

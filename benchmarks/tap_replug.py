@@ -39,17 +39,17 @@ def lines_given(pieces: Iterable[bytes]) -> Counter[str]:
 
 def lines_recorded(records: Iterable[dict[str, Any]]) -> Counter[str]:
     """Lines that the records hold: information, final results, and what was cut off."""
-    kept: Counter[str] = Counter()
+    lines: Counter[str] = Counter()
     for record in records:
         if record["kind"] not in ("exchange", "late", "unsolicited", "gap"):
             continue
-        kept.update(record.get("lines") or ())
+        lines.update(record.get("lines") or ())
         if (status := record.get("status")) in FINAL:
-            kept[FINAL[status] + (record.get("code") or "")] += 1
+            lines[FINAL[status] + (record.get("code") or "")] += 1
         # after a time-out the line goes on growing, and is recorded when it ends
         if record.get("status") != "timeout" and (partial := (record.get("partial") or "").strip(" \t\r\n")):
-            kept[partial] += 1
-    return kept
+            lines[partial] += 1
+    return lines
 
 
 def size(lines: Counter[str]) -> int:
@@ -95,7 +95,7 @@ def cycles(count: int, seed: int, folder: Path, bytewise_s: float = 3e-4) -> dic
         (r["command"], tuple(r["lines"])) for r in records if r["kind"] == "exchange" and r["status"] == "ok"
     )
     pieces = [path.read_bytes() for path in sorted(folder.glob("given-*.bin"))]
-    given, kept = lines_given(pieces), lines_recorded(records)
+    given, recorded = lines_given(pieces), lines_recorded(records)
     received = sum(len(piece) for piece in pieces)
     ends = [r["received_bytes"] for r in records if r["kind"] == "end"]
     closed = [r for r in records if r["kind"] == "gap" and r["state"] == "closed"]
@@ -108,10 +108,11 @@ def cycles(count: int, seed: int, folder: Path, bytewise_s: float = 3e-4) -> dic
     return {
         "cycles": count, "answers_read": len(read), "lost": (Counter(read) - logged).total(),
         "received_bytes": received, "received_bytes_by_the_tap": ends[-1] if ends else None,
-        "line_bytes_given": size(given), "line_bytes_recorded": size(kept),
+        "line_bytes_given": size(given), "line_bytes_recorded": size(recorded),
         "line_bytes_in_gap_records": size(lines_recorded(r for r in records if r["kind"] == "gap")),
-        "line_bytes_missing": size(given - kept), "line_bytes_invented": size(kept - given), "bytes_sent": sent_bytes,
-        "bytes_never_read": sent_bytes - received, "gap_records": len(closed), "cycles_in_a_gap_record": covered,
+        "line_bytes_missing": size(given - recorded), "line_bytes_invented": size(recorded - given),
+        "bytes_sent": sent_bytes, "bytes_never_read": sent_bytes - received, "gap_records": len(closed),
+        "cycles_in_a_gap_record": covered,
         "gaps_in_summary": summary["gaps"], "nodes_used": len(nodes), "bad_lines": len(bad),
     }  # fmt: skip
 

@@ -126,8 +126,8 @@ def pytest_collection_finish() -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
     """No doctests here: their collector would import what tests run in processes of their own, dask's clusters too."""
-    found = yield
-    return [one for one in found if not isinstance(one, DoctestModule)]
+    collectors = yield
+    return [collector for collector in collectors if not isinstance(collector, DoctestModule)]
 
 
 @pytest.fixture(scope="module")
@@ -202,14 +202,14 @@ def field_logs() -> Any:
     from aerpaw_cmp.logs.ingest import ingest
     from aerpaw_cmp.logs.readers import ReadOptions
 
-    kept = Path(_OF_ALL or os.environ["AERPAW_CMP_CACHE"]) / "field_logs.pickle"
-    if kept.exists():
-        return pickle.loads(kept.read_bytes())
-    found = ingest(REAL, options=ReadOptions(timezone="America/New_York"))
-    part = kept.with_suffix(f".{os.getpid()}")
-    part.write_bytes(pickle.dumps(found))
-    part.replace(kept)
-    return found
+    store = Path(_OF_ALL or os.environ["AERPAW_CMP_CACHE"]) / "field_logs.pickle"
+    if store.exists():
+        return pickle.loads(store.read_bytes())
+    ingested = ingest(REAL, options=ReadOptions(timezone="America/New_York"))
+    part = store.with_suffix(f".{os.getpid()}")
+    part.write_bytes(pickle.dumps(ingested))
+    part.replace(store)
+    return ingested
 
 
 @pytest.fixture
@@ -232,9 +232,9 @@ def _cf_faults(path: Path) -> list[str]:
     book = suite.load_dataset(str(path))
     scores = suite.run_all(book, [f"cf:{version}"], skip_checks=[])
     book.close()
-    found, errors = scores[f"cf:{version}"]
+    groups, errors = scores[f"cf:{version}"]
     assert not errors
-    return [text for group in found for text in _messages(group)]
+    return [text for group in groups for text in _messages(group)]
 
 
 def _messages(result: Any) -> list[str]:

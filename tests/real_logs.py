@@ -12,7 +12,7 @@ def dataset12(name: str) -> dict[str, Any]:
     import numpy as np
     from scipy.io import loadmat
 
-    found = loadmat(REAL / "dataset12" / f"{name}.mat")
-    data = {k: np.ravel(v).astype(float) for k, v in found.items() if k[0] == "m" or k == "timestamp_power"}
+    columns = loadmat(REAL / "dataset12" / f"{name}.mat")
+    data = {k: np.ravel(v).astype(float) for k, v in columns.items() if k[0] == "m" or k == "timestamp_power"}
     longitude, latitude = ("mX", "mY") if data["mX"].mean() < 0 else ("mY", "mX")
     return data | {"longitude": data[longitude], "latitude": data[latitude]}

@@ -63,11 +63,11 @@ def test_both_sides_of_kriging_agree(capsys: pytest.CaptureFixture[str]) -> None
 
 @pytest.mark.skipif(not LINUX or not shutil.which("cc"), reason="needs Linux and a C compiler")
 def test_outputs_are_whole_after_kills_and_errors() -> None:
-    found = json.loads(said_by("output_faults", "--kills", "10", "--seed", "3", "--jobs", "site import"))
-    assert found["n"] == 0
-    assert found["total"]["killed"] >= 8
-    assert found["total"]["full"] == found["total"]["broken"] == found["jobs"]["site import"]["calls"] > 5
-    assert found["planted_fault"]["violations"] > 0
+    counts = json.loads(said_by("output_faults", "--kills", "10", "--seed", "3", "--jobs", "site import"))
+    assert counts["n"] == 0
+    assert counts["total"]["killed"] >= 8
+    assert counts["total"]["full"] == counts["total"]["broken"] == counts["jobs"]["site import"]["calls"] > 5
+    assert counts["planted_fault"]["violations"] > 0
 
 
 @pytest.mark.skipif(not LINUX, reason="forks, and /dev/full")

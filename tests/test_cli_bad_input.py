@@ -70,8 +70,8 @@ def test_the_unchanged_flight_passes(run: Run, tmp_path: Path) -> None:
     ],
 )
 def test_bad_logs(run: Run, name: str, files: dict[str, bytes | str | None], code: int, words: str) -> None:
-    found, err = run(**files)
-    assert found == code, err
+    exit_code, err = run(**files)
+    assert exit_code == code, err
     assert words in err
 
 

@@ -94,8 +94,8 @@ def test_the_page_lists_what_json_prints(
 
 def test_the_page_lists_what_a_tap_prints() -> None:
     """Its records become the object as they are."""
-    assert listed("tap") == [*(one.name for one in dataclasses.fields(TapSummary)), "modems"]
-    assert listed("tap --export") == [one.name for one in dataclasses.fields(ExportSummary)]
+    assert listed("tap") == [*(field.name for field in dataclasses.fields(TapSummary)), "modems"]
+    assert listed("tap --export") == [field.name for field in dataclasses.fields(ExportSummary)]
 
 
 def test_the_page_has_every_command() -> None:

@@ -25,10 +25,10 @@ SAMPLE = ROOT / "sample_logs"
 
 def leaves(group: Any, *names: str) -> dict[tuple[str, ...], Any]:
     """Every command of the program by its words."""
-    found: dict[tuple[str, ...], Any] = {}
+    commands: dict[tuple[str, ...], Any] = {}
     for name, command in group.commands.items():
-        found |= leaves(command, *names, name) if hasattr(command, "commands") else {(*names, name): command}
-    return found
+        commands |= leaves(command, *names, name) if hasattr(command, "commands") else {(*names, name): command}
+    return commands
 
 
 PROGRAM: Any = typer.main.get_command(app)
@@ -59,7 +59,7 @@ def test_the_table_of_commands_and_the_program_agree() -> None:
 
 @EACH
 def test_every_command_has_help_quiet_json_and_examples_that_parse(words: tuple[str, ...]) -> None:
-    options = {option for one in LEAVES[words].params for option in one.opts}
+    options = {option for parameter in LEAVES[words].params for option in parameter.opts}
     assert {"--quiet", "-q", "--json"} <= options
     lines = examples_of(words)
     assert lines

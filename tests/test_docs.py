@@ -32,8 +32,8 @@ def commands(text: str) -> list[tuple[str, bool]]:
     text = text.replace("\\\n", " ")
     lines = [line.strip().removeprefix("$ ") for line in text.splitlines()]
     inside = re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
-    found = [(line, True) for line in lines if line.startswith(STARTS)]
-    return found + [(span, False) for span in inside if span.startswith(STARTS)]
+    in_block = [(line, True) for line in lines if line.startswith(STARTS)]
+    return in_block + [(span, False) for span in inside if span.startswith(STARTS)]
 
 
 def words_of(line: str) -> list[str]:
@@ -57,10 +57,10 @@ def check(line: str, in_block: bool) -> None:
         parse([word for word in words if word not in ("-h", "--help")], in_block)
 
 
-def parse(words: list[str], whole: bool) -> None:
+def parse(words: list[str], complete: bool) -> None:
     """Let the program read a line; within a sentence it may leave out what the command needs."""
     if words[0].startswith("-"):
-        assert words[0] in {option for one in PROGRAM.params for option in one.opts} | {
+        assert words[0] in {option for parameter in PROGRAM.params for option in parameter.opts} | {
             "--version",
             "--debug",
             "--help",
@@ -74,7 +74,7 @@ def parse(words: list[str], whole: bool) -> None:
         try:
             context = command.make_context(name, [] if group else words, parent=context, resilient_parsing=group)
         except Exception as error:
-            if whole or type(error).__name__ != "MissingParameter":
+            if complete or type(error).__name__ != "MissingParameter":
                 raise
 
 

@@ -25,5 +25,5 @@ def test_the_function_exists_and_names_the_equation(row: re.Match[str]) -> None:
 
 
 def test_all_displayed_equations_of_the_paper_are_there() -> None:
-    found = {int(n) for row in ROWS for n in re.findall(r"arXiv 2502\.10324 eq\. (\d+)", row["equation"])}
-    assert found == set(range(1, 20))
+    numbers = {int(n) for row in ROWS for n in re.findall(r"arXiv 2502\.10324 eq\. (\d+)", row["equation"])}
+    assert numbers == set(range(1, 20))

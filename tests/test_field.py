@@ -81,8 +81,8 @@ def test_report_completes_with_baselines_and_audit(report: Report, name: str) ->
 @pytest.mark.parametrize("name", ["dataset12_40m", "dataset12_70m"])
 def test_free_space_leaves_what_an_independent_trial_left(report: Report, name: str) -> None:
     expected = {"dataset12_40m": {"USRP1": 6.56, "USRP2": 5.47}, "dataset12_70m": {"USRP1": 7.14, "USRP2": 6.30}}[name]
-    found = {channel: m["baselines"]["free_space"]["rmse_db"] for channel, m in report(name)["rss"]["LW1"].items()}
-    assert found == pytest.approx(expected, abs=0.05)
+    rmse_db = {channel: m["baselines"]["free_space"]["rmse_db"] for channel, m in report(name)["rss"]["LW1"].items()}
+    assert rmse_db == pytest.approx(expected, abs=0.05)
 
 
 def test_snr_of_four_towers_is_scored_per_tower(report: Report) -> None:
@@ -90,10 +90,10 @@ def test_snr_of_four_towers_is_scored_per_tower(report: Report) -> None:
     towers = report("aadm")["rss"]
     assert set(towers) == {"LW1", "LW2", "LW3", "LW4"}
     for channels in towers.values():
-        found, snr = channels["snr"], channels["snr"]["snr"]
+        score, snr = channels["snr"], channels["snr"]["snr"]
         assert snr["noise_dbm"] == pytest.approx(-93.96, abs=0.01)
-        assert snr["n"] == found["n"]
-        assert snr["rmse_db"] ** 2 - snr["mean_error_db"] ** 2 == pytest.approx(found["rmse_db"] ** 2, rel=1e-3)
+        assert snr["n"] == score["n"]
+        assert snr["rmse_db"] ** 2 - snr["mean_error_db"] ** 2 == pytest.approx(score["rmse_db"] ** 2, rel=1e-3)
 
 
 @pytest.mark.parametrize(("name", "limit"), [("nr_rank_flight1", 0.07), ("nr_rank_flight3", 0.10)])

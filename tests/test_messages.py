@@ -147,8 +147,8 @@ def test_a_message_says_what_was_found_what_is_expected_and_what_to_type(kind: s
     assert text.startswith("aerpaw-cmp: ")
     assert "Traceback" not in text
     assert "Errno" not in text
-    found = re.split(r"; expected |\. Likely cause: |[.?] Next: |; did you mean ", text)
-    assert len(found[0].split()) >= 3
+    parts = re.split(r"; expected |\. Likely cause: |[.?] Next: |; did you mean ", text)
+    assert len(parts[0].split()) >= 3
     assert re.search(r"expected |Likely cause: |did you mean |problems\n", text), "neither expected nor likely cause"
     assert re.search(r"Next: \S|did you mean ", text), "nothing to type next"
     assert len(text.splitlines()[0]) < 420

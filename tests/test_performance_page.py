@@ -16,8 +16,8 @@ pytestmark = pytest.mark.skipif(
 
 
 def test_the_page_is_made_from_the_history() -> None:
-    found = performance.runs(performance.HISTORY)
-    assert (ROOT / "docs" / "performance.md").read_text(encoding="utf-8") == performance.page(found)
+    history = performance.runs(performance.HISTORY)
+    assert (ROOT / "docs" / "performance.md").read_text(encoding="utf-8") == performance.page(history)
 
 
 def test_every_axis_has_a_title_and_what_was_not_measured_is_said() -> None:

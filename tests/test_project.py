@@ -45,7 +45,7 @@ def test_classifiers_are_known_and_name_every_python_that_set_up_looks_for() -> 
     searched = re.findall(
         r"python(3\.\d+)", (ROOT / "tools/setup_venv").read_text().partition("for name in")[2].partition("do")[0]
     )
-    assert versions == sorted(searched, key=lambda one: int(one[2:]))
+    assert versions == sorted(searched, key=lambda version: int(version[2:]))
     assert PROJECT["requires-python"] == f">={versions[0]}"
     assert (ROOT / "aerpaw_cmp/py.typed").is_file()
 
@@ -64,16 +64,16 @@ def test_the_readme_of_a_package_index_needs_no_file_of_ours(source: str, tmp_pa
     code = "from hatchling.build import prepare_metadata_for_build_wheel as make; print(make('.'))"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    told = email.message_from_bytes((tmp_path / done.stdout.strip() / "METADATA").read_bytes())
-    assert told["Description-Content-Type"] == "text/markdown"
-    assert "Paper, https://arxiv.org/abs/2502.10324" in told.get_all("Project-URL")
-    readme, shown = (ROOT / "README.md").read_text(), told.get_payload()
+    metadata = email.message_from_bytes((tmp_path / done.stdout.strip() / "METADATA").read_bytes())
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    assert "Paper, https://arxiv.org/abs/2502.10324" in metadata.get_all("Project-URL")
+    readme, shown = (ROOT / "README.md").read_text(), metadata.get_payload()
     if not source:
         assert shown.strip() == readme.strip()
         return
     links = re.findall(r"(!?)\[[^\]\[]*\]\(([^)]+)\)", readme)
     seen = re.findall(r"(!?)\[[^\]\[]*\]\(([^)]+)\)", shown)
-    tag = f"v{told['Version']}"
+    tag = f"v{metadata['Version']}"
     for (image, target), (also, address) in zip(links, seen, strict=True):
         kind = "raw" if image else "blob"
         own = f"https://forge.example/lab/aerpaw-cmp/{kind}/{tag}/{target}"
@@ -218,14 +218,14 @@ def parsed(path: Path) -> ast.Module:
 
 def sections(docstring: str) -> dict[str, list[str]]:
     """Lines of each section of a NumPy docstring."""
-    found: dict[str, list[str]] = {}
+    by_title: dict[str, list[str]] = {}
     lines = docstring.splitlines()
     for title, line in itertools.pairwise([*lines, ""]):
         if re.fullmatch(r"-{3,}", line) and title[:1].strip():
-            found[title] = []
-        elif found:
-            found[list(found)[-1]].append(line)
-    return found
+            by_title[title] = []
+        elif by_title:
+            by_title[list(by_title)[-1]].append(line)
+    return by_title
 
 
 def public_functions(body: list[ast.stmt], home: str) -> Iterator[tuple[str, ast.FunctionDef]]:
@@ -239,8 +239,8 @@ def public_functions(body: list[ast.stmt], home: str) -> Iterator[tuple[str, ast
 def lacking(function: ast.FunctionDef) -> list[str]:
     """Parameters that the docstring does not describe, and what it returns, where there are four or more."""
     a = function.args
-    given = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))]
-    names = [one.arg for one in given if one.arg not in ("self", "cls")]
+    arguments = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))]
+    names = [argument.arg for argument in arguments if argument.arg not in ("self", "cls")]
     if len(names) < 4:
         return []
     parts = sections(ast.get_docstring(function) or "")
@@ -253,7 +253,7 @@ def lacking(function: ast.FunctionDef) -> list[str]:
 
 def test_functions_of_four_parameters_describe_each_and_what_they_return() -> None:
     """Every public function of a public module; those of the command line describe themselves in ``--help``."""
-    found, seen = {}, 0
+    undescribed, seen = {}, 0
     for path in modules():
         inside = path.relative_to(ROOT)
         if inside.parts[1] == "cli" or inside.stem.startswith("_"):
@@ -261,8 +261,8 @@ def test_functions_of_four_parameters_describe_each_and_what_they_return() -> No
         for name, function in public_functions(parsed(path).body, inside.as_posix()):
             seen += 1
             if missing := lacking(function):
-                found[name] = missing
-    assert found == {}
+                undescribed[name] = missing
+    assert undescribed == {}
     assert seen > 1000
 
 
@@ -299,8 +299,10 @@ def test_records_of_many_fields_are_built_by_keyword() -> None:
     trees = {path: parsed(path) for path in modules()}
     classes = {node.name for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
     assert len(classes) > 300
-    found = {p.name: lines for p, tree in trees.items() if (lines := built_by_position(tree, {*classes, "cls"}, 5))}
-    assert found == {}
+    by_position = {
+        p.name: lines for p, tree in trees.items() if (lines := built_by_position(tree, {*classes, "cls"}, 5))
+    }
+    assert by_position == {}
     assert built_by_position(ast.parse("x = m.Link(1, 2, 3)\ny = Link(1, 2, c=3)"), {"Link"}, 2) == [(1, "Link")]
 
 
@@ -312,9 +314,9 @@ def private_imports(tree: ast.AST) -> list[str]:
 
 def test_no_module_takes_a_private_name_of_another() -> None:
     """A private module of a package may be imported (the parsers share some); a private name of a module may not."""
-    found = {path.name: names for path in modules() if (names := private_imports(parsed(path)))}
+    imports = {path.name: names for path in modules() if (names := private_imports(parsed(path)))}
     own = {path.stem for path in (ROOT / "parsers" / "aerpaw_parsers").glob("_*.py")}
-    assert {name: left for name, names in found.items() if (left := set(names) - own)} == {}
+    assert {name: left for name, names in imports.items() if (left := set(names) - own)} == {}
     assert private_imports(ast.parse("from .replay import Replay, _poses\nfrom . import __version__")) == ["_poses"]
 
 

@@ -125,13 +125,13 @@ def test_a_replayed_flight_has_levels_matrices_and_paths_that_agree(flight: ac.F
     replayed = flight.replay(max_depth=0, foliage="none")
     key = next(key for key in replayed.series if key[1] != "rank")
     level, h = replayed.rss_dbm[key], replayed.h[key]
-    one = replayed.series[key]
-    power = one.link.transmit_power_dbm + 10 * np.log10((np.abs(h) ** 2).mean(axis=(1, 2)))
-    known = np.isfinite(level[one.valid])
-    assert level[one.valid][known] == pytest.approx(power[known], abs=1e-9)
+    series = replayed.series[key]
+    power = series.link.transmit_power_dbm + 10 * np.log10((np.abs(h) ** 2).mean(axis=(1, 2)))
+    known = np.isfinite(level[series.valid])
+    assert level[series.valid][known] == pytest.approx(power[known], abs=1e-9)
     assert replayed.paths[key].depth.max() == 0
     data = replayed.to_xarray()["/".join(key)]
-    assert data.sizes["time"] == one.valid.sum()
+    assert data.sizes["time"] == series.valid.sum()
     assert {"time", "east_m"} <= set(data.coords)
     compared = replayed.compare()
     levels = compared.to_xarray()["/".join(key)]
@@ -154,14 +154,14 @@ def test_trace_takes_plain_positions_and_equals_free_space_where_nothing_reflect
 
     link = ac.Link(3.4e9, {"LW1": single_element()}, single_element(), transmit_power_dbm=40.0)
     site = ac.load_site("lake_wheeler")
-    found = ac.trace(site, link, site.towers["LW1"].position_m + np.array([[100.0, 0.0, 60.0]]), max_depth=0)
+    traced = ac.trace(site, link, site.towers["LW1"].position_m + np.array([[100.0, 0.0, 60.0]]), max_depth=0)
     metres = np.hypot(100.0, 60.0)
     friis = 40.0 - 20 * np.log10(4 * np.pi * metres * 3.4e9 / 299_792_458.0)
-    assert found.rss_dbm[0, 0] == pytest.approx(friis, abs=1e-9)
-    data = found.to_xarray()
-    assert data.rss_dbm.sel(tower="LW1").item() == found.rss_dbm[0, 0]
-    assert (data.h_real + 1j * data.h_imag).values.tobytes() == found.h.tobytes()
-    assert "1 poses, towers LW1" in repr(found)
+    assert traced.rss_dbm[0, 0] == pytest.approx(friis, abs=1e-9)
+    data = traced.to_xarray()
+    assert data.rss_dbm.sel(tower="LW1").item() == traced.rss_dbm[0, 0]
+    assert (data.h_real + 1j * data.h_imag).values.tobytes() == traced.h.tobytes()
+    assert "1 poses, towers LW1" in repr(traced)
     with pytest.raises(Exception, match="positions"):
         ac.trace(site, link, [[1.0, 2.0]])
 

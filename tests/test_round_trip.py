@@ -40,8 +40,8 @@ def round_trip(folder: Path, **plan: object) -> dict[str, dict[str, RssResult]]:
     simulate(path)
     data = load_data(load_flight(path), folder)
     results: dict[str, dict[str, RssResult]] = {}
-    for one in run_flight(data, audit=False).result.rss:
-        results.setdefault(one.tower, {})[one.channel] = one
+    for result in run_flight(data, audit=False).result.rss:
+        results.setdefault(result.tower, {})[result.channel] = result
     return results
 
 
@@ -49,9 +49,9 @@ def test_planted_offsets_come_back_to_a_tenth_without_noise(tmp_path: Path) -> N
     rss = round_trip(tmp_path)
     for tower, channels in OFFSETS.items():
         for channel, planted in channels.items():
-            found = rss[tower][channel]
-            assert abs(found.score.offset_db - planted) < 0.1 + 1e-9, (tower, channel, found.score.offset_db)
-            assert not found.score.at_edge
+            result = rss[tower][channel]
+            assert abs(result.score.offset_db - planted) < 0.1 + 1e-9, (tower, channel, result.score.offset_db)
+            assert not result.score.at_edge
 
 
 def test_planted_offsets_lie_in_their_intervals_with_noise(tmp_path: Path) -> None:
@@ -90,18 +90,18 @@ def test_the_clock_has_one_sign_on_every_path(tmp_path: Path) -> None:
     simulate(path)
     settings = load_flight(path)
     files = read_logs(settings, tmp_path)
-    found = {}
+    by_lag = {}
     for lag in ("apply", 2.5, 0.0, -2.5):
         changed = settings.model_copy(update={"rss": settings.rss.model_copy(update={"lag": lag})})
         data = gather(changed, tmp_path, files)
         result = run_flight(data, audit=False).result
-        found[lag] = metrics(report_data(data, result))["rss"]["LW1"]["USRP1"]
-    assert abs(found["apply"]["lag_s"] - 2.5) < 0.05
-    low, high = found["apply"]["clock"]["ci95_s"]
+        by_lag[lag] = metrics(report_data(data, result))["rss"]["LW1"]["USRP1"]
+    assert abs(by_lag["apply"]["lag_s"] - 2.5) < 0.05
+    low, high = by_lag["apply"]["clock"]["ci95_s"]
     assert low <= 2.5 <= high
     for lag in (2.5, 0.0, -2.5):
-        assert found[lag]["lag_s"] == found[lag]["clock"]["radio_minus_telemetry_s"] == lag
-    rmse = {lag: numbers["rmse_db"] for lag, numbers in found.items()}
+        assert by_lag[lag]["lag_s"] == by_lag[lag]["clock"]["radio_minus_telemetry_s"] == lag
+    rmse = {lag: numbers["rmse_db"] for lag, numbers in by_lag.items()}
     assert rmse["apply"] < 0.3, rmse  # corners of the plan lie between telemetry rows
     assert rmse[2.5] < 0.3, rmse
     assert rmse[2.5] < 0.3 * rmse[0.0] < 0.3 * rmse[-2.5]
@@ -179,10 +179,13 @@ def test_the_sample_logs_are_what_simulate_writes(tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert main(["simulate", str(SAMPLE), "-o", str(out)]) == 0
     settings = load_flight(SAMPLE)
-    kept, made = (read_logs(settings, folder) for folder in (SAMPLE.parent, out))
-    for log, one, two in zip(settings.logs, kept, made, strict=True):
-        assert (one.result.lines, len(one.result.rejected)) == (two.result.lines, len(two.result.rejected)), log.path
-        for old, new in zip(one.result.streams, two.result.streams, strict=True):
+    in_git, simulated = (read_logs(settings, folder) for folder in (SAMPLE.parent, out))
+    for log, shipped, remade in zip(settings.logs, in_git, simulated, strict=True):
+        assert (shipped.result.lines, len(shipped.result.rejected)) == (
+            remade.result.lines,
+            len(remade.result.rejected),
+        ), log.path
+        for old, new in zip(shipped.result.streams, remade.result.streams, strict=True):
             for column in old.frame.columns:
                 if old.frame[column].dtype.kind == "f":
                     np.testing.assert_allclose(old.frame[column], new.frame[column], atol=2e-3, err_msg=log.path)

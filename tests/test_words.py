@@ -37,7 +37,7 @@ def texts_of(path: Path) -> Iterator[tuple[int, str]]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     bodies = [statement for node in ast.walk(tree) if isinstance(node, documented) for statement in node.body]
-    docstrings = {id(one.value) for one in bodies if isinstance(one, ast.Expr)}
+    docstrings = {id(statement_.value) for statement_ in bodies if isinstance(statement_, ast.Expr)}
     for node in ast.walk(tree):
         text = node.value if isinstance(node, ast.Constant) and id(node) not in docstrings else None
         if isinstance(text, str) and " " in text.strip():
@@ -59,14 +59,14 @@ FILES = [
 
 
 def test_no_user_reads_a_banned_word() -> None:
-    found = {
+    by_line = {
         f"{path.relative_to(ROOT)}:{line}": wrong
         for path in FILES
         if path.name != "uplot.min.js"
         for line, text in texts_of(path)
         if (wrong := faults(text))
     }
-    assert found == {}
+    assert by_line == {}
     assert len(FILES) > 300
 
 
@@ -83,7 +83,11 @@ def options(group: Any, name: str = "") -> Iterator[tuple[str, str]]:
         if hasattr(command, "commands"):
             yield from options(command, f"{name}{verb} ")
         else:
-            yield from ((f"{name}{verb} {one.opts[0]}", one.help) for one in command.params if getattr(one, "help", ""))
+            yield from (
+                (f"{name}{verb} {parameter.opts[0]}", parameter.help)
+                for parameter in command.params
+                if getattr(parameter, "help", "")
+            )
 
 
 def test_help_of_an_option_is_a_noun_phrase_with_its_default_in_brackets() -> None:

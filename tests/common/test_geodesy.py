@@ -40,7 +40,7 @@ def test_places_come_back_in_their_shape(shape: tuple[int, ...]) -> None:
     latitude, longitude = FRAME.to_geographic(east, north)
     back = FRAME.to_local(latitude, longitude)
     assert np.shape(latitude) == np.shape(longitude) == shape
-    assert [one.shape for one in back] == [shape, shape]
+    assert [coordinate.shape for coordinate in back] == [shape, shape]
     assert back[0] == pytest.approx(east, abs=1e-6)
     assert back[1] == pytest.approx(north, abs=1e-6)
 

@@ -16,7 +16,7 @@ class Record:
 
 
 def test_numbers_that_are_none_become_null_in_every_container() -> None:
-    found = json_safe(
+    safe = json_safe(
         {
             "list": [1.0, float("nan"), np.float64("inf")],
             "array": np.array([[1.5, np.nan], [-np.inf, 2.0]]),
@@ -28,7 +28,7 @@ def test_numbers_that_are_none_become_null_in_every_container() -> None:
             2: {"b", "a"},
         }
     )
-    assert found == {
+    assert safe == {
         "list": [1.0, None, None],
         "array": [[1.5, None], [None, 2.0]],
         "whole": [0, 1, 2],
@@ -38,7 +38,7 @@ def test_numbers_that_are_none_become_null_in_every_container() -> None:
         "10": 0.5,
         "2": ["a", "b"],
     }
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert json.loads(json.dumps(safe, allow_nan=False)) == safe
 
 
 def test_a_record_gives_its_fields_and_leaves_out_what_it_has_not() -> None:

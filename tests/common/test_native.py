@@ -127,12 +127,12 @@ class Watch:
             content = os.read(self._descriptor, 1 << 16)
         except BlockingIOError:
             return []
-        found, at = [], 0
+        entries, at = [], 0
         while at < len(content):
             size = struct.unpack_from("iIII", content, at)[3]
-            found.append(content[at + 16 : at + 16 + size].rstrip(b"\0").decode())
+            entries.append(content[at + 16 : at + 16 + size].rstrip(b"\0").decode())
             at += 16 + size
-        return found
+        return entries
 
 
 @pytest.fixture
@@ -158,12 +158,12 @@ def test_no_hostile_file_opens_or_shows_anything_but_itself(private: Path, tmp_p
         path.write_bytes(content)
         begun = time.process_time()
         try:
-            found = repr(read(path))
+            shown = repr(read(path))
         except AerpawCmpError as error:
-            found = str(error)
+            shown = str(error)
         assert watch.opened() == [], name
-        assert "root:" not in found, name
-        assert SECRET[:12].decode() not in found, name
+        assert "root:" not in shown, name
+        assert SECRET[:12].decode() not in shown, name
         assert time.process_time() - begun < 30, name
 
 

@@ -325,7 +325,7 @@ def test_two_renames_where_the_system_cannot_exchange(
             os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
     with OutputFolder(target, job="test"):  # any next run mends
-        found = content(target)
-    assert found["a"] == (b"2" if step == 2 else b"1")
-    assert set(found) == {"a", SUMS}
+        files = content(target)
+    assert files["a"] == (b"2" if step == 2 else b"1")
+    assert set(files) == {"a", SUMS}
     assert [p.name for p in tmp_path.iterdir()] == ["report"]

@@ -11,8 +11,8 @@ from aerpaw_cmp.common.stages import Stages, share_of
 
 
 def test_stages_keep_their_order_and_add_up() -> None:
-    told: list[tuple[str, float | None]] = []
-    stages = Stages(lambda text, fraction=None: told.append((text, fraction)))
+    calls: list[tuple[str, float | None]] = []
+    stages = Stages(lambda text, fraction=None: calls.append((text, fraction)))
     for name in ("read", "replay", "read"):
         with stages(name):
             time.sleep(0.002)
@@ -21,7 +21,7 @@ def test_stages_keep_their_order_and_add_up() -> None:
     assert list(stages.seconds) == ["read", "replay", "fails"]
     assert stages.seconds["read"] >= 0.004 > 0.002 <= stages.seconds["replay"]
     share_of(stages.progress, "maps")(0.5)
-    assert told == [("read", None), ("replay", None), ("fails", None), ("maps", 0.5)]
+    assert calls == [("read", None), ("replay", None), ("fails", None), ("maps", 0.5)]
 
 
 def test_a_share_is_a_line_per_quarter_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,9 +81,9 @@ def test_quiet_leaves_warnings(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_seconds_of_a_stage_are_of_its_work_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Giving memory back takes milliseconds: a stage that had nothing to do once seemed to have run."""
-    found = Stages()
+    timed = Stages()
     known: list[bool] = []
-    monkeypatch.setattr(stages, "give_memory_back", lambda: known.append("work" in found.seconds))
-    with found("work"):
+    monkeypatch.setattr(stages, "give_memory_back", lambda: known.append("work" in timed.seconds))
+    with timed("work"):
         pass
     assert known == [True]

@@ -18,28 +18,28 @@ pytestmark = pytest.mark.field
 TABLE = list(csv.reader((Path(__file__).parent / "golden.csv").read_text().splitlines()))[1:]
 
 
-def rows_of(found: Ingested) -> dict[str, list[str]]:
+def rows_of(ingested: Ingested) -> dict[str, list[str]]:
     rows = {}
-    for file in found:
+    for file in ingested:
         result = file.result
         counts = (result.lines, result.accepted, len(result.rejected), len(result.streams))
-        total = sum(len(one.frame) for one in result.streams)
+        total = sum(len(stream.frame) for stream in result.streams)
         rows[os.path.relpath(file.path, REAL)] = [result.reader, *map(str, (*counts, total))]
-    for left in found.skipped:
+    for left in ingested.skipped:
         rows[os.path.relpath(left.path, REAL)] = ["no log", left.reason.removeprefix("no log: ")]
     return rows
 
 
 @pytest.fixture(scope="module")
-def found(field_logs: Ingested) -> dict[str, list[str]]:
+def rows(field_logs: Ingested) -> dict[str, list[str]]:
     return rows_of(field_logs)
 
 
-def test_no_file_is_left_without_a_word(found: dict[str, list[str]]) -> None:
-    assert set(found) == {row[0] for row in TABLE}
-    assert not any("no reader knows" in row[-1] for row in found.values())
+def test_no_file_is_left_without_a_word(rows: dict[str, list[str]]) -> None:
+    assert set(rows) == {row[0] for row in TABLE}
+    assert not any("no reader knows" in row[-1] for row in rows.values())
 
 
 @pytest.mark.parametrize("row", TABLE, ids=[row[0] for row in TABLE])
-def test_golden_counts(found: dict[str, list[str]], row: list[str]) -> None:
-    assert found[row[0]] == [cell for cell in row[1:] if cell]
+def test_golden_counts(rows: dict[str, list[str]], row: list[str]) -> None:
+    assert rows[row[0]] == [cell for cell in row[1:] if cell]

@@ -36,15 +36,15 @@ def calibrated(name: str, folder: Path, flights: list[str]) -> Path:
     return site
 
 
-def same_numbers(one: Any, other: Any) -> bool:
+def same_numbers(left: Any, right: Any) -> bool:
     """Whether two records agree but for rounding."""
-    if isinstance(one, dict):
-        return set(one) == set(other) and all(same_numbers(value, other[key]) for key, value in one.items())
-    if isinstance(one, list):
-        return len(one) == len(other) and all(map(same_numbers, one, other))
-    if isinstance(one, float):
-        return bool(one == pytest.approx(other, rel=0.01, abs=0.01))
-    return bool(one == other)
+    if isinstance(left, dict):
+        return set(left) == set(right) and all(same_numbers(value, right[key]) for key, value in left.items())
+    if isinstance(left, list):
+        return len(left) == len(right) and all(map(same_numbers, left, right))
+    if isinstance(left, float):
+        return bool(left == pytest.approx(right, rel=0.01, abs=0.01))
+    return bool(left == right)
 
 
 def first_words(folder: Path, site: Path, log: str) -> tuple[str, dict]:
@@ -78,7 +78,7 @@ def test_an_unseen_flight_of_the_sounder_is_told_its_lock_by_other_flights(tmp_p
     sentence, metrics = left_out["reported"](
         REAL / "afar/results_useful_ori_exp_300_loc_2.mat", site, tmp_path
     )  # fmt: skip
-    (numbers,) = (one for _, one in left_out["rows"](metrics))
+    (numbers,) = (scores for _, scores in left_out["rows"](metrics))
     assert "P(locked), learned on other flights" in sentence
     assert "Expect " in sentence
     assert numbers["P(detected) brier"] < 0.75 * numbers["P(detected) constant_brier"]
@@ -105,16 +105,16 @@ def test_packaged_numbers_are_what_the_command_gives(name: str, tmp_path: Path) 
             assert getattr(made.errors, field) == pytest.approx(value, abs=0.02), field
     assert made.receivers == packaged.receivers
     contents = [read_table(folder_of(p) / r.file, "") for p in ("lake_wheeler", site) for r in packaged.receivers]
-    for one, other in zip(contents[: len(packaged.receivers)], contents[len(packaged.receivers) :], strict=True):
-        assert same_numbers(json.loads(one), json.loads(other))
+    for remade, shipped in zip(contents[: len(packaged.receivers)], contents[len(packaged.receivers) :], strict=True):
+        assert same_numbers(json.loads(remade), json.loads(shipped))
     assert len(made.series) == len(packaged.series)
     assert made.series or made.receivers
-    for one, other in zip(made.series, packaged.series, strict=True):
-        assert same_numbers(one.model_dump(), other.model_dump())
+    for remade, shipped in zip(made.series, packaged.series, strict=True):
+        assert same_numbers(remade.model_dump(), shipped.model_dump())
         for file in ("tower_file", "uav_file"):
             tables = [
                 read_sphere_csv(folder_of(place) / getattr(series, file))
-                for place, series in ((site, one), ("lake_wheeler", other))
+                for place, series in ((site, remade), ("lake_wheeler", shipped))
             ]
             theta, phi = np.meshgrid(np.radians(np.arange(5.0, 180.0, 10.0)), np.radians(np.arange(0.0, 360.0, 15.0)))
             gains = [table.gain_dbi(theta, phi) for table in tables]

@@ -132,14 +132,14 @@ def exchanges(folder, query=None):
 def all_kept(sim, folder, query="nr5g_csi"):
     """Every answer that the modem saw read stands in the log once, in order, and nothing that it did not send."""
     command = QUERIES[query].text
-    kept = []
+    logged = []
     for r in records_of(folder)[0]:
         own = r["kind"] == "exchange" and r["query"] == query and r["status"] == "ok"
         if own or (r["kind"] == "late" and r["lines"] and f'"{query}"' in r["lines"][0]):
-            kept.append(tuple(r["lines"]))
-    assert kept == [s.lines for s in sim.journal if s.command == command][: len(kept)]
-    assert len(kept) >= sum(s.read for s in sim.journal if s.command == command)
-    return kept
+            logged.append(tuple(r["lines"]))
+    assert logged == [s.lines for s in sim.journal if s.command == command][: len(logged)]
+    assert len(logged) >= sum(s.read for s in sim.journal if s.command == command)
+    return logged
 
 
 @pytest.fixture

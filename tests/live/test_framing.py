@@ -27,11 +27,11 @@ TRANSCRIPTS = {
 
 
 def every_cut(data, feed_all):
-    whole = feed_all([data])
-    assert feed_all([data[i : i + 1] for i in range(len(data))]) == whole
+    uncut = feed_all([data])
+    assert feed_all([data[i : i + 1] for i in range(len(data))]) == uncut
     for cut in range(len(data) + 1):
-        assert feed_all([data[:cut], data[cut:]]) == whole, f"cut at byte {cut}"
-    return whole
+        assert feed_all([data[:cut], data[cut:]]) == uncut, f"cut at byte {cut}"
+    return uncut
 
 
 def framed(pieces):
@@ -53,10 +53,10 @@ def test_recorded_transcripts_at_every_cut():
         events = every_cut(data, framed)
         assert every_cut(data.replace(b"\n", b"\r\n"), framed) == events
         # nothing is lost: every line but echoes, finals and blanks stands in an event
-        kept = "".join("".join(e.lines) for e in events if isinstance(e, Answer)).replace(" ", "")
+        text = "".join("".join(e.lines) for e in events if isinstance(e, Answer)).replace(" ", "")
         for line in data.decode("latin-1").split("\n"):
             if line.startswith("+Q"):
-                assert line.strip().replace(" ", "") in kept, path.name
+                assert line.strip().replace(" ", "") in text, path.name
 
 
 def test_transcript_meaning():
@@ -194,12 +194,12 @@ def test_every_line_comes_out_once(lines):
     if framer._open is not None:
         events.append(framer.give_up())
     events += framer.settle()
-    kept = 0
+    count = 0
     for event in events:
         if isinstance(event, Unsolicited):
-            kept += 1
+            count += 1
         elif isinstance(event, Late):
-            kept += len(event.lines) + (event.status != "cut")
+            count += len(event.lines) + (event.status != "cut")
         else:
-            kept += len(event.lines) + (event.status not in ("timeout", "lost"))
-    assert kept == len(lines)
+            count += len(event.lines) + (event.status not in ("timeout", "lost"))
+    assert count == len(lines)

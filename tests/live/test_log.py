@@ -155,10 +155,10 @@ def test_what_memory_cannot_hold_is_counted(tmp_path):
     done = run_child(FULL_DISK, tmp_path, 25)
     assert done.returncode == 0, done.stderr
     records = list(read_log(tmp_path))
-    kept = [r["i"] for r in records if r["kind"] == "x"]
+    written = [r["i"] for r in records if r["kind"] == "x"]
     (disk,) = [r for r in records if r["kind"] == "disk"]
-    assert kept == sorted(kept)
-    assert disk["lost"] == 80 - len(kept) == 15 + 1
+    assert written == sorted(written)
+    assert disk["lost"] == 80 - len(written) == 15 + 1
     assert any(
         "record numbers are missing" in w
         for w in READER.read(next(tmp_path.iterdir()).read_bytes(), ReadOptions()).warnings
@@ -251,8 +251,8 @@ def test_a_stall_beyond_memory_is_counted(tmp_path, monkeypatch):
         writer.append({"kind": "x", "i": i})
     hang.set()
     writer.close()
-    kept = [r["i"] for r in read_log(tmp_path) if r["kind"] == "x"]
-    assert kept == [0, *range(21, 31)]
+    written = [r["i"] for r in read_log(tmp_path) if r["kind"] == "x"]
+    assert written == [0, *range(21, 31)]
     assert writer.lost == 20
 
 
@@ -344,8 +344,8 @@ def test_sigkill_loses_nothing_acknowledged(tmp_path):
         rest = process.communicate()[0].splitlines()
         acknowledged = int([*seen, *rest][-1])
         bad = []
-        kept = [r["i"] for r in read_log(folder, bad) if r["kind"] == "x"]
-        assert kept[: acknowledged + 1] == list(range(acknowledged + 1))
+        written = [r["i"] for r in read_log(folder, bad) if r["kind"] == "x"]
+        assert written[: acknowledged + 1] == list(range(acknowledged + 1))
         assert len(bad) <= 1
         assert all(b.torn_tail for b in bad)
 
@@ -408,9 +408,9 @@ def test_reader_at_cuts_all_over_its_lines():
     near = {end + k for end in ends for k in range(-3, 4)}
     for cut in sorted({*range(0, len(data), 4), *near & set(range(len(data)))}):  # every byte about the line ends
         result = READER.read(data[:cut], ReadOptions())
-        whole = sum(end < cut for end in ends)
+        complete = sum(end < cut for end in ends)
         # a last line that lacks nothing but its line end is sound
-        assert result.accepted + result.blank in (whole, whole + (cut in ends))
+        assert result.accepted + result.blank in (complete, complete + (cut in ends))
         assert len(result.rejected) <= 1
         assert all(line.reason.startswith("torn tail") for line in result.rejected)
 

@@ -149,7 +149,7 @@ def test_recorded_answers_decode():
     assert ranks == [2, 2]
     assert len(cells) >= 7
     assert all(cell.values["rat"] in ("NR5G-SA", "EN-DC", "LTE") for cell in cells)
-    found = {(c.values["rat"], (c.values.get("nr") or c.values["lte"])["rsrp_dbm"]) for c in cells}
+    levels = {(c.values["rat"], (c.values.get("nr") or c.values["lte"])["rsrp_dbm"]) for c in cells}
     assert {
         ("NR5G-SA", -68),
         ("NR5G-SA", -109),
@@ -157,7 +157,7 @@ def test_recorded_answers_decode():
         ("EN-DC", -76),
         ("EN-DC", -96),
         ("LTE", -93),
-    } <= found
+    } <= levels
 
 
 # all invented: an IMEI with its right check digit, IMSI of the test network 001-01, and so on

@@ -95,18 +95,18 @@ def test_nothing_to_replay(tmp_path, content):
 
 def test_what_two_threads_say_at_once_comes_one_behind_the_other():
     """Longer than the system's buffer of a terminal, so that each writer has to wait in the middle."""
-    said = [letter * 200_000 + b"\n" for letter in (b"a", b"b")]
+    sent = [letter * 200_000 + b"\n" for letter in (b"a", b"b")]
     with ModemSimulator() as modem, held(modem.port) as reader:
-        threads = [threading.Thread(target=modem._write, args=(text,)) for text in said]
+        threads = [threading.Thread(target=modem._write, args=(text,)) for text in sent]
         for thread in threads:
             thread.start()
         threads[0].join(0.1)  # both wait for the reader by now
-        heard = b""
-        while len(heard) < sum(map(len, said)):
-            heard += reader.read(4096)
+        received = b""
+        while len(received) < sum(map(len, sent)):
+            received += reader.read(4096)
         for thread in threads:
             thread.join()
-    assert sorted(heard.splitlines(keepends=True)) == said
+    assert sorted(received.splitlines(keepends=True)) == sent
 
 
 def test_simulator_cleans_up(tmp_path):

@@ -45,9 +45,9 @@ def test_every_answer_is_in_the_log_once(modem, tap, tools, tmp_path):
     assert records[-1]["kind"] == "end"
     assert records[-1]["reason"] == "test"
     assert [r["n"] for r in records[1:]] == sorted(r["n"] for r in records[1:])
-    kept = tools.all_kept(sim, tmp_path / "log")  # the simulator's PMI makes each answer unique
+    logged = tools.all_kept(sim, tmp_path / "log")  # the simulator's PMI makes each answer unique
     assert summary.exit_code == 0
-    assert summary.answers["nr5g_csi"] == {"ok": len(kept)}
+    assert summary.answers["nr5g_csi"] == {"ok": len(logged)}
     asked = {r["query"] for r in records if r["kind"] == "exchange"}
     assert asked == {"sync", "identity", "firmware", "csi_ctrl", "nr5g_csi", *TapSettings(tmp_path).queries}
     for r in records:
@@ -293,15 +293,15 @@ def test_a_disk_fault_does_not_stop_the_polling(modem, tap, tools, tmp_path):
     session.wait(lambda: len(served_and_read(sim, CSI)) >= 3)
     path = next((tmp_path / "log").iterdir())
     fd = next(int(f.name) for f in Path("/proc/self/fd").iterdir() if os.path.realpath(f) == str(path))
-    kept = os.dup(fd)
+    duplicate = os.dup(fd)
     full = os.open("/dev/full", os.O_WRONLY)
     os.dup2(full, fd)  # from here on the kernel says ENOSPC
     count = len(sim.journal)
     session.wait(lambda: len(sim.journal) > count + 10)
     assert any("disk is full" in text for text in session.said)
-    os.dup2(kept, fd)  # and now there is room again
+    os.dup2(duplicate, fd)  # and now there is room again
     session.wait(lambda: any("takes records again; 0 were lost" in text for text in session.said))
-    os.close(kept)
+    os.close(duplicate)
     os.close(full)
     summary = session.end()
     assert (summary.lost_records, summary.exit_code) == (0, 0)

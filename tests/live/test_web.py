@@ -89,9 +89,9 @@ def ask(web, path="/", method="GET", host="127.0.0.1", **headers):
     link.endheaders()
     answer = link.getresponse()
     body = b"" if answer.status == 200 and path.startswith("/events") else answer.read()
-    found = answer.status, dict(answer.getheaders()), body
+    parts = answer.status, dict(answer.getheaders()), body
     link.close()
-    return found
+    return parts
 
 
 # the server ----------------------------------------------------------------------------------------------------
@@ -319,9 +319,9 @@ def test_a_long_flight_comes_in_pieces():
                           "sent_mono_ns": 0, "last_mono_ns": 0, "sent_utc_ns": 0})  # fmt: skip
     hand.feed.digest()
     cursor, sizes = "", []
-    while (found := hand.feed.after(cursor))[0] is not None:
-        sizes.append(len(rows_of(found[0])))
-        cursor = found[1]
+    while (piece := hand.feed.after(cursor))[0] is not None:
+        sizes.append(len(rows_of(piece[0])))
+        cursor = piece[1]
     assert sizes == [CHUNK, CHUNK, 10]
 
 

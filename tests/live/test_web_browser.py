@@ -79,9 +79,9 @@ class Flight:
 
 @pytest.fixture(scope="module")
 def driver():
-    found = start("--window-size=1440,1000", "--autoplay-policy=no-user-gesture-required")
-    yield found
-    found.quit()
+    browser = start("--window-size=1440,1000", "--autoplay-policy=no-user-gesture-required")
+    yield browser
+    browser.quit()
 
 
 @pytest.fixture
@@ -270,10 +270,10 @@ def browsers_of(driver):
         if folder.name.isdigit():
             with contextlib.suppress(OSError):
                 parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-    found = [driver.service.process.pid]
-    for pid in found:
-        found += [child for child, parent in parents.items() if parent == pid]
-    return found[1:]
+    processes = [driver.service.process.pid]
+    for pid in processes:
+        processes += [child for child, parent in parents.items() if parent == pid]
+    return processes[1:]
 
 
 def test_a_browser_that_is_stopped_misses_nothing(driver, fly):

@@ -13,17 +13,17 @@ from aerpaw_cmp.machine import doctor, llvm
 def test_every_unwell_check_has_a_remedy_and_the_whole_is_json(monkeypatch: pytest.MonkeyPatch) -> None:
     library = llvm.Library(Path("/x/libLLVM.so.19.1"), (19, 1))
     monkeypatch.setattr(llvm, "candidates", lambda: [library])
-    monkeypatch.setattr(llvm, "try_library", lambda one: llvm.Trial(one, True))
-    found = doctor.checks()
+    monkeypatch.setattr(llvm, "try_library", lambda candidate: llvm.Trial(candidate, True))
+    checks = doctor.checks()
     asked = [
         "Python", "Sionna RT", "Mitsuba", "Dr.Jit", "LLVM", "GPU", "CPU", "Memory", "Disk", "Cache", "Readers",
         "Serial",
     ]  # fmt: skip
-    assert set(asked) <= {check.name for check in found}
-    for check in found:
+    assert set(asked) <= {check.name for check in checks}
+    for check in checks:
         assert check.status in ("ok", "warn", "fail")
         assert bool(check.remedy) == (check.status != "ok"), check
-    assert json.loads(json.dumps(doctor.as_dict(found)))["checks"][0]["name"] == "Python"
+    assert json.loads(json.dumps(doctor.as_dict(checks)))["checks"][0]["name"] == "Python"
 
 
 def test_python_too_old() -> None:
@@ -55,10 +55,10 @@ def test_a_gpu_that_works_needs_no_llvm(monkeypatch: pytest.MonkeyPatch) -> None
     for works, status in ((True, "warn"), (False, "fail")):
         trial = llvm.Trial(None, works, "" if works else "the trial ended with 1: no CUDA device")
         monkeypatch.setattr(llvm, "try_variant", lambda _, trial=trial: trial)
-        found = {check.name: check for check in doctor.checks()}
-        assert found["LLVM"].status == status
-        assert found["GPU"].status == ("ok" if works else "warn")
-        assert ("cuda_ad_mono_polarized" in found["GPU"].found) == works
+        checks = {check.name: check for check in doctor.checks()}
+        assert checks["LLVM"].status == status
+        assert checks["GPU"].status == ("ok" if works else "warn")
+        assert ("cuda_ad_mono_polarized" in checks["GPU"].found) == works
 
 
 def test_a_child_that_aborts_is_a_row_not_a_crash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,10 +83,10 @@ def test_versions_that_do_not_belong_together(monkeypatch: pytest.MonkeyPatch) -
     installed = {"sionna-rt": "2.2.0", "mitsuba": "3.8.0"}
     monkeypatch.setattr(doctor.versions, "version", lambda name: installed.get(name, "not installed"))
     monkeypatch.setattr(doctor.metadata, "requires", lambda _: ["mitsuba==3.9.1", "drjit==1.5.0", "numpy>=1.26"])
-    found = {check.name: check for check in doctor.package_checks()}
-    assert found["Sionna RT"].status == "ok"
-    assert found["Mitsuba"].remedy == "pip install 'mitsuba==3.9.1'"
-    assert found["Dr.Jit"].found == "not installed"
+    checks = {check.name: check for check in doctor.package_checks()}
+    assert checks["Sionna RT"].status == "ok"
+    assert checks["Mitsuba"].remedy == "pip install 'mitsuba==3.9.1'"
+    assert checks["Dr.Jit"].found == "not installed"
 
 
 def test_memory_is_the_lower_of_machine_and_control_group(tmp_path: Path) -> None:

@@ -53,8 +53,8 @@ def test_newest_first_and_each_file_once(folders: tuple[Path, dict[str, str]]) -
     (folder / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
     (folder / "libLLVM.so").symlink_to("libLLVM-14.so.1")
     (folder / "libLLVM-21.so").symlink_to("gone.so")
-    found = llvm.candidates(environ)
-    assert [library.version for library in found] == [(22,), (19, 1), (14,), (9,)]
+    libraries = llvm.candidates(environ)
+    assert [library.version for library in libraries] == [(22,), (19, 1), (14,), (9,)]
 
 
 def test_none_found(folders: tuple[Path, dict[str, str]]) -> None:
@@ -288,8 +288,8 @@ def test_a_library_that_is_called_by_its_interface_has_the_version_of_its_other_
     (tmp_path / "libLLVM.so.1").touch()
     for name in ("libLLVM-19.so.1", "libLLVM.so", "libLLVM-19.so"):
         (tmp_path / name).symlink_to("libLLVM.so.1")
-    found = llvm.candidates({llvm.FOLDERS_VARIABLE: str(tmp_path)})
-    assert [one.version for one in found] == [(19,)]
+    libraries = llvm.candidates({llvm.FOLDERS_VARIABLE: str(tmp_path)})
+    assert [library.version for library in libraries] == [(19,)]
 
 
 @pytest.mark.sionna

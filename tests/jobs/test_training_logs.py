@@ -249,13 +249,13 @@ def held(seed: int, often: float) -> np.ndarray:
 @pytest.mark.parametrize("often", [0.05, 0.1, 0.3])
 def test_half_of_a_rank_log_is_known_by_how_long_its_ranks_hold(often: float) -> None:
     """Rows without CSI and another base of the indicator change nothing; another flight of the modem is another."""
-    whole, other = held(1, often), held(2, often)
-    known = marks_text(ranks_of(whole), MARKS)
+    flown, another = held(1, often), held(2, often)
+    known = marks_text(ranks_of(flown), MARKS)
     assert len(known) == MARKS
-    for half in (whole[:1000], whole[1000:], whole[500:1500] - 1.0):
+    for half in (flown[:1000], flown[1000:], flown[500:1500] - 1.0):
         gaps = np.insert(half, np.arange(0, len(half), 7), np.nan)
         assert shared(known, marks_text(ranks_of(gaps)))
-    assert not set(marks_text(ranks_of(whole))) & set(marks_text(ranks_of(other)))
+    assert not set(marks_text(ranks_of(flown))) & set(marks_text(ranks_of(another)))
 
 
 def test_ranks_that_any_modem_reports_carry_no_marks() -> None:
@@ -279,6 +279,6 @@ def test_half_of_an_nr_flight_is_not_scored_by_the_receiver_that_learned_from_it
     for data in flights:
         assert set(receiver.trained_on).isdisjoint(flight_logs(data))  # other line ends
         assert receiver.knows(rank_samples(data, data.rank[0]))
-    kept, said = counted_once(flights)
-    assert [data.settings.flight.name for data in kept] == ["whole"]
-    assert said == ["half holds readings of whole in another log: they are counted once"]
+    counted, notes = counted_once(flights)
+    assert [data.settings.flight.name for data in counted] == ["whole"]
+    assert notes == ["half holds readings of whole in another log: they are counted once"]

@@ -182,8 +182,7 @@ def replay(
     search = search if choice is None else replace(search, samples=choice.samples)
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
     notes += map(Omission, cache.warnings) if cache else []
-    bent, over, unmodelled = _bent(site, scene, link, poses, search, field, run)
-    through, added = _passing(site, scene, link, poses, search, field, run)
+    (bent, over, unmodelled), (through, added) = further_fields(site, scene, link, poses, search, field, run)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
     more = [item for item in (over, added) if item is not None]
     result = _evaluated(scene, link, poses, paths, search, field, run, more)
@@ -240,6 +239,25 @@ def passed(
     if search.max_depth > 1:
         notes.append(Omission("paths over a crown and a building, or over two crowns"))
     return scene, mirror.merge([paths, bounces], search.max_depth, None), notes
+
+
+def further_fields(
+    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, run: Run
+) -> tuple[tuple[EdgePaths | None, Fields | None, list[Omission]], tuple[ThroughWalls | None, Fields | None]]:
+    """Paths over edges and paths through walls, where they are asked for, with what they add to H and to the powers.
+
+    Parameters
+    ----------
+    site, scene, link, poses, search, field, run
+        As for :func:`replay`.
+
+    Returns
+    -------
+    (paths, fields, notes) over edges; (paths, fields) through walls
+        None where they were not asked for.
+    """
+    options = site, scene, link, poses, search, field, run
+    return _bent(*options), _passing(*options)
 
 
 def _shaped_ground(

@@ -11,7 +11,9 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.mapping import coverage_map as mapping
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.tiles import PLANES, Budget, Reach, Tiling
+from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.search.occlusion import Occlusion
+from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
 
 FRAME = SiteFrame(35.7, -78.7)
@@ -96,6 +98,23 @@ def test_tiles_are_the_map_in_one_piece(change):
         left = {0: 0.4, 1: 0.9}[chosen["max_depth"]]
         assert np.mean(counts) < left * len(site.buildings), "some are left out"
     assert (maps["none"].rank.max(axis=(0, 1, 2)) > 0).mean() > 0.5
+
+
+def test_a_tile_that_only_the_border_of_a_beam_touches_keeps_what_stands_on_that_border():
+    """The mirrored ray over a wall's very end meets the tile's corner, and a hut stands on it."""
+    tower = {"T": Tower("T", 35.7, -78.7, 0.0, -10.0, 10.0)}
+    wall, hut = Building("wall", box(20, 0, 40, 1), 30.0), Building("hut", box(29.5, -5.5, 30.5, -4.5), 30.0)
+    site = Site("corner", FRAME, tower, (wall, hut), area_m=(-50.0, 50.0, -50.0, 50.0))
+    budget = Budget(carrier_hz=3.4e9, transmit_power_dbm=40.0, gain_db=0.0, floor_dbm=-150.0)
+    tile = np.array([[35.0, -14.0, 10.0], [40.0, -10.0, 10.0]])
+    reached = Reach(site, budget, max_depth=1).of(tile)
+    assert {building.name for building in reached.buildings} == {"wall", "hut"}
+    link = Link(3.4e9, {"T": single_element()}, single_element())
+    labels = []
+    for buildings in ((wall,), reached.buildings):  # the hut takes the path away, so it had to be kept
+        found = trace(replace(site, buildings=buildings), link, [[40.0, -10.0, 10.0]], max_depth=1)
+        labels.append([found.faces.label[face] for face in found.paths.faces[:, 0] if face > 0])
+    assert [len(some) for some in labels] == [1, 0]
 
 
 def test_sionna_in_tiles_keeps_every_building():

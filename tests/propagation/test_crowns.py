@@ -12,9 +12,10 @@ from shapely.geometry import box
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import Array
 from aerpaw_cmp.propagation.check.audit import Second, audit
+from aerpaw_cmp.propagation.drivers.parts import replay_in_parts
 from aerpaw_cmp.propagation.field.foliage import P833, CrownIndex, NoFoliage, Opaque, foliage_loss_db
 from aerpaw_cmp.propagation.field.sum import channel_matrices
-from aerpaw_cmp.propagation.options import Field, Search
+from aerpaw_cmp.propagation.options import Field, Run, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search.crowns import FACES_PER_CROWN, Crowns
 from aerpaw_cmp.site.antennas import Isotropic
@@ -374,6 +375,21 @@ def test_a_pose_or_tower_in_its_own_crown_has_no_bounce(scenes):
     for source, target in ((ENDS[0], at), (at, ENDS[1])):
         site = scenes.site(towers=(tuple(source),), trees=trees((100, 0, 0, 20, 10, 5)))
         assert bounces(scenes, site, target)[0] == []
+
+
+def test_bottoms_of_two_crowns_in_one_plane_stay_two_faces_in_parts_of_a_flight(scenes):
+    """Each half of the flight bounces off one crown; both bottoms are the first facet that its half meets."""
+    site = scenes.site(trees=trees((30, 1, 0, 20, 8, 12), (-30, 1, 0, 20, 8, 12)))
+    crowns, poses = Crowns(site.trees), scenes.poses([[60.0, 0.0, 10.0], [-60.0, 0.0, 10.0]])
+    options = Search(crowns=crowns), Field(loss=opaque(crowns)), Run()
+    parts = replay_in_parts(site, scenes.link(site), poses, *options, size=1)
+    met = {(int(pose), parts.faces.label[faces[0]]) for pose, faces in zip(*off_crowns(parts), strict=True)}
+    assert met == {(0, "crown 1 bottom"), (1, "crown 2 bottom")}
+
+
+def off_crowns(replayed):
+    paths = replayed.paths.select(replayed.paths.off_crown & (replayed.paths.depth == 1))
+    return paths.pose, paths.faces
 
 
 def test_bottoms_of_crowns_in_one_plane_reflect_once_where_they_overlap(scenes):

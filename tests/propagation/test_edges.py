@@ -92,6 +92,37 @@ def test_the_audit_sees_a_path_over_an_edge_that_is_not_there() -> None:
         assert audit.doubtful == 0
 
 
+def test_the_audit_allows_a_ten_thousandth_of_a_percent_unless_its_series_for_edges_is_in_it() -> None:
+    # the second transition function is a series cut off at 1e-5; all else of both ways is float64
+    barn, where = place(BARN), poses((70.0, 3.0, 2.0), (60.0, -40.0, 9.0))
+    for diffraction, allowed in (("none", 1e-6), ("edges", 3e-5)):
+        ours = trace(barn, LINK, where, diffraction=diffraction)
+        for share in (0.5, 2.0):
+            off = replace(ours, h=(1.0 + share * allowed) * ours.h)
+            found = against_reference(barn, where, off, np.arange(1, 2), Expected.of(LINK), ks=(10.0,), max_depth=2)
+            assert any("H differs" in failure for failure in found.failures) == (share > 1.0)
+
+
+@pytest.mark.parametrize("end", ["towers", "uav"])
+def test_a_pattern_at_one_end_alone_is_the_same_compiled(monkeypatch: pytest.MonkeyPatch, end: str) -> None:
+    """Both components complex: nothing of one end's pattern may stay where the other end radiates along theta."""
+    pattern = SimpleNamespace(
+        name="crossed", field=lambda theta, phi: (np.sin(theta) * np.exp(1j * phi), (0.3 - 0.8j) * np.cos(theta + phi))
+    )
+    plain = Array(np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.2]]), np.radians([0.0, 70.0]))
+    turned_wave = replace(plain, patterns=(pattern,))
+    ends = (turned_wave, plain) if end == "towers" else (plain, turned_wave)
+    link, fields = Link(HZ, {"T": ends[0]}, ends[1]), []
+    for mode in ("never", "always"):
+        monkeypatch.setenv("AERPAW_CMP_COMPILED", mode)
+        fields.append(trace(place(BARN), link, poses((70.0, 3.0, 2.0), (60.0, -40.0, 9.0)), diffraction="edges").h)
+    assert fields[0] == pytest.approx(fields[1], abs=1e-9 * np.abs(fields[0]).max())
+    both_plain = trace(
+        place(BARN), Link(HZ, {"T": plain}, plain), poses((70.0, 3.0, 2.0), (60.0, -40.0, 9.0)), diffraction="edges"
+    )
+    assert np.abs(fields[0] - both_plain.h).max() > 0.1 * np.abs(fields[0]).max()
+
+
 # Two edges that meet are crossed so near their corner that the iteration has not ended: nothing is judged there.
 NEAR_A_CORNER_M = 1.0
 

@@ -136,3 +136,17 @@ def test_a_bounce_straight_down_and_paths_through_walls_in_words(scenes):
         lit.rss_power_dbm[0, 0], abs=0.02
     )
     assert lines[0].count("through hall") == 2
+
+
+def test_what_comes_after_an_antenna_that_sends_nothing_loses_nothing(scenes):
+    """A dipole does not radiate along its axis: its term takes all, and no later one is made of nothing over nothing."""
+    site = scenes.site()
+    source, above = np.array([0.0, 0, 10]), scenes.poses([0.0, 0.0, 60.0])
+    link = scenes.link(site, single_element(HalfWaveDipole()))
+    found = replay(site, link, above, Search(max_depth=1))
+    explained = explain_paths(found.paths, found.faces, source, above, link, {})
+    assert [path.depth for path in explained] == [0, 1]
+    for path in explained:
+        assert path.terms_db.pop("tower antenna") == -math.inf
+        assert set(path.terms_db.values()) == {0.0}
+        assert path.level_dbm == -math.inf

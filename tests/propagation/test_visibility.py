@@ -82,6 +82,22 @@ def test_few_links_of_the_bench_scene_differ():
     assert change[~differs].max() < 1e-9
 
 
+@pytest.mark.parametrize("further", [{"diffraction": "edges"}, {"refraction": True}])
+def test_paths_over_edges_and_through_walls_are_no_difference_between_pairs(monkeypatch, further):
+    """They are those of the array centres on both sides; the audit counts reflections and lines of sight alone."""
+    monkeypatch.setattr(field_audit, "_explicit", lambda *_: field_audit.FieldAudit())
+    site, link, poses = random_scene(20, buildings=8, seed=4)
+    counts, fields = [], []
+    for search in (Search(), Search(**further)):
+        centre = replay(site, link, poses, search)
+        audit = per_pair(site, link, poses, centre, np.arange(20), search, ks=(10.0, 1000.0))
+        counts.append((audit.pairs_links, audit.pairs_differ, audit.pairs_rank_differs))
+        assert audit.pairs_rss_max_db < 1e-9
+        fields.append(centre.h)
+    assert counts == [(20, 0, 0)] * 2
+    assert (fields[0] != fields[1]).any()
+
+
 def shadowed(scenes):
     """A wall that ends beside the straight way to some poses; the elements of the UAV lie a metre apart."""
     site = scenes.site([Building("wall", box(20, 0, 20.5, 30), 30.0)], ((0.0, 0.0, 10.0), (5.0, -3.0, 12.0)))

@@ -13,7 +13,7 @@ from ..arrays import Array, Link, Poses
 from ..engines import search_paths
 from ..field.sum import channel_matrices, mean_pair_power, rss_dbm
 from ..options import Field, Run, Search
-from ..replay import passed
+from ..replay import further_fields, passed
 from ..scene import Scene, within_reach
 
 
@@ -38,6 +38,8 @@ def replay_pairs(
     site: Site, link: Link, poses: Poses, search: Search = Search(), field: Field = Field(), run: Run = Run()
 ) -> PairChannels:
     """Replay with paths of each element pair; as many searches as the UAV has elements.
+
+    Paths over edges and through walls are those of the array centres, as in a replay.
 
     Parameters
     ----------
@@ -64,13 +66,14 @@ def replay_pairs(
     ports, towers = len(arrays[0]), len(arrays)
     singles = {f"{n} {p}": _single(array, p) for n, array in link.tower_arrays.items() for p in range(ports)}
     scene = Scene.of(site, link, poses)
-    excluded = scene.excluded if search.links is None else scene.excluded | ~search.links
+    if search.links is not None:
+        scene = replace(scene, excluded=scene.excluded | ~search.links)
     offsets = np.concatenate([array.positions_m @ array.mount.T for array in arrays])
     several = replace(
         scene,
         sources_m=np.repeat(scene.sources_m, ports, axis=0) + offsets,
         usable=np.repeat(scene.usable, ports, axis=0),
-        excluded=np.repeat(excluded, ports, axis=0),
+        excluded=np.repeat(scene.excluded, ports, axis=0),
     )
     h = np.zeros((len(poses), towers, len(uav), ports), dtype=np.complex128)
     power = np.zeros((len(poses), towers))
@@ -85,6 +88,10 @@ def replay_pairs(
         h[:, :, element] = fields.h[..., 0, 0].reshape(len(poses), towers, ports)
         power += fields.power.reshape(len(poses), towers, ports).sum(axis=2) / (ports * len(uav))
     h = np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
+    (_, over_edges, _), (_, through_walls) = further_fields(site, scene, link, poses, search, field, quiet)
+    for added in (over_edges, through_walls):
+        if added is not None:
+            h, power = h + added.h, power + added.power
     level = rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm)
     h = np.where(np.isfinite(level)[:, :, None, None], h, 0.0)
     return PairChannels(h, level, rss_dbm(power, link.transmit_power_dbm, link.noise_floor_dbm))

@@ -213,10 +213,7 @@ class _Local:
         estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
         for covered, columns in coverage_patterns(self.values_):
             samples, values = self.points_m_[covered], self.values_[np.ix_(covered, columns)]
-            skip = None
-            if leave_out:
-                skip = np.full(len(covered), -1, dtype=np.int64)
-                skip[covered] = np.arange(covered.sum())
+            skip = choose.renumbered(covered) if leave_out else None
             estimate[:, columns] = self._one_pattern(samples, values, targets, skip)
         estimate = estimate[:, 0] if self._one_field else estimate
         return estimate, np.full_like(estimate, np.nan)
@@ -224,10 +221,7 @@ class _Local:
     def _one_pattern(
         self, samples: FloatArray, values: FloatArray, targets: FloatArray, skip: IntArray | None
     ) -> FloatArray:
-        if self.selection == "random":
-            chosen = choose.random_within(samples, targets, self.neighbours, self.radius_m, self.seed, skip)
-        else:
-            chosen = choose.nearest(samples, targets, self.neighbours, self.radius_m, skip)
+        chosen = choose.by_rule(self, samples, targets, skip)
         estimate = np.full((len(targets), values.shape[1]), np.nan)
         count = chosen.count
         for m in np.unique(count[count > 0]):

@@ -239,11 +239,7 @@ class OrdinaryKriging:
         estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
         variance = np.full_like(estimate, np.nan)
         for covered, columns in coverage_patterns(self.values_):
-            skip = None
-            if place is not None:
-                new_number = np.full(len(self.points_m_), -1, dtype=np.int64)
-                new_number[covered] = np.arange(covered.sum())
-                skip = new_number[place]
+            skip = None if place is None else choose.renumbered(covered)[place]
             rule = self._weights(self.points_m_[covered], targets, skip)
             estimate[:, columns] = _apply(rule, self.values_[np.ix_(covered, columns)])
             variance[:, columns] = rule.variance[:, None] * self.sill_[columns]
@@ -274,10 +270,7 @@ class OrdinaryKriging:
         scale = np.ones(samples.shape[1])
         scale[2:] = self.vertical_scale
         samples, targets = samples * scale, targets * scale
-        if self.selection == "random":
-            chosen = choose.random_within(samples, targets, self.neighbours, self.radius_m, self.seed, skip)
-        else:
-            chosen = choose.nearest(samples, targets, self.neighbours, self.radius_m, skip)
+        chosen = choose.by_rule(self, samples, targets, skip)
         if self.outside == "nearest":
             empty = np.flatnonzero(chosen.count == 0)
             wider = choose.nearest(

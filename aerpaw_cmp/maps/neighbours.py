@@ -9,11 +9,11 @@ at the same place are taken in that order).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from ..common.units import FloatArray, IntArray
+from ..common.units import BoolArray, FloatArray, IntArray
 
 # Targets per query; bounds the memory.
 CHUNK = 4096
@@ -87,6 +87,38 @@ def nearest(
             todo = _fill_nearest(tree, targets_m, todo, radius_m, skip, ask, chosen)
             ask *= 2
     return chosen
+
+
+class Rule(Protocol):
+    """Settings of a predictor that decide which samples a target has."""
+
+    neighbours: int
+    radius_m: float
+    selection: Literal["nearest", "random"]
+    seed: int
+
+
+def by_rule(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntArray | None = None) -> Neighbours:
+    """The samples of each target that a predictor uses: its nearest ones, or some at random.
+
+    Parameters
+    ----------
+    rule : Rule
+    samples_m, targets_m, skip
+        As for :func:`nearest`.
+
+    Returns
+    -------
+    Neighbours
+    """
+    if rule.selection == "random":
+        return random_within(samples_m, targets_m, rule.neighbours, rule.radius_m, rule.seed, skip)
+    return nearest(samples_m, targets_m, rule.neighbours, rule.radius_m, skip)
+
+
+def renumbered(taken: BoolArray) -> IntArray:
+    """Number of each sample among those of a mask (samples,); -1 of the others."""
+    return np.where(taken, np.cumsum(taken) - 1, -1)
 
 
 def in_strips(places_m: FloatArray, together: int) -> IntArray:

@@ -1,8 +1,20 @@
 """From a site, a link and poses to paths and channel matrices.
 
-``replay.replay(site, link, poses, Search(...), Field(...), Run(...))`` is the door; only ``sionna.py`` loads Sionna.
+``replay.replay(site, link, poses, Search(...), Field(...), Run(...))`` is the door; ``search.sionna`` alone loads
+Sionna.
 
-Where each law stands: Fresnel coefficients in ``field.fresnel``, the slant rotation and the dyad of a reflection in
-``field.dyads``, the wedge in ``field.wedge``, the sum over paths in ``field.sum``; what hides in ``search.occlusion``,
-mirror images in ``search.mirror``; the second ways that judge them in ``check``.
+Each law stands once; NumPy and the compiled loops (``field.kernels``, ``field.edge_kernels``) evaluate one source:
+
+======================================  ==============================================================
+Fresnel coefficients of a face          ``field.fresnel.coefficients`` (``half_space``, ``slab``)
+slant of an element                     ``field.dyads.slant_rotation``; its parts ``arrays.Array.slant_parts``
+field of an element, dyad of a bounce   ``field.dyads.field_vector``, ``field.dyads.reflected``
+diffraction at a wedge                  ``field.wedge.wedge``; paths over edges ``field.edges``
+sum over paths                          ``field.sum.channel_matrices``
+mirror images                           ``search.mirror``; among thousands of faces ``search.beams``
+visibility                              ``search.occlusion.Occlusion``; of triangles ``search.beams.segment_cut``
+legs of a path                          ``paths.legs``
+======================================  ==============================================================
+
+``check`` holds the second ways that judge them; ``check.reference`` shares nothing with ``search`` and ``field``.
 """

@@ -58,6 +58,11 @@ class Array:
     def __len__(self) -> int:
         return len(self.positions_m)
 
+    @property
+    def slant_parts(self) -> FloatArray:
+        """Cosines and sines (2, elements) of the slants: the vertical and the horizontal part of each element."""
+        return np.stack([np.cos(self.slant_rad), np.sin(self.slant_rad)])
+
 
 @dataclass(frozen=True, slots=True)
 class Poses:

@@ -100,6 +100,14 @@ class Faces:
     def __len__(self) -> int:
         return len(self.normal)
 
+    def height_m(self, face: int, points_m: FloatArray) -> FloatArray:
+        """Heights (...) of points (..., 3) in front of the plane of one face."""
+        return np.asarray(points_m @ self.normal[face] - self.offset_m[face])
+
+    def mirrored(self, face: int, points_m: FloatArray) -> FloatArray:
+        """Images of points (..., 3) in the plane of one face."""
+        return np.asarray(points_m - 2.0 * self.height_m(face, points_m)[..., None] * self.normal[face])
+
     def select(self, rows: IntArray) -> Faces:
         """Some of the faces."""
         columns: dict[str, Any] = {name: tuple(getattr(self, name)[row] for row in rows) for name in _WORDS}

@@ -317,7 +317,7 @@ def _bent(
         loss_db = field.loss_db(bends, scene.sources_m, poses.position_m)
         clear &= True if loss_db is None else np.isfinite(loss_db)
         paths, loss_db = paths.select(clear), None if loss_db is None else loss_db[clear]
-    h, power = edge_channels(paths, edges, scene.faces, scene.sources_m, poses, link, loss_db, threads=run.threads)
+    h, power = edge_channels(paths, edges, scene.faces, scene.sources_m, poses, link, loss_db, run.threads)
     missing = "three edges" if search.diffraction == "all" else "two edges, after a reflection off a wall,"
     missing = f"diffraction over {missing} and with more than one reflection on a side"
     return paths, Fields(h, power, power), [Omission(missing)]

@@ -119,15 +119,9 @@ class Second:
 
 
 def audit(
-    site: Site,
-    link: Link,
-    poses: Poses,
-    replay: Replay,
-    search: Search = Search(),
-    field: Field = Field(),
-    run: Run = Run(),
-    second: Second = Second(),
-) -> Audit:
+    site: Site, link: Link, poses: Poses, replay: Replay,
+    search: Search = Search(), field: Field = Field(), run: Run = Run(), second: Second = Second(),
+) -> Audit:  # fmt: skip
     """Check a replay by another engine, on the whole scene (nothing left out).
 
     Parameters

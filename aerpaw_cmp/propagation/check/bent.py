@@ -67,10 +67,8 @@ def bent_matrix(reference: Reference, target: Vector, turn: Matrix) -> tuple[int
     Parameters
     ----------
     reference : Reference
-    target : (3,)
-        Centre of the UAV's array [m].
-    turn : (3, 3)
-        Body to site.
+    target, turn
+        As of :meth:`Reference.pair`.
 
     Returns
     -------

@@ -86,14 +86,9 @@ def _moved(site: Site, tower: Tower, name: str, place_m: AnyArray) -> Tower:
 
 
 def replay_moving(
-    site: Site,
-    link: Link,
-    poses: Poses,
-    sources_m: FloatArray,
-    search: Search = Search(),
-    field: Field = Field(),
-    run: Run = Run(),
-) -> Replay:
+    site: Site, link: Link, poses: Poses, sources_m: FloatArray,
+    search: Search = Search(), field: Field = Field(), run: Run = Run(),
+) -> Replay:  # fmt: skip
     """Replay a flight against one tower that has a place of its own at every pose.
 
     Parameters

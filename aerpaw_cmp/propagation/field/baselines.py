@@ -49,10 +49,8 @@ def two_ray_dbm(
 
     Parameters
     ----------
-    sources_m : (towers, 3) or (poses, towers, 3)
-        The latter for towers that move.
-    targets_m : (poses, 3)
-    carrier_hz, transmit_power_dbm : float
+    sources_m, targets_m, carrier_hz, transmit_power_dbm
+        As for :func:`free_space_dbm`.
     ground_material : str
         Half-space below ``ground_m``.
     ground_m : float or (towers,)

@@ -82,7 +82,7 @@ def _gather(w: FloatArray, t: Tables, r: Rows, first: int, many: int) -> None:
         _copy(w, _SOURCE + p, t.source[r.tower[path]])
         _copy(w, _TARGET + p, t.target[r.pose[path]])
         for at, side in ((_SOURCE, 0), (_TARGET, 1)):
-            face = r.ground[path, side]
+            face = r.ground[path, side]  # -1 is the last row of the mirrors, which mirrors nothing
             _copy(w, at + _MIRROR + p, t.mirror[face])
             w[at + _MIRROR + 7 * LANES + p] = 1.0 if face >= 0 else 0.0
         w[_LOST + p] = r.lost[path]
@@ -223,6 +223,7 @@ def _elements(w: FloatArray, at: int, array: Any, index: IntArray, span: tuple[i
     """Fields and places of all elements of an end."""
     places, slants, fields, side = array
     parts, edge, (first, many) = _PARTS + 8 * side * LANES, _LAST if side else _EDGE, span
+    # 1 along theta: the other end's pattern stood here
     w[_ELEMENT + 5 * LANES : _ELEMENT + 9 * LANES] = 0.0
     w[_ELEMENT + 5 * LANES : _ELEMENT + 6 * LANES] = 1.0
     for i in range(places.shape[2]):

@@ -64,7 +64,6 @@ class Tables(NamedTuple):
         """
         wavelength = wavelength_m(link.carrier_hz)
         arrays, uav = list(link.tower_arrays.values()), link.uav_array
-        slants = [np.stack([np.cos(a.slant_rad), np.sin(a.slant_rad)]) for a in (*arrays, uav)]
         material = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
         inward_n = np.cross(edges.along, edges.normal_n)
         lines = edges.start_m, edges.along, edges.face_axis, inward_n, edges.normal, edges.exterior[:, None]
@@ -76,24 +75,17 @@ class Tables(NamedTuple):
             source=np.hstack([sources_m, mounts.reshape(-1, 9)]),
             target=np.hstack([poses.position_m, axes.reshape(-1, 9)]),
             tower_m=np.stack([array.positions_m.T for array in arrays]),
-            tower_slant=np.stack(slants[:-1]),
+            tower_slant=np.stack([array.slant_parts for array in arrays]),
             uav_m=uav.positions_m.T[None],
-            uav_slant=slants[-1][None],
+            uav_slant=uav.slant_parts[None],
             wave_number=2.0 * np.pi / wavelength,
         )
 
 
 def edge_channels(
-    paths: EdgePaths,
-    edges: Edges,
-    faces: Faces,
-    sources_m: FloatArray,
-    poses: Poses,
-    link: Link,
-    loss_db: FloatArray | None = None,
-    *,
-    threads: int | None = None,
-) -> tuple[ComplexArray, FloatArray]:
+    paths: EdgePaths, edges: Edges, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link,
+    loss_db: FloatArray | None, threads: int | None,
+) -> tuple[ComplexArray, FloatArray]:  # fmt: skip
     """Contribution of paths over edges to the channel matrices.
 
     Parameters
@@ -107,9 +99,9 @@ def edge_channels(
         Centres of the tower arrays, in the order of ``link.tower_arrays`` [m].
     poses : Poses
     link : Link
-    loss_db : (paths,), optional
+    loss_db : (paths,) or None
         Further loss of each path, such as foliage.
-    threads : int, optional
+    threads : int or None
         Of compiled code.
 
     Returns
@@ -196,6 +188,7 @@ def _alike(paths: EdgePaths, t: Tables, fields: list[FloatArray | None], double:
     along, radius = _in_edge(target, edge_2)
     u_t, v_t = turn[0] + turn[1] * along + turn[2] * radius, turn[3] + turn[4] * along + turn[5] * radius
     total = np.hypot(u_t[:, :, None] - u_s[:, None, :], v_t[:, :, None] + v_s[:, None, :])
+    # whole cycles go before the exponential: at 1 km they would take five digits of the phase
     cycles = total * (t.wave_number / (2.0 * np.pi))
     carrier = np.exp(-2j * np.pi * (cycles - np.round(cycles))) / np.sqrt(total)
     (b_in, p_in), (b_out, p_out) = parts
@@ -439,10 +432,8 @@ def over_two(
 
     Returns
     -------
-    before, after : Vector
-        Directions of the legs.
-    cosines : (Number, Number)
-        Of the angles between legs and edges.
+    before, after, cosines
+        As of :func:`over_one`.
     joined : tuple of 4 complex
         Matrix over (after, before) and (beta, phi) with spreading, but for one over the root of the length.
     turn : tuple of 6 Number

@@ -34,6 +34,7 @@ def half_space(cosine: Any, eta_re: Any, eta_im: Any) -> tuple[Any, Any, Any, An
     -------
     te_re, te_im, tm_re, tm_im, root_re, root_im
     """
+    # the root without cancellation; its imaginary part has the sign of eta's, so that the refracted wave decays
     a = eta_re - (1.0 - cosine * cosine)
     t = np.sqrt(0.5 * (np.sqrt(a * a + eta_im * eta_im) + np.abs(a)))
     q = eta_im / larger(2.0 * t, 1e-300)

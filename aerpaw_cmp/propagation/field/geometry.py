@@ -59,8 +59,7 @@ class Elements(NamedTuple):
 
 def _columns(array: Array, element: IntArray) -> tuple[FloatArray, FloatArray]:
     """Places (3, pairs) and slants (2, pairs) of chosen elements."""
-    slant = array.slant_rad[element]
-    return np.ascontiguousarray(array.positions_m[element].T), np.stack([np.cos(slant), np.sin(slant)])
+    return np.ascontiguousarray(array.positions_m[element].T), np.ascontiguousarray(array.slant_parts[:, element])
 
 
 # Pattern fields of tower and UAV; None for 1 along theta in all directions.
@@ -101,6 +100,7 @@ def geometry(
         image = image - 2.0 * ((image * normal).sum(axis=1) - offset)[:, None] * normal
         for vectors in (frame, normals[:, :step]):
             vectors -= 2.0 * np.einsum("nij,nj->ni", vectors, normal)[..., None] * normal[:, None, :]
+    # the poses between the first and the last of these paths: a part of a flight turns no other array
     first, last = paths.pose.min(initial=len(poses)), paths.pose.max(initial=0)
     axes = np.einsum("nij,jk->nki", poses.rotation[first : last + 1], link.uav_array.mount)
     return Geometry(

@@ -141,6 +141,7 @@ def _fill(
                 x, y, z, length = dyads.direction(image, frame, tower_m, place, axes, uav_m)
                 put(w, _X + p, (x, y, z))
                 w[_LENGTH + p] = length
+            # one empty entry stands for all paths where every pattern is 1 along theta
             _radiate(w, pairs, first, frame, 1.0, elements.tower_slant[tower], e_tower[path % len(e_tower)], _WAVE)
             _radiate(w, pairs, first, axes, -1.0, elements.uav_slant, e_uav[path % len(e_uav)], _UAV)
             for step in range(g.depth[path]):

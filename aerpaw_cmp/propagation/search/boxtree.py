@@ -173,13 +173,12 @@ def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-de
         How many of them count.
     todo : (DEEPEST,) int
         Room for nodes that wait.
-    hits : (items,) int
-        Gets the items; has room for all of the tree.
+    hits
+        As of :func:`overlapping`.
 
     Returns
     -------
     int
-        How many there are.
     """
     return _collected(tree, _outside, (planes, many), todo, hits)
 

@@ -251,8 +251,8 @@ class _Search:
             if self._height(source_m[None])[0] <= tolerance_m:
                 return PathSet.empty(max_depth)
             poses = poses[self._height(targets_m[poses]) > tolerance_m]
-        start = self._mirrored(source_m[None])[0] if self.before else source_m
-        target = self._mirrored(targets_m[poses]) if self.after else targets_m[poses]
+        start = self.faces.mirrored(self.ground, source_m[None])[0] if self.before else source_m
+        target = self.faces.mirrored(self.ground, targets_m[poses]) if self.after else targets_m[poses]
         pieces: list[PathSet] = []
         for facets, beams in zip(self.crowns._families, self.crowns.beams(start), strict=True):
             facet, pose, point = _single_bounces(facets, beams, target, tolerance_m)
@@ -269,10 +269,7 @@ class _Search:
 
     def _height(self, point_m: FloatArray) -> FloatArray:
         """Heights (n,) above the ground plane."""
-        return np.asarray(point_m @ self.faces.normal[self.ground] - self.faces.offset_m[self.ground])
-
-    def _mirrored(self, point_m: FloatArray) -> FloatArray:
-        return np.asarray(point_m - 2.0 * self._height(point_m)[:, None] * self.faces.normal[self.ground])
+        return self.faces.height_m(self.ground, point_m)
 
     def _unfolded(
         self, source_m: FloatArray, point_m: FloatArray, target_m: FloatArray
@@ -287,7 +284,7 @@ class _Search:
                 below, above = self._height(end), self._height(point_m)
                 with np.errstate(divide="ignore", invalid="ignore"):
                     share = (below / (below + above))[:, None]
-                points.insert(place, end + share * (self._mirrored(point_m) - end))
+                points.insert(place, end + share * (self.faces.mirrored(self.ground, point_m) - end))
         return np.stack(points, axis=1), good
 
     def _free(self, source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray, tree: IntArray) -> BoolArray:

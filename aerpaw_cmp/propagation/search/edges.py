@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray, IntArray
 from .. import compiled
 from ..edges import NEAREST_M, EdgePaths, Edges
@@ -206,14 +207,7 @@ def _mirrors(kernels: ModuleType, faces: Faces, surfaces: Surfaces | None) -> An
     none = np.zeros(0, np.int64), np.zeros((0, 3, 2))
     first, flat = none if surfaces is None else (surfaces.first, surfaces.flat_m)
     return kernels.Mirrors(
-        normal=faces.normal,
-        offset=faces.offset_m,
-        along=faces.along,
-        across=faces.across,
-        lower=faces.lower,
-        upper=faces.upper,
-        first=first,
-        flat=flat,
+        offset=faces.offset_m, first=first, flat=flat, **named(faces, "normal along across lower upper")
     )
 
 
@@ -317,8 +311,8 @@ def _over_edges(
 ) -> list[EdgePaths]:
     """Paths of one tower with the given ground reflections before and after the edge."""
     poses = np.flatnonzero(alive & np.isfinite(targets_m).all(axis=1))
-    source = _mirrored(faces, ground[0], source_m)
-    ends = _mirrored(faces, ground[1], targets_m[poses])
+    images = (source_m, targets_m[poses])
+    source, ends = (p if face < 0 else faces.mirrored(face, p) for face, p in zip(ground, images, strict=True))
     at_source, near = (part[:, 0] for part in _round_edges(edges, source[None]))
     lit = np.flatnonzero(near >= 0.0)
     pieces = []
@@ -336,8 +330,7 @@ def _over_edges(
         good = np.ones(len(pose), np.bool_)
         for index, spot, end in zip(ground, bounce, (source_m, targets_m[pose]), strict=True):
             if index >= 0:
-                normal, offset = faces.normal[index], faces.offset_m[index]
-                good &= (point @ normal - offset > NEAREST_M) & (end @ normal - offset > 0.0)
+                good &= (faces.height_m(index, point) > NEAREST_M) & (faces.height_m(index, end) > 0.0)
                 rows = np.flatnonzero(good)
                 good[rows] = inside(faces, np.full(len(rows), index), spot[rows], 0.0)
         good[good] &= exposed.at(edge[good], point[good])
@@ -358,20 +351,11 @@ def _round_edges(edges: Edges, points_m: FloatArray) -> tuple[FloatArray, FloatA
     return along, np.where((far >= NEAREST_M) & ((up >= 0.0) | (up_n >= 0.0)), far, -1.0)
 
 
-def _mirrored(faces: Faces, ground: int, points_m: FloatArray) -> FloatArray:
-    """Points (..., 3) mirrored in a ground plane; as they are for -1."""
-    if ground < 0:
-        return points_m
-    normal = faces.normal[ground]
-    return np.asarray(points_m - 2.0 * (points_m @ normal - faces.offset_m[ground])[..., None] * normal)
-
-
 def _on_ground(faces: Faces, ground: int, image_m: FloatArray, points_m: FloatArray) -> FloatArray:
     """Points where the lines from images to points (paths, 3) pass a ground plane; NaN for -1."""
     if ground < 0:
         return np.full_like(points_m, np.nan)
-    normal, offset = faces.normal[ground], faces.offset_m[ground]
-    below, above = image_m @ normal - offset, points_m @ normal - offset
+    below, above = faces.height_m(ground, image_m), faces.height_m(ground, points_m)
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = below / (below - above)
-    return np.asarray(image_m + np.asarray(share)[..., None] * (points_m - image_m))
+        share = np.asarray(below / (below - above))
+    return np.asarray(image_m + share[..., None] * (points_m - image_m))

@@ -119,6 +119,7 @@ class Occlusion:
     def _boxes(self, start: FloatArray, end: FloatArray, solids: IntArray) -> BoolArray:
         """Check whether segments meet bounding boxes: slab test, (segments, solids)."""
         direction = end - start
+        # the quotients of a level segment become huge with the right sign, where 0 / 0 would be no number
         direction = np.where(direction == 0.0, 1e-300, direction)
         low, high = self.low[solids], self.high[solids]
         enter = np.zeros((len(start), len(solids)))

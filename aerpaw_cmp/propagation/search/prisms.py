@@ -39,14 +39,9 @@ def find_paths(
 
     Parameters
     ----------
-    faces : Faces
-        Closed solids and ground planes.
-    links : Links
+    faces, links, max_depth, extent_m
+        As there.
     run : SearchRun
-    max_depth : int
-        0 to 3.
-    extent_m : (points, 3), optional
-        Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
 
     Returns
     -------

@@ -652,11 +652,11 @@ def own_coefficients(
     )
     pieces: list[PathSet] = []
     gains: list[ComplexArray] = []
-    slants = np.stack([_slants(array) for array in arrays])
+    slants = np.stack([array.slant_parts for array in arrays])
     every = np.ones((len(sources_m), len(targets_m)), np.bool_)
     for finder, towers, some in _each_batch(make, groups, every):
         part, gain = _raw_paths(finder, _Ends(targets_m[some], turns[1][some], _CENTRE), some, towers, rays)
-        gains.append(np.einsum("pab,au,pbv->puv", gain, _slants(probe.uav_array), slants[part.tower]))
+        gains.append(np.einsum("pab,au,pbv->puv", gain, probe.uav_array.slant_parts, slants[part.tower]))
         pieces.append(part)
     paths = PathSet.one_after_another(pieces) if pieces else PathSet.empty(rays.max_depth)
     gain = np.concatenate(gains) if gains else np.zeros((0, 2, 2), dtype=np.complex128)
@@ -666,11 +666,6 @@ def own_coefficients(
     length = path_lengths(paths, sources_m, targets_m)
     cycles = length / wavelength_m(probe.carrier_hz)
     return Coefficients(paths, gain * np.exp(-2j * np.pi * (cycles - np.round(cycles)))[:, None, None], length)
-
-
-def _slants(array: Array) -> FloatArray:
-    """Weights (V and H, elements) of slanted elements: model 2 of TR 38.901 is a combination of the two."""
-    return np.stack([np.cos(array.slant_rad), np.sin(array.slant_rad)])
 
 
 def _raw_paths(
@@ -743,10 +738,13 @@ def own_channels(
 
 
 def _slanted(a: AnyArray, uav: Array, tower: Array) -> ComplexArray:
-    """(rx, uav ports, tx, tower ports) from V and H halves (rx, 2 uav elements, tx, 2 tower elements)."""
+    """(rx, uav ports, tx, tower ports) from V and H halves (rx, 2 uav elements, tx, 2 tower elements).
+
+    Slanted elements are sums of both: model 2 of 3GPP TR 38.901 section 7.3.2.
+    """
     n_uav, n_tower = len(uav), len(tower)
     halves = a.reshape(len(a), 2, n_uav, a.shape[2], 2, n_tower).astype(np.complex128)
-    return np.asarray(np.einsum("rautbv,au,bv->rutv", halves, _slants(uav), _slants(tower)))
+    return np.asarray(np.einsum("rautbv,au,bv->rutv", halves, uav.slant_parts, tower.slant_parts))
 
 
 def _groups(faces: Faces, sources_m: FloatArray, usable: BoolArray | None) -> Iterator[tuple[IntArray, IntArray]]:

@@ -13,7 +13,8 @@ from typing import Any
 
 from ..common.errors import InputError
 from ..common.outputs import OutputFile
-from .log import BadLine, Record, read_log, segments
+from ..logs.checksums import Record
+from .log import BadLine, read_log, segments
 
 COLUMNS = (
     *("time_utc", "uncertainty_s", "n", "query", "status"),

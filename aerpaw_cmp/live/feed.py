@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from .log import Record
+from ..logs.checksums import Record
 from .modem import RI_QUERY
 from .session import TapStatus
 

@@ -13,23 +13,16 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
-import json
 import os
 import threading
 import time
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from ..common.errors import InputError
-
-SCHEMA = "aerpaw-cmp-tap/1"
-_CRC = b',"crc":"'
-
-Record = dict[str, Any]
+from ..logs.checksums import Record, decode_record, encode_record
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,41 +31,6 @@ class Clock:
 
     utc_ns: Callable[[], int] = time.time_ns
     mono_ns: Callable[[], int] = time.monotonic_ns
-
-
-def encode_record(record: Record) -> bytes:
-    r"""One line, with its checksum and line end.
-
-    Examples
-    --------
-    >>> encode_record({"kind": "end", "n": 3})
-    b'{"kind":"end","n":3,"crc":"a5ccacec"}\n'
-    """
-    body = json.dumps(record, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii")[:-1]
-    return body + _CRC + b'%08x"}\n' % zlib.crc32(body)
-
-
-def decode_record(line: bytes) -> Record:
-    """A line's record.
-
-    Raises
-    ------
-    ValueError
-        With the reason, if the line is torn or its checksum is wrong.
-    """
-    line = line.strip()
-    body, mark, tail = line.rpartition(_CRC)
-    if not mark or len(tail) != 10 or not tail.endswith(b'"}'):
-        raise ValueError("torn line: it does not end with a checksum")
-    if b"%08x" % zlib.crc32(body) != tail[:8]:
-        raise ValueError("damaged line: its checksum does not fit")
-    try:
-        record = json.loads(body + b"}")
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-    if not isinstance(record, dict):
-        raise ValueError("not a record")
-    return record
 
 
 def boot_id() -> str:

@@ -19,8 +19,9 @@ from typing import Any
 
 from .. import __version__
 from ..common.errors import InputError
+from ..logs.checksums import SCHEMA, Record
 from .framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
-from .log import SCHEMA, Clock, Record, SegmentLog, boot_id, clock_synchronised
+from .log import Clock, SegmentLog, boot_id, clock_synchronised
 from .modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
 from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port, modem_manager
 from .predict import Asked, Predict, PredictionWorker

@@ -11,7 +11,8 @@ import threading
 from collections import deque
 from pathlib import Path
 
-from .log import Record, SegmentLog
+from ..logs.checksums import Record
+from .log import SegmentLog
 
 
 class LogWriter:

@@ -68,6 +68,10 @@ class Lines:
         """Bytes of line ``i``."""
         return self.data[self.starts[i] : self.ends[i]]
 
+    def number_at(self, offsets: Iterable[int]) -> IntArray:
+        """0-based lines in which bytes of the file lie."""
+        return np.searchsorted(self.starts, np.array([*offsets], dtype=np.int64), side="right") - 1
+
     def text(self, i: int) -> str:
         """Line ``i`` as text for people: at most ``TEXT_LIMIT`` characters, broken bytes replaced."""
         piece = self.data[self.starts[i] : min(self.ends[i], self.starts[i] + 4 * TEXT_LIMIT)]
@@ -241,6 +245,11 @@ def columns(groups: list[tuple[bytes, ...]], count: int) -> list[AnyArray]:
     if not groups:
         return [np.empty(0, dtype="S1") for _ in range(count)]
     return [np.array(column, dtype=np.bytes_) for column in zip(*groups, strict=True)]
+
+
+def cells(texts: Sequence[bytes]) -> AnyArray:
+    """Texts as an array of bytes; NumPy makes none of an empty list."""
+    return np.array(texts or [b""], dtype=np.bytes_)[: len(texts)]
 
 
 def numbers(column: AnyArray) -> AnyArray:

@@ -99,12 +99,10 @@ class Rows:
         cells = [cell.strip() for cell in self.columns[name].tolist()]
         scaled = [cell[-1:] in _SI and cell[-2:-1].isdigit() for cell in cells]  # 'nan' is no nano
         scale = np.array([_SI[cell[-1:]] if mark else 1.0 for cell, mark in zip(cells, scaled, strict=True)])
-        plain = np.array(
-            [cell[:-1] if mark else cell for cell, mark in zip(cells, scaled, strict=True)] or [b""], dtype=np.bytes_
-        )
+        plain = _lines.cells([cell[:-1] if mark else cell for cell, mark in zip(cells, scaled, strict=True)])
         for word in (b"n/a", b"-"):
             plain = np.where(plain == word, b"", plain)
-        return np.asarray(_lines.numbers(plain)[: len(cells)] * scale, dtype=np.float64)
+        return np.asarray(_lines.numbers(plain) * scale, dtype=np.float64)
 
     def text(self, name: str) -> list[str]:
         """A column as text."""
@@ -169,23 +167,9 @@ class Rows:
         level[silent] = np.nan
         return level, flag
 
-    def rank(self, ri: FloatArray, *, base: int = 1, none: BoolArray | None = None) -> dict[str, FloatArray]:
-        """Columns ``rank`` and ``ri_raw`` of reported indicators; what is no rank is flagged.
-
-        Parameters
-        ----------
-        ri : float array, shape (n,)
-            As written; NaN where nothing is.
-        base : {0, 1}
-            What rank 1 is written as.
-        none : bool array, shape (n,), optional
-            Rows in which the number means that nothing was reported.
-        """
-        absent = np.isnan(ri) | (np.zeros(len(self), dtype=bool) if none is None else none)
-        good = (ri >= base) & (ri <= 7 + base) & (ri == np.round(ri)) & ~absent
-        self.mark(absent, "no_csi")
-        self.mark(~good & ~absent, "ri_out_of_range")
-        return {"rank": np.where(good, ri + 1 - base, np.nan), "ri_raw": ri}
+    def rank(self, ri: FloatArray, *, none: BoolArray | None = None) -> dict[str, FloatArray]:
+        """Columns ``rank`` and ``ri_raw`` of reported indicators; see :func:`ranks`."""
+        return {"rank": ranks(ri, self.flag, none=none), "ri_raw": ri}
 
     def result(self, streams: Iterable[Stream | None]) -> ReadResult:
         """The streams that have rows, with the account."""
@@ -396,15 +380,36 @@ def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = No
     )
 
 
+def ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = None, means: bool = False) -> FloatArray:
+    """Ranks of indicators that count from one, NaN for what is none; the reason is added to ``flag``, in place.
+
+    Parameters
+    ----------
+    ri : float array, shape (m,)
+        As written; NaN where nothing is.
+    flag : object array, shape (m,)
+    none : bool array, shape (m,), optional
+        Where the number means that nothing was reported.
+    means : bool
+        Does the program print means over its period? Then a value between two ranks is none, but no fault.
+
+    Returns
+    -------
+    float array, shape (m,)
+    """
+    absent = np.isnan(ri) | (np.zeros(len(ri), dtype=bool) if none is None else none)
+    inside = (ri >= 1) & (ri <= 8) & ~absent
+    integer = inside & (ri == np.round(ri))
+    _lines.add_flag(flag, absent, "no_csi")
+    _lines.add_flag(flag, ~(inside if means else integer) & ~absent, "ri_out_of_range")
+    _lines.add_flag(flag, (inside & ~integer) if means else np.zeros(len(ri), dtype=bool), "rank_is_a_mean")
+    return np.where(integer, ri, np.nan)
+
+
 def mean_rank(
-    rows: Rows,
-    ri: FloatArray,
-    columns: Mapping[str, FloatArray],
-    *,
-    none: BoolArray,
-    pick: IntArray | None = None,
+    rows: Rows, ri: FloatArray, columns: Mapping[str, FloatArray], *, pick: IntArray | None = None
 ) -> list[Stream | None]:
-    """Rank streams ``gnb`` of a base station that counts from one and prints means over its report period.
+    """Rank streams ``gnb`` of a base station that prints means over its report period, 0 where nothing was reported.
 
     A mean between two ranks is no rank: it stands in ``rank_mean`` and its row is flagged ``rank_is_a_mean``.
 
@@ -414,8 +419,6 @@ def mean_rank(
     ri : float array, shape (m,)
     columns : mapping
         Further columns.
-    none : bool array, shape (m,)
-        Where the number means that nothing was reported.
     pick : int array, shape (m,), optional
         See :meth:`Rows.stream`.
 
@@ -425,18 +428,9 @@ def mean_rank(
         See :func:`of_ues`.
     """
     flag = (rows.flag if pick is None else rows.flag[pick]).copy()
-    absent = np.isnan(ri) | none
-    good = (ri >= 1) & (ri <= 8) & ~absent
-    integer = good & (ri == np.round(ri))
-    _lines.add_flag(flag, absent, "no_csi")
-    _lines.add_flag(flag, ~good & ~absent, "ri_out_of_range")
-    _lines.add_flag(flag, good & ~integer, "rank_is_a_mean")
-    values = {
-        "rank": np.where(integer, ri, np.nan),
-        "ri_raw": ri,
-        **columns,
-        "rank_mean": np.where(good, ri, np.nan),
-    }
+    rank = ranks(ri, flag, none=ri == 0, means=True)
+    rank_mean = np.where((ri >= 1) & (ri <= 8), ri, np.nan)
+    values = {"rank": rank, "ri_raw": ri, **columns, "rank_mean": rank_mean}
     about = {"ri_base": "one", "source": "CSI report, mean over the period"}
     return of_ues(rows, "rank", rows.options.channel or "gnb", values, pick=pick, flag=flag, about=about)
 

@@ -515,8 +515,8 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
     if len(buildings) < 2:
         return []
     shapes = [building.footprint for building in buildings]
-    first, second = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-    pairs = [(int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j]
+    former, latter = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+    pairs = [(int(i), int(j)) for i, j in zip(former, latter, strict=True) if i < j]
     # outlines simplified by 'site import' may still overlap by some decimetres
     overlapping = [(i, j) for i, j in pairs if not shapes[i].intersection(shapes[j]).buffer(-OVERLAP_M / 2).is_empty]
     if not overlapping:

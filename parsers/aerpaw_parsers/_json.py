@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_right
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,8 @@ import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray, IntArray
 from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs.records import RejectedLine
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
 # What Android and modems write for 'unavailable'.
 SENTINELS = (2147483647, -2147483648, 9223372036854775807, 268435455, 65535)
@@ -155,6 +157,16 @@ def listed(entry: dict[str, Any], name: str) -> list[dict[str, Any]]:
     """A list of objects within an object."""
     value = entry.get(name)
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
+
+
+def ue_ranks(
+    rows: _rows.Rows, ues: list[tuple[int, dict[str, Any]]], names: Mapping[str, tuple[str, ...]]
+) -> ReadResult:
+    """Rank streams of UEs, each with its row; ``names`` are the keys of each column, ``ri`` among them."""
+    entries = [ue for _, ue in ues]
+    columns = {name: column(entries, *keys) for name, keys in names.items()}
+    pick = np.array([i for i, _ in ues], dtype=np.int64)
+    return rows.result(_rows.mean_rank(rows, columns.pop("ri"), columns, pick=pick))
 
 
 def bracket(line: bytes) -> str | None:

@@ -24,7 +24,7 @@ def pdsch_rank(rows: _rows.Rows, values: dict[str, FloatArray]) -> Stream | None
     """Stream of the scheduled rank; ``values`` holds ``ri_raw`` and what stands beside it."""
     raw = values["ri_raw"]
     missing = np.isnan(raw)
-    odd = ~missing & ~((raw >= 1) & (raw <= 8))
+    odd = ~missing & ~((raw >= 1) & (raw <= 8) & (raw == np.round(raw)))
     rows.mark(missing, NO_RANK)
     rows.mark(odd & (raw != 0), "rank_out_of_range")
     rows.mark(odd & (raw == 0), "no_csi")

@@ -47,7 +47,8 @@ _FACTORS = {written: (unit, one) for unit, many in _READ_IN.items() for written,
 IsHeader = Callable[[list[str]], bool]
 
 
-def _split(line: bytes, separator: str) -> list[str]:
+def split_row(line: bytes, separator: str) -> list[str]:
+    """Fields of a line; quotes hide separators."""
     text = line.decode("utf-8-sig", errors="replace")
     if '"' not in text:
         return text.split(separator)
@@ -71,7 +72,7 @@ def header_of(lines: Sequence[bytes], is_header: IsHeader) -> tuple[int, str, li
         for separator in SEPARATORS:
             if separator.encode() not in line:
                 continue
-            names = [name.strip() for name in _split(line, separator)]
+            names = [name.strip() for name in split_row(line, separator)]
             if len(names) > 1 and is_header([plain(name) for name in names]):
                 return i, separator, names
     return None
@@ -85,7 +86,7 @@ def starts(head: bytes, is_header: IsHeader) -> bool:
         return False
     at, separator, names = header
     below = [line for line in lines[at + 1 :] if line.strip()][:5]
-    return not below or any(abs(len(_split(line, separator)) - len(names)) <= 1 for line in below)
+    return not below or any(abs(len(split_row(line, separator)) - len(names)) <= 1 for line in below)
 
 
 def _number(text: str) -> float:
@@ -231,8 +232,25 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
     header = header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
     if header is None:
         return None
-    at, separator, names = header
-    lines = _lines.split(data)
+    return cut(_lines.split(data), *header)
+
+
+def cut(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> Sheet:
+    """The table below a header; lines above it, headers again and words at the end are comments, torn rows rejected.
+
+    Parameters
+    ----------
+    lines : Lines
+    at : int
+        0-based line of the header.
+    separator : str
+    names : list of str
+        Fields of the header.
+
+    Returns
+    -------
+    Sheet
+    """
     below = ~lines.blank
     below[: at + 1] = False
     row: list[int] = []
@@ -240,7 +258,7 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
     comments: list[int] = [*range(at + 1)]
     odd: list[tuple[int, int]] = []
     for i in np.flatnonzero(below).tolist():
-        fields = _fitted(_split(lines.raw(i), separator), names)
+        fields = _fitted(split_row(lines.raw(i), separator), names)
         if len(fields) != len(names):
             odd.append((i, len(fields)))
         elif fields[0].strip() == names[0] and [text.strip() for text in fields] == names:

@@ -14,6 +14,7 @@ import numpy as np
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.readers import ReadOptions
 
 _CLOCK = r"[T _,]{0,2}(\d{1,2})[:.](\d\d)(?:[:.](\d\d(?:[.,:]\d{1,9})?))? ?([AaPp][Mm])?"
@@ -144,7 +145,7 @@ def read(
     ):
         warnings.append("the times have no seconds (a table saved by a spreadsheet?): rows of a minute share one time")
     cells = [text.encode() if _COMMON.fullmatch(text) else _dated(text, bool(first)) or b"-" for text in shown]
-    return "wall", np.array(cells or [b"-"], dtype=np.bytes_)[: len(cells)], warnings
+    return "wall", _lines.cells(cells), warnings
 
 
 def refuse_rounded(texts: Sequence[str]) -> None:

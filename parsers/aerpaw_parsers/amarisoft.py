@@ -73,7 +73,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb`` with CQI and MCS; UsageError if no time zone is given."""
     lines = _lines.split(data)
     entries, rejected = _table(lines)
-    time = np.array([item[1] for item in entries] or [b""], dtype=np.bytes_)[: len(entries)]
+    time = _lines.cells([item[1] for item in entries])
     row = np.array([item[0] for item in entries], dtype=np.int64)
     rows = _rows.built(
         lines, row, {"time": time}, options, reader="amarisoft", reason=lambda _line: None, extra=rejected
@@ -81,7 +81,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     timed = [entries[i][2] for i in rows.at.tolist()]
     value = {name: np.array([item.get(name, np.nan) for item in timed]) for name in _WANTED}
     columns = {"cqi": value["cqi"], "mcs": value["mcs"], "rnti": value["RNTI"]}
-    return rows.result(_rows.mean_rank(rows, value["ri"], columns, none=value["ri"] == 0))
+    return rows.result(_rows.mean_rank(rows, value["ri"], columns))
 
 
 def sniff_json(head: bytes) -> bool:
@@ -108,15 +108,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
         for ue in _json.listed(replies[at], "ue_list")
         for cell in _json.listed(ue, "cells")
     ]
-    cells = [cell for _, cell in pairs]
-    columns = {
-        "cqi": _json.column(cells, "cqi"),
-        "mcs": _json.column(cells, "dl_mcs"),
-        "rnti": _json.column(cells, "rnti"),
-    }
-    ri = _json.column(cells, "ri")
-    pick = np.array([i for i, _ in pairs], dtype=np.int64)
-    return rows.result(_rows.mean_rank(rows, ri, columns, none=ri == 0, pick=pick))
+    return _json.ue_ranks(rows, pairs, {"ri": ("ri",), "cqi": ("cqi",), "mcs": ("dl_mcs",), "rnti": ("rnti",)})
 
 
 READER = Reader(

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
@@ -228,12 +227,7 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
 def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     ri = sheet.numbers(column)
     flag = rows.flag.copy()
-    good = (ri >= 1) & (ri <= 8)
-    integer = ri == np.round(ri)
-    _lines.add_flag(flag, ri == 0, "no_csi")
-    _lines.add_flag(flag, np.isfinite(ri) & ~good & (ri != 0), "ri_out_of_range")
-    _lines.add_flag(flag, good & ~integer, "rank_is_a_mean")
-    values = {"rank": np.where(good & integer, ri, np.nan), "ri_raw": ri}
+    values = {"rank": _rows.ranks(ri, flag, none=ri == 0, means=True), "ri_raw": ri}
     name = re.sub(r"\W+", "_", sheet.plain[column])
     source = "scheduled PDSCH rank" if "pdsch" in name else "CSI report"
     return rows.stream("rank", name, values, where=np.isfinite(ri), flag=flag, ri_base="one", source=source)

@@ -7,23 +7,21 @@ since 1970 in UTC (``clock: local_as_utc`` for wall time stored so).
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, Stream
 
-from . import _stamps
-from ._sheet import SEPARATORS
+from . import _sheet, _stamps
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
 # What may stand beside a rank, or beside a level: the positions of a table merged by hand are its track.
@@ -41,17 +39,9 @@ def sniff(head: bytes) -> bool:  # noqa: ARG001 - the contract of sniffers
     return False
 
 
-def _fields(line: bytes, separator: str) -> list[str]:
-    text = line.decode("utf-8", errors="replace")
-    if '"' not in text:
-        return text.split(separator)
-    # a stray CR or NUL would end the csv module's patience with the whole line
-    return next(csv.reader([text.replace("\0", "\ufffd").replace("\r", " ")], delimiter=separator), [])
-
-
 def _separator(header: bytes) -> str:
     """The sign that the header's names stand between: the most frequent one, a comma where none does."""
-    return max(SEPARATORS, key=lambda sign: header.count(sign.encode()))
+    return max(_sheet.SEPARATORS, key=lambda sign: header.count(sign.encode()))
 
 
 def _header(data: bytes) -> tuple[int, str, list[str]] | None:
@@ -64,10 +54,7 @@ def _header(data: bytes) -> tuple[int, str, list[str]] | None:
     line = data[data.rfind(b"\n", 0, begun.start()) + 1 : end if end >= 0 else len(data)].removesuffix(b"\r")
     line = line.removeprefix(b"\xef\xbb\xbf")
     separator = _separator(line)
-    try:
-        return first, separator, [name.strip() for name in _fields(line, separator)]
-    except csv.Error as error:
-        raise InputError(f"the header is no CSV ({error})", expected="column names", line=first + 1) from error
+    return first, separator, [name.strip() for name in _sheet.split_row(line, separator)]
 
 
 def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, int]]:
@@ -160,14 +147,14 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     first, separator, header = top
     kind, where = _checked(options, header)
     lines = _lines.split(data)
-    row, cells, rejected = _cells(lines, first, separator, len(header))
-    column = {name: [fields[i] for fields in cells] for name, i in where.items()}
+    sheet = _sheet.cut(lines, first, separator, header)
+    column = {name: [fields[i] for fields in sheet.cells] for name, i in where.items()}
     comma = separator != ","  # a decimal comma, where the separator leaves room for one
     clock, time, warnings = _times(column.pop("time"), options, comma=comma)
     numbers = {name: _numbers(texts, comma=comma) for name, texts in column.items()}
     rows = _rows.built(
-        lines, row, {"time": time, **numbers}, options, reader="generic_csv", reason=lambda _line: None, clock=clock,
-        extra=rejected, markup=np.array([first]),
+        lines, sheet.row, {"time": time, **numbers}, options, reader="generic_csv", reason=lambda _line: None,
+        clock=clock, extra=sheet.rejected, markup=sheet.blank_rows,
     )  # fmt: skip
     rows.warnings += warnings
     if kind == "rss" and options.unit is None:
@@ -223,29 +210,6 @@ def _track(rows: _rows.Rows, kind: Kind) -> Stream | None:
         return None
     values = {name: _finite(rows, name) for name in names}
     return rows.stream("telemetry", "vehicle", values, flag=_lines.flags(len(rows)), source="mapped columns")
-
-
-def _cells(
-    lines: _lines.Lines, first: int, separator: str, width: int
-) -> tuple[AnyArray, list[list[str]], list[RejectedLine]]:
-    """Rows with as many fields as the header, and the rest as rejected lines."""
-    numbers: list[int] = []
-    cells: list[list[str]] = []
-    rejected: list[RejectedLine] = []
-    for i in np.flatnonzero(~lines.blank).tolist():
-        if i == first:
-            continue
-        try:
-            fields = _fields(lines.raw(i), separator)
-        except csv.Error as error:
-            rejected.append(lines.reject(i, f"no CSV: {error}"))
-            continue
-        if len(fields) == width:
-            numbers.append(i)
-            cells.append(fields)
-        else:
-            rejected.append(lines.reject(i, f"{len(fields)} fields where the header has {width} (torn line?)"))
-    return np.array(numbers, dtype=np.int64), cells, rejected
 
 
 READER = Reader(

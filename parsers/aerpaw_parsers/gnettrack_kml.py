@@ -40,8 +40,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         If no time zone is given.
     """
     lines = _lines.split(data)
-    begin = np.array([match.start() for match in _PLACEMARK.finditer(data)], dtype=np.int64)
-    row = np.searchsorted(lines.starts, begin, side="right") - 1
+    begin = [match.start() for match in _PLACEMARK.finditer(data)]
+    row = lines.number_at(begin)
     if len(np.unique(row)) < len(row):
         raise InputError(
             "several placemarks on a line",

@@ -46,12 +46,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Telemetry ``track``; UsageError if the times have no zone and none is given."""
     lines = _lines.split(data)
     points = [(at, values) for at, values in _points(data) if {b"lat", b"lon", b"time"} <= set(values)]
-    row = np.searchsorted(lines.starts, np.array([at for at, _ in points], dtype=np.int64), side="right") - 1
+    row = lines.number_at(at for at, _ in points)
     row, first = np.unique(row, return_index=True)
     placed = [points[i][1] for i in first.tolist()]
     clock, time, warnings = _stamps.read([values[b"time"].decode("ascii", "replace") for values in placed], options)
     column = {
-        name.decode(): np.array([values.get(name, b"") for values in placed] or [b""], dtype=np.bytes_)[: len(placed)]
+        name.decode(): _lines.cells([values.get(name, b"") for values in placed])
         for name in (b"lat", b"lon", b"ele", b"course")
     }
     rows = _rows.built(
@@ -69,8 +69,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 def _torn(lines: _lines.Lines, data: bytes, row: object) -> list[RejectedLine]:
     """Lines on which a point begins that is not whole."""
-    places = np.array([start.start() for start in _START.finditer(data)], dtype=np.int64)
-    begun = np.unique(np.searchsorted(lines.starts, places, side="right") - 1)
+    begun = np.unique(lines.number_at(start.start() for start in _START.finditer(data)))
     return lines.reject_all(np.setdiff1d(begun, np.asarray(row)), "a point without position or time (torn?)")
 
 

@@ -52,7 +52,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """
     lines = _lines.split(data)
     reports = list(_RECORD.finditer(data))
-    row = np.searchsorted(lines.starts, np.array([item.start() for item in reports], dtype=np.int64), side="right") - 1
+    row = lines.number_at(item.start() for item in reports)
     row, first = np.unique(row, return_index=True)
     texts = [cells[first] for cells in _lines.columns([item.groups(b"") for item in reports], 7)]
     names = ("time", "what", "value", "unit", *_POSITION)
@@ -79,9 +79,8 @@ def _measured(rows: _rows.Rows, name: str, where: BoolArray) -> Stream | None:
 
 def _markup(lines: _lines.Lines, row: IntArray) -> IntArray:
     """Lines without a hint of a report, which is nearly all of the file: they need no second look."""
-    hints = np.array([hint.start() for hint in _HINT.finditer(lines.data)], dtype=np.int64)
     plain = np.ones(len(lines), dtype=bool)
-    plain[np.searchsorted(lines.starts, hints, side="right") - 1] = False
+    plain[lines.number_at(hint.start() for hint in _HINT.finditer(lines.data))] = False
     plain[row] = False
     return np.flatnonzero(plain)
 

@@ -29,13 +29,13 @@ from . import (
 
 _PATTERN = re.compile(rb"Frequency ?= ?\d{1,6} ?\(MHz\)")
 _CUT = re.compile(rb"Phi ?= ?-?\d{1,3}(?:\.\d{1,6})? ?\(deg\)")
-_GAIN = re.compile(rb"(?:\d{1,3}\s*\n)?Frequency\tE ?Total\. ?dB")
+_GAIN = re.compile(rb"\A(?:\d{1,3}\s*\n)?Frequency\tE ?Total\. ?dB")
 _LEVELS = re.compile(rb"(?i)g-?net ?track|\b(?:rsrp|rxlev|rscp|level)\b\W{0,20}-?\d{2,3}\b")
 _CELL_SEARCH = re.compile(rb"Found CELL \d{1,5}\.\d MHz, EARFCN=\d")
 _PLAN = re.compile(rb'"fileType"\s*:\s*"Plan"|\A\s*QGC WPL \d+')
 _PLANNING = re.compile(rb"(?im)^(?:HORIZONTAL\s+\d{1,4}|REVNUM:,TIA)")
 _PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
-_POWER_REFS = re.compile(rb"(?:\xef\xbb\xbf)?Node,Category,Channel,[^\n]{0,80}Gain,Freq_")
+_POWER_REFS = re.compile(rb"\A(?:\xef\xbb\xbf)?Node,Category,Channel,[^\n]{0,80}Gain,Freq_")
 _UHD = re.compile(rb"\[(?:INFO|WARNING|ERROR)\] \[(?:UHD|B200|X300|MULTI_USRP|GPS|USRP|OV|CONFIG|AD936X|CORES)\]")
 _RADIO = re.compile(
     rb"Software Radio Systems (?:LTE|RAN)|srs(?:ran|lte)/(?:ue|enb|gnb)\.(?:conf|yml)|--== srsRAN gNB"
@@ -45,6 +45,10 @@ _PLACE = re.compile(rb"\s*-?\d{1,3}\.\d{2,12}, ?-?\d{1,3}\.\d{2,12}\s*")
 _AT = re.compile(rb"(?i)\s*(?:at[+&a-z][^\r\n]{0,200}|\+[A-Z0-9]{2,12}: ?[^\r\n]{0,300}|OK|ERROR|ATI)\s*")
 _NEMO_BINARY = re.compile(rb"(?i)nmfs|nemo file|anite")
 _SCRIPT_TALK = re.compile(rb"\[[-0-9/]{10} [0-9:.]{8,18}\] ")
+
+
+# How a file is known: a function of its first bytes, or a pattern that stands in them.
+_Test = Callable[[bytes], bool] | re.Pattern[bytes]
 
 
 def _texts(head: bytes) -> list[bytes]:
@@ -142,8 +146,9 @@ def _yaml(head: bytes) -> bool:
     return re.search(rb"(?m)^flight:", head[:4096]) is not None and re.search(rb"(?m)^logs:", head) is not None
 
 
-def _sniffer(test: Callable[[bytes], bool]) -> Callable[[bytes], bool]:
-    return lambda head: bool(head.strip()) and test(head)
+def _sniffer(test: _Test) -> Callable[[bytes], bool]:
+    known = test if callable(test) else lambda head: test.search(head) is not None
+    return lambda head: bool(head.strip()) and known(head)
 
 
 def _refuse(what: str) -> Callable[[bytes, ReadOptions], ReadResult]:
@@ -153,12 +158,12 @@ def _refuse(what: str) -> Callable[[bytes, ReadOptions], ReadResult]:
     return read
 
 
-_KINDS: tuple[tuple[str, str, Callable[[bytes], bool]], ...] = (
+_KINDS: tuple[tuple[str, str, _Test], ...] = (
     ("antenna_pattern", "a measured antenna pattern (for 'antenna: {model: file}' in flight.yaml)", _antenna_text),
     ("antenna_grid", "antenna gain grids of MATLAB (for 'antenna: {model: gain_grid}' in flight.yaml)", _antenna_mat),
     ("matlab_other", "MATLAB variables that are no flight", _other_mat),
-    ("power_references", "a table of USRP reference powers", lambda head: _POWER_REFS.match(head) is not None),
-    ("antenna_gain", "antenna gain over frequency, without directions", lambda head: _GAIN.match(head) is not None),
+    ("power_references", "a table of USRP reference powers", _POWER_REFS),
+    ("antenna_gain", "antenna gain over frequency, without directions", _GAIN),
     (
         "kml_levels",
         "a KML with levels in a layout that is not read: give the program's text log or CSV",
@@ -185,12 +190,12 @@ _KINDS: tuple[tuple[str, str, Callable[[bytes], bool]], ...] = (
     (
         "cell_search",
         "a cell search of srsRAN: cells at one moment, without times",
-        lambda head: _CELL_SEARCH.search(head) is not None,
+        _CELL_SEARCH,
     ),
     (
         "flight_plan",
         "a planned route, not a flight: 'aerpaw-cmp predict' reads it",
-        lambda head: _PLAN.search(head) is not None,
+        _PLAN,
     ),
     ("flight_yaml", "a flight file of settings, not a log: give it to 'report'", _yaml),
 )

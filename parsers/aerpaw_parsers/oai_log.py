@@ -87,10 +87,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rnti = np.array([float(int(item["rnti"], 16)) if "rnti" in item else np.nan for item in timed])
     reported = np.flatnonzero(~np.isnan(value["ri"]))
     ri = value["ri"][reported]
-    good = (ri >= 1) & (ri <= 8)
     flag = rows.flag[reported].copy()
-    _lines.add_flag(flag, ~good, "ri_out_of_range")
-    columns = {"rank": np.where(good, ri, np.nan), "ri_raw": ri, "cqi": value["cqi"][reported], "rnti": rnti[reported]}
+    columns = {"rank": _rows.ranks(ri, flag), "ri_raw": ri, "cqi": value["cqi"][reported], "rnti": rnti[reported]}
     columns |= {"sinr_db": value["sinr"][reported], "rsrp_dbm": value["rsrp"][reported]}
     about = {"ri_base": "one", "source": "CSI report, last one"}
     ranks = _rows.of_ues(rows, "rank", options.channel or "oai", columns, pick=reported, flag=flag, about=about)

@@ -66,7 +66,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     lines = _lines.split(data)
     entries, rejected = _tables(lines)
     row = np.array([item[0] for item in entries], dtype=np.int64)
-    time = np.array([item[1] for item in entries] or [b""], dtype=np.bytes_)[: len(entries)]
+    time = _lines.cells([item[1] for item in entries])
     rows = _rows.built(
         lines, row, {"time": time}, options, reader="quectel_console", reason=lambda _line: None, extra=rejected
     )
@@ -88,10 +88,8 @@ def _rank(rows: _rows.Rows, name: str, values: list[tuple[str, dict[str, float]]
     where = np.array([title == name for title, _ in values], dtype=bool)
     column = {key: np.array([value.get(key, np.nan) for _, value in values]) for key in ("ri", "cqi", "mcs")}
     ri = column["ri"]
-    good = (ri >= 1) & (ri <= 8)
     flag = rows.flag.copy()
-    _lines.add_flag(flag, where & ~good, "no_csi")
-    content = {"rank": np.where(good, ri, np.nan), "ri_raw": ri, "cqi": column["cqi"], "mcs": column["mcs"]}
+    content = {"rank": _rows.ranks(ri, flag, none=ri == 0), "ri_raw": ri, "cqi": column["cqi"], "mcs": column["mcs"]}
     return rows.stream("rank", name, content, where=where, flag=flag, channel=name, ri_base="one", source="CSI report")
 
 

@@ -125,13 +125,9 @@ def _rank(rows: _rows.Rows, rat: str) -> Stream | None:
     """Rank stream of one radio access."""
     mcs, ri, cqi, pmi = (rows.number(f"{rat}_{name}") for name in ("mcs", "ri", "cqi", "pmi"))
     flag = rows.flag.copy()
-    none = (ri == 0) | np.isnan(ri)
-    good = (ri >= 1) & (ri <= 8) & (ri == np.round(ri))
-    _lines.add_flag(flag, none, "no_csi")
-    _lines.add_flag(flag, ~good & ~none, "ri_out_of_range")
     idle = (mcs == 0) & (ri == 0) & (cqi == 0) & (pmi == 0)
     values = {
-        "rank": np.where(good, ri, np.nan),
+        "rank": _rows.ranks(ri, flag, none=ri == 0),
         "ri_raw": ri,
         "mcs": np.where(idle | ~((mcs >= 0) & (mcs <= 31)), np.nan, mcs),
         "cqi": np.where(idle | ~((cqi >= 0) & (cqi <= 15)), np.nan, cqi),

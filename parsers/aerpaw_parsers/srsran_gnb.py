@@ -64,9 +64,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows = _rows.matched(data, pattern, options, reader="srsran_gnb", reason=torn)
     rnti = np.array([int(text, 16) if text else np.nan for text in rows.text("rnti")], dtype=np.float64)
     columns = {"cqi": rows.number("cqi"), "mcs": rows.number("mcs"), "rnti": rnti, "pci": rows.number("pci")}
-    ri = rows.number("ri")
     rows.clock_from = rows.clock_from or ("program" if own_stamp else None)
-    return rows.result(_rows.mean_rank(rows, ri, columns, none=ri == 0))
+    return rows.result(_rows.mean_rank(rows, rows.number("ri"), columns))
 
 
 def sniff_json(head: bytes) -> bool:
@@ -110,12 +109,14 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     )
     rows.warnings += warnings
     pairs = [(i, ue) for i, at in enumerate(rows.at.tolist()) for ue in _ues(entries[with_ue[at]])]
-    pick = np.array([i for i, _ in pairs], dtype=np.int64)
-    ues = [ue for _, ue in pairs]
-    names = {"cqi": ("cqi", "dl_cqi"), "mcs": ("dl_mcs", "mcs"), "rnti": ("rnti",), "pci": ("pci",)}
-    columns = {name: _json.column(ues, *keys) for name, keys in names.items()}
-    ri = _json.column(ues, "dl_ri", "ri")
-    return rows.result(_rows.mean_rank(rows, ri, columns, none=ri == 0, pick=pick))
+    names = {
+        "ri": ("dl_ri", "ri"),
+        "cqi": ("cqi", "dl_cqi"),
+        "mcs": ("dl_mcs", "mcs"),
+        "rnti": ("rnti",),
+        "pci": ("pci",),
+    }
+    return _json.ue_ranks(rows, pairs, names)
 
 
 READER = Reader(

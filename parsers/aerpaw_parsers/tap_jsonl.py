@@ -19,8 +19,6 @@ command and last byte; ``uncertainty_s`` is half of that span. RSRP and SINR bes
 
 from __future__ import annotations
 
-import json
-import zlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -30,11 +28,12 @@ import pandas as pd
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray
 from aerpaw_cmp.logs import make_frames
+from aerpaw_cmp.logs.checksums import SCHEMA, decode_record
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Attribute, Kind, ReadResult, RejectedLine, Stream
 
-SCHEMA = "aerpaw-cmp-tap/1"
-_CRC = b',"crc":"'
+from . import _json
+
 # RSRP and SINR older than this do not stand beside a rank.
 COMPANION_S = 2.0
 
@@ -57,16 +56,8 @@ def decode_line(line: bytes) -> dict[str, Any]:
     ValueError
         With the reason, if the line is torn or damaged.
     """
-    body, mark, tail = line.strip().rpartition(_CRC)
-    if not mark or len(tail) != 10 or not tail.endswith(b'"}'):
-        raise ValueError("torn line: it does not end with a checksum")
-    if b"%08x" % zlib.crc32(body) != tail[:8]:
-        raise ValueError("damaged line: its checksum does not fit")
-    try:
-        record = json.loads(body + b"}")
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-    if not isinstance(record, dict) or not isinstance(record.get("kind"), str):
+    record = decode_record(line)
+    if not isinstance(record.get("kind"), str):
         raise ValueError("not a record of the tap")
     if record["kind"] == "exchange":
         for key in ("sent_utc_ns", "last_utc_ns"):
@@ -229,10 +220,6 @@ def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]]
     return records, rejected, blank
 
 
-def _mapping(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
-
-
 def _int(value: Any) -> int:
     return value if type(value) is int and abs(value) < 2**62 else 0
 
@@ -264,7 +251,7 @@ def _rank_columns(exchanges: list[tuple[int, dict[str, Any]]], query: str) -> Co
     for number, record in exchanges:
         if record.get("query") == query:
             status = [] if record.get("status") == "ok" else [f"status:{record.get('status')}"]
-            answers.append((number, record, _mapping(record.get("decoded")), _flags(record) + status))
+            answers.append((number, record, _json.inside(record, "decoded"), _flags(record) + status))
     return _columns(answers, {name: name for name in ("rank", "ri_raw", "mcs", "cqi", "pmi")})
 
 
@@ -272,7 +259,7 @@ def _rsrp_columns(exchanges: list[tuple[int, dict[str, Any]]]) -> Columns:
     """RSRP and SINR of the NR serving cell."""
     answers = []
     for number, record in exchanges:
-        values = _mapping(_mapping(record.get("decoded")).get("nr"))
+        values = _json.inside(_json.inside(record, "decoded"), "nr")
         if record.get("query") == "servingcell" and values:
             answers.append((number, record, values, _flags(record)))
     return _columns(answers, {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"})

@@ -16,10 +16,11 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.live import log as log_module
-from aerpaw_cmp.live.log import Clock, LogSettings, SegmentLog, decode_record, encode_record, read_log
+from aerpaw_cmp.live.log import Clock, LogSettings, SegmentLog, read_log
 from aerpaw_cmp.live.writer import LogWriter
+from aerpaw_cmp.logs.checksums import SCHEMA, decode_record, encode_record
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_parsers.tap_jsonl import READER, SCHEMA, decode_line
+from aerpaw_parsers.tap_jsonl import READER, decode_line
 from tests.live.terminals import until
 
 

@@ -18,12 +18,12 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.live.feed import CHUNK, MEASURED, STALE_S, Feed, Rows
-from aerpaw_cmp.live.log import encode_record
 from aerpaw_cmp.live.play import Player
 from aerpaw_cmp.live.predict import RunningInterval
 from aerpaw_cmp.live.session import TapStatus
 from aerpaw_cmp.live.stop import Stop
 from aerpaw_cmp.live.web import Address, Limits, WebServer
+from aerpaw_cmp.logs.checksums import encode_record
 from benchmarks.tap_common import damaged
 from tests.live.terminals import until
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.readers import ReadOptions, by_name
 
 OPTIONS = ReadOptions(timezone="America/New_York")
 PATTERN = re.compile(rb"^(?P<time>[\d.]+) (?P<value>\S+)$", re.MULTILINE)
@@ -24,14 +24,30 @@ def test_si_suffixes_scale_by_powers_of_a_thousand() -> None:
     assert np.isnan(scaled[-2:]).all()
 
 
-@pytest.mark.parametrize("base", [0, 1])
-def test_ranks_1_to_8_are_ranks_whatever_the_base(base: int) -> None:
-    written = np.array([base - 1.0, *np.arange(base, base + 8.0), base + 8.0, base + 0.5, np.nan])
+def test_ranks_1_to_8_are_ranks() -> None:
+    written = np.array([0.0, *np.arange(1.0, 9.0), 9.0, 1.5, np.nan])
     rows = read(b"".join(b"1740927600.5 x\n" for _ in written))
-    columns = rows.rank(written, base=base)
+    columns = rows.rank(written)
     np.testing.assert_array_equal(columns["rank"], [np.nan, *range(1, 9), np.nan, np.nan, np.nan])
     np.testing.assert_array_equal(columns["ri_raw"], written)
     assert [flag for flag in rows.flag.tolist() if flag] == ["ri_out_of_range"] * 3 + ["no_csi"]
+
+
+@pytest.mark.parametrize(
+    ("reader", "line"),
+    [
+        ("nemo_csv", b"1,-1500.0,35.72,-78.69,30.5,%s,,,\n"),
+        ("quectel_console", b'2025-03-02 10:00:00\n|----+\n| 0 | +QNWCFG: "nr5g_csi" | 24 | %s | 12 | 5 |\n'),
+    ],
+)
+def test_a_fraction_is_no_rank_in_any_format(reader: str, line: bytes) -> None:
+    """A mean, or a damaged digit: rank 1.5 would count as a rank of its own."""
+    rank = [
+        next(s for s in by_name(reader).read(line % cell, OPTIONS).streams if s.kind == "rank").frame["rank"]
+        for cell in (b"1.5", b"2.0")
+    ]
+    assert np.isnan(rank[0]).all()
+    assert rank[1].tolist() == [2.0]
 
 
 @pytest.mark.parametrize(("unit", "per_s"), [("s", 1), ("ms", 10**3), ("us", 10**6)])

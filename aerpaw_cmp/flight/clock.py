@@ -244,6 +244,7 @@ def _finer(
     nats, step = likelihood(lags), _STEP_S
     while step > _FINEST_S:
         total = nats.sum(axis=0).max(axis=0)
+        # 2 nat more: an optimum that is not excluded may lie between two lags that are
         near = lags[total > total.max() - EVIDENCE_NAT - 2.0]
         if len(near) > _MOST_FINE:
             break

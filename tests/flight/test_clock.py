@@ -10,6 +10,7 @@ from scipy.stats import multivariate_normal
 from aerpaw_cmp.flight import replay as flight_replay
 from aerpaw_cmp.flight.clock import (
     CANNOT_TELL,
+    EVIDENCE_NAT,
     OK,
     SHIFTED,
     STAMPS_S,
@@ -378,6 +379,19 @@ def test_lags_are_tried_finely_where_one_stands_out(bend: float, finest: float) 
     assert np.abs(tried).max() <= 15.0
     edge, _ = _finer(lags, lambda some: -30.0 * (some - 15.0)[None, None] ** 2, 15.0)
     assert (edge.max(), np.diff(edge)[-1]) == (15.0, pytest.approx(0.02))
+
+
+def test_an_optimum_between_two_excluded_lags_is_found() -> None:
+    """Two lags explain a level about as well: the second lies half way between lags that are excluded by themselves."""
+    lags = np.arange(-30, 31) * 0.5
+
+    def likelihood(some: np.ndarray) -> np.ndarray:
+        return np.maximum(-40.0 * some**2, -3.0 - 40.0 * (some - 3.25) ** 2)[None, None]
+
+    assert (likelihood(lags[np.abs(lags - 3.25) < 1.0]) < -EVIDENCE_NAT).all()
+    tried, own = _finer(lags, likelihood, 15.0)
+    assert own[0, 0, np.abs(tried - 3.25) < 0.02].max() > -EVIDENCE_NAT
+    assert _judged(tried, own, ["one"], 15.0).ci95_s[1] > 3.25
 
 
 def test_the_parts_of_a_likelihood_are_the_best_of_their_grid() -> None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.flight.clock import CANNOT_TELL, SHIFTED, ClockEstimate, judge_clock
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
-from aerpaw_cmp.flight.draft import drafts
+from aerpaw_cmp.flight.draft import DraftOptions, drafts
 from aerpaw_cmp.flight.replay import clock_channels
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest
@@ -34,7 +34,7 @@ def drafted(path: Path, timezone: str) -> FlightData | None:
     try:
         files = ingest([path], options=ReadOptions(timezone=timezone))
         with tempfile.TemporaryDirectory() as folder:
-            (made,) = drafts(files, Path(folder), timezone=timezone)
+            (made,) = drafts(files, Path(folder), DraftOptions(timezone=timezone))
             flight = Path(folder) / "flight.yaml"
             flight.write_text(made.text)
             settings = load_flight(flight)

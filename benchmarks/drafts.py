@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.flight.draft import drafts
+from aerpaw_cmp.flight.draft import DraftOptions, drafts
 from aerpaw_cmp.logs.flight_file import IngestedFile
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
@@ -35,7 +35,7 @@ def outcome(read: Callable[[], Sequence[IngestedFile]], timezone: str) -> tuple[
         if not files:
             return "refused", "no log"
         with tempfile.TemporaryDirectory() as folder:
-            made = drafts(files, Path(folder), timezone=timezone)
+            made = drafts(files, Path(folder), DraftOptions(timezone=timezone))
     except AerpawCmpError as error:
         return "refused", str(error)
     words = [remark for draft in made for remark in draft.remarks if "can be compared" in remark]

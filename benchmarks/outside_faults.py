@@ -42,7 +42,7 @@ FAULTS = (
     Fault("take-off ground not added to ranks", "aerpaw_cmp/flight/data.py", "up = above + site.datum.takeoff_ground_m", "up = above + 0.0", RAW),
     Fault("attitude held between rows", "aerpaw_cmp/flight/track.py", "Rotation.from_matrix(matrices))(t).as_matrix())", "Rotation.from_matrix(matrices))(at[np.searchsorted(at, t, side='right') - 1]).as_matrix())", "tests/flight/test_track.py"),
     Fault("attitude late by half a second", "aerpaw_cmp/flight/track.py", "Rotation.from_matrix(matrices))(t).as_matrix())", "Rotation.from_matrix(matrices))(np.maximum(t - 0.5, at[0])).as_matrix())", "tests/flight/test_track.py"),
-    Fault("positions late by a row", "aerpaw_cmp/flight/track.py", "_interpolate(t[valid], self._time_s, self._position)", "_interpolate(t[valid] - 1.0, self._time_s, self._position)", "tests/flight/test_track.py"),
+    Fault("positions late by a row", "aerpaw_cmp/flight/track.py", "interpolated(t[valid], self._time_s, self._position)", "interpolated(t[valid] - 1.0, self._time_s, self._position)", "tests/flight/test_track.py"),
     Fault("altitude in feet", "aerpaw_cmp/flight/track.py", "altitude[rows] + self.ground_m", "altitude[rows] * 0.3048 + self.ground_m", "tests/flight/test_track.py"),
     Fault("yaw counter-clockwise", "aerpaw_cmp/propagation/arrays.py", "np.pi / 2 - np.radians(yaw_deg)", "np.pi / 2 + np.radians(yaw_deg)", "tests/flight/test_track.py"),
     Fault("nose up taken for nose down", "aerpaw_cmp/propagation/arrays.py", "-np.radians(pitch_deg)", "np.radians(pitch_deg)", "tests/flight/test_track.py tests/propagation/test_attitude_chain.py"),

@@ -131,7 +131,7 @@ def score_forecast(
         The one rank said; 0 where there is no forecast.
     constant : (ranks,)
         The constant forecast, from the flights of the fit (:func:`constant_forecast`).
-    replicates, seed : int
+    replicates : int
         Block bootstrap.
 
     Returns

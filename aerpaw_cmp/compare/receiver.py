@@ -291,7 +291,7 @@ def _fit_multinomial(
     -----
     Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., section 4.4.
     """
-    design = _design(x) * 1.0
+    design = _design(x)
     lead, width = design.shape[:-2], design.shape[-1]
     target = one_hot(rank) * weight[:, None]
     ridge = np.full(width, penalty)

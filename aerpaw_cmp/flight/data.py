@@ -659,14 +659,14 @@ def _check_overlap(data: FlightData) -> None:
             cause="'skip', or a log left out",
         )
     for kind, series in data.series:
-        if data.track is None and (isinstance(series, RssSeries) or series.position_m is None):
+        if isinstance(series, RankSeries) and series.position_m is not None:
+            continue
+        if data.track is None:
             raise UsageError(
                 f"{kind} of {series.tower} has no positions of its own and there is no telemetry log",
                 expected="a telemetry log (vehicle_out, say) under 'logs'",
             )
-    for kind, series in data.series:
-        if data.track is not None and (isinstance(series, RssSeries) or series.position_m is None):
-            _check_shared(data, f"{kind} of {series.tower}", series.time, data.track)
+        _check_shared(data, f"{kind} of {series.tower}", series.time, data.track)
     for kind, series in data.series:
         if series.tower in data.nodes and len(series.time):
             what = f"{kind} of {series.tower}"

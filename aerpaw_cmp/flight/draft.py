@@ -50,15 +50,27 @@ RANK = (
 SITE = "lake_wheeler"
 
 
-def draft(
-    files: Sequence[IngestedFile],
-    folder: Path,
-    *,
-    timezone: str | None = None,
-    time_origin: str | None = None,
-    mapping: Mapping[str, Any] | None = None,
-    site: str = SITE,
-) -> tuple[str, list[str]]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DraftOptions:
+    """Options of a draft.
+
+    Parameters
+    ----------
+    timezone, time_origin : str, optional
+        What zone-less clocks and relative times were read with.
+    mapping : mapping
+        ``columns``, ``kind``, ``unit`` and ``ri_base`` that generic CSVs were read with.
+    site : str
+        Packaged site, or the path of a site.yaml against the folder; what it remembers of antennas is used.
+    """
+
+    timezone: str | None = None
+    time_origin: str | None = None
+    mapping: Mapping[str, Any] = field(default_factory=dict)
+    site: str = SITE
+
+
+def draft(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = DraftOptions()) -> tuple[str, list[str]]:
     """The text of a flight.yaml that names the logs.
 
     Parameters
@@ -67,12 +79,7 @@ def draft(
         As ``ingest`` read them.
     folder : Path
         Of the flight.yaml; the paths in it are relative to it.
-    timezone, time_origin : str, optional
-        What zone-less clocks and relative times were read with.
-    mapping : mapping, optional
-        ``columns``, ``kind``, ``unit`` and ``ri_base`` that generic CSVs were read with.
-    site : str
-        Packaged site, or the path of a site.yaml against ``folder``; what it remembers of antennas is used.
+    options : DraftOptions
 
     Returns
     -------
@@ -84,18 +91,15 @@ def draft(
     UsageError
         If no log has what a flight needs.
     """
-    flown = _flown(files)
+    flown, site = _flown(files), options.site
     every = [stream for file in files for stream in file.result.streams]
     entries = _Entries(
         folder=folder,
         flown=flown,
         has_level=_has_level(files, flown),
-        time_origin=time_origin,
-        mapping=dict(mapping or {}),
-        timezone=timezone,
+        options=options,
         positioned=any(_has_positions(stream) for stream in every),
         placer=_placer(files, flown, site_place(site, folder)),
-        memory=site_place(site, folder),
         locks=any(may_lose_lock(stream) for stream in every),
     )
     # of copies, the one on the telemetry's clock, then the fullest
@@ -113,8 +117,8 @@ def draft(
             "towers:\n",
             *(f"  {name}: {_plain(tower)}  # {about}\n" for name, (tower, about) in entries.towers.items()),
         ]
-    if timezone:
-        parts.append(f"timezone: {timezone}\n")
+    if options.timezone:
+        parts.append(f"timezone: {options.timezone}\n")
     parts += ["logs:\n", *entries.lines.values()]
     parts += [NO_TRACK] if entries.without_track else []
     parts += [f"  # left out: {remark}\n" for remark in entries.out]
@@ -164,15 +168,7 @@ class Draft:
     remarks: tuple[str, ...]
 
 
-def drafts(
-    files: Sequence[IngestedFile],
-    folder: Path,
-    *,
-    timezone: str | None = None,
-    time_origin: str | None = None,
-    mapping: Mapping[str, Any] | None = None,
-    site: str = SITE,
-) -> list[Draft]:
+def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = DraftOptions()) -> list[Draft]:
     """A flight.yaml for each flight that the logs are of, in the order of time; see :func:`draft`.
 
     Where one flight alone is complete (levels or ranks, and positions) all logs stand in its draft, those that do not
@@ -184,14 +180,7 @@ def drafts(
         Logs of one or of several flights.
     folder : Path
         Against which the paths are written.
-    timezone : str, optional
-        Of clocks without a zone.
-    time_origin : str, optional
-        Of relative times.
-    mapping : mapping, optional
-        Keys of a log that ``--map`` gave.
-    site : str
-        As for :func:`draft`.
+    options : DraftOptions
 
     Returns
     -------
@@ -200,11 +189,10 @@ def drafts(
     """
     every = [flight for flight in flights(files) if flight.measured]
     complete = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
-    options_of_clock = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping, "site": site}
     groups = [flight.files for flight in complete] if len(complete) > 1 else [list(files)]
     written = []
     for group in groups:
-        text, remarks = draft(group, folder, **options_of_clock)  # type: ignore[arg-type]
+        text, remarks = draft(group, folder, options)
         written.append(Draft(_name(_flown(group), group), text, tuple(remarks)))
     home = {file.path for group in groups for file in group}
     homeless = [one_line(os.path.relpath(Path(f.path).resolve(), folder)) for f in files if f.path not in home]
@@ -349,10 +337,7 @@ class _Entries:
     flown: tuple[Stream, Span] | None
     """The telemetry that gives the track, and its span."""
     has_level: bool
-    time_origin: str | None
-    mapping: dict[str, Any]
-    """Of generic CSVs."""
-    timezone: str | None = None
+    options: DraftOptions
     lines: dict[str, str] = field(default_factory=dict)
     """By the path as it was given."""
     kinds: set[str] = field(default_factory=set)
@@ -368,8 +353,6 @@ class _Entries:
     positioned: bool = False
     """Some log to compare has positions of its own."""
     placer: Placer | None = None
-    memory: str | Path = SITE
-    """Site whose memory is used."""
     locks: bool = False
     """The receiver is a sounder that loses its lock."""
     towers: dict[str, tuple[Mapping[str, Any], str]] = field(default_factory=dict)
@@ -414,7 +397,7 @@ class _Entries:
     def _enter(self, file: IngestedFile, path: str, shown: str) -> None:
         streams = [s for s in file.result.streams if s.kind != "kpi"]  # no report compares these
         entry, comment = _entry(file, path)
-        origin = None if self.time_origin else self._origin(streams)
+        origin = None if self.options.time_origin else self._origin(streams)
         if self.placer is not None:
             levels = [s for s in streams if s.kind == "rss" and not is_ratio(s)]
             if comment:
@@ -440,17 +423,17 @@ class _Entries:
         self.out += [f"{shown}: {name}: {reason}" for name, reason in refused.items() if reason != RATIO]
         if all(s.kind == "telemetry" for s in compared):
             entry, comment = {"path": path, "reader": file.result.reader}, ""
-        if self.time_origin and any("clock" in s.attributes for s in compared):
-            entry["time_origin"] = self.time_origin
+        if self.options.time_origin and any("clock" in s.attributes for s in compared):
+            entry["time_origin"] = self.options.time_origin
         elif origin is not None:
             entry["time_origin"] = f"{origin.time.astype('datetime64[ms]')}Z"
             comment = _also(comment, f"time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?")
         if file.result.reader == "generic_csv":
-            entry |= self.mapping
+            entry |= self.options.mapping
         if refused:
             entry["skip"] = sorted(refused)
         comment = self._ask_heights_and_floor(compared, entry, path, comment)
-        for question in questions(file, compared, self.timezone):
+        for question in questions(file, compared, self.options.timezone):
             comment = _also(comment, question)
         self.lines[file.path] = f"  - {_flow(entry)}{comment}\n"
         if self.placer is not None:
@@ -516,12 +499,12 @@ class _Entries:
         -------
         str
         """
-        places = {}
+        places, memory = {}, site_place(self.options.site, self.folder)
         for pci in entry.get("cells", [None]):
             level = next((s for s in levels if s.attributes.get("pci") == pci), None)
             if level is not None:
                 series = _key(level, entry)[1], file.result.reader
-                airframe = searching_airframe(self.memory, placer.site.towers, series, file.sha256)
+                airframe = searching_airframe(memory, placer.site.towers, series, file.sha256)
                 places[pci] = placer.propose(placer.levels(level, self._floor_db(level), airframe))
         for pci, place in places.items():
             if place is None:
@@ -605,7 +588,7 @@ class _Entries:
         span = stream_span(stream)
         if self.flown is None or span is None or stream.kind == "telemetry":
             return 0.0
-        trap = clock_trap(span, self.flown[1], self.timezone)
+        trap = clock_trap(span, self.flown[1], self.options.timezone)
         written = stream.attributes.get("clock_from") == "written"
         return trap.hours if trap is not None and trap.is_utc and not written else 0.0
 
@@ -623,7 +606,7 @@ class _Entries:
         if relative and not (dated or same_clock or _has_positions(stream)):
             return "its times are relative; read it again with --time-origin"
         if self.flown is not None and not relative and not _meet(span, self.flown[1]):
-            return _late(span, self.flown[1], self.timezone)
+            return _late(span, self.flown[1], self.options.timezone)
         return RATIO if self.has_level and is_ratio(stream) else None
 
 

@@ -76,9 +76,9 @@ def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tupl
 
 
 def sphere_angles(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Zenith angle and azimuth (n,) [rad] of directions (n, 3)."""
-    theta = np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
-    return np.asarray(theta), np.asarray(np.arctan2(direction[:, 1], direction[:, 0]))
+    """Zenith angle and azimuth (...,) [rad] of directions (..., 3)."""
+    forward, left, up = np.moveaxis(direction, -1, 0)
+    return np.asarray(np.arctan2(np.hypot(forward, left), up)), np.asarray(np.arctan2(left, forward))
 
 
 def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | float:

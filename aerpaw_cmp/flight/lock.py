@@ -8,6 +8,7 @@ import numpy as np
 
 from ..common.units import FloatArray
 from ..compare.detection import aligned_quality
+from ..compare.serving import at_times
 from ..logs.records import Stream
 
 # Quality [dB] at perfect lock (the peak of 4095 chips), and below which the receiver has lost it.
@@ -64,7 +65,8 @@ def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | N
                     "at its own times, 0.032768 s a row"
                 )
         else:
-            quality = _nearest(time, at, quality)
+            order = np.argsort(at, kind="stable")
+            quality = at_times(time, at[order], quality[order], within_s=_WITHIN_S)
         if np.isfinite(quality).any():
             return np.where(np.isfinite(quality), (quality > LOST_QUALITY_DB).astype(np.float64), np.nan), remark
     return None, ""
@@ -72,12 +74,3 @@ def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | N
 
 def _seconds(stream: Stream) -> FloatArray:
     return np.asarray(stream.frame["time"].to_numpy("datetime64[ns]").astype(np.int64) * 1e-9)
-
-
-def _nearest(time: FloatArray, at: FloatArray, values: FloatArray) -> FloatArray:
-    """Values at the nearest instant; NaN where none is near."""
-    order = np.argsort(at, kind="stable")
-    at, values = at[order], values[order]
-    right = np.clip(np.searchsorted(at, time), 1, len(at) - 1) if len(at) > 1 else np.zeros(len(time), dtype=np.int64)
-    best = np.where(np.abs(at[right] - time) < np.abs(at[right - 1] - time), right, right - 1)
-    return np.where(np.abs(at[best] - time) <= _WITHIN_S, values[best], np.nan)

@@ -16,6 +16,7 @@ from ..logs.records import Stream
 from ..propagation.field.baselines import free_space_dbm
 from ..site.antennas import MeasuredPattern
 from ..site.site import Site
+from .learned_gain import sphere_angles
 from .scored import unscored
 from .track import Track
 
@@ -120,9 +121,7 @@ class Placer:
         rotation = self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation
 
         def gain_db(towards: FloatArray) -> FloatArray:
-            in_body = np.einsum("nji,mnj->mni", rotation, towards)
-            theta = np.arctan2(np.hypot(in_body[..., 0], in_body[..., 1]), in_body[..., 2])
-            return airframe.gain_dbi(theta, np.arctan2(in_body[..., 1], in_body[..., 0]))
+            return airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", rotation, towards)))
 
         return replace(track, airframe_db=gain_db)
 

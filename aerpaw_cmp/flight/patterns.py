@@ -15,6 +15,7 @@ from shapely.ops import substring
 
 from ..common.errors import UsageError
 from ..common.units import FloatArray, spread_out
+from .track import interpolated
 
 Nose = Literal["along", "fixed", "four headings"]
 # How the nose is held: along the track; turned by 90 degrees from leg to leg; to the north.
@@ -108,7 +109,7 @@ def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float, most_s: fl
             yaw.append(w.yaw_deg)
     seconds = np.arange(0.0, min(begin, most_s) + 1e-9, 1.0)
     leg = np.minimum(np.searchsorted(np.array(time), seconds), len(yaw) - 1)
-    position = np.stack([np.interp(seconds, time, np.array(at)[:, k]) for k in range(3)], axis=1)
+    position = interpolated(seconds, np.array(time), np.array(at))
     return Route(
         name=name, waypoints=tuple(waypoints), position_m=position, yaw_deg=np.array(yaw)[leg] % 360.0, time_s=seconds
     )

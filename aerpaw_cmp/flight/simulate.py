@@ -32,6 +32,7 @@ from ..propagation.replay import replay
 from ..site.site import Site
 from .data import site_place
 from .settings import FlightFile, LogSettings, PlanSettings, files_of
+from .track import interpolated
 
 # What was planted.
 TRUTH = "truth.json"
@@ -59,7 +60,7 @@ class Trajectory:
 
     def position_at(self, time_s: FloatArray) -> FloatArray:
         """Positions (n, 3) [m] at times [s]."""
-        return np.stack([np.interp(time_s, self.time_s, self.position_m[:, i]) for i in range(3)], axis=-1)
+        return interpolated(time_s, self.time_s, self.position_m)
 
     def velocity_at(self, time_s: FloatArray) -> FloatArray:
         """Velocities (n, 3) [m/s] east, north, up; zero while waiting."""

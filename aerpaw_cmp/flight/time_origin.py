@@ -9,6 +9,7 @@ import pandas as pd
 
 from ..common.units import AnyArray, FloatArray
 from ..logs.records import Stream, has_wall_clock
+from .track import interpolated
 
 # Two receivers on one aircraft tell places this near each other, in the median.
 AGREE_M = 12.0
@@ -98,7 +99,6 @@ def _median_distance(time_s: FloatArray, log_m: FloatArray, track_s: FloatArray,
     inside = (time_s >= track_s[0]) & (time_s <= track_s[-1])
     if 2 * inside.sum() < len(time_s):
         return float("nan")
-    interpolated = np.stack([np.interp(time_s[inside], track_s, track_m[:, i]) for i in range(3)], axis=1)
-    apart = log_m[inside] - interpolated
+    apart = log_m[inside] - interpolated(time_s[inside], track_s, track_m)
     apart[:, 2] -= np.median(apart[:, 2])  # the logs count heights from grounds of their own
     return float(np.median(np.linalg.norm(apart, axis=1)))

@@ -105,10 +105,6 @@ class TrackPoses:
         Which of :data:`REASONS` it is; 0 where valid.
     attitude_known : (n,) bool
         False where level flight along the course stands in for the attitude.
-    raised : (n,) bool
-        The height was below the minimum and was raised to it.
-    velocity_mps : (n, 3)
-        East, north, up [m/s]; NaN where not valid.
     """
 
     position_m: FloatArray
@@ -116,8 +112,6 @@ class TrackPoses:
     valid: BoolArray
     reason_code: AnyArray
     attitude_known: BoolArray
-    raised: BoolArray
-    velocity_mps: FloatArray
 
     def __len__(self) -> int:
         return len(self.valid)
@@ -359,23 +353,17 @@ class Track:
             t = np.clip(t, self._time_s[0], self._time_s[-1])
         position = np.full((n, 3), np.nan)
         rotation = np.full((n, 3, 3), np.nan)
-        velocity = np.full((n, 3), np.nan)
-        known, raised = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        known = np.zeros(n, dtype=bool)
         if valid.any():
-            position[valid] = _interpolate(t[valid], self._time_s, self._position)
-            velocity[valid] = _interpolate(t[valid], self._time_s, self._velocity)
+            position[valid] = interpolated(t[valid], self._time_s, self._position)
             rotation[valid], known[valid] = self._rotations(t[valid])
-            floor = self.ground_m + self.minimum_height_m
-            raised[valid] = position[valid, 2] < floor
-            position[raised, 2] = floor
+            position[valid, 2] = np.maximum(position[valid, 2], self.ground_m + self.minimum_height_m)
         return TrackPoses(
             position_m=position,
             rotation=rotation,
             valid=valid,
             reason_code=code.astype(np.int8),
             attitude_known=known,
-            raised=raised,
-            velocity_mps=velocity,
         )
 
     def _codes(self, t: FloatArray) -> AnyArray:
@@ -405,12 +393,12 @@ class Track:
     def _course_at(self, t: FloatArray) -> FloatArray:
         """Course over ground [deg], interpolated as a direction."""
         angle = np.radians(self._course_deg)
-        mixed = _interpolate(t, self._time_s, np.column_stack([np.sin(angle), np.cos(angle)]))
+        mixed = interpolated(t, self._time_s, np.column_stack([np.sin(angle), np.cos(angle)]))
         return np.asarray(np.degrees(np.arctan2(mixed[:, 0], mixed[:, 1])))
 
 
-def _interpolate(t: FloatArray, at: FloatArray, values: FloatArray) -> FloatArray:
-    """Linear interpolation of columns (rows, m) at t (n,)."""
+def interpolated(t: FloatArray, at: FloatArray, values: FloatArray) -> FloatArray:
+    """Columns (rows, m) known at ``at`` (rows,), ascending, at t (n,): linear between rows, (n, m)."""
     return np.column_stack([np.interp(t, at, values[:, i]) for i in range(values.shape[1])])
 
 

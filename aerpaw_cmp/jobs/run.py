@@ -95,19 +95,19 @@ def run_ingest(
         if out is not None:
             target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=inputs, force=force))
         if draft is not None:
-            from ..flight.draft import SITE, drafts
+            from ..flight.draft import SITE, DraftOptions, drafts
 
             drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=inputs, force=force))
         files = ingest(paths, options=ReadOptions(**options), reader=reader)
         account = summary(files)
         if draft is not None:
-            options_of_clock = {key: options.get(key) for key in ("timezone", "time_origin")}
-            named = ("columns", "kind", "unit", "ri_base")
-            options_of_clock["mapping"] = {key: options[key] for key in named if options.get(key)}
+            keys = ("columns", "kind", "unit", "ri_base")
+            mapping = {key: options[key] for key in keys if options.get(key)}
             home = drafted.target.parent
             if site is not None and Path(site).is_file():
                 site = os.path.relpath(Path(site).resolve(), home.resolve())
-            flight_drafts = drafts(files, home, site=site or SITE, **options_of_clock)
+            clock = {key: options.get(key) for key in ("timezone", "time_origin")}
+            flight_drafts = drafts(files, home, DraftOptions(mapping=mapping, site=site or SITE, **clock))
             numbered = (
                 draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(flight_drafts) + 1)
             )

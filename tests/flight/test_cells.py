@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.draft import draft
+from aerpaw_cmp.flight.draft import DraftOptions, draft
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs.reporting.compare_flight import serving_of
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
@@ -71,7 +71,7 @@ def test_cells_go_to_the_towers_that_the_flight_file_names(phone: Path) -> None:
 
 def test_a_draft_asks_which_tower_has_which_cell(phone: Path) -> None:
     files = ingest(phone, options=ReadOptions(timezone=ZONE))
-    text, remarks = draft(files, phone, timezone=ZONE)
+    text, remarks = draft(files, phone, DraftOptions(timezone=ZONE))
     settings = parse_yaml(text, FlightFile)
     (cells,) = (log.cells for log in settings.logs if log.cells)
     assert set(cells) == {1, 2, 7}

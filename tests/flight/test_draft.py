@@ -15,7 +15,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight import draft as drafting
 from aerpaw_cmp.flight.data import load_data, read_logs
-from aerpaw_cmp.flight.draft import draft, receiver_floor_db
+from aerpaw_cmp.flight.draft import DraftOptions, draft, receiver_floor_db
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.logs import ingest as ingest_module
 from aerpaw_cmp.logs.flight_file import read_flight
@@ -43,7 +43,7 @@ def _grow(path: Path) -> None:
 def test_the_draft_of_the_sample_logs_is_a_flight(logs: Path) -> None:
     target = logs.parent / "plans" / "flight.yaml"
     target.parent.mkdir()
-    text, remarks = draft(ingest(logs, options=OPTIONS), target.parent, timezone=ZONE)
+    text, remarks = draft(ingest(logs, options=OPTIONS), target.parent, DraftOptions(timezone=ZONE))
     target.write_text(text, encoding="utf-8")
     settings, given = load_flight(target), load_flight(SAMPLE / "flight.yaml")
     named = {(Path(log.path).name, log.reader, log.node, log.channel) for log in settings.logs}
@@ -69,7 +69,7 @@ def test_another_day_a_ratio_and_relative_times_are_left_out(logs: Path) -> None
     telemetry = next(logs.glob("UAV/*vehicleOut.txt"))
     long = telemetry.read_text().replace("2025-06-01", "2025-05-01")
     (logs / "UAV/old_vehicleOut.txt").write_text(long + long.replace("2025-05-01", "2025-05-02"))
-    text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
+    text, remarks = draft(ingest(logs, options=OPTIONS), logs, DraftOptions(timezone=ZONE))
     left = {remark.split(": ")[1]: remark for remark in remarks if remark.startswith("left out: ")}
     assert set(left) == {"LW1/x_quality_log.txt", "LW2/USRP2_power_log.txt", "UAV/old_vehicleOut.txt"}
     assert "ratio" in left["LW1/x_quality_log.txt"]
@@ -83,7 +83,7 @@ def test_a_radio_clock_in_utc_is_asked_about_and_compared(logs: Path) -> None:
         (logs / name).write_text((logs / name).read_text().replace("2025-06-01 10:", hour))
     text = (logs / "LW3/USRP1_power_log.txt").read_text()  # of another flight, four hours later
     (logs / "LW3/USRP1_later_power_log.txt").write_text(text.replace("2025-06-01 10:", "2025-06-01 14:") + text[-40:])
-    text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
+    text, remarks = draft(ingest(logs, options=OPTIONS), logs, DraftOptions(timezone=ZONE))
     (line,) = [line for line in text.splitlines() if "LW1/USRP1" in line]
     assert "clock: utc" in line
     assert line.endswith("is it UTC?")
@@ -108,7 +108,7 @@ def test_what_a_draft_names_is_read_whatever_it_is_called(logs: Path) -> None:
         (logs / f"{name} LW{i % 5 + 1}" / f"usrp{10 + i}_power_log.txt").write_bytes(content + b"\n" * i)
     (logs / "left\nout\r_quality_log.txt").write_bytes(content + b"\n" * 20)
     target = logs / "it's a flight: 1.yaml"
-    text, remarks = draft(ingest(logs, options=OPTIONS), target.parent, timezone=ZONE)
+    text, remarks = draft(ingest(logs, options=OPTIONS), target.parent, DraftOptions(timezone=ZONE))
     target.write_text(text, encoding="utf-8")
     assert not any("\n" in remark or "\r" in remark for remark in remarks)
     data = load_data(load_flight(target), target.parent)
@@ -119,7 +119,7 @@ def test_what_a_draft_names_is_read_whatever_it_is_called(logs: Path) -> None:
 def test_a_log_may_be_called_like_a_number(logs: Path, name: str) -> None:
     shutil.move(logs / "LW1/USRP1_power_log.txt", logs / name)
     files = ingest([logs / name, *logs.glob("UAV/*vehicleOut.txt")], options=OPTIONS)
-    text, _ = draft(files, logs, timezone=ZONE)
+    text, _ = draft(files, logs, DraftOptions(timezone=ZONE))
     assert parse_yaml(text, FlightFile).logs[1].path == name
 
 
@@ -141,7 +141,7 @@ def test_one_record_of_each_channel_and_rank(logs: Path) -> None:
     _grow(logs / "LW1/USRP1_again_power_log.txt")
     shutil.copy(next(logs.glob("UAV/*vehicleOut.txt")), logs / "UAV/z_vehicleOut.txt")
     _grow(logs / "UAV/z_vehicleOut.txt")
-    text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
+    text, remarks = draft(ingest(logs, options=OPTIONS), logs, DraftOptions(timezone=ZONE))
     left = [remark for remark in remarks if remark.startswith("left out: ")]
     assert len(left) == 3
     assert any("the same bytes as LW1/USRP1_power_log.txt" in r or "the same bytes as LW1/copy" in r for r in left)
@@ -156,7 +156,7 @@ def test_of_two_logs_of_a_channel_the_fuller_one_is_taken(logs: Path) -> None:
     full = logs / "LW1/USRP1_power_log.txt"
     part = logs / "LW1/USRP1_a_power_log.txt"
     part.write_text("".join(full.read_text().splitlines(keepends=True)[100:200]))
-    text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
+    text, remarks = draft(ingest(logs, options=OPTIONS), logs, DraftOptions(timezone=ZONE))
     assert "LW1/USRP1_power_log.txt, reader" in text
     left = "left out: LW1/USRP1_a_power_log.txt: LW1/USRP1_power_log.txt has USRP1 of that tower and time already"
     assert left in remarks
@@ -172,7 +172,7 @@ def test_relative_ranks_with_positions_need_no_origin(logs: Path) -> None:
     assert "time_origin" not in text
     assert "no telemetry here" not in text  # its positions are its own
     origin = "2025-06-01T14:00:00Z"
-    text, _ = draft(ingest(nemo, options=ReadOptions(time_origin=origin)), logs, time_origin=origin)
+    text, _ = draft(ingest(nemo, options=ReadOptions(time_origin=origin)), logs, DraftOptions(time_origin=origin))
     (logs / "flight.yaml").write_text(text)
     settings = load_flight(logs / "flight.yaml")
     (again,) = read_logs(settings, logs)
@@ -180,7 +180,7 @@ def test_relative_ranks_with_positions_need_no_origin(logs: Path) -> None:
 
 
 def test_levels_without_telemetry_are_asked_about(logs: Path) -> None:
-    _, remarks = draft(ingest(logs / "LW1", options=OPTIONS), logs, timezone=ZONE)
+    _, remarks = draft(ingest(logs / "LW1", options=OPTIONS), logs, DraftOptions(timezone=ZONE))
     assert [r for r in remarks if "no telemetry here" in r]
 
 
@@ -188,7 +188,7 @@ def test_the_tower_is_told_by_the_folder_of_the_log(logs: Path) -> None:
     far = logs / "LW4_campaign" / "first" / "run"
     far.mkdir(parents=True)
     shutil.move(logs / "LW2/USRP1_power_log.txt", far / "power_log.txt")
-    text, _ = draft(ingest([logs / "LW3", far], options=OPTIONS), logs / "LW3", timezone=ZONE)
+    text, _ = draft(ingest([logs / "LW3", far], options=OPTIONS), logs / "LW3", DraftOptions(timezone=ZONE))
     assert "{path: USRP1_power_log.txt, reader: sounder_log, node: LW3, channel: USRP1}\n" in text
     assert "node: LW4}  # which tower?" in text  # a guess
 
@@ -196,7 +196,7 @@ def test_the_tower_is_told_by_the_folder_of_the_log(logs: Path) -> None:
 def test_a_ratio_is_kept_where_nothing_else_is(logs: Path) -> None:
     shutil.move(logs / "LW1/USRP1_power_log.txt", logs / "LW1/x_quality_log.txt")
     files = ingest([logs / "LW1/x_quality_log.txt", *logs.glob("UAV/*vehicleOut.txt")], options=OPTIONS)
-    text, remarks = draft(files, logs, timezone=ZONE)
+    text, remarks = draft(files, logs, DraftOptions(timezone=ZONE))
     assert "LW1/x_quality_log.txt" in text
     assert any(r.endswith("a ratio to the noise as a level?") for r in remarks)
 
@@ -226,7 +226,7 @@ def _seconds(row: str) -> float:
 
 
 def test_a_draft_says_how_many_samples_it_compares(logs: Path) -> None:
-    text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
+    text, remarks = draft(ingest(logs, options=OPTIONS), logs, DraftOptions(timezone=ZONE))
     (counted,) = (remark for remark in remarks if remark.endswith("can be compared"))
     settings = parse_yaml(text, FlightFile)
     data = load_data(settings, logs)
@@ -248,7 +248,7 @@ def test_levels_without_positions_do_not_spoil_ranks_that_have_them(logs: Path) 
     frame = rank.result.streams[0].frame.assign(rsrp_dbm=-80.0, cqi=9.0)
     (logs / "nemo.csv").write_bytes(nemo_csv(frame, "2025-06-01T14:00:00Z"))
     files = [*ingest(logs / "nemo.csv"), *ingest(logs / "LW1", options=OPTIONS)]
-    text, remarks = draft(files, logs, timezone=ZONE)
+    text, remarks = draft(files, logs, DraftOptions(timezone=ZONE))
     assert [log.path for log in parse_yaml(text, FlightFile).logs] == ["nemo.csv"]
     assert any(remark.endswith("samples can be compared") and not remark.startswith("0") for remark in remarks)
     assert any("USRP1_power_log.txt: it has no positions, and no telemetry is here" in remark for remark in remarks)
@@ -304,7 +304,7 @@ def test_attitude_height_and_floor_are_proposed(tmp_path: Path, attitude: bool) 
         *ingest([tmp_path / "levels_LW1.csv"], reader="generic_csv",
                 options=ReadOptions(time_origin=origin, kind="rss", columns={"time": "t", "rss_db": "rss_dbm"})),
     ]  # fmt: skip
-    text, remarks = draft(files, tmp_path, time_origin=origin)
+    text, remarks = draft(files, tmp_path, DraftOptions(time_origin=origin))
     settings = parse_yaml(text, FlightFile)
     assert settings.rt.attitude == ("logged" if attitude else "level")
     assert any("no attitude" in remark for remark in remarks) is not attitude

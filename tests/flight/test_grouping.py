@@ -9,7 +9,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.flight import time_origin
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.draft import drafts
+from aerpaw_cmp.flight.draft import DraftOptions, drafts
 from aerpaw_cmp.flight.grouping import flights
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.time_origin import origin_of
@@ -202,7 +202,7 @@ def test_a_log_that_goes_with_no_flight_is_said_once_beside_the_first(tmp_path: 
     write_flight(tmp_path / "noon", "2025-03-02T17:00:00", turn=0.5)
     times = np.datetime64("2025-03-09T15:00:00", "ns") + np.arange(50) * np.timedelta64(1, "s")
     (tmp_path / "LW2_power_log.txt").write_bytes(format_power_log(times, np.linspace(-40, -60, 50), ZONE))
-    made = drafts(ingest(tmp_path, options=OPTIONS), tmp_path, timezone=ZONE)
+    made = drafts(ingest(tmp_path, options=OPTIONS), tmp_path, DraftOptions(timezone=ZONE))
     assert len({draft.name for draft in made}) == len(made) == 2
     said = [[text for text in draft.remarks if "it goes with no flight here" in text] for draft in made]
     assert said == [["left out: LW2_power_log.txt: it goes with no flight here"], []]

@@ -7,7 +7,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError, UsageError
 from aerpaw_cmp.flight.data import FlightData, load_data
-from aerpaw_cmp.flight.draft import draft
+from aerpaw_cmp.flight.draft import DraftOptions, draft
 from aerpaw_cmp.flight.heights import height_in_name
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest
@@ -86,7 +86,7 @@ def test_a_moving_tower_may_be_a_phone_without_altitude(tmp_path: Path) -> None:
 def test_a_draft_takes_the_height_of_the_files_name_and_asks(tmp_path: Path, name: str, height: str | None) -> None:
     write(tmp_path / name, altitude=False)
     files = ingest(tmp_path, options=ReadOptions(timezone=ZONE))
-    text, remarks = draft(files, tmp_path, timezone=ZONE)
+    text, remarks = draft(files, tmp_path, DraftOptions(timezone=ZONE))
     assert (f"height_m: {height}" in text) == (height is not None)
     (asked,) = (remark for remark in remarks if name in remark and remark.startswith("check: "))
     assert ("height_m as the file's name says?" if height else "which height_m?") in asked
@@ -94,7 +94,7 @@ def test_a_draft_takes_the_height_of_the_files_name_and_asks(tmp_path: Path, nam
 
 def test_a_draft_of_a_log_with_altitudes_asks_for_no_height(tmp_path: Path) -> None:
     write(tmp_path / "60m.csv", altitude=True)
-    text, _ = draft(ingest(tmp_path, options=ReadOptions(timezone=ZONE)), tmp_path, timezone=ZONE)
+    text, _ = draft(ingest(tmp_path, options=ReadOptions(timezone=ZONE)), tmp_path, DraftOptions(timezone=ZONE))
     assert " height_m" not in text
 
 

@@ -11,7 +11,7 @@ from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.compare.locate import NodeEstimate, level_track
 from aerpaw_cmp.flight import node
-from aerpaw_cmp.flight.draft import draft
+from aerpaw_cmp.flight.draft import DraftOptions, draft
 from aerpaw_cmp.flight.node import listed_places
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.logs.ingest import IngestedFile, ingest
@@ -49,7 +49,7 @@ def _logs(folder: Path, node: tuple[float, float, float], level_100_m: float, sl
 
 
 def _drafted(folder: Path, node: tuple[float, float, float], level_100_m: float = -60.0) -> tuple[FlightFile, str]:
-    text, remarks = draft(_logs(folder, node, level_100_m), folder, time_origin=ORIGIN)
+    text, remarks = draft(_logs(folder, node, level_100_m), folder, DraftOptions(time_origin=ORIGIN))
     return parse_yaml(text, FlightFile), "\n".join(remarks)
 
 

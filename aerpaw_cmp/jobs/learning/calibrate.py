@@ -24,6 +24,7 @@ from ...compare.learning.correction import BIN_S
 from ...compare.learning.learning_curve import CurvePoint, learning_curve
 from ...compare.mount import GainOf
 from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
+from ...flight.learned_gain import sphere_angles
 from ...flight.lock import LOCK_FLOOR_DB
 from ...flight.settings import AntennaSettings, load_flight, load_pattern
 from ...flight.training import counted_once, flight_logs
@@ -405,8 +406,7 @@ def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
     pattern = load_pattern(settings, folder)
 
     def gain(direction: FloatArray) -> FloatArray:
-        theta = np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
-        e_theta, e_phi = pattern.field(theta, np.arctan2(direction[:, 1], direction[:, 0]))
+        e_theta, e_phi = pattern.field(*sphere_angles(direction))
         power = np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2
         return np.asarray(10.0 * np.log10(np.maximum(power, 1e-6)))
 

@@ -15,6 +15,7 @@ from ...compare.direction_gain import LinkSamples
 from ...flight.data import FlightData, load_data
 from ...flight.settings import FlightFile, load_flight
 from ...flight.simulate import planned_poses
+from ...flight.track import interpolated
 from ...logs.route import read_route
 from ...maps.grid import Grid
 from ...propagation.arrays import rotation_from_aircraft
@@ -265,7 +266,7 @@ def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
         count = max(int(along[-1] / STEP_M) + 1, 2) if along[-1] > 0 else 1
         at = np.linspace(0.0, along[-1], count)
         leg = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(position) - 1)
-        position = np.stack([np.interp(at, along, position[:, i]) for i in range(3)], axis=-1)
+        position = interpolated(at, along, position)
         yaw, time = yaw[leg], at / SPEED_MPS
         remarks += (f"Points every {STEP_M:g} m; times by a speed of {SPEED_MPS:g} m/s.",)
     return Targets(kind="route", name=where.stem, position_m=position, yaw_deg=yaw, time_s=time, remarks=remarks)

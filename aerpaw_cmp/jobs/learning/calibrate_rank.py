@@ -114,7 +114,7 @@ class FittedReceiver:
     trained_on: tuple[str, ...] = ()
     """SHA-256 of their logs: no score there is worth anything; receivers of 0.3 have none."""
     marks: tuple[str, ...] = ()
-    """Some of their reports; receivers of 0.7 and before have none."""
+    """Some of their reports; receivers of 0.3 have none."""
     mixture: receiver.ReceiverMixture
     timing: Timing = Timing()
 

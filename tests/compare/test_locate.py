@@ -82,10 +82,10 @@ def test_a_median_is_below_the_floor_where_most_samples_are() -> None:
 def _flights(count: int, floor_db: float) -> Iterator[tuple[LevelTrack, FloatArray]]:
     """Flights drawn from the model, and where the node truly stood: away from where the levels say, as in the field."""
     random = np.random.default_rng(5)
-    time, position = _lawnmower(75)
+    time, position = _lawnmower(40)
     for _ in range(count):
         seen = np.array([*random.uniform(-200.0, 200.0, 2), 1.5])
-        blank = LevelTrack(time, position, np.array([-60.0, -60.0]).repeat([1, 74]))
+        blank = LevelTrack(time, position, np.array([-60.0, -60.0]).repeat([1, 39]))
         mean, cover = _prior(blank, seen)
         cover = cover - 100.0**2 + 10.0**2  # the level at 100 m is free: 10 dB are enough
         level = np.maximum(random.multivariate_normal(mean, cover), floor_db)

@@ -4,7 +4,6 @@ import json
 import os
 import resource
 import signal
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.jobs.mapping import coverage_map as mapping
@@ -232,18 +232,16 @@ def test_without_zarr_the_message_says_how_to_get_it(tmp_path, monkeypatch):
         make(tmp_path / "map.zarr")
 
 
-def test_the_command_in_tiles(tmp_path):
+def test_the_command_in_tiles(tmp_path, monkeypatch, capsys, blank_pictures):
+    monkeypatch.chdir(tmp_path)
     words = ["--spacing", "240", "--tile-m", "600", "--foliage", "none"]
-    words += ["--rss-altitude", "30", "--rank-altitude", "30"]
-    command = [sys.executable, "-m", "aerpaw_cmp", "map", SITE, "-o", "out", *words]
-    first = subprocess.run([*command, "--json"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert first.returncode == 0, first.stderr
-    tiles = json.loads(first.stdout)["tiles"]
+    command = ["map", SITE, "-o", "out", *words, "--rss-altitude", "30", "--rank-altitude", "30"]
+    assert main([*command, "--json"]) == 0
+    tiles = json.loads(capsys.readouterr().out)["tiles"]
     assert (tiles["store"], tiles["tiles"], tiles["shown_every"]) == ("out.zarr", 8, 1)
     assert (tmp_path / "out" / "map.html").is_file()
-    other = subprocess.run([*command, "-k", "5"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert other.returncode == 2
-    assert "another job: ks" in other.stderr
+    assert main([*command, "-k", "5"]) == 2
+    assert "another job: ks" in capsys.readouterr().err
     assert (tmp_path / "out" / "map.html").is_file()
 
 

@@ -191,7 +191,12 @@ def _kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
 
     if term.frame == "pair":
         return term.sd_db**2 * gaussian_kernel(at, to, term.length)
-    return np.asarray(term.sd_db**2 * np.exp(cdist(at, to) / -term.length))
+    # in place: these matrices are most of the time of a calibration
+    kernel = np.asarray(cdist(at, to))
+    kernel /= -term.length
+    np.exp(kernel, out=kernel)
+    kernel *= term.sd_db**2
+    return kernel
 
 
 def _covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Sequence[LinkSamples]) -> FloatArray:
@@ -202,7 +207,8 @@ def _covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Seq
     out = np.zeros(same.shape)
     for term in terms:
         at, to = (np.concatenate([argument_of(s, term.frame) for s in series]) for series in (first, second))
-        out += _kernel(term, at, to) * (same if term.per == "antenna" else 1.0)
+        kernel = _kernel(term, at, to)
+        out += kernel * same if term.per == "antenna" else kernel
     return out
 
 
@@ -266,6 +272,10 @@ class GainFit:
     common_scale: float
     _weights: FloatArray = field(repr=False)
     _lower: FloatArray = field(repr=False)
+    # mean gain over the rows, by terms and antenna: every flight that is predicted asks for it
+    _zeros: dict[tuple[tuple[Term, ...], str], float] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @property
     def antennas(self) -> tuple[str, ...]:
@@ -315,8 +325,8 @@ class GainFit:
     def mean(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> FloatArray:
         """The gain of :meth:`predict` alone (n,) [dB]."""
         gain = np.full(len(samples), np.nan)
-        terms, known, rows = self._terms(frames), self._known_rows(samples), self._rows_of(samples.antenna)
-        zero = float((_covariance(terms, rows, self.rows) @ self._weights).mean())
+        terms, known = self._terms(frames), self._known_rows(samples)
+        zero = self._zero(terms, samples.antenna)
         for start in range(0, len(known), AT_ONCE):
             part = known[start : start + AT_ONCE]
             gain[part] = _covariance(terms, [samples.part(part)], self.rows) @ self._weights - zero
@@ -355,6 +365,13 @@ class GainFit:
                 f"tower and channel {antenna!r} were not fitted", expected="one of " + ", ".join(self.antennas)
             )
         return rows
+
+    def _zero(self, terms: tuple[Term, ...], antenna: str) -> float:
+        """Mean of the gain over the rows of an antenna [dB]."""
+        if (terms, antenna) not in self._zeros:
+            gain = _covariance(terms, self._rows_of(antenna), self.rows) @ self._weights
+            self._zeros[terms, antenna] = float(gain.mean())
+        return self._zeros[terms, antenna]
 
     @staticmethod
     def _known_rows(samples: LinkSamples) -> IntArray:

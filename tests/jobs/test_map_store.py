@@ -15,7 +15,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.jobs.mapping import coverage_map as mapping
-from aerpaw_cmp.jobs.tasks.workers import Here, Processes
+from aerpaw_cmp.jobs.tasks.workers import InProcess, Processes
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import RATIO_LIMIT_DB
 from aerpaw_cmp.maps.store import LEDGER
@@ -52,7 +52,7 @@ def assert_like(outcome, reference):
             np.testing.assert_allclose(getattr(maps, name), expected, atol=0.00501, err_msg=f"{mode} {name}")
 
 
-class Watched(Here):
+class Watched(InProcess):
     """Runs tasks here; ends as told after so many."""
 
     def __init__(self, ending=None, after=99):

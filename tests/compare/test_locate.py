@@ -79,13 +79,13 @@ def test_a_median_is_below_the_floor_where_most_samples_are() -> None:
     assert len(level_track([], np.zeros((0, 3)), []).level_db) == 0
 
 
-def _flights(count: int, floor_db: float) -> Iterator[tuple[LevelTrack, FloatArray]]:
+def _flights(count: int, floor_db: float, bins: int = 75) -> Iterator[tuple[LevelTrack, FloatArray]]:
     """Flights drawn from the model, and where the node truly stood: away from where the levels say, as in the field."""
     random = np.random.default_rng(5)
-    time, position = _lawnmower(40)
+    time, position = _lawnmower(bins)
     for _ in range(count):
         seen = np.array([*random.uniform(-200.0, 200.0, 2), 1.5])
-        blank = LevelTrack(time, position, np.array([-60.0, -60.0]).repeat([1, 39]))
+        blank = LevelTrack(time, position, np.array([-60.0, -60.0]).repeat([1, bins - 1]))
         mean, cover = _prior(blank, seen)
         cover = cover - 100.0**2 + 10.0**2  # the level at 100 m is free: 10 dB are enough
         level = np.maximum(random.multivariate_normal(mean, cover), floor_db)
@@ -96,7 +96,7 @@ def _flights(count: int, floor_db: float) -> Iterator[tuple[LevelTrack, FloatArr
 @pytest.mark.parametrize("floor_db", [-np.inf, -62.0])
 def test_the_region_holds_the_node_nine_times_of_ten(floor_db: float) -> None:
     inside = 0
-    for track, truth in _flights(25, floor_db):
+    for track, truth in _flights(25, floor_db, bins=40):
         estimate = locate(track)
         away = np.hypot(*(estimate.place_m[:2] - truth))
         inside += truth in estimate

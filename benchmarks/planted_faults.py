@@ -125,7 +125,7 @@ def _forget() -> None:
     foliage._last_index.clear()
 
 
-def _found(fault: Fault) -> tuple[Any, Any, str, Any, str]:
+def _target(fault: Fault) -> tuple[Any, Any, str, Any, str]:
     """Module and owner of a fault's function, its name, the function and its source.
 
     Raises
@@ -153,14 +153,14 @@ def stale() -> list[str]:
     lines = []
     for fault in FAULTS:
         try:
-            _found(fault)
+            _target(fault)
         except LookupError as error:
             lines.append(str(error))
     return lines
 
 
 def _plant(fault: Fault, undo: list[Callable[[], None]]) -> None:
-    module, owner, name, raw, source = _found(fault)
+    module, owner, name, raw, source = _target(fault)
     scope: dict[str, Any] = {}
     code = compile("from __future__ import annotations\n" + source.replace(fault.old, fault.new), fault.where, "exec")
     exec(code, module.__dict__ | {"__name__": module.__name__}, scope)

@@ -16,12 +16,12 @@ from hatchling.metadata.plugin.interface import MetadataHookInterface
 _LINK = re.compile(r"(?P<image>!?)(?P<text>\[[^\]\[]*\])\((?P<target>(?![a-z]+:|#|/)[^)\s]+)\)")
 
 
-def whole(text: str, source: str, version: str) -> str:
+def with_addresses(text: str, source: str, version: str) -> str:
     """A text in Markdown whose links into the project begin with the address of a version of it."""
 
-    def address(found: re.Match[str]) -> str:
-        kind = "raw" if found["image"] else "blob"
-        return f"{found['image']}{found['text']}({source.rstrip('/')}/{kind}/v{version}/{found['target']})"
+    def address(link: re.Match[str]) -> str:
+        kind = "raw" if link["image"] else "blob"
+        return f"{link['image']}{link['text']}({source.rstrip('/')}/{kind}/v{version}/{link['target']})"
 
     return _LINK.sub(address, text)
 
@@ -33,5 +33,5 @@ class ReadmeLinks(MetadataHookInterface):
         """Set the README, with whole addresses where the project has one."""
         text = Path(self.root, "README.md").read_text(encoding="utf-8")
         source = metadata.get("urls", {}).get("Source")
-        text = whole(text, source, metadata["version"]) if source else text
+        text = with_addresses(text, source, metadata["version"]) if source else text
         metadata["readme"] = {"content-type": "text/markdown", "text": text}

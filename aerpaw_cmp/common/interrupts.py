@@ -27,13 +27,13 @@ SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 # Undone when :func:`noted` ends: hidden places whose owner an interrupt did not let finish its first step.
 AT_END: list[Callable[[], None]] = []
 
-_came = False
+_signalled = False
 _last: int = signal.SIGINT
 
 
 def interrupted() -> bool:
     """Check whether an interrupt came since :func:`noted` began; False outside of it."""
-    return _came
+    return _signalled
 
 
 def last() -> signal.Signals:
@@ -49,7 +49,7 @@ def raise_interrupt() -> None:
     KeyboardInterrupt
         If one came.
     """
-    if _came:
+    if _signalled:
         raise KeyboardInterrupt
 
 
@@ -62,7 +62,7 @@ def noted() -> Iterator[None]:
     KeyboardInterrupt
         For whatever became of one on its way, which is its cause then.
     """
-    global _came, _last
+    global _signalled, _last
     ours = _set(SIGNALS, _note)
     if not ours:
         yield
@@ -74,14 +74,14 @@ def noted() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if not _came:
+        if not _signalled:
             raise
         raise KeyboardInterrupt from error
     finally:
         _set(SIGNALS, signal.SIG_IGN, _note)
         while AT_END:
             AT_END.pop()()
-        _came = False
+        _signalled = False
         sys.unraisablehook = previous
         for number, before in ours:
             signal.signal(number, before)
@@ -99,8 +99,8 @@ def _set(numbers: tuple[int, ...], handler: _Handler, *untouched: _Handler) -> l
 
 
 def _note(number: int, _frame: FrameType | None) -> None:
-    global _came, _last
-    _came, _last = True, number
+    global _signalled, _last
+    _signalled, _last = True, number
     raise KeyboardInterrupt
 
 

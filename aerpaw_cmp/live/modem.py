@@ -449,7 +449,7 @@ _PERSONAL = re.compile(
     r"|\+\d{7,}"  # international number
     r"|\d{10,}F?"  # IMEI, IMSI, ICCID, national number; cell identities have at most 9 hex digits
 )
-_WHOLE = re.compile(
+_PRIVATE_ANSWER = re.compile(
     r"\+(CNUM|CLIP|CMT|CMGR|CMGL|CDS|CUSD|COLP|CLCC|CBM|CIMI|CGSN|GSN|QCCID|CCID|ICCID|EGMR|CPBR|CSCA)\b"
 )
 _MESSAGE_FOLLOWS = re.compile(r"\+(CMT|CMGR|CMGL|CDS|CBM):")
@@ -478,7 +478,7 @@ class Redactor:
             self.count += 1
             return "<redacted message>"
         self._message_follows = _MESSAGE_FOLLOWS.search(text) is not None
-        private = _WHOLE.search(text)
+        private = _PRIVATE_ANSWER.search(text)
         if private:
             self.count += 1
             return text[: private.end()] + ": <redacted>"

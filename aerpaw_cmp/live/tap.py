@@ -100,7 +100,7 @@ class Tap:
         self._schedule = Schedule(periods)
         self._port: SerialPort | None = None
         self._info: PortInfo | None = None
-        self._heard: bytearray | None = None
+        self._first_bytes: bytearray | None = None
         self._early: list[Record] = []
         self._received = 0
         self._log_open = False
@@ -292,13 +292,13 @@ class Tap:
         self._leave_framer()
         self._framer = Framer()
         self._port = SerialPort.open(info.path)
-        self._heard = bytearray()
+        self._first_bytes = bytearray()
         try:
             # the second probe only where the first gets no answer
             if not any(self._probe() for _ in range(2)):
-                raise not_a_modem(info.path, bytes(self._heard))
+                raise not_a_modem(info.path, bytes(self._first_bytes))
         finally:
-            self._heard = None
+            self._first_bytes = None
         self._info = info
         self._last_final_ns = self._last_csi_ns = self._clock.mono_ns()
 
@@ -470,8 +470,8 @@ class Tap:
         assert self._port is not None
         data = self._port.read()
         self._received += len(data)
-        if self._heard is not None:
-            self._heard += data[: 4096 - len(self._heard)]
+        if self._first_bytes is not None:
+            self._first_bytes += data[: 4096 - len(self._first_bytes)]
         answer = None
         for event in self._framer.feed(data):
             if isinstance(event, Answer):

@@ -173,7 +173,7 @@ class Rejects:
 
     def __init__(self) -> None:
         self.before = 0  # lines of the pieces in front of this one
-        self._kept: list[RejectedLine] = []
+        self._first_lines: list[RejectedLine] = []
         self._reasons: dict[str, RejectedReason] = {}
 
     def add(self, lines: Lines, numbers: Sequence[int] | IntArray, reason: str) -> None:
@@ -182,15 +182,17 @@ class Rejects:
             return
         low, high = int(min(numbers)) + self.before + 1, int(max(numbers)) + self.before + 1
         self._count(reason, len(numbers), low, high)
-        if len(self._kept) < 4 * KEPT_REJECTED:  # more come in the order of the file, but for the reasons of a piece
+        if (
+            len(self._first_lines) < 4 * KEPT_REJECTED
+        ):  # more come in the order of the file, but for the reasons of a piece
             for i in sorted(numbers)[:KEPT_REJECTED]:
-                self._kept.append(RejectedLine(int(i) + self.before + 1, reason, lines.text(int(i))))
+                self._first_lines.append(RejectedLine(int(i) + self.before + 1, reason, lines.text(int(i))))
 
     def add_line(self, number: int, reason: str, text: str) -> None:
         """A line by its number from 1."""
         self._count(reason, 1, number, number)
-        if len(self._kept) < 8 * KEPT_REJECTED:
-            self._kept.append(RejectedLine(number, reason, text))
+        if len(self._first_lines) < 8 * KEPT_REJECTED:
+            self._first_lines.append(RejectedLine(number, reason, text))
 
     def _count(self, reason: str, count: int, low: int, high: int) -> None:
         old = self._reasons.get(reason, RejectedReason(reason, 0, low, high))
@@ -198,7 +200,7 @@ class Rejects:
 
     def result(self) -> tuple[tuple[RejectedLine, ...], tuple[RejectedReason, ...]]:
         """The first of them in the order of the file, and the reasons."""
-        ordered = sorted(self._kept, key=lambda line: line.number)[:KEPT_REJECTED]
+        ordered = sorted(self._first_lines, key=lambda line: line.number)[:KEPT_REJECTED]
         return tuple(ordered), tuple(sorted(self._reasons.values(), key=lambda item: item.first))
 
 

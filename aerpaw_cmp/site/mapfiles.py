@@ -279,7 +279,7 @@ def _osm_elements(root: ElementTree.Element) -> Iterator[dict[str, Any]]:
     for item in root:
         element: dict[str, Any] = {
             "type": _plain(item.tag),
-            **{key: item.get(key) for key in _KEPT if key in item.attrib},
+            **{key: item.get(key) for key in _ATTRIBUTES if key in item.attrib},
         }
         element["tags"] = {tag.get("k", ""): tag.get("v", "") for tag in _named(item, "tag")}
         if element["type"] == "way":
@@ -289,7 +289,7 @@ def _osm_elements(root: ElementTree.Element) -> Iterator[dict[str, Any]]:
         yield element
 
 
-_KEPT = {"id", "lat", "lon", "visible", "action"}
+_ATTRIBUTES = {"id", "lat", "lon", "visible", "action"}
 
 
 def _named(root: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:

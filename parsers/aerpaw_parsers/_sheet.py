@@ -42,7 +42,7 @@ _READ_IN = {
     "dB": {"db": 1.0},
     "dBm": {"dbm": 1.0},
 }  # fmt: skip
-_FACTORS = {written: (unit, one) for unit, many in _READ_IN.items() for written, one in many.items()}
+_FACTORS = {written: (unit, factor) for unit, units in _READ_IN.items() for written, factor in units.items()}
 
 IsHeader = Callable[[list[str]], bool]
 

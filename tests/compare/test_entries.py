@@ -11,12 +11,12 @@ from aerpaw_cmp.compare.entries import LevelSeries, crps_normal, intervals, leve
 from aerpaw_cmp.compare.statistics import bootstrap_means
 
 RNG = np.random.default_rng(2)
-ONE = LevelSeries(
-    name="one", time_s=np.arange(60) * 2.0, measured_db=RNG.normal(-70, 6, 60), level_db=RNG.normal(-72, 3, 60),
+LONG = LevelSeries(
+    name="long", time_s=np.arange(60) * 2.0, measured_db=RNG.normal(-70, 6, 60), level_db=RNG.normal(-72, 3, 60),
     sd_db=RNG.uniform(2.0, 9.0, 60),
 )  # fmt: skip
-TWO = LevelSeries(
-    name="two", time_s=np.arange(25) * 1.5, measured_db=RNG.normal(-60, 4, 25), level_db=np.full(25, -61.0)
+SHORT = LevelSeries(
+    name="short", time_s=np.arange(25) * 1.5, measured_db=RNG.normal(-60, 4, 25), level_db=np.full(25, -61.0)
 )
 
 
@@ -29,10 +29,10 @@ def test_the_crps_is_the_area_between_the_forecast_and_the_step(error: float) ->
 
 @pytest.mark.parametrize("own", [True, False])
 def test_scores_are_those_by_hand(own: bool) -> None:
-    series = dataclasses.replace(ONE, own_offset=own)
-    scores, sd = level_scores([series]), ONE.sd_db
+    series = dataclasses.replace(LONG, own_offset=own)
+    scores, sd = level_scores([series]), LONG.sd_db
     assert sd is not None
-    plain = ONE.measured_db - ONE.level_db
+    plain = LONG.measured_db - LONG.level_db
     error = plain - plain.mean() if own else plain
     assert scores["rmse_db"] == pytest.approx(np.sqrt(np.mean(error**2)))
     assert scores["bias_db"] == pytest.approx(abs(plain.mean()))
@@ -40,8 +40,8 @@ def test_scores_are_those_by_hand(own: bool) -> None:
     assert scores["log_score"] == pytest.approx(-np.mean(norm.logpdf(error, 0.0, sd)))
     assert scores["coverage_90"] == pytest.approx(np.mean(np.abs(error) <= 1.644854 * sd))
     assert scores["n"] == 60.0
-    both = level_scores([series, TWO])
-    assert both["rmse_db"] == pytest.approx((scores["rmse_db"] + TWO.error_db.std()) / 2)
+    both = level_scores([series, SHORT])
+    assert both["rmse_db"] == pytest.approx((scores["rmse_db"] + SHORT.error_db.std()) / 2)
     assert both["n"] == 85.0
     assert np.isnan(both["crps_db"])
     fast = np.tile([3.0, -3.0], 400)  # a tenth of a second: gone in the mean of four seconds
@@ -53,22 +53,22 @@ def test_scores_are_those_by_hand(own: bool) -> None:
 
 
 def test_intervals_are_those_of_blocks_of_twenty_seconds() -> None:
-    assert (ONE.block, TWO.block) == (10, 13)  # 20 s at 2 s and at 1.5 s a sample
-    assert dataclasses.replace(ONE, time_s=np.zeros(60)).block == 1
-    assert dataclasses.replace(ONE, time_s=np.arange(60) * 0.1).block == 60
+    assert (LONG.block, SHORT.block) == (10, 13)  # 20 s at 2 s and at 1.5 s a sample
+    assert dataclasses.replace(LONG, time_s=np.zeros(60)).block == 1
+    assert dataclasses.replace(LONG, time_s=np.arange(60) * 0.1).block == 60
     total = np.zeros(2000)
-    for series, block, own in ((ONE, 10, True), (TWO, 13, True)):
+    for series, block, own in ((LONG, 10, True), (SHORT, 13, True)):
         error = series.error_db
         drawn = bootstrap_means(
-            np.column_stack([error, error**2]), block, replicates=2000, seed=20240715 + (series is TWO)
+            np.column_stack([error, error**2]), block, replicates=2000, seed=20240715 + (series is SHORT)
         )
         total += np.sqrt(drawn[:, 1] - own * drawn[:, 0] ** 2) / 2
-    np.testing.assert_allclose(rmse_replicates([ONE, TWO]), total)
-    free = dataclasses.replace(ONE, own_offset=False)
+    np.testing.assert_allclose(rmse_replicates([LONG, SHORT]), total)
+    free = dataclasses.replace(LONG, own_offset=False)
     error = free.error_db
     drawn = bootstrap_means(error[:, None] ** 2, 10, replicates=2000, seed=20240715)[:, 0]
     np.testing.assert_allclose(rmse_replicates([free]), np.sqrt(drawn))
-    worse = dataclasses.replace(ONE, level_db=ONE.measured_db + 2.0 * (ONE.level_db - ONE.measured_db))
-    ends = intervals([worse], {"base": [ONE]})
-    assert ends["rmse_ci95_db"] == pytest.approx(np.quantile(2.0 * rmse_replicates([ONE]), [0.025, 0.975]))
-    assert ends["difference_to_base_ci95_db"] == pytest.approx(np.quantile(rmse_replicates([ONE]), [0.025, 0.975]))
+    worse = dataclasses.replace(LONG, level_db=LONG.measured_db + 2.0 * (LONG.level_db - LONG.measured_db))
+    ends = intervals([worse], {"base": [LONG]})
+    assert ends["rmse_ci95_db"] == pytest.approx(np.quantile(2.0 * rmse_replicates([LONG]), [0.025, 0.975]))
+    assert ends["difference_to_base_ci95_db"] == pytest.approx(np.quantile(rmse_replicates([LONG]), [0.025, 0.975]))

@@ -291,6 +291,8 @@ def test_an_antenna_beats_every_wrong_frame_and_a_place_loses_to_one(causes: str
 
 
 if __name__ == "__main__":
-    for one in KINDS:
-        named, wrongly, words = shares(one, 200)
-        sys.stdout.write(f"{one.__name__:12} named {named:.1%}, accused {wrongly:.1%}, against the interval {words}\n")
+    for trouble in KINDS:
+        named, wrongly, words = shares(trouble, 200)
+        sys.stdout.write(
+            f"{trouble.__name__:12} named {named:.1%}, accused {wrongly:.1%}, against the interval {words}\n"
+        )

@@ -35,7 +35,7 @@ def logs(tmp_path: Path) -> Path:
     return tmp_path / "logs"
 
 
-def _grow(path: Path) -> None:
+def _lengthen(path: Path) -> None:
     """Other bytes, the same records."""
     path.write_bytes(path.read_bytes() + b"\n")
 
@@ -138,9 +138,9 @@ def test_a_name_that_is_no_text_is_left_out(logs: Path, capsys: pytest.CaptureFi
 def test_one_record_of_each_channel_and_rank(logs: Path) -> None:
     for name in ("copy_of_USRP1_power_log.txt", "USRP1_again_power_log.txt"):
         shutil.copy(logs / "LW1/USRP1_power_log.txt", logs / "LW1" / name)
-    _grow(logs / "LW1/USRP1_again_power_log.txt")
+    _lengthen(logs / "LW1/USRP1_again_power_log.txt")
     shutil.copy(next(logs.glob("UAV/*vehicleOut.txt")), logs / "UAV/z_vehicleOut.txt")
-    _grow(logs / "UAV/z_vehicleOut.txt")
+    _lengthen(logs / "UAV/z_vehicleOut.txt")
     text, remarks = draft(ingest(logs, options=OPTIONS), logs, DraftOptions(timezone=ZONE))
     left = [remark for remark in remarks if remark.startswith("left out: ")]
     assert len(left) == 3

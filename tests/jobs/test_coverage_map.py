@@ -147,7 +147,7 @@ def test_modes_share_one_search_and_nothing_is_kept(site):
     position = np.array([[20.0, 20.0, 30.0]])
     for mode in mapping.FOLIAGE:
         channels.of(mode)(position, ("A", "B"))
-    assert not channels._kept
+    assert not channels._ready
 
 
 def test_heights_are_above_the_ground_of_the_elevation_model():

@@ -158,13 +158,13 @@ CASES |= {
     ),
 }
 
-TWO = "[2025-03-02 10:00:{s:02d}.000000] {text}\n"
+STAMPED = "[2025-03-02 10:00:{s:02d}.000000] {text}\n"
 CASES |= {
     "two UEs of an OAI gNB": Case(
         "oai.log",
         "".join(
-            TWO.format(s=s, text=f"[NR_MAC] UE {ue}: CQI {15 - s}, RI {ri}, PMI (14,1)")
-            + TWO.format(s=s, text=f"UE RNTI {ue} CU-UE-ID 1 in-sync PH 0 dB average RSRP {rsrp - s} (16 meas)")
+            STAMPED.format(s=s, text=f"[NR_MAC] UE {ue}: CQI {15 - s}, RI {ri}, PMI (14,1)")
+            + STAMPED.format(s=s, text=f"UE RNTI {ue} CU-UE-ID 1 in-sync PH 0 dB average RSRP {rsrp - s} (16 meas)")
             for s in (1, 2)
             for ue, ri, rsrp in (("1f4d", 2, -78), ("2a3b", 1, -98))
         ),
@@ -178,9 +178,11 @@ CASES |= {
     ),
     "two UEs of srsENB": Case(
         "x_radio_enb_log.txt",
-        TWO.format(s=0, text="rat rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch pucch phr mcs brate ok nok (%) bsr")
+        STAMPED.format(
+            s=0, text="rat rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch pucch phr mcs brate ok nok (%) bsr"
+        )
         + "".join(
-            TWO.format(s=s, text=f"lte {ue}   11   {ri}    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k")
+            STAMPED.format(s=s, text=f"lte {ue}   11   {ri}    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k")
             for s in (1, 2)
             for ue, ri in (("46", 2), ("47", 1))
         ),
@@ -189,9 +191,11 @@ CASES |= {
     ),
     "one UE of srsENB that attaches again": Case(
         "x_radio_enb_log.txt",
-        TWO.format(s=0, text="rat rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch pucch phr mcs brate ok nok (%) bsr")
+        STAMPED.format(
+            s=0, text="rat rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch pucch phr mcs brate ok nok (%) bsr"
+        )
         + "".join(
-            TWO.format(s=s, text=f"lte {ue}   11   2    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k")
+            STAMPED.format(s=s, text=f"lte {ue}   11   2    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k")
             for s, ue in ((1, 46), (2, 46), (3, 47))
         ),
         {"srsenb": {"time": [1, 2, 3], "rank": [2, 2, 2], "rnti": [0x46, 0x46, 0x47]}},
@@ -423,14 +427,14 @@ CASES |= {
     "OAI's newest layout": Case(
         "oai.log",
         "".join(
-            TWO.format(
+            STAMPED.format(
                 s=s,
                 text="UE RNTI 2460 CU-UE-ID 2 in-sync PH 28 dB PCMAX 24 dBm, average RSRP -74 (8 meas), average SINR 40.0",
             )
-            + TWO.format(
+            + STAMPED.format(
                 s=s, text="UE 2460: dlsch_rounds 9/5/1/0, dlsch_errors 2, BLER 0.19557 MCS (1) 23 (Qm 8) CCE fail 3"
             )
-            + TWO.format(s=s, text=f"UE 2460: CSI [CQI {16 - s} RI {s} PMI (14,1)] SRS [UL-RI 2 TPMI 0]")
+            + STAMPED.format(s=s, text=f"UE 2460: CSI [CQI {16 - s} RI {s} PMI (14,1)] SRS [UL-RI 2 TPMI 0]")
             for s in (1, 2)
         ),
         {"oai": {"time": [1, 2], "rank": [1, 2], "cqi": [15, 14]}, "nr_rsrp": {"rss_db": [-74, -74]}},
@@ -460,9 +464,11 @@ CASES |= {
     ),
     "srsUE: two carriers share a PCI": Case(
         "x_radio_log.txt",
-        TWO.format(s=0, text=" cc  pci  rsrp   pl   cfo | mcs  snr  iter  brate  bler  ta_us | mcs   buff  brate  bler")
+        STAMPED.format(
+            s=0, text=" cc  pci  rsrp   pl   cfo | mcs  snr  iter  brate  bler  ta_us | mcs   buff  brate  bler"
+        )
         + "".join(
-            TWO.format(s=s, text=UE.format(pci=1, level=level).replace("   0 ", f"   {cc} ", 1))
+            STAMPED.format(s=s, text=UE.format(pci=1, level=level).replace("   0 ", f"   {cc} ", 1))
             for s in (1, 2)
             for cc, level in ((0, -60 - s), (1, -70 - s))
         ),
@@ -471,8 +477,10 @@ CASES |= {
     ),
     "srsUE of srsLTE, before 2020": Case(
         "x_radio_log.txt",
-        TWO.format(s=0, text="cc  rsrp    pl    cfo   mcs   snr turbo  brate   bler   ta_us  mcs   buff  brate   bler")
-        + TWO.format(
+        STAMPED.format(
+            s=0, text="cc  rsrp    pl    cfo   mcs   snr turbo  brate   bler   ta_us  mcs   buff  brate   bler"
+        )
+        + STAMPED.format(
             s=1, text=" 0   -77    78   1.2k    24    33  0.84   5.8M     0%   0.0    18   193k   624k     0%"
         ),
         {"lte_rsrp": {"time": [1], "rss_db": [-77], "sinr_db": [33], "pathloss_db": [78]}},
@@ -480,8 +488,8 @@ CASES |= {
     ),
     "srsENB of srsLTE, before 2020": Case(
         "x_radio_enb_log.txt",
-        TWO.format(s=0, text="rnti  cqi    ri   mcs  brate   bler   snr   phr   mcs  brate   bler    bsr")
-        + TWO.format(s=1, text="  46  15.0     2  27.5   1.2M     0%  33.1  40.0  22.9   624k     0%    0.0"),
+        STAMPED.format(s=0, text="rnti  cqi    ri   mcs  brate   bler   snr   phr   mcs  brate   bler    bsr")
+        + STAMPED.format(s=1, text="  46  15.0     2  27.5   1.2M     0%  33.1  40.0  22.9   624k     0%    0.0"),
         {"srsenb": {"time": [1], "rank": [2], "cqi": [15]}},
         "srsenb_log",
     ),

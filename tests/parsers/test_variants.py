@@ -13,8 +13,8 @@ from tests.parsers.samples import BINARY, NEMO_CSV, OPTIONS, QUECTEL_CSI, SAMPLE
 
 TEXTS = [
     (reader, name, data, accepted)
-    for reader, found in SAMPLES.items()
-    for name, (data, accepted, _) in found.items()
+    for reader, cases in SAMPLES.items()
+    for name, (data, accepted, _) in cases.items()
     if reader not in BINARY
 ]
 VARIANTS = {

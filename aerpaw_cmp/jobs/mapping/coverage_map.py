@@ -201,7 +201,7 @@ class SiteChannels:
         cast = settings.engine != "image"
         self.reach = Reach(site, budget, max_depth=settings.max_depth, every=cast, crowns=reflect)
         self.paths = self.paths_off_crowns = 0
-        self._kept: dict[tuple[str, bytes], job.Evaluation] = {}
+        self._ready: dict[tuple[str, bytes], job.Evaluation] = {}
         self._take_site(site)
 
     def _take_site(self, site: Site) -> None:
@@ -223,9 +223,9 @@ class SiteChannels:
             if towers != self.names:
                 raise ValueError(f"towers {towers} are not those of the site")
             chunk = position_m.tobytes()
-            if (mode, chunk) not in self._kept:
-                self._kept |= {(name, chunk): evaluated for name, evaluated in self._all_modes(position_m).items()}
-            return self._kept.pop((mode, chunk))
+            if (mode, chunk) not in self._ready:
+                self._ready |= {(name, chunk): evaluated for name, evaluated in self._all_modes(position_m).items()}
+            return self._ready.pop((mode, chunk))
 
         return evaluate
 

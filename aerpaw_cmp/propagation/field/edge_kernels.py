@@ -30,13 +30,13 @@ _EXTERIOR, _MATERIAL_0, _MATERIAL_N = (row * LANES for row in (15, 16, 19))
 # Rows of an element: its field along beta and phi, its place along the edge and its distance from it.
 EACH = 6 * LANES
 
-for _one in (
+for _short in (
     dyads.arctangent, wedge.transition, wedge.pole, wedge.edge_term, wedge.obliquity, wedge.matrix, wedge.coupled,
     wedge.of_wave, wedge.along_face, wedge.ground_wave, edges.dot, edges.distance, edges.unit, edges.mirrored,
     edges.round_edge, edges.element_place, edges.angle_round, edges.end_parts, edges.after_mirror,
     edges.element_parts, edges.into_face, edges.over_one, edges.over_two,
 ):  # fmt: skip
-    law(_one)
+    law(_short)
 for _long in (wedge.sector, wedge.quadrant, wedge.at_face):  # called some times each
     law(_long, inline=False)
 

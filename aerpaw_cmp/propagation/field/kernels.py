@@ -41,12 +41,12 @@ def _smaller(a, b):  # type: ignore[no-untyped-def]  # noqa: ARG001
     return lambda a, b: a if a < b else b
 
 
-for _one in (
+for _short in (
     dyads.sine_cosine, dyads.turned, dyads.turned_back, dyads.direction, dyads.slant_rotation, dyads.field_vector,
     dyads.incidence, dyads.reflected, dyads.spreading, dyads.received, fresnel.half_space, fresnel.echo, fresnel.slab,
     fresnel.returned, fresnel.reflection, fresnel.passing, fresnel.transmission,
 ):  # fmt: skip
-    law(_one)
+    law(_short)
 
 
 @kernel

@@ -112,8 +112,8 @@ def test_a_tile_that_only_the_border_of_a_beam_touches_keeps_what_stands_on_that
     link = Link(3.4e9, {"T": single_element()}, single_element())
     labels = []
     for buildings in ((wall,), reached.buildings):  # the hut takes the path away, so it had to be kept
-        found = trace(replace(site, buildings=buildings), link, [[40.0, -10.0, 10.0]], max_depth=1)
-        labels.append([found.faces.label[face] for face in found.paths.faces[:, 0] if face > 0])
+        traced = trace(replace(site, buildings=buildings), link, [[40.0, -10.0, 10.0]], max_depth=1)
+        labels.append([traced.faces.label[face] for face in traced.paths.faces[:, 0] if face > 0])
     assert [len(some) for some in labels] == [1, 0]
 
 

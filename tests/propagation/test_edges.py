@@ -99,8 +99,8 @@ def test_the_audit_allows_a_ten_thousandth_of_a_percent_unless_its_series_for_ed
         ours = trace(barn, LINK, where, diffraction=diffraction)
         for share in (0.5, 2.0):
             off = replace(ours, h=(1.0 + share * allowed) * ours.h)
-            found = against_reference(barn, where, off, np.arange(1, 2), Expected.of(LINK), ks=(10.0,), max_depth=2)
-            assert any("H differs" in failure for failure in found.failures) == (share > 1.0)
+            audit = against_reference(barn, where, off, np.arange(1, 2), Expected.of(LINK), ks=(10.0,), max_depth=2)
+            assert any("H differs" in failure for failure in audit.failures) == (share > 1.0)
 
 
 @pytest.mark.parametrize("end", ["towers", "uav"])

@@ -143,8 +143,8 @@ def test_what_comes_after_an_antenna_that_sends_nothing_loses_nothing(scenes):
     site = scenes.site()
     source, above = np.array([0.0, 0, 10]), scenes.poses([0.0, 0.0, 60.0])
     link = scenes.link(site, single_element(HalfWaveDipole()))
-    found = replay(site, link, above, Search(max_depth=1))
-    explained = explain_paths(found.paths, found.faces, source, above, link, {})
+    replayed = replay(site, link, above, Search(max_depth=1))
+    explained = explain_paths(replayed.paths, replayed.faces, source, above, link, {})
     assert [path.depth for path in explained] == [0, 1]
     for path in explained:
         assert path.terms_db.pop("tower antenna") == -math.inf

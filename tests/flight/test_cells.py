@@ -19,7 +19,7 @@ from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.report.build import report_data
 from aerpaw_cmp.report.export import metrics
 from aerpaw_cmp.report.plots import flight as figures
-from aerpaw_cmp.report.plots.flight import shown_confusion
+from aerpaw_cmp.report.plots.serving import shown_confusion
 from aerpaw_cmp.site.siteyaml import load_site
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"

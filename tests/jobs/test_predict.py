@@ -27,7 +27,7 @@ from aerpaw_cmp.jobs.prediction.where import TargetOptions, Targets, find_target
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.html import coded
-from aerpaw_cmp.report.plots.flight import against_specs
+from aerpaw_cmp.report.plots.against import against_specs
 from aerpaw_cmp.report.prediction_html import prediction_metrics, write_prediction
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted

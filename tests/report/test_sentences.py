@@ -21,7 +21,8 @@ ROOT = Path(__file__).parents[2] / "aerpaw_cmp" / "report"
 TABLE = Path(__file__).with_name("sentences.md")
 GAP = "…"
 SOURCES = {
-    "report": ("words.py", "first_screen.py", "plots/flight.py", "plots/rss.py", "plots/rank.py",
+    "report": ("words.py", "first_screen.py", "plots/flight.py", "plots/serving.py", "plots/against.py",
+               "plots/rss.py", "plots/rank.py",
                "templates/report.html.jinja", "templates/explorer.html.jinja",
                "templates/method.html.jinja", "templates/plates.html.jinja", "templates/site_view.html.jinja"),
     "map": ("maps/words.py", "maps/figures.py", "templates/map.html.jinja", "templates/map_explorer.html.jinja"),

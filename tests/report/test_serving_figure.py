@@ -8,7 +8,7 @@ import pytest
 from aerpaw_cmp.compare.serving import compare_serving
 from aerpaw_cmp.report import canvas, html
 from aerpaw_cmp.report.plots import flight as figures
-from aerpaw_cmp.report.plots.flight import confusion, serving_spec, shown_confusion
+from aerpaw_cmp.report.plots.serving import confusion, serving_spec, shown_confusion
 
 
 @pytest.fixture

@@ -1,38 +1,22 @@
-"""Figures of a report, in order, with their captions; those of serving cells and of a prediction beside the flight."""
+"""The figures of a flight's report, in order, with their captions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...common.units import AnyArray
 from ...compare.result import RankResult, RssResult
-from ...compare.serving import ServingComparison
-from ..against import Against, AgainstSeries
-from ..canvas import (
-    MEASURED,
-    POINTS_PER_CLOUD,
-    SIMULATED,
-    TOWER,
-    FigureSpec,
-    colour_bar,
-    legend_below,
-    subplots,
-    time_axis,
-)
+from ..canvas import POINTS_PER_CLOUD, FigureSpec
 from ..data import ReportData, Track
 from ..names import safe_name
 from ..words import count, learned_on
 from . import rank as rank_figures
 from . import rss as rss_figures
-from .rank import draw_counts
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from .against import against_specs
+from .serving import serving_spec
 
 
 def figure_specs(data: ReportData) -> list[FigureSpec]:
@@ -182,113 +166,3 @@ def _rank_specs(data: ReportData, panel: RankResult) -> Iterator[FigureSpec]:
             partial(rank_figures.agreement_curve, panel),
             page=False,
         )  # fmt: skip
-
-
-# --- serving cells ---------------------------------------------------------------------------------------------------
-
-# Cells with a row of their own; the others stand together.
-MOST_CELLS = 16
-
-OTHER, NONE = "others", "no path"
-
-
-def shown_confusion(serving: ServingComparison, most: int = MOST_CELLS) -> tuple[list[str], AnyArray]:
-    """Names and counts (cells, cells + 1) of a matrix that can be read; the last column: no cell predicted.
-
-    Cells that neither served nor were predicted are left out. Of more than ``most``, those of fewest samples are added
-    up as "others"; that row and column meet in hits and misses alike, so their cell has no frame.
-    """
-    counts = np.asarray(serving.confusion)
-    weight = counts.sum(axis=1) + counts[:, :-1].sum(axis=0)
-    order = [int(i) for i in np.argsort(-weight, kind="stable") if weight[i] > 0]
-    first, few = sorted(order[:most]), sorted(order[most:])
-    names = [serving.cells[i] for i in first]
-    columns = np.column_stack([counts[:, first], counts[:, few].sum(axis=1)] if few else [counts[:, first]])
-    columns = np.column_stack([columns, counts[:, -1]])
-    table = columns[first]
-    if few:
-        table, names = np.vstack([table, columns[few].sum(axis=0)]), [*names, OTHER]
-    return names, table
-
-
-def confusion(serving: ServingComparison) -> Any:
-    """Cell that served against cell predicted strongest: counts, coloured by their share of the row."""
-    names, table = shown_confusion(serving)
-    longest = max((len(name) for name in names), default=0)
-    fig, ax = subplots((min(9.2, 3.6 + 0.62 * len(names) + 0.05 * longest), 1.9 + 0.42 * len(names)))
-    image = draw_counts(ax, table.astype(np.float64))
-    for row, name in enumerate(names):
-        if name != OTHER:
-            ax.add_patch(_frame(row))
-    ax.set_xticks(range(len(names) + 1), [*names, NONE], rotation=45 if len(names) > 4 else 0,
-                  ha="right" if len(names) > 4 else "center", fontsize=8)  # fmt: skip
-    ax.set_yticks(range(len(names)), names, fontsize=8)
-    ax.set(xlabel="Cell predicted strongest", ylabel="Cell that served")
-    colour_bar(fig, image, [ax], "Share of the cell that served [%]")
-    return fig
-
-
-def _frame(place: int) -> Any:
-    """The frame of a hit."""
-    from matplotlib.patches import Rectangle
-
-    return Rectangle((place - 0.47, place - 0.46), 0.94, 0.92, fill=False, edgecolor=TOWER, linewidth=1.4)
-
-
-def serving_spec(serving: ServingComparison) -> FigureSpec:
-    """The matrix with its words."""
-    return FigureSpec(
-        "serving_confusion",
-        "serving",
-        "Which cell serves",
-        f"Counts of {count(serving.n)} samples; colour is the share of each cell that served (rows). Framed: "
-        f"the cell predicted strongest served, {100 * serving.hit_share:.0f} % of all; always naming the cell that "
-        f"served most hits {100 * serving.majority_share:.0f} %. Levels are as simulated, without offsets.",
-        lambda: confusion(serving),
-    )
-
-
-# Of the reliability plot.
-SHARES = np.arange(0.1, 1.0, 0.1)
-
-
-def against_specs(against: Against) -> Iterator[FigureSpec]:
-    """Levels over time with their intervals, then reliability and sharpness."""
-    for s in against.series:
-        yield FigureSpec(
-            f"against_{safe_name(s.name)}", "against",
-            f"{s.name}: predicted before this flight",
-            "Band: 90 % interval of one sample as it was predicted. Nothing of this flight was used.",
-            partial(_over_time, s),
-        )  # fmt: skip
-    if not against.series:
-        return
-    yield FigureSpec(
-        "against_reliability", "against", "Reliability and sharpness",
-        "Left: share of samples inside intervals of a nominal share; on the diagonal intervals hold what they say. "
-        "Right: standard deviations that were given; smaller is sharper.",
-        partial(_reliability, against),
-    )  # fmt: skip
-
-
-def _over_time(s: AgainstSeries) -> Figure:
-    fig, ax = subplots((9.2, 3.4))
-    ax.fill_between(s.time_s, s.low_db, s.high_db, color=SIMULATED, alpha=0.22, linewidth=0, label="90 %")
-    ax.plot(s.time_s, s.measured_db, ".", markersize=2, color=MEASURED, label="measured", rasterized=True)
-    ax.plot(s.time_s, s.level_db, color=SIMULATED, linewidth=1.2, label="predicted")
-    time_axis(ax, np.datetime64(0, "ns") if s.start is None else s.start)
-    ax.set_ylabel("level [dB]")
-    legend_below(ax, 3)
-    return fig
-
-
-def _reliability(against: Against) -> Figure:
-    fig, (coverage, right) = subplots((9.2, 3.6), 1, 2)
-    coverage.plot([0, 100], [0, 100], color="0.6", linewidth=1)
-    for s in against.series:
-        coverage.plot(100 * SHARES, [100 * s.coverage(share) for share in SHARES], "o-", markersize=3, label=s.name)
-        right.hist(s.sd_db, bins=30, histtype="step", label=s.name)
-    coverage.set(xlabel="nominal [%]", ylabel="observed [%]")
-    coverage.legend(fontsize=8)
-    right.set(xlabel="standard deviation of one sample [dB]", ylabel="samples")
-    return fig

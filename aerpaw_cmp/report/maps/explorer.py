@@ -20,7 +20,7 @@ from ..names import k_key
 from ..packed import NONE, PackedArrays, step_for
 from ..shapes import listed
 from .data import JOINT, MapLayer, MapsData, RankMap, RssMap, at_height
-from .figures import grouped
+from .figures import grouped, half_width
 
 # Base64 that the layers may take; beyond it layers of single towers are left out, then cells.
 MOST_BYTES = 4_000_000
@@ -213,11 +213,6 @@ def ramp(name: str, colours: int = 128) -> str:
     from matplotlib.colors import to_hex
 
     return "".join(to_hex(colour)[1:] for colour in colormaps[name](np.linspace(0.0, 1.0, colours)))
-
-
-def half_width(at_m: FloatArray) -> float:
-    """Half of the spacing of cell centres [m]; 15 where there is one cell only."""
-    return float(at_m[1] - at_m[0]) / 2 if len(at_m) > 1 else 15.0
 
 
 def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dict[str, Any]:

@@ -46,16 +46,17 @@ def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
 # --- one map ------------------------------------------------------------------------------------
 
 
+def half_width(at_m: FloatArray) -> float:
+    """Half of the spacing of cell centres [m]; 15 where there is one cell only."""
+    return float(at_m[1] - at_m[0]) / 2 if len(at_m) > 1 else 15.0
+
+
 def extent_m(data: MapsData) -> tuple[float, float, float, float]:
     """Outer edges of the grid: west, east, south, north [m]."""
-    half_east = (data.east_m[1] - data.east_m[0]) / 2 if len(data.east_m) > 1 else 15.0
-    half_north = (data.north_m[1] - data.north_m[0]) / 2 if len(data.north_m) > 1 else 15.0
-    return (
-        float(data.east_m[0] - half_east),
-        float(data.east_m[-1] + half_east),
-        float(data.north_m[0] - half_north),
-        float(data.north_m[-1] + half_north),
+    (west, east), (south, north) = (
+        (float(at[0]) - half_width(at), float(at[-1]) + half_width(at)) for at in (data.east_m, data.north_m)
     )
+    return west, east, south, north
 
 
 def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | None = None, **options: Any) -> Any:

@@ -51,6 +51,9 @@ class OffsetFit:
     at_edge: bool
 
 
+_NO_FIT = OffsetFit(float("nan"), float("nan"), 0, False)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Censored:
     """Offset where "below" is an observation too; only ``n`` = 0 where a side has no level.
@@ -169,7 +172,7 @@ def grid_offset(
     grid = offset_grid(step_db, span_db)
     difference = _difference(measured_db, simulated_db)
     if not len(difference):
-        return OffsetFit(float("nan"), float("nan"), 0, False)
+        return _NO_FIT
     mean, variance = _mean_and_variance(difference)
     best = nearest_offset(grid, mean, step_db)
     rmse = float(np.hypot(np.sqrt(variance), mean - grid[best]))
@@ -248,7 +251,7 @@ def trimmed_offset(
     difference = np.sort(_difference(measured_db, simulated_db))
     n = len(difference)
     if not n:
-        return OffsetFit(float("nan"), float("nan"), 0, False)
+        return _NO_FIT
     count = int(np.ceil(keep * n - 1e-9))
     centre = float(difference.mean())
     d = difference - centre
@@ -414,7 +417,7 @@ def pooled_moments(
     for members in groups.values():
         filled = [moments[key] for key in members if moments[key].n]
         if not filled:
-            fits |= {key: OffsetFit(float("nan"), float("nan"), 0, False) for key in members}
+            fits |= dict.fromkeys(members, _NO_FIT)
             continue
         total = sum(item.n for item in filled)
         mean = filled[0].mean_db + sum((item.mean_db - filled[0].mean_db) * (item.n / total) for item in filled)

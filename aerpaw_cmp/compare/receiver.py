@@ -229,6 +229,11 @@ def _standard(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     return x.mean(axis=-2), np.asarray(np.where(scale > 1e-9, scale, 1.0))
 
 
+def _standardised(x: FloatArray) -> FloatArray:
+    mean, scale = _standard(x)
+    return (x - mean[..., None, :]) / scale[..., None, :]
+
+
 def _design(x: FloatArray) -> FloatArray:
     return np.concatenate([np.ones((*x.shape[:-1], 1)), x], axis=-1)
 
@@ -262,8 +267,7 @@ def out_of_group(x: FloatArray, rank: IntArray, groups: IntArray, penalty: float
     (..., n, ranks)
         Probabilities; they sum to 1 over the last axis.
     """
-    mean, scale = _standard(x)
-    z = (x - mean[..., None, :]) / scale[..., None, :]
+    z = _standardised(x)
     result = np.empty((*z.shape[:-1], MAX_RANK))
     for group in np.unique(groups):
         out = groups == group
@@ -547,8 +551,7 @@ def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> flo
 
 
 def _own_losses(x: FloatArray, rank: IntArray) -> FloatArray:
-    mean, scale = _standard(x)
-    z = (x - mean[..., None, :]) / scale[..., None, :]
+    z = _standardised(x)
     weights = _fit_multinomial(z, rank, np.ones(len(rank)), CHOICE_PENALTY, steps=6)
     p = _softmax(_design(z) @ np.swapaxes(weights, -1, -2))
     return np.array([log_losses(item, rank).mean() for item in p])

@@ -18,6 +18,7 @@ from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..logs.ingest import Held, IngestedFile, ingest, read_log
 from ..logs.records import Stream
+from ..propagation.arrays import Link
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
 from .heights import at_height, lacks_height
@@ -90,11 +91,20 @@ class FlightData:
     warnings: tuple[str, ...]
     nodes: Mapping[str, Track] = field(default_factory=dict)
     """Tracks of the towers that move; ``site`` has them in the middle of their positions."""
+    _links: dict[str, Link] = field(init=False, default_factory=dict, repr=False, compare=False)
 
     @property
     def series(self) -> list[tuple[str, RssSeries | RankSeries]]:
         """Every series with the kind of what it measured, RSS first."""
         return [*(("RSS", s) for s in self.rss), *(("rank", s) for s in self.rank)]
+
+    def link_of(self, series: RssSeries | RankSeries) -> Link:
+        """The link of a series to its tower; antenna files are read once."""
+        settings = series.link if isinstance(series, RssSeries) else self.settings.link.rank
+        key = f"{series.tower} {series.settings_key if isinstance(series, RssSeries) else series.channel}"
+        if key not in self._links:
+            self._links[key] = settings.build([series.tower], self.folder)
+        return self._links[key]
 
     def poses_at(self, time: Times) -> TrackPoses:
         """Poses of the UAV at instants (n,), for a flight with a track."""

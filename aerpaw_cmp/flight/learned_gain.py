@@ -77,8 +77,8 @@ def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tupl
 
 def sphere_angles(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Zenith angle and azimuth (...,) [rad] of directions (..., 3)."""
-    forward, left, up = np.moveaxis(direction, -1, 0)
-    return np.asarray(np.arctan2(np.hypot(forward, left), up)), np.asarray(np.arctan2(left, forward))
+    x, y, z = np.moveaxis(direction, -1, 0)
+    return np.asarray(np.arctan2(np.hypot(x, y), z)), np.asarray(np.arctan2(y, x))
 
 
 def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | float:

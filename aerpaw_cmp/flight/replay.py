@@ -133,7 +133,7 @@ def replay_rss(
     rt, out = data.settings.rt, dict[int, Replayed]()
     for members in groups.values():
         tower = data.rss[members[0]].tower
-        link = data.rss[members[0]].link.build([tower], data.folder)
+        link = data.link_of(data.rss[members[0]])
         times = [telemetry_time(data.rss[i].time, shifts[i]) for i in members]
         valid, places, tracks = _towers_and_poses(data, tower, times)
         poses = [valid_poses(track, rt.attitude) for track in tracks]
@@ -257,7 +257,7 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
 
 def _along(data: FlightData, series: RssSeries, instants: Times, step_s: float) -> Along:
     """Predictors of the level of a series along the telemetry; the replay has at most one reflection."""
-    link = series.link.build([series.tower], data.folder)
+    link = data.link_of(series)
     blocks = np.array_split(instants, max(1, -(-len(instants) // BLOCK)))  # of about one size
     parts = [_levels_along(data, link, series.tower, part) for part in blocks]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -346,7 +346,7 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
     """
     out = []
     for series in data.rank:
-        link = data.settings.link.rank.build([series.tower], data.folder)
+        link = data.link_of(series)
         position, valid = rank_positions(series, data.track)
         place, known = data.tower_at(series.tower, series.time)
         valid = valid & known

@@ -149,11 +149,11 @@ def _tried_replays(data: FlightData) -> tuple[list[PlannedStage], list[PlannedSt
         track = data.track.pose_at(np.concatenate([series.time for series in members]))
         poses = Poses(track.position_m[track.valid], attitude_rotation(track, rt.attitude)[track.valid])
         name = f"replay RSS {tower} {', '.join(series.channel for series in members)}"
-        rss.append(_tried(site, rt, name, members[0].link.build([tower], data.folder), poses))
+        rss.append(_tried(site, rt, name, data.link_of(members[0]), poses))
     for item in data.rank:
         position, valid = rank_positions(item, data.track)
         rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
-        link = data.settings.link.rank.build([item.tower], data.folder)
+        link = data.link_of(item)
         rank.append(_tried(site, rt, f"replay rank {item.tower}", link, Poses(position[valid], rotation)))
     return rss, rank
 

@@ -111,7 +111,7 @@ def _replay(
     time = np.array([t.removesuffix("Z") for t in utc_texts(o.start, o.samples.time_s)], "datetime64[ns]")
     pose = data.poses_at(time)
     poses = Poses(pose.position_m, attitude_rotation(pose, data.settings.rt.attitude))
-    replayed = trace(data.site, series.link.build([series.tower], data.folder), poses, engine, **options)
+    replayed = trace(data.site, data.link_of(series), poses, engine, **options)
     gain_db = getattr(replayed, level)[:, 0] - o.free_space_db
     return np.asarray(np.where(np.isfinite(gain_db), gain_db, np.nanmean(gain_db)))
 

@@ -218,7 +218,7 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
     low = data.settings.rank.minimum_height_m
     with np.errstate(invalid="ignore"):
         keep = valid if low is None else valid & (position[:, 2] >= low)
-    link = data.settings.link.rank.build([series.tower], data.folder)
+    link = data.link_of(series)
     ports = {len(link.uav_array), len(link.tower_arrays[series.tower])}
     if series.tower in data.nodes:
         raise UsageError(

@@ -220,8 +220,8 @@ def _pose(
                 notes.append(f"{clock.applied_s[at]:.3f} s are taken off the radio's clock")
         track = data.poses_at(time[at : at + 1])
         _check_pose(track.valid, series, at)
-        return series.link.build([series.tower], data.folder), valid_poses(track, rt.attitude), notes, time[at : at + 1]
-    link = data.settings.link.rank.build([series.tower], data.folder)
+        return data.link_of(series), valid_poses(track, rt.attitude), notes, time[at : at + 1]
+    link = data.link_of(series)
     position, valid = rank_positions(series, data.track)
     _check_pose(valid[at : at + 1], series, at)
     rotation: FloatArray = np.eye(3)[None]

@@ -22,13 +22,19 @@ VERBS = {name: command for name, command in PROGRAM.commands.items() if not hasa
 VERBS |= {f"site {name}": command for name, command in PROGRAM.commands["site"].commands.items()}
 
 
-@pytest.mark.parametrize("name", VERBS)
+OUTPUTS = {name: option for name, verb in VERBS.items() for option in verb.params if "-o" in option.opts}
+
+
+def test_what_writes_has_an_output_option() -> None:
+    assert set(OUTPUTS) >= {"report", "ingest", "calibrate", "campaign", "map", "simulate", "site import"}
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
 def test_the_output_option_says_what_it_takes_and_its_default(name: str) -> None:
-    for option in VERBS[name].params:
-        if "-o" in option.opts:
-            assert "--out" in option.opts
-            assert option.metavar in ("DIR", "FILE")
-            assert option.required or option.default is not None or "[default: " in option.help
+    option = OUTPUTS[name]
+    assert "--out" in option.opts
+    assert option.metavar in ("DIR", "FILE")
+    assert option.required or option.default is not None or "[default: " in option.help
 
 
 WITHOUT_INPUT = {"bench", "doctor", "formats", "sample", "site", "tap", "modem-sim"}

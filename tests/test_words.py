@@ -91,7 +91,9 @@ def options(group: Any, name: str = "") -> Iterator[tuple[str, str]]:
 
 
 def test_help_of_an_option_is_a_noun_phrase_with_its_default_in_brackets() -> None:
-    for name, text in options(typer.main.get_command(app)):
+    texts = list(options(typer.main.get_command(app)))
+    assert len(texts) > 100
+    for name, text in texts:
         assert not re.match(r"What|Whose|Which|Whether|Of |Only say|In place", text), (name, text)
         assert "may be repeated" not in text, name
         assert not re.search(r"(?<!\[)\b[Dd]efault:", text), (name, text)

@@ -192,6 +192,7 @@ def test_mounts_are_found_together():
     gains = {k: (lambda d, a=a: pattern(d @ turn(a, 0.0, 0.0))) for k, a in truth.items()}
     flights = [s for k in range(2) for s in planted(f"f{k}", 50 + k, gains)]
     mounts = fit_mounts(flights, {"uav": pattern, "LW1.A": pattern, "LW1.B": pattern}, turn)
+    assert set(mounts) == {"uav", "LW1.A", "LW1.B"}
     for name, fit in mounts.items():
         true = truth[name.removeprefix("LW1.")]
         assert abs((fit.azimuth_deg - true + 180) % 360 - 180) <= 10

@@ -225,10 +225,10 @@ def test_predicted_ranks_are_scored_where_they_were_flown(said, levels):
 def test_a_prediction_that_learned_from_the_flight_is_refused(said):
     data, folder = said
     about = json.loads((folder / "metrics.json").read_text())
-    for digest in (f.sha256 for f in data.files if f.path.endswith("LW1/USRP1_power_log.txt")):
-        (folder / "metrics.json").write_text(json.dumps({**about, "trained_on": [digest]}))
-        with pytest.raises(UsageError, match="this flight's own log"):
-            score_against(data, folder)
+    (digest,) = (f.sha256 for f in data.files if f.path.endswith("LW1/USRP1_power_log.txt"))
+    (folder / "metrics.json").write_text(json.dumps({**about, "trained_on": [digest]}))
+    with pytest.raises(UsageError, match="this flight's own log"):
+        score_against(data, folder)
 
 
 def test_a_prediction_of_another_place_is_no_score(said):

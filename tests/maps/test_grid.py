@@ -69,10 +69,16 @@ def test_nearest_tower_serves_and_ties_go_to_the_first():
 def test_borders_part_the_serving_areas(places):
     """On a border its two towers are equally near and none is nearer; a step to each side changes the server."""
     towers = np.array(places, dtype=float)
-    for border in voronoi_borders(towers, AREA):
+    borders = voronoi_borders(towers, AREA)
+    assert borders, "all towers stand in the area"
+    for border in borders:
         a, b = border.towers
+        along = border.line_m[1] - border.line_m[0]
+        across = 1e-6 * np.linalg.norm(along) * (towers[b] - towers[a]) / np.linalg.norm(towers[b] - towers[a])
         for share in (0.1, 0.5, 0.9):
-            point = border.line_m[0] + share * (border.line_m[1] - border.line_m[0])
+            point = border.line_m[0] + share * along
+            servers = [np.hypot(*(towers - point - side * across).T).argmin() for side in (-1, 1)]
+            assert servers == [a, b]
             far = np.hypot(*(towers - point).T)
             assert far[a] == pytest.approx(far[b], rel=1e-9, abs=1e-6)
             assert far.min() == pytest.approx(far[a], rel=1e-9, abs=1e-6)

@@ -159,6 +159,16 @@ CASES |= {
 }
 
 STAMPED = "[2025-03-02 10:00:{s:02d}.000000] {text}\n"
+
+
+def srsenb(*rows: tuple[int, str, int]) -> str:
+    """srsENB's console: seconds, UE and rank of each row."""
+    head = "rat rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch pucch phr mcs brate ok nok (%) bsr"
+    row = "lte {ue}   11   {ri}    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k"
+    texts = [(0, head), *((s, row.format(ue=ue, ri=ri)) for s, ue, ri in rows)]
+    return "".join(STAMPED.format(s=s, text=text) for s, text in texts)
+
+
 CASES |= {
     "two UEs of an OAI gNB": Case(
         "oai.log",
@@ -178,26 +188,13 @@ CASES |= {
     ),
     "two UEs of srsENB": Case(
         "x_radio_enb_log.txt",
-        STAMPED.format(
-            s=0, text="rat rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch pucch phr mcs brate ok nok (%) bsr"
-        )
-        + "".join(
-            STAMPED.format(s=s, text=f"lte {ue}   11   {ri}    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k")
-            for s in (1, 2)
-            for ue, ri in (("46", 2), ("47", 1))
-        ),
+        srsenb((1, "46", 2), (1, "47", 1), (2, "46", 2), (2, "47", 1)),
         {"srsenb_rnti0046": {"time": [1, 2], "rank": [2, 2]}, "srsenb_rnti0047": {"time": [1, 2], "rank": [1, 1]}},
         "srsenb_log",
     ),
     "one UE of srsENB that attaches again": Case(
         "x_radio_enb_log.txt",
-        STAMPED.format(
-            s=0, text="rat rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch pucch phr mcs brate ok nok (%) bsr"
-        )
-        + "".join(
-            STAMPED.format(s=s, text=f"lte {ue}   11   2    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k")
-            for s, ue in ((1, 46), (2, 46), (3, 47))
-        ),
+        srsenb((1, "46", 2), (2, "46", 2), (3, "47", 2)),
         {"srsenb": {"time": [1, 2, 3], "rank": [2, 2, 2], "rnti": [0x46, 0x46, 0x47]}},
         "srsenb_log",
     ),

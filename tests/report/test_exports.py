@@ -339,7 +339,9 @@ def test_same_flight_same_kmz(data, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         formats.write_exports(points.of_report(data), tmp_path / name, ["kmz", "geojson"])
-    for path in sorted((tmp_path / "a" / "exports").iterdir()):
+    files = sorted((tmp_path / "a" / "exports").iterdir())
+    assert {path.suffix for path in files} == {".kmz", ".geojson"}
+    for path in files:
         assert path.read_bytes() == (tmp_path / "b" / "exports" / path.name).read_bytes()
 
 

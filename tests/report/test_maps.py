@@ -38,7 +38,9 @@ def test_files(few_maps, tmp_path):
 
 
 def test_every_map_figure_has_units_and_a_legend(few_maps):
-    for spec in maps_figures.figure_specs(few_maps):
+    specs = list(maps_figures.figure_specs(few_maps))
+    assert len(specs) > 3
+    for spec in specs:
         with canvas.style():
             fig = spec.draw()
         labels = [ax.get_xlabel() + ax.get_ylabel() for ax in fig.axes]
@@ -71,10 +73,13 @@ def test_cdf_counts_positions_out_of_coverage_as_below(maps_data):
     maps = [m for m in maps_data.rss if m.antennas == "SISO"]
     with canvas.style():
         fig = maps_figures.cdfs(maps)
-    lines = fig.axes[0].get_lines()
-    for line, layer in zip(lines, maps, strict=False):
-        assert line.get_ydata()[0] == pytest.approx(1 - layer.coverage, abs=2 / layer.rss_dbm.size)
-        assert line.get_ydata()[-1] == 1.0
+    heights = sorted({layer.altitude_m for layer in maps})
+    assert len(heights) > 1
+    for ax, height in zip(fig.axes, heights, strict=True):
+        layers = [layer for layer in maps if layer.altitude_m == height]
+        for line, layer in zip(ax.get_lines(), layers, strict=True):
+            assert line.get_ydata()[0] == pytest.approx(1 - layer.coverage, abs=2 / layer.rss_dbm.size)
+            assert line.get_ydata()[-1] == 1.0
 
 
 def test_borders_only_where_towers_share_the_area(maps_data):

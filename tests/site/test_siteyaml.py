@@ -169,7 +169,9 @@ def test_the_documented_site_is_valid() -> None:
 
 def test_the_documented_differences_are_the_computed_ones() -> None:
     text = (Path(__file__).parents[2] / "docs" / "lake_wheeler.md").read_text(encoding="utf-8")
-    for note in load_site("lake_wheeler").notes[2:]:
+    notes = load_site("lake_wheeler").notes[2:]
+    assert len(notes) == 5
+    for note in notes:
         tower, metres = note[:3], note.split(" lies ")[1].split(" from")[0]
         row = next(line for line in text.splitlines() if line.startswith(f"| {tower} "))
         assert f"| {metres} |" in row

@@ -49,8 +49,8 @@ def benchmark(
     """Score channel models on published flights with frozen splits."""
     from ..jobs.benchmarks import benchmark_run as job
 
-    action, *arguments = words or ["run"]
-    if action not in ACTIONS or len(arguments) != (1 if action == "score" else 0):
+    action, *entries = words or ["run"]
+    if action not in ACTIONS or len(entries) != (1 if action == "score" else 0):
         raise UsageError(
             f"benchmark {' '.join(words or [])}", expected=f"one of {', '.join(ACTIONS)}; score takes a file"
         )
@@ -68,12 +68,7 @@ def benchmark(
         return 0
     if action == "score":
         result = job.score_predictions(
-            Path(arguments[0]),
-            data,
-            tasks=tasks,
-            manifest=manifest,
-            leaderboard=leaderboard,
-            accept_levels=accept_levels,
+            Path(entries[0]), data, tasks=tasks, manifest=manifest, leaderboard=leaderboard, accept_levels=accept_levels
         )
     else:
         result = job.run_benchmark(

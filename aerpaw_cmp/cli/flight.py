@@ -8,10 +8,9 @@ from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
-from ..common.errors import one_line
 from ..jobs.options import RunOptions
 from .app import DryRun, Export, Force, Json, LogsRoot, command, output
-from .shown import number, print_files, print_json, print_plan, records, say, table
+from .shown import number, print_files, print_json, print_plan, records, say, table, warn_all
 
 
 @command(
@@ -103,10 +102,6 @@ def _verdict(outcome: Any, strict: bool) -> int:
     return 1 if strict and outcome.failed_checks else 0
 
 
-# Warnings of a report that are also said here.
-_WARNINGS = 10
-
-
 def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:
     """One line per model; over several channels the range of its errors, which the page has one by one."""
     rows = []
@@ -162,11 +157,7 @@ def _print_report_summary(outcome: Any) -> None:
     _print_forecasts(outcome.metrics["rank"])
     if "against" in outcome.metrics:
         print(outcome.metrics["against"]["sentence"])
-    warnings = [one_line(text) for text in outcome.metrics["warnings"]]
-    for text in warnings[:_WARNINGS]:
-        say.warn(f"warning: {text}")
-    if len(warnings) > _WARNINGS:
-        say.warn(f"and {len(warnings) - _WARNINGS} more warnings, all in the report")
+    warn_all(outcome.metrics["warnings"])
     print(f"report: {outcome.folder / 'report.html'}")
     if audited := (outcome.metrics.get("rt") or {}).get("audit"):
         print(audited["summary"])

@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from ..jobs.options import RunOptions
 from .app import Flights, Force, Json, LogsRoot, command, output
-from .shown import print_json, records, say
+from .shown import print_json, records, say, warn_all
 
 
 @command(
@@ -72,6 +72,5 @@ def _print_summary(outcome: Any) -> None:
         "P(above)": "mean_p_above:.2f", "outside flown": "share_outside_flown:.0%", "points": "points",
     }  # fmt: skip
     records(series, columns, "Prediction")
-    for text in m["warnings"][:10]:
-        say.warn(f"warning: {text}")
+    warn_all(m["warnings"])
     print(f"page: {outcome.folder / 'prediction.html'}")

@@ -10,6 +10,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+from ..common.errors import one_line
+
 _EVERY_S = 30.0
 
 
@@ -82,6 +84,18 @@ def _bar() -> Any:
 
 # What all commands of this process say on standard error.
 say = ProgressLines()
+
+
+# Warnings of a page that are also said on the terminal.
+_WARNINGS = 10
+
+
+def warn_all(texts: Sequence[str]) -> None:
+    """Say the first warnings of a page, and how many more it has."""
+    for text in texts[:_WARNINGS]:
+        say.warn(f"warning: {one_line(text)}")
+    if len(texts) > _WARNINGS:
+        say.warn(f"and {len(texts) - _WARNINGS} more warnings, all on the page")
 
 
 # Version of what ``--json`` prints (docs/reference/json.md): it rises when a key is renamed or removed.

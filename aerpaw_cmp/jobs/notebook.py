@@ -216,17 +216,7 @@ class Flight:
         return out / "report.html"
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw the trajectory with the towers, seen from above.
-
-        Parameters
-        ----------
-        axes : matplotlib.axes.Axes, optional
-            Default: those of a new figure.
-
-        Returns
-        -------
-        matplotlib.axes.Axes
-        """
+        """Draw the trajectory with the towers, seen from above, on matplotlib axes (default: new ones); give them."""
         axes = axes if axes is not None else _new_axes()
         axes.plot(self.track.east_m, self.track.north_m, label=self.settings.flight.name)
         for name, tower in self.site.towers.items():
@@ -398,17 +388,7 @@ class Comparison:
         return _tree(nodes)
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw calibrated and simulated levels along time.
-
-        Parameters
-        ----------
-        axes : matplotlib.axes.Axes, optional
-            Default: those of a new figure.
-
-        Returns
-        -------
-        matplotlib.axes.Axes
-        """
+        """Draw calibrated and simulated levels along time, on axes as :meth:`Flight.plot` takes them."""
         axes = axes if axes is not None else _new_axes()
         for item in self.result.rss:
             name, measured_dbm = f"{item.tower} {item.channel}", item.measured_db + item.score.offset_db

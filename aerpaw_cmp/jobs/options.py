@@ -42,7 +42,7 @@ DEFAULT = RunOptions()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOutcome:
-    """Outcome of a job.
+    """Outcome of a job; one that fails raises with what was found, what was expected and the likely cause.
 
     Parameters
     ----------

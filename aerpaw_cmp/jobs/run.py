@@ -77,11 +77,6 @@ def run_ingest(
     -------
     dict
         What :func:`aerpaw_cmp.logs.ingest.summary` says; with a draft also ``draft`` and ``drafts``.
-
-    Raises
-    ------
-    UsageError, InputError, OutputError
-        With what was found, expected, and the likely cause.
     """
     from ..logs.flight_file import fill, is_flight_file
     from ..logs.ingest import ingest, summary
@@ -107,17 +102,17 @@ def run_ingest(
             if site is not None and Path(site).is_file():
                 site = os.path.relpath(Path(site).resolve(), home.resolve())
             clock = {key: options.get(key) for key in ("timezone", "time_origin")}
-            flight_drafts = drafts(files, home, DraftOptions(mapping=mapping, site=site or SITE, **clock))
+            flights = drafts(files, home, DraftOptions(mapping=mapping, site=site or SITE, **clock))
             numbered = (
-                draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(flight_drafts) + 1)
+                draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(flights) + 1)
             )
             places = [draft, *numbered]
             further = [OutputFile(place, own=is_sealed, inputs=inputs, force=force) for place in places[1:]]
-            for file, flight_draft in zip([drafted, *map(outputs.enter_context, further)], flight_drafts, strict=True):
+            for file, flight_draft in zip([drafted, *map(outputs.enter_context, further)], flights, strict=True):
                 file.write(sealed(flight_draft.text))
             account["draft"] = [
                 remark if place is draft else f"{place.name}: {remark}"
-                for place, flight_draft in zip(places, flight_drafts, strict=True)
+                for place, flight_draft in zip(places, flights, strict=True)
                 for remark in flight_draft.remarks
             ]
             account["drafts"] = [str(place) for place in places]
@@ -206,11 +201,6 @@ def run_report(flight: Path, chosen: ReportOptions = AS_IT_COMES, options: RunOp
     Returns
     -------
     JobOutcome
-
-    Raises
-    ------
-    UsageError, InputError
-        With what was found, expected, and the likely cause.
     """
     from ..flight.data import load_data
     from ..flight.replay import replay_flight
@@ -363,11 +353,6 @@ def run_site_import(
     -------
     list of str
         A line per thing that was done.
-
-    Raises
-    ------
-    UsageError, InputError
-        With what was found, expected, and the likely cause.
     """
     from ..site.canopy import with_canopy, with_heights
     from ..site.footprints import import_site, site_yaml
@@ -466,11 +451,6 @@ def run_map(
     Returns
     -------
     JobOutcome
-
-    Raises
-    ------
-    UsageError, InputError
-        With what was found, expected, and the likely cause.
     """
     from ..maps.grid import Grid
     from ..report.maps.html import maps_metrics, write_maps
@@ -701,11 +681,6 @@ def run_calibrate(
     -------
     JobOutcome
         The settings file is the first of its ``files``.
-
-    Raises
-    ------
-    UsageError, InputError
-        With what was found, expected, and the likely cause.
     """
     from ..site.learned import remember
     from ..site.siteyaml import site_model

@@ -214,12 +214,8 @@ class Bench:
 
     def skipped(self, task: str, *, training: bool) -> list[str]:
         """Files that a task lacks, each with its source; empty where it can be run."""
-        definition = self.manifest.tasks[task]
-        absent = [
-            name
-            for flight in (*definition.test, *(definition.train if training else ()))
-            for name in self.missing(flight)
-        ]
+        spec = self.manifest.tasks[task]
+        absent = [name for flight in (*spec.test, *(spec.train if training else ())) for name in self.missing(flight)]
         return [
             f"{name}: {self.manifest.files[name].path} of {self.manifest.files[name].repository}"
             for name in dict.fromkeys(absent)
@@ -291,20 +287,20 @@ class Question:
 
 def questions(bench: Bench, task: str, flight: str) -> Iterator[Question]:
     """The folds of one test flight."""
-    definition = bench.manifest.tasks[task]
+    spec = bench.manifest.tasks[task]
     tests = bench.observed(flight)
-    folds = [folds_of(definition.split, o) for o in tests]
+    folds = [folds_of(spec.split, o) for o in tests]
     for fold in np.unique(np.concatenate(folds)):
         rows = [np.flatnonzero(f == fold) for f in folds]
         targets = [o.part(r) for o, r in zip(tests, rows, strict=True)]
         some = next(o for o in targets if len(o.samples))
         train = [
-            o.part(may_know(definition.split, o, some, same_flight=False))
-            for name in definition.train
+            o.part(may_know(spec.split, o, some, same_flight=False))
+            for name in spec.train
             for o in bench.observed(name)
         ]
-        if not definition.own_offset:
-            train += [o.part(may_know(definition.split, o, some, same_flight=True)) for o in tests]
+        if not spec.own_offset:
+            train += [o.part(may_know(spec.split, o, some, same_flight=True)) for o in tests]
         yield Question([o for o in train if len(o.samples)], targets, rows)
 
 
@@ -351,9 +347,9 @@ def truth(bench: Bench, task: str, *, training: bool = False) -> pd.DataFrame:
     training : bool
         The training flights in place of the test flights.
     """
-    definition = bench.manifest.tasks[task]
-    flights = [f for f in definition.train if not bench.missing(f)] if training else bench.tests(task)
-    of = _rank_rows if definition.kind == "rank" else _level_rows
+    spec = bench.manifest.tasks[task]
+    flights = [f for f in spec.train if not bench.missing(f)] if training else bench.tests(task)
+    of = _rank_rows if spec.kind == "rank" else _level_rows
     parts = [frame for flight in flights for frame in of(bench, task, flight)]
     if not parts:
         parts = [pd.DataFrame(columns=[*KEY, "fold", "measured"])]
@@ -502,12 +498,8 @@ def score_task(
     series = _level_series(bench, task, table, entry)
     if not accept_levels:
         _check_levels(task, table, entry)
-    baseline_series = {
-        name: _level_series(bench, task, table, baseline)
-        for name, baseline in baselines.items()
-        if baseline is not entry
-    }
-    return {**level_scores(series), **intervals(series, baseline_series)}
+    peers = {name: _level_series(bench, task, table, peer) for name, peer in baselines.items() if peer is not entry}
+    return {**level_scores(series), **intervals(series, peers)}
 
 
 def _joined(task: str, table: pd.DataFrame, entry: Entry, values: Sequence[str]) -> pd.DataFrame:

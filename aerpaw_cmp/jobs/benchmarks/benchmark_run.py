@@ -19,7 +19,7 @@ from ... import __version__
 from ...common.cells import guarded
 from ...common.errors import InputError, OutputError, UsageError
 from ...common.files import atomic_path
-from ...common.jsonable import json_object
+from ...common.jsonable import json_object, named
 from ...common.outputs import OutputFile, OutputFolder, is_sealed
 from ...common.stages import Progress, begin_peak, peak_mib, silent
 from ...common.versions import utc_now
@@ -173,13 +173,8 @@ def _page(bench: benchmark.Bench, scores: Scores) -> str:
 
     tables = []
     for task, rows in scores.items():
-        definition = bench.manifest.tasks[task]
-        about = {
-            "title": definition.title,
-            "rule": definition.rule,
-            "kind": definition.kind,
-            "flights": bench.tests(task),
-        }
+        spec = bench.manifest.tasks[task]
+        about = {**named(spec, "title rule kind"), "flights": bench.tests(task)}
         tables.append(task_table(task, {**about, "skipped": bench.skipped(task, training=False)}, rows))
     lacking = dict.fromkeys(text for task in bench.manifest.tasks for text in bench.skipped(task, training=True))
     return benchmark_page(tables, list(lacking), utc_now(), __version__)

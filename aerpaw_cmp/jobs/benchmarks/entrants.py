@@ -41,15 +41,13 @@ def anchored(question: Question, gain: GainOf) -> list[Answer]:
 
     The standard deviation is that of the training residuals about these offsets.
     """
-    residuals = [o.samples.residual_db - gain(o) for o in question.train]
+    errors = [o.samples.residual_db - gain(o) for o in question.train]
     out = []
     for item in question.targets:
-        mine = [r for o, r in zip(question.train, residuals, strict=True) if _same(o, item)]
+        mine = [r for o, r in zip(question.train, errors, strict=True) if _same(o, item)]
         if not mine:
-            mine = [
-                r for o, r in zip(question.train, residuals, strict=True) if o.samples.antenna == item.samples.antenna
-            ]
-        mine = mine or residuals
+            mine = [r for o, r in zip(question.train, errors, strict=True) if o.samples.antenna == item.samples.antenna]
+        mine = mine or errors
         offset = float(np.concatenate(mine).mean()) if mine else 0.0
         spread = float(np.sqrt(np.mean(np.concatenate([r - r.mean() for r in mine]) ** 2))) if mine else 10.0
         out.append((item.free_space_db + gain(item) + offset, np.full(len(item.samples), max(spread, 0.1))))

@@ -104,11 +104,9 @@ def run(
         store.check()
     with stages("flights"):
         outcomes, orders = kept_outcomes(tasks, store, progress)
-    input_paths = _inputs_of(files, logs_root)
+    inputs = _inputs_of(files, logs_root)
     with (
-        open_workers(
-            options.workers, options.scheduler if orders else None, paths=input_paths, progress=progress
-        ) as crew,
+        open_workers(options.workers, options.scheduler if orders else None, paths=inputs, progress=progress) as crew,
         stages("flights"),
     ):
         compute(orders, crew, outcomes, store, progress)

@@ -147,15 +147,13 @@ def rank_settings(
     return choices
 
 
-def _paired(errors: Mapping[str, Any], first_errors: Mapping[str, Any], flights: Sequence[str]) -> FloatArray:
+def _paired(errors: Mapping[str, Any], base: Mapping[str, Any], flights: Sequence[str]) -> FloatArray:
     """Mean difference on the links that both settings scored, per flight, in the order of the dates."""
     differences = []
     for flight in flights:
-        common_links = sorted(set(errors.get(flight, ())) & set(first_errors.get(flight, ())))
-        if common_links:
-            differences.append(
-                float(np.mean([errors[flight][link] - first_errors[flight][link] for link in common_links]))
-            )
+        links = sorted(set(errors.get(flight, ())) & set(base.get(flight, ())))
+        if links:
+            differences.append(float(np.mean([errors[flight][link] - base[flight][link] for link in links])))
     return np.array(differences)
 
 

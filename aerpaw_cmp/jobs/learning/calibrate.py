@@ -194,12 +194,12 @@ def calibrate(
             place = calibration.learn(series, with_place)
     with stages("ground"):
         ground = fit_ground(flights, observed, learned) if settings.fit.ground else None
-    fits_without: dict[str, Learned] = {}
+    fits: dict[str, Learned] = {}
     with stages("scores"):
-        scores = score_all(observed, recipe, stages, fits_without)
+        scores = score_all(observed, recipe, stages, fits)
         stages.progress("scores: controls")
         controls = controls_of(observed, recipe)
-        locks = learned_locks(observed, recipe, fits_without)
+        locks = learned_locks(observed, recipe, fits)
     with stages("curve"):
         curve = learning_curve(observed, recipe)
     warnings += mount_warnings(learned)
@@ -452,7 +452,7 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
 
 
 def score_all(
-    observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits_without: dict[str, Learned]
+    observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits: dict[str, Learned]
 ) -> dict[str, tuple[Score, ...]]:
     """Every split, on flights that had no part in the fit; fits of one are used by the next.
 
@@ -461,7 +461,7 @@ def score_all(
     observed : sequence of Observed
     recipe : Recipe
     stages : Stages
-    fits_without : dict of str to Learned
+    fits : dict of str to Learned
         Receives what was learned without each flight.
 
     Returns
@@ -471,7 +471,7 @@ def score_all(
     scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
     if len(calibration.flights_of(observed)) < 2:
         return scores
-    scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, fits_without)
+    scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, fits)
     for split, parts, own_rest in (
         ("altitude_left_out", calibration.altitude_parts, False),
         ("heading_left_out", calibration.heading_parts, False),
@@ -479,7 +479,7 @@ def score_all(
         ("route_left_out", calibration.route_parts, True),
     ):
         stages.progress(f"scores: {split.replace('_', ' ')}")
-        scores[split] = calibration.parts_left_out(observed, recipe, fits_without, parts, own_rest=own_rest)
+        scores[split] = calibration.parts_left_out(observed, recipe, fits, parts, own_rest=own_rest)
     return scores
 
 

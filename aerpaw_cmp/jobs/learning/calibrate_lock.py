@@ -12,9 +12,7 @@ from ...flight.lock import LOCK_FLOOR_DB
 from ...site.learned import LearnedLock
 
 
-def learned_locks(
-    observed: Sequence[Observed], recipe: Recipe, fits_without: Mapping[str, Learned]
-) -> dict[str, LearnedLock]:
+def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:
     """P(lock) by antenna, of levels that were predicted without the flight at hand, and its scores on flights left out.
 
     Parameters
@@ -22,7 +20,7 @@ def learned_locks(
     observed : sequence of Observed
         Of all flights.
     recipe : Recipe
-    fits_without : mapping of str to Learned
+    fits : mapping of str to Learned
         What was learned without each flight; learned here where it is empty.
 
     Returns
@@ -33,12 +31,12 @@ def learned_locks(
     able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
     if len({o.samples.flight for o in able}) < 2:
         return {}
-    if not fits_without:
-        fits_without = {}
-        flight_left_out(observed, recipe, fits_without)
+    if not fits:
+        fits = {}
+        flight_left_out(observed, recipe, fits)
     out = {}
     for antenna in dict.fromkeys(o.samples.antenna for o in able):
-        lock = _learned([_Levels(o, fits_without[o.samples.flight]) for o in able if o.samples.antenna == antenna])
+        lock = _learned([_Levels(o, fits[o.samples.flight]) for o in able if o.samples.antenna == antenna])
         if lock is not None:
             out[antenna] = lock
     return out

@@ -90,19 +90,17 @@ def antenna_files(
         "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
     )
     out: dict[str, str | bytes] = {}
-    for (antenna, end), sphere_map in maps.items():
+    for (antenna, end), gains in maps.items():
         stem = safe_name(f"{antenna}.{end}")
-        out[f"{stem}.csv"] = sphere_csv(
-            sphere_map.gain_dbi, sphere_map.sd_db, (*notes, *_notes(calibration, antenna, end))
-        )
-        pattern = SpherePattern(stem, sphere_map.gain_dbi, sphere_map.sd_db)
+        out[f"{stem}.csv"] = sphere_csv(gains.gain_dbi, gains.sd_db, (*notes, *_notes(calibration, antenna, end)))
+        pattern = SpherePattern(stem, gains.gain_dbi, gains.sd_db)
         out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz)
         source = f"learned from the flights {names}, calibration {calibration.settings.calibration}"
         attributes = file_attributes(
             f"{antenna}, antenna at the {end}", source, utc_now(), __version__, "; ".join(notes[1:])
         )  # fmt: skip
         attributes[KEY] = " ".join(calibration.trained_on)
-        sphere = sphere_netcdf(sphere_map.gain_dbi, sphere_map.sd_db, attributes, carrier_hz)
+        sphere = sphere_netcdf(gains.gain_dbi, gains.sd_db, attributes, carrier_hz)
         if sphere is not None:
             out[f"{stem}.nc"] = sphere
     return out
@@ -120,10 +118,8 @@ def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str
     term = next((t for t in fit.model.terms if t.frame == "pair"), None)
     if term is None or end == "uav":
         return ()
-    directions, length = fit.seen("pair", antenna), term.length
-    at = directions[
-        determining(directions, lambda first, second: gaussian_kernel(first, second, length), PAIR_SHARE, MOST_PAIRS)
-    ]
+    flown, length = fit.seen("pair", antenna), term.length
+    at = flown[determining(flown, lambda a, b: gaussian_kernel(a, b, length), PAIR_SHARE, MOST_PAIRS)]
     return PairGain(
         directions=at,
         gain_db=fit.gain("pair", antenna, at)[0],
@@ -306,15 +302,13 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
     for antenna in calibration.fit.antennas:
         files = {}
         for end in ("tower", "uav"):
-            sphere_map = maps[antenna, end]
+            gains = maps[antenna, end]
             files[end] = f"{safe_name(f'{name}.{antenna}.{end}')}.csv.gz"
             notes = (f"aerpaw-cmp calibrate: {name}, {antenna} {end}", *_notes(calibration, antenna, end))
-            tables[files[end]] = sphere_csv(sphere_map.gain_dbi, sphere_map.sd_db, notes, decimals=2).encode()
+            tables[files[end]] = sphere_csv(gains.gain_dbi, gains.sd_db, notes, decimals=2).encode()
         samples = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
         first, ends = calibration.first_series(antenna), (maps[antenna, "uav"], maps[antenna, "tower"])
-        sd_db = np.concatenate(
-            [calibration.learned.predict(o.part(spread_out(len(o), SD_SAMPLES)))[1] for o in samples]
-        )
+        sds = np.concatenate([calibration.learned.predict(o.part(spread_out(len(o), SD_SAMPLES)))[1] for o in samples])
         series.append(
             LearnedSeries(
                 tower=samples[0].tower,
@@ -323,7 +317,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
                 carrier_hz=first[1].link.carrier_hz,
                 tower_file=files["tower"],
                 uav_file=files["uav"],
-                sd_db=round(float(np.nanmean(sd_db)), 2),
+                sd_db=round(float(np.nanmean(sds)), 2),
                 lock=_at_unit_gain(calibration.locks.get(antenna), *ends),
                 level=_level(calibration, first[1], *ends),
             )

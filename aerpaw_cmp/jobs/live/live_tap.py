@@ -80,13 +80,11 @@ def tap_modems(
         sessions = []
         for number, (port, name) in enumerate(zip(ports, names, strict=True)):
             alone = len(ports) == 1
-            of_port = dataclasses.replace(
-                settings, port=port, folder=settings.folder if alone else settings.folder / name
-            )
+            each = dataclasses.replace(settings, port=port, folder=settings.folder if alone else settings.folder / name)
             sessions.append(
                 partial(
                     run_tap,
-                    of_port,
+                    each,
                     on_status=partial(on_status, "" if alone else name),
                     watch=None if feed is None else partial(feed.put, number),
                     stop=stop,

@@ -268,7 +268,7 @@ class SiteChannels:
         run = Run(job=Job(self.reach.extent_m, links, links))
         replayed = replay(self.site, self.siso, poses, search, run=run)
         self.paths += len(replayed.paths)
-        siso, mimo = replayed.h, self._matrices(replayed, replayed.paths, poses, self.mimo, None)
+        siso, mimo = replayed.h, channel_matrices(replayed.paths, replayed.faces, self.sources_m, poses, self.mimo).h
         result = {}
         for mode in s.foliage:
             loss = self._loss_db(mode, replayed.paths, poses)
@@ -327,12 +327,6 @@ class SiteChannels:
         wavelength = wavelength_m(self.settings.carrier_hz)
         return trees_db + stand_loss_db(self.site, source, paths.vertices_m, target, model, wavelength)
 
-    def _matrices(
-        self, replayed: Replay, paths: PathSet, poses: Poses, link: Link, loss_db: FloatArray | None
-    ) -> ComplexArray:
-        h: ComplexArray = channel_matrices(paths, replayed.faces, self.sources_m, poses, link, loss_db).h
-        return h
-
     def _shaded(
         self, clear: ComplexArray, replayed: Replay, poses: Poses, link: Link, loss_db: FloatArray | None
     ) -> ComplexArray:
@@ -344,7 +338,8 @@ class SiteChannels:
         touched[paths.pose[loss_db > 0], paths.tower[loss_db > 0]] = True
         # a path of infinite loss is an obstacle, not a weak path
         again = touched[paths.pose, paths.tower] & np.isfinite(loss_db)
-        h[touched] = self._matrices(replayed, paths.select(again), poses, link, loss_db[again])[touched]
+        some = channel_matrices(paths.select(again), replayed.faces, self.sources_m, poses, link, loss_db[again])
+        h[touched] = some.h[touched]
         return np.asarray(h)
 
 
@@ -623,12 +618,10 @@ def maps_record(
     MapsData
     """
     s, result, flown = outcome.settings, outcome.shown, outcome.corrected
-    rss = tuple(panel for mode, maps in outcome.ordered() for panel in _rss_maps(maps, mode))
-    rank = tuple(panel for mode, maps in outcome.ordered() for panel in _rank_maps(maps, mode))
+    rss = tuple(item for mode, maps in outcome.ordered() for item in _rss_maps(maps, mode))
+    rank = tuple(item for mode, maps in outcome.ordered() for item in _rank_maps(maps, mode))
     towers = result.tower_names if len(result.tower_names) > 1 else ()
-    by_tower = (
-        panel for mode, maps in outcome.ordered() for tower in towers for panel in _rank_maps(maps, mode, tower)
-    )
+    by_tower = (item for mode, maps in outcome.ordered() for tower in towers for item in _rank_maps(maps, mode, tower))
     return page.MapsData(
         title=f"Coverage and rank maps, {outcome.site.name}",
         name=name,

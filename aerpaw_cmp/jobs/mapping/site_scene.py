@@ -84,8 +84,8 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
         Where the scene lies, or where its towers stand, is not said.
     """
     named = dict(_pair(text, "--material", "wall=concrete") for text in facts.materials)
-    base_model = None if facts.base is None else site_model(facts.base)
-    start = _origin(facts.origin, base_model)
+    base = None if facts.base is None else site_model(facts.base)
+    start = _origin(facts.origin, base)
     with OutputFile(out, own=is_sealed, inputs=[path], force=force) as output:
         scene = placed_scene(path, materials=named, turn_deg=facts.turn_deg)
         actions = [_summary(scene), *scene.notes]
@@ -97,12 +97,10 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
                 f"is added at its lowest point, up = {bounds(scene)[0][2]:g} m; scene.ground_plane: false leaves it out"
             )
         low, high = bounds(scene)
-        content: dict[str, Any] = (
-            {} if base_model is None else base_model.model_dump(mode="json", exclude_defaults=True)
-        )
+        content: dict[str, Any] = {} if base is None else base.model_dump(mode="json", exclude_defaults=True)
         for key in ("buildings", "dem", "tower_ground"):
             content.pop(key, None)
-        content["name"] = path.stem if base_model is None else f"{base_model.name}, {path.stem}"
+        content["name"] = path.stem if base is None else f"{base.name}, {path.stem}"
         content["origin"] = start
         content["scene"] = SceneModel(
             path=Path(os.path.relpath(path.resolve(), out.resolve().parent)).as_posix(),
@@ -112,7 +110,7 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
             merge_m=facts.merge_m,
             ground_plane=ground_plane,
         ).model_dump(mode="json", exclude_defaults=True)
-        if base_model is None or facts.towers:
+        if base is None or facts.towers:
             content["towers"] = _towers(
                 facts.towers, SiteFrame(start["latitude_deg"], start["longitude_deg"]), low, high
             )

@@ -87,23 +87,19 @@ class PlanOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ranked:
-    """A candidate: route, pattern (None of a file), standard deviation that it leaves [dB], why it may not be flown."""
+class Candidate:
+    """A flight to choose: route, pattern (None of a file), why it may not be flown; ranked: what it leaves [dB]."""
 
     route: Route
-    pattern: Pattern | None
-    sd_db: float
+    pattern: Pattern | None = None
     refused: str = ""
+    sd_db: float = math.nan
 
     @property
     def row(self) -> dict[str, Any]:
         """For metrics.json."""
         length = {"length_m": self.route.length_m, "minutes": self.route.duration_s / 60.0}
         return {"name": self.route.name, "sd_db": self.sd_db, **length, "refused": self.refused}
-
-
-# Route, pattern (None of a file), and why it may not be flown.
-Candidate = tuple[Route, Pattern | None, str]
 
 
 def plan_flight(
@@ -196,7 +192,7 @@ def plan_flight(
     )
 
 
-def _sentence(best: Ranked, curve: Sequence[Mapping[str, float]], now_db: float) -> str:
+def _sentence(best: Candidate, curve: Sequence[Mapping[str, float]], now_db: float) -> str:
     """Opening text of the page."""
     minutes = best.route.duration_s / 60.0
     text = (
@@ -208,12 +204,12 @@ def _sentence(best: Ranked, curve: Sequence[Mapping[str, float]], now_db: float)
     return text
 
 
-def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float], stages: Stages) -> list[Ranked]:
+def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float], stages: Stages) -> list[Candidate]:
     """Candidates by what they leave, those that may not be flown last."""
     ranked = []
-    for number, (route, pattern, refused) in enumerate(candidates):
-        stages.progress(f"rank {route.name}", number / len(candidates))
-        ranked.append(Ranked(route=route, pattern=pattern, sd_db=leaves_db(route), refused=refused))
+    for number, candidate in enumerate(candidates):
+        stages.progress(f"rank {candidate.route.name}", number / len(candidates))
+        ranked.append(replace(candidate, sd_db=leaves_db(candidate.route)))
     ranked.sort(key=lambda candidate: (bool(candidate.refused), candidate.sd_db))
     if ranked[0].refused:
         raise UsageError(
@@ -256,7 +252,7 @@ def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
 
 def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     """The tool's own patterns; those that leave the area on the way between legs are dropped."""
-    out: list[Candidate] = []
+    out = []
     shapes = [("lawnmower", 0.0, False), ("lawnmower", 90.0, False), ("lawnmower", 0.0, True), ("cross", 0.0, False)]
     for height, (shape, azimuth, turns), nose in product(plan.heights_m, shapes, NOSES):
         if turns and nose != "along":
@@ -267,13 +263,13 @@ def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
         except UsageError:
             continue
         if not _leaves_area(route, area):
-            out.append((route, pattern, ""))
+            out.append(Candidate(route=route, pattern=pattern))
     return out
 
 
 def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     """Routes of files, flown at the speed of the plan; why one may not be flown."""
-    out: list[Candidate] = []
+    out = []
     for path in plan.routes:
         targets = find_targets(path, site, TargetOptions(heights_m=plan.heights_m))
         if targets.kind == "grid" or len(targets) < 2:
@@ -288,7 +284,7 @@ def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
         refused = "leaves the allowed area" if _leaves_area(route, area) else ""
         if route.duration_s > 60.0 * plan.minutes + 1.0:
             refused = f"takes {route.duration_s / 60.0:.1f} min of {plan.minutes:g} min"
-        out.append((route, None, refused))
+        out.append(Candidate(route=route, refused=refused))
     return out
 
 
@@ -390,7 +386,7 @@ CURVE_OF = 3
 
 
 def _curve(
-    ranked: Sequence[Ranked], leaves_db: Callable[[Route], float], site: Site, area: Any, plan: PlanOptions
+    ranked: Sequence[Candidate], leaves_db: Callable[[Route], float], site: Site, area: Any, plan: PlanOptions
 ) -> list[dict[str, float]]:
     """Standard deviations that shorter and longer flights of the best candidates leave; of files, shorter ones."""
     out: list[dict[str, float]] = []
@@ -407,7 +403,7 @@ def _curve(
     return out
 
 
-def _of_length(candidate: Ranked, share: float, area: Any, plan: PlanOptions) -> Route | None:
+def _of_length(candidate: Candidate, share: float, area: Any, plan: PlanOptions) -> Route | None:
     """A candidate that takes this share of the battery; None of a file for more than it has."""
     if candidate.pattern is not None:
         return route_of(candidate.pattern, area, plan.speed_mps, 60.0 * share * plan.minutes)
@@ -430,11 +426,6 @@ def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: R
     Returns
     -------
     JobOutcome
-
-    Raises
-    ------
-    UsageError, InputError
-        With what was found, expected, and the likely cause.
     """
     inputs = target_files(Path(target), plan.target.site, options.logs_root)
     inputs += [path for path in (plan.fence, *plan.avoid, *plan.routes) if path is not None]

@@ -254,17 +254,15 @@ def _check_shared(where: Path, sources: Mapping[str, Source], site: Site, who: s
     """UsageError where the sources share no tower with the site, or none with the planned flight and its band."""
     planned = flight_of(where)
     towers, bands = {s.tower for s in sources.values()}, {s.link.carrier_hz for s in sources.values()}
-    planned_towers = (
-        {log.node for log in planned.logs if log.node} if planned is not None else set(site.towers) | towers
-    )
+    nodes = {log.node for log in planned.logs if log.node} if planned is not None else set(site.towers) | towers
     links = [planned.link.rss, *planned.link.channels.values()] if planned is not None else []
     carriers = {link.carrier_hz for link in links if "carrier_hz" in link.model_fields_set}
     near = not carriers or any(abs(a / b - 1.0) <= CARRIER_BAND for a in carriers for b in bands)
-    if (not planned_towers or planned_towers & towers) and near:
+    if (not nodes or nodes & towers) and near:
         return
     raise UsageError(
         f"{who} {', '.join(sorted(towers))} at {', '.join(f'{b / 1e9:g} GHz' for b in sorted(bands))}; "
-        f"{where.name} asks for {', '.join(sorted(planned_towers)) or 'any tower'}"
+        f"{where.name} asks for {', '.join(sorted(nodes)) or 'any tower'}"
         + (f" at {', '.join(f'{c / 1e9:g} GHz' for c in sorted(carriers))}" if carriers else ""),
         expected="--with a flight that shares a tower and the band",
     )
@@ -530,7 +528,7 @@ def _place_and_nose(targets: Targets, rows: IntArray) -> FloatArray:
 def run_predict(
     where: Path,
     flights: Sequence[Path],
-    targets: TargetOptions,
+    target: TargetOptions,
     options: RunOptions = DEFAULT,
     *,
     threshold_db: float | None = None,
@@ -543,7 +541,7 @@ def run_predict(
         See :func:`.where.find_targets`.
     flights : sequence of Path
         Flight files, or calibration.yaml files that list some; none: the memory of the site.
-    targets : TargetOptions
+    target : TargetOptions
     options : RunOptions
         ``out`` is ``reports/prediction-NAME`` by default.
     threshold_db : float, optional
@@ -551,18 +549,13 @@ def run_predict(
     Returns
     -------
     JobOutcome
-
-    Raises
-    ------
-    UsageError, InputError
-        With what was found, expected, and the likely cause.
     """
     known = named_flights(flights)
-    inputs = [*target_files(where, targets.site, options.logs_root), *files_of(known, options.logs_root)]
+    inputs = [*target_files(where, target.site, options.logs_root), *files_of(known, options.logs_root)]
     folder, stages = options.out or Path("reports") / f"prediction-{where.stem}", Stages(options.progress)
     with OutputFolder(folder, job="predict", inputs=inputs, force=options.force) as output:
         prediction = predict(
-            where, known, targets, threshold_db=threshold_db, logs_root=options.logs_root, stages=stages
+            where, known, target, threshold_db=threshold_db, logs_root=options.logs_root, stages=stages
         )
         with output.filling() as place:
             options.progress("page")

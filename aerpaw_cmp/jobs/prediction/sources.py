@@ -258,9 +258,7 @@ def memory_of(place: str | Path, site: Site) -> Memory:
         Nothing that a level can be predicted from.
     """
     every = remembered(place)
-    known = {
-        name: memory for name, memory in every.items() if memory.series.level and memory.series.tower in site.towers
-    }
+    known = {name: entry for name, entry in every.items() if entry.series.level and entry.series.tower in site.towers}
     if known:
         return Memory(known, site)
     raise UsageError(

@@ -9,8 +9,7 @@ from __future__ import annotations
 import dataclasses
 import gzip
 import math
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -104,22 +103,16 @@ def _audit(
     ks = data.settings.rank.k
     total = sum(len(r.poses) for r in replays)
     few = int(np.clip(REFERENCE_LINKS_AT_MOST // max(len(replays), 1), 3, REFERENCE_LINKS))
-    named: list[str] = []
-    calls: list[Callable[[], Audit]] = []
+    parts: list[Audit] = []
     for site, replayed, expected in standing(data, replays):
         count = len(replayed.poses)
         links = min(count, max(math.ceil(data.settings.rt.audit_links * count / max(total, 1)), 1))
         if links:
-            named.append(f"audit {replayed.replay.towers[0]}: {links} links")
-            calls.append(
-                partial(_of_series, data.settings.rt, ks, site, replayed, expected, links=links, reference_links=few)
-            )
-    if not calls:
+            progress(f"audit {replayed.replay.towers[0]}: {links} links")
+            second = Second(links=links, expected=expected, ks=ks, reference_links=few)
+            parts.append(_of_series(data.settings.rt, site, replayed, second))
+    if not parts:
         return None
-    parts: list[Audit] = []
-    for text, call in zip(named, calls, strict=True):
-        progress(text)
-        parts.append(call())
     free_memory()
     errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
     links = sum(p.links for p in parts)
@@ -140,16 +133,7 @@ def _audit(
     )
 
 
-def _of_series(
-    rt: RtSettings,
-    ks: Sequence[float],
-    site: Site,
-    replayed: Replayed,
-    expected: Expected,
-    *,
-    links: int,
-    reference_links: int,
-) -> Audit:
+def _of_series(rt: RtSettings, site: Site, replayed: Replayed, second: Second) -> Audit:
     """The audit of one series, as the settings ask for it."""
     return audit(
         site,
@@ -163,7 +147,7 @@ def _of_series(
         ),
         Field(loss=path_loss(site, rt, replayed.link.carrier_hz)),
         Run(cache_dir=None if rt.advanced.cache else ""),
-        Second(links=links, expected=expected, ks=ks, reference_links=reference_links),
+        second,
     )
 
 

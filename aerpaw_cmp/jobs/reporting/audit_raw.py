@@ -233,10 +233,10 @@ def _towers_checked(data: FlightData, account: _Account) -> dict[str, Tower]:
         ground = float(tower.get("ground_offset_m") or 0.0) if offsets else 0.0
         height = float(choice.antenna_height_m or height)
         ours = data.site.towers[name]
-        distance_m = float(np.linalg.norm(ours.position_m - np.array([east, north, ground + height])))
+        apart_m = float(np.linalg.norm(ours.position_m - np.array([east, north, ground + height])))
         spare = 1e-6 * math.hypot(east, north)
         account.add(
-            "tower", distance_m, f"tower {name}", spare=spare if math.hypot(east, north) < FURTHEST_M else math.inf
+            "tower", apart_m, f"tower {name}", spare=spare if math.hypot(east, north) < FURTHEST_M else math.inf
         )
         out[name] = replace(ours, east_m=east, north_m=north, ground_m=ground, antenna_height_m=height)
     return out

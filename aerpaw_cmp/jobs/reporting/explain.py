@@ -268,11 +268,11 @@ def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterato
         if tuple(sequence.tolist()) not in traced:
             yield (
                 words,
-                why_not(replayed.faces, source, target, sequence, replayed.surfaces) or _reason_unknown(replayed),
+                why_not(replayed.faces, source, target, sequence, replayed.surfaces) or _otherwise(replayed),
             )
 
 
-def _reason_unknown(replayed: Replay) -> str:
+def _otherwise(replayed: Replay) -> str:
     if replayed.engine == "sionna":
         return f"nothing is in its way: not found with {replayed.samples} samples per tower"
     stopped = "stopped by the terrain, or the ground of another tower"

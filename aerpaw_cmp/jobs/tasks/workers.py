@@ -397,10 +397,8 @@ def _trouble(facts: Any, ours: WorkerFacts) -> str:
     if isinstance(facts, BaseException):
         return f"aerpaw-cmp cannot be loaded there ({type(facts).__name__}: {facts})"
     if facts.code != ours.code:
-        difference = (
-            f"aerpaw-cmp {facts.version}, here {ours.version}" if facts.version != ours.version else "another state"
-        )
-        return f"{facts.host} runs other code ({difference} of the program or of NumPy, SciPy, Sionna RT)"
+        what = f"aerpaw-cmp {facts.version}, here {ours.version}" if facts.version != ours.version else "another state"
+        return f"{facts.host} runs other code ({what} of the program or of NumPy, SciPy, Sionna RT)"
     if facts.missing:
         more = f" and {len(facts.missing) - 1} more" if len(facts.missing) > 1 else ""
         return f"{facts.host} does not see {facts.missing[0]}{more}"

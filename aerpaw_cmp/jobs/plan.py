@@ -26,9 +26,8 @@ from ..site.siteyaml import load_site
 
 MEASURED = "CPU seconds of reading and replay, tried on a few poses now; a stage with a dash was not tried"
 
-TRIED_POSES = (32, 160)
-# Of the two replays that a time is extrapolated from.
-TRIED_TILES = 4
+# Of the two replays that a time is extrapolated from, and of the tiles of a map.
+TRIED_POSES, TRIED_TILES = (32, 160), 4
 
 
 @dataclass(frozen=True, slots=True)

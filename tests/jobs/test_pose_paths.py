@@ -26,7 +26,7 @@ def test_bent_and_passing_paths_are_drawn_from_tower_to_uav_where_they_were_aske
         source_m=lambda _: np.array([0.0, 0.0, 10.0]),
     )  # fmt: skip
     series = SimpleNamespace(tower="T", time=np.arange(2).astype("datetime64[s]"))
-    data, replays = SimpleNamespace(site=site, rss=[series], rank=[]), SimpleNamespace(all=[replayed])
+    data, replays = SimpleNamespace(site=site, series=[("RSS", series)]), SimpleNamespace(all=[replayed])
     (paths,) = pose_paths(data, replays)  # type: ignore[arg-type]
     kinds = [[kind for _, kind in lines] for lines in paths.lines]
     behind = set(kinds[0])

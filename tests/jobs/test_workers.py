@@ -171,7 +171,7 @@ class Later:
 def test_a_scheduler_without_workers_is_spoken_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """A season waited for half an hour without a word for workers that had given up while the machine was busy."""
     monkeypatch.setattr(workers, "NO_WORKER_S", 0.1)
-    monkeypatch.setattr(workers, "LOOK_S", 0.05)
+    monkeypatch.setattr(workers, "COUNT_EVERY_S", 0.05)
     messages: list[str] = []
     crew = workers.Cluster(NoWorkers(messages), lambda text, _share=None: messages.append(text))
     results: dict[int, Any] = {}

@@ -410,9 +410,7 @@ def reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:
 
 
 def _provenance(settings: CalibrationFile, flights: Sequence[FlightData], command: str) -> dict[str, Any]:
-    begins = [s.time.min() for data in flights for s in data.rss] + [
-        s.time.min() for data in flights for s in data.rank
-    ]
+    begins = [s.time.min() for data in flights for _, s in data.series]
     days = {str(begin.astype("datetime64[D]")) for begin in begins if has_wall_clock(begin)}
     return {
         "command": command,

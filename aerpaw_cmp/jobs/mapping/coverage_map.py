@@ -68,14 +68,9 @@ RATIOS = ("spread", "condition")
 # Those of the paper.
 INTERPOLATORS = ("Kriging", "makima", "spline")
 
-# Receivers, positions times heights, beyond which a map is written tile by tile.
-TILED_ABOVE = 1_000_000
-
-# Positions along a side of a tile: some 0.7 MB of values per tower, height and foliage mode.
-TILE_CELLS = 128
-
-# Of a map in tiles, as many positions are drawn and exported beside the store.
-SHOWN_POSITIONS = 20_000
+# A map of more receivers (positions times heights) is written in tiles of so many positions a side (some 0.7 MB of
+# values per tower, height and foliage mode); so many positions of it are drawn and exported beside the store.
+TILED_ABOVE, TILE_CELLS, SHOWN_POSITIONS = 1_000_000, 128, 20_000
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,10 +21,8 @@ from ..learning.calibrate import observe
 from ..learning.calibrate_rank import RankSamples, rank_samples
 from .predict import RANKS
 
-NEAR_M = 30.0
-NEAR_UP_M = 15.0
-# A sample is scored by the nearest predicted point within these distances [m] whose nose differs by less [deg].
-TURNED_DEG = 45.0
+# A sample is scored by the nearest predicted point within these distances whose nose differs by less.
+NEAR_M, NEAR_UP_M, TURNED_DEG = 30.0, 15.0, 45.0
 
 FEWEST = 20
 

@@ -161,9 +161,8 @@ def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dic
 
 # --- models --------------------------------------------------------------------------------------------------------
 
-HULL_M = 60.0
-# Targets further than this from every sample that is known are flagged, horizontally and in height [m].
-HULL_UP_M = 20.0
+# Targets further than this from every sample that is known are flagged, horizontally and in height.
+HULL_M, HULL_UP_M = 60.0, 20.0
 
 # Level above free space and standard deviation of 4 s means (n,) [dB], and where the model is a guess.
 Levels = tuple[FloatArray, FloatArray, BoolArray]

@@ -438,7 +438,7 @@ class _Series:
         return float(self.series.measured_db[row]) - 10 * math.log10(value) if value > 0 else math.nan
 
 
-# Clocks nearer to the telemetry's have no sign to see; samples; the opposite must be better by a tenth to fail.
+# Clocks nearer to the telemetry's have no sign to see; samples; wrong is a sign whose opposite spreads a tenth less.
 LEAST_AHEAD_S, CLOCK_SAMPLES, WRONG_SIGN = 0.2, 60, 0.9
 
 

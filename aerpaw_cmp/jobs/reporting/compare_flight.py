@@ -22,7 +22,6 @@ from ...common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ...compare import offset as offsets
 from ...compare import rank as ranks
 from ...compare import rss, statistics
-from ...compare.causes import Cause
 from ...compare.detection import DetectionForecast, DetectionScore, score_detection
 from ...compare.forecast import ForecastScore, score_forecast
 from ...compare.ladder import log_distance_level_db
@@ -56,9 +55,8 @@ from .likely_cause import cause_of
 # Both sides are averaged over these windows to see how much of the error is fading.
 AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
 
-AVERAGING_WAVELENGTHS = 40
 # And over stretches of path, each of which counts once, however long the UAV hovered there.
-AVERAGING_LENGTH_M = 20.0
+AVERAGING_WAVELENGTHS, AVERAGING_LENGTH_M = 40, 20.0
 
 # Two passes of one place, first and second half of a flight, come this near.
 PASSES_WITHIN_M = 3.0
@@ -248,7 +246,7 @@ def _further(
         censored=_censored(settings, levels),
         detection=_detection(case.data, series, levels, case.simple["free_space"]),
         snr=_snr(series, levels),
-        likely_cause=_cause(case.data.site, series, replayed, levels, case.simple["free_space"]),
+        likely_cause=cause_of(case.data.site, series, replayed, levels, case.simple["free_space"]),
     )
 
 
@@ -267,12 +265,6 @@ def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
     out = {} if errors is None else named(errors, "rmse_db free_space_rmse_db rmse_4s_db")
     out |= {} if lock is None else named(lock, "floor_rmse_db free_space_floor_rmse_db")
     return out or None
-
-
-def _cause(site: Site, series: RssSeries, replayed: Replayed, levels: Levels, free_space: FloatArray) -> Cause | None:
-    """The likely cause of the error of a channel; None where no trouble is shown."""
-    cause = cause_of(site, series.tower, rss.seconds(series.time), replayed, levels, free_space)
-    return None if cause.name == "none" else cause
 
 
 def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[str, float]:

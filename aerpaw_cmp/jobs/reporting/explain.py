@@ -147,7 +147,7 @@ def run_explain(
 
 
 def _series(data: FlightData, tower: str, channel: str | None) -> RssSeries | RankSeries:
-    every: list[RssSeries | RankSeries] = [*data.rss, *data.rank]
+    every = [series for _, series in data.series]
     towers = list(dict.fromkeys(series.tower for series in every))
     mine = {series.channel: series for series in reversed(every) if series.tower == tower}
     if not mine:

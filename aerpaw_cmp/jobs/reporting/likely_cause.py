@@ -10,6 +10,7 @@ import numpy as np
 from ...common.units import FloatArray
 from ...compare import rss
 from ...compare.causes import Cause, LevelEvidence, likely_cause
+from ...flight.data import RssSeries
 from ...flight.replay import Replayed
 from ...propagation.field.baselines import free_space_dbm
 from ...site.antennas import Isotropic
@@ -19,17 +20,13 @@ from .levels import Levels
 ANGLES_DEG = tuple(float(angle) for angle in range(10, 360, 10))
 
 
-def cause_of(
-    site: Site, tower: str, time_s: FloatArray, replayed: Replayed, levels: Levels, free_space: FloatArray
-) -> Cause:
-    """Likely cause of the error of one tower and channel; ``none`` for a tower that moves.
+def cause_of(site: Site, series: RssSeries, replayed: Replayed, levels: Levels, free_space: FloatArray) -> Cause | None:
+    """Likely cause of the error of one tower and channel; None where no trouble shows, and for a tower that moves.
 
     Parameters
     ----------
     site : Site
-    tower : str
-    time_s : (n,)
-        Of the samples.
+    series : RssSeries
     replayed : Replayed
     levels : Levels
         Measured and predicted at the samples.
@@ -38,10 +35,11 @@ def cause_of(
 
     Returns
     -------
-    Cause
+    Cause or None
     """
     if replayed.tower_m is not None:
-        return Cause(name="none")
+        return None
+    time_s = rss.seconds(series.time)
     directions = _link_geometry(replayed, replayed.source_m(site), replayed.poses.rotation)
     order = np.argsort(time_s, kind="stable")
     names = ("uav_azimuth_deg", "uav_elevation_deg", "azimuth_deg")
@@ -58,11 +56,12 @@ def cause_of(
         },
         other_towers_db={
             name: (levels.simulated_db - free_space + level)[order]
-            for name, level in _other_towers(site, tower, replayed, _gain_db(replayed, directions)).items()
+            for name, level in _other_towers(site, series.tower, replayed, _gain_db(replayed, directions)).items()
         },
         clock_confirmed=replayed.clock is not None and replayed.clock.result.verdict == "ok",
     )
-    return likely_cause(evidence)
+    cause = likely_cause(evidence)
+    return None if cause.name == "none" else cause
 
 
 def _link_geometry(replayed: Replayed, place_m: FloatArray, rotation: FloatArray) -> dict[str, FloatArray]:

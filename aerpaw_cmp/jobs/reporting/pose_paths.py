@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...common.units import FloatArray
-from ...flight.data import FlightData, RankSeries, RssSeries
+from ...flight.data import FlightData
 from ...flight.replay import FlightReplay, Replayed
 from ...propagation.paths import PathSet
 from ...report.data import DIFFRACTED, PASSING, PosePaths
@@ -22,8 +22,7 @@ SHORTEST = 8
 def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> tuple[PosePaths, ...]:
     """Paths of each tower's first series at about ``limit`` of its poses, spread over the flight."""
     by_tower: dict[str, PosePaths] = {}
-    every: list[RssSeries | RankSeries] = [*data.rss, *data.rank]
-    for series, replayed in zip(every, replays.all, strict=True):
+    for (_, series), replayed in zip(data.series, replays.all, strict=True):
         if series.tower not in by_tower and replayed.valid.any():
             poses = np.unique(np.linspace(0, len(replayed.poses) - 1, limit).astype(np.int64))
             time = series.time[replayed.valid][poses]

@@ -40,15 +40,8 @@ OnResult = Callable[[int, Any], None]
 # A task in work when a worker is lost is tried again; after so many tries once more, alone.
 TRIES = 2
 
-# How long a scheduler may take to answer.
-CONNECT_S = 10.0
-
-# A scheduler that has had no worker for so long is spoken of, again and again.
-NO_WORKER_S = 30.0
-
-
-# How often workers are counted.
-COUNT_EVERY_S = 2.0
+# Time for a scheduler to answer, after which one without a worker is spoken of, and between counts of workers.
+CONNECT_S, NO_WORKER_S, COUNT_EVERY_S = 10.0, 30.0, 2.0
 
 
 @dataclass(frozen=True, slots=True)

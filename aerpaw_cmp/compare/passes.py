@@ -322,6 +322,7 @@ def _pair(
 
 def _common(first: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:
     """Rows of both that name the same cell, in the order of the cells (both are sorted and have each cell once)."""
+    # one integer per cell: numpy intersects rows of two columns by sorting records, ten times slower
     a, b = ((cells[:, 0] << 32) + cells[:, 1] for cells in (first, second))
     _, i, j = np.intersect1d(a, b, assume_unique=True, return_indices=True)
     return i, j

@@ -65,7 +65,7 @@ def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | N
                     "at its own times, 0.032768 s a row"
                 )
         else:
-            order = np.argsort(at, kind="stable")
+            order = np.argsort(at, kind="stable")  # a log may have been put together of parts
             quality = at_times(time, at[order], quality[order], within_s=_WITHIN_S)
         if np.isfinite(quality).any():
             return np.where(np.isfinite(quality), (quality > LOST_QUALITY_DB).astype(np.float64), np.nan), remark

@@ -659,6 +659,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
     notes: list[str] = []
     content: dict[str, Any] = {}
     channels = dict(settings.link.channels)
+    # the airframe last: it belongs to every channel, also to those that antennas of towers bring
     for key, name in sorted(settings.antennas.items(), key=lambda item: item[0] == "uav"):
         try:
             named = find_named(name, folder)

@@ -56,6 +56,7 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     track_s = tracked[0].astype(np.int64) / 1e9 - zero_s
     log_m, track_m = _metres(mine[1], tracked[1]), _metres(tracked[1], tracked[1])
     length = time_s[-1] - time_s[0]
+    # half of the log may stick out at either end of the track
     shifts = np.arange(-time_s[0] - 0.5 * length, track_s[-1] - time_s[0] - 0.5 * length, 1.0)
     misses = np.array([_median_distance(time_s + shift, log_m, track_s, track_m) for shift in shifts])
     if not len(misses) or not np.isfinite(misses).any():

@@ -138,8 +138,8 @@ class Reach:
         places = [tower.position_m[:2] for tower in site.towers.values()]
         spans = (site.area_m, np.ravel(places), shapely.bounds(footprints).ravel())
         farthest = np.nanmax(np.abs(np.concatenate(spans)))
+        # corners (2, 3) of a box round everything, however the site is turned: it sets the tolerances of all tiles
         self.extent_m = np.sqrt(2.0) * farthest * np.array([[-1.0] * 3, [1.0] * 3])
-        """Corners (2, 3) of a box round everything, however the site is turned: it sets the tolerances of all tiles."""
         self._mirrors_at = np.zeros((0, 2))  # beside the walls: any crown
         if crowns:
             trees = np.column_stack([site.trees.east_m, site.trees.north_m])

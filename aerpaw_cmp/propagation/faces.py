@@ -38,10 +38,10 @@ class _Face(NamedTuple):
     offset_m: float
     lower: tuple[float, float]
     upper: tuple[float, float]
-    polygon: Polygon | None
     material: str
     label: str
-    solid: int
+    polygon: Polygon | None = None
+    solid: int = -1
 
 
 def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
@@ -90,10 +90,8 @@ def _ground(height_m: float, material: str, several: bool) -> _Face:
         offset_m=height_m,
         lower=(-np.inf, -np.inf),
         upper=(np.inf, np.inf),
-        polygon=None,
         material=material,
         label=label,
-        solid=-1,
     )
 
 
@@ -145,7 +143,6 @@ def _walls(building: Building, footprint: Polygon, solid: int) -> list[_Face]:
                     offset_m=offset,
                     lower=(first, foot),
                     upper=(first + length, top),
-                    polygon=None,
                     material=building.material,
                     label=label,
                     solid=solid,

@@ -232,6 +232,17 @@ def test_limits_of_links_are_those_of_the_replay(scenes):
     assert (audit.failures, audit.doubtful) == ((), 1)  # over the upper rim of the wall
 
 
+def test_a_pose_within_reach_of_one_tower_has_paths_to_all(scenes):
+    """A hundred kilometres count from the nearest tower: the link to one behind it is longer, and is no phantom."""
+    site = scenes.site(towers=((0.0, 0.0, 10.0), (-2000.0, 0.0, 10.0)))
+    link = scenes.link(site)
+    for east_m, paths in ((99_000.0, 4), (101_000.0, 0)):
+        pose = scenes.poses([[east_m, 0.0, 50.0]])
+        replayed = replay(site, link, pose)
+        assert len(replayed.paths) == paths
+        assert audited(site, link, pose, replayed).failures == ()
+
+
 def test_rough_ground_and_each_reflection_lose_what_their_formulas_say(scenes):
     """Ament's factor at the ground alone, whatever else a path meets; a roof is level, too, and not the ground."""
     site = scenes.site((Building("hall", shapely.box(0, -20, 10, 20), 8.0),), ((-10.0, 0.0, 20.0),))

@@ -231,7 +231,9 @@ class _OneLink:
         phantom = doubtful = missing = 0
         ground = self.reference.site.towers[self.replay.towers[self.tower]].ground_m
         gap = math.dist(self.target, self.reference.source)
-        nowhere = self.target[2] < min(ground, 0.0) or not 0.01 <= gap <= 1e5
+        # a pose is beyond reach where it is so from every tower, not from this one alone
+        nearest = min(math.dist(self.target, tower.position_m) for tower in self.reference.site.towers.values())
+        nowhere = self.target[2] < min(ground, 0.0) or gap < 0.01 or nearest > 1e5
         for path in self.mine:
             sequence = self.sequence(path)
             keys.add(None if sequence is None else _key(sequence))

@@ -76,11 +76,11 @@ class Rules(NamedTuple):
 
     depth: int
     clearance: float
-    end: float
-    margin: float
-    side: float
-    beams: bool
-    shadows: bool
+    end: float = END_M
+    margin: float = 0.0
+    side: float = SIDE_M
+    beams: bool = True
+    shadows: bool = True
 
 
 def grow_paths(
@@ -164,10 +164,7 @@ def estimate(
 
 def _rules(surfaces: Surfaces, max_depth: int, *, solids: bool, beams: bool = True, shadows: bool = True) -> Rules:
     margin = SOLID_MARGIN if solids else 0.0
-    return Rules(
-        depth=max_depth, clearance=2.0 * surfaces.merge_m, end=END_M, margin=margin, side=SIDE_M, beams=beams,
-        shadows=shadows,
-    )  # fmt: skip
+    return Rules(max_depth, 2.0 * surfaces.merge_m, margin=margin, beams=beams, shadows=shadows)
 
 
 def _searches(surfaces: Surfaces, links: Links, rules: Rules) -> Iterator[tuple[int, IntArray, _Search]]:
@@ -852,7 +849,7 @@ def try_out() -> None:
     """
     triangle = np.array([[[5.0, -9.0, -9.0], [5.0, 9.0, -9.0], [5.0, 0.0, 9.0]]])
     tree = box_tree(triangle.min(axis=1), triangle.max(axis=1))
-    rules = Rules(1, 1e-3, END_M, 0.0, SIDE_M, beams=True, shadows=True)
+    rules = Rules(1, 1e-3)
     free = _direct(_Solids(tree, triangle, tree), np.zeros(3), np.array([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]]), rules)
     if free.tolist() != [False, True]:
         raise RuntimeError(f"compiled code sees {free.tolist()} where one of two points is hidden")

@@ -212,11 +212,10 @@ def _mirrors(kernels: ModuleType, faces: Faces, surfaces: Surfaces | None) -> An
 
 
 def _solids(kernels: ModuleType, hiding: Occlusion | None, surfaces: Surfaces | None) -> Any:
-    from .beams import END_M, SIDE_M, Rules  # compiled
+    from .beams import Rules  # compiled
     from .boxtree import box_tree
 
-    clearance = 0.0 if surfaces is None else 2.0 * surfaces.merge_m
-    rules = Rules(1, clearance, END_M, 0.0, SIDE_M, beams=True, shadows=True)
+    rules = Rules(1, 0.0 if surfaces is None else 2.0 * surfaces.merge_m)
     if surfaces is not None:
         return kernels.Solids(
             normal=np.zeros((0, 3)),

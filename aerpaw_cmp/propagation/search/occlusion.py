@@ -59,10 +59,10 @@ class Occlusion:
         solid, footprint, planes = _prisms(faces, rows, starts)
         cuts = np.searchsorted(solid, np.arange(len(starts) + 1)).tolist()
         touched = _abutting(footprint, tolerance_m).tolist()
+        # per solid and convex piece: outward normals (planes, 3) and offsets (planes,); top and bottom come first
         self.pieces = [planes[start:stop] for start, stop in pairwise(cuts)]
-        """Per solid and convex piece: outward normals (planes, 3) and offsets (planes,); top and bottom come first."""
+        # per solid and convex piece: whether another piece, of any solid, touches it
         self.abutting = [touched[start:stop] for start, stop in pairwise(cuts)]
-        """Per solid and convex piece: whether another piece, of any solid, touches it."""
 
     def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
         """Check whether polylines source - vertices (paths, depth, 3) - target are cut (paths,)."""

@@ -167,8 +167,7 @@ class _Scene:
     """A Sionna scene with the way back from its triangles to faces."""
 
     scene: Any
-    face_of: dict[int, IntArray]
-    """object id -> face of each triangle"""
+    face_of: dict[int, IntArray]  # object id -> face of each triangle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -128,6 +128,7 @@ def _is_px4_gps(sheet: _sheet.Sheet, latitude: int) -> bool:
 def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
     """Put NaN for positions that cannot be (or 0, 0) into a dictionary of columns; their mask."""
     latitude, longitude = values["latitude_deg"], values["longitude_deg"]
+    # receivers write 0, 0 before their first fix
     lost: AnyArray = np.asarray(
         ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)) | ((latitude == 0) & (longitude == 0))
     )

@@ -257,8 +257,8 @@ def cut(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> Sheet
     cells: list[list[str]] = []
     comments: list[int] = [*range(at + 1)]
     odd: list[tuple[int, int]] = []
-    for i in np.flatnonzero(below).tolist():
-        fields = _fitted(split_row(lines.raw(i), separator), names)
+    split = _fitted([(i, split_row(lines.raw(i), separator)) for i in np.flatnonzero(below).tolist()], names)
+    for i, fields in split:
         if len(fields) != len(names):
             odd.append((i, len(fields)))
         elif fields[0].strip() == names[0] and [text.strip() for text in fields] == names:
@@ -284,11 +284,22 @@ def cut(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> Sheet
     )
 
 
-def _fitted(fields: list[str], names: list[str]) -> list[str]:
-    """Fields of a row without what a separator at the end of rows, or of the header alone, makes of them."""
-    if len(fields) == len(names) + 1 and not fields[-1].strip():
-        return fields[:-1]
-    return [*fields, ""] if len(fields) == len(names) - 1 and not names[-1] else fields
+def _fitted(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[int, list[str]]]:
+    """Rows without what a separator at the end of rows, or of the header alone, makes of them.
+
+    An empty field more is the table's habit or none: a row whose time or level has a bare decimal comma looks so, too,
+    and its columns would be those beside.
+    """
+    longer = [not fields[-1].strip() for _, fields in rows if len(fields) == len(names) + 1]
+    filled = longer.count(False)  # a torn row or two may have a field more, too
+    if 2 * longer.count(True) > len(rows) and filled <= max(1, len(rows) // 100):
+        rows = [
+            (i, fields[:-1] if len(fields) == len(names) + 1 and not fields[-1].strip() else fields)
+            for i, fields in rows
+        ]
+    if not names[-1]:
+        rows = [(i, [*fields, ""] if len(fields) == len(names) - 1 else fields) for i, fields in rows]
+    return rows
 
 
 # Names of the column of times, the surest first.

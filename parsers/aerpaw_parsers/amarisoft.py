@@ -30,6 +30,7 @@ _TITLE = re.compile(
     re.MULTILINE,
 )
 _LINE = re.compile(_STAMP + rb"(\S.*)$")
+# Columns that are read, and the base of their numbers.
 _WANTED = {"RNTI": 16, "cqi": 10, "ri": 10, "mcs": 10}
 
 

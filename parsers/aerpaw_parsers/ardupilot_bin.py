@@ -22,6 +22,7 @@ from . import _autopilot
 
 _MARK = b"\xa3\x95"
 _FMT = 128
+# Letters of a layout: code of struct, and the factor that makes SI or degrees of it (c, C, e, E 0.01; L 1e-7 deg).
 _TYPES = {
     "b": ("b", 1.0), "B": ("B", 1.0), "h": ("h", 1.0), "H": ("H", 1.0), "i": ("i", 1.0), "I": ("I", 1.0),
     "f": ("f", 1.0), "d": ("d", 1.0), "c": ("h", 0.01), "C": ("H", 0.01), "e": ("i", 0.01), "E": ("I", 0.01),

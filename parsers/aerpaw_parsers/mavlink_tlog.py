@@ -16,6 +16,7 @@ from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 from . import _autopilot
 
 _POSITION, _ATTITUDE, _GPS = 33, 30, 24
+# MAVLink's CRC_EXTRA: a hash of the fields, so that a message of another layout fails the checksum.
 _EXTRA = {_POSITION: 104, _ATTITUDE: 39, _GPS: 24}
 _LAYOUT = {
     _POSITION: struct.Struct("<IiiiihhhH"),
@@ -45,11 +46,13 @@ def _packet(data: bytes, at: int) -> tuple[int, int, int, bytes] | None:
         return None
     mark, size = data[at + 8], data[at + 9]
     if mark == 0xFE:
+        # version 1: length, sequence, system, component, message; checksum
         head, kind, system, tail = 6, data[at + 13], data[at + 11], 2
     elif mark == 0xFD:
         if at + 18 > len(data):
             return None
         head, system = 10, data[at + 13]
+        # a signature of 13 bytes stands behind the checksum where the first flag is set
         kind, tail = int.from_bytes(data[at + 15 : at + 18], "little"), 15 if data[at + 10] & 1 else 2
     else:
         return None

@@ -164,41 +164,26 @@ _KINDS: tuple[tuple[str, str, _Test], ...] = (
     ("matlab_other", "MATLAB variables that are no flight", _other_mat),
     ("power_references", "a table of USRP reference powers", _POWER_REFS),
     ("antenna_gain", "antenna gain over frequency, without directions", _GAIN),
-    (
-        "kml_levels",
-        "a KML with levels in a layout that is not read: give the program's text log or CSV",
-        lambda head: _kml(head) and _LEVELS.search(head) is not None,
-    ),
+    ("kml_levels", "a KML with levels in a layout that is not read: give the program's text log or CSV",
+     lambda head: _kml(head) and _LEVELS.search(head) is not None),
     ("kml_other", "a KML without measurements (a geofence, a map, a route for 'aerpaw-cmp predict')", _plain_kml),
     ("gpx_other", "a GPX without points", _gpx),
-    (
-        "at_transcript",
-        "a modem transcript without times (AT answers; 'aerpaw-cmp tap' logs them with times)",
-        _transcript,
-    ),
+    ("at_transcript", "a modem transcript without times (AT answers; 'aerpaw-cmp tap' logs them with times)",
+     _transcript),
     ("nemo_summary", "a Nemo summary of a session (counts and rates, no samples)", _nemo_summary),
     ("nemo_binary", "a binary Nemo measurement file (.nmfs: export it as CSV with Nemo's own tools)", _nemo_binary),
     ("uhd_console", "the console of a USRP program, without samples", _uhd),
-    (
-        "radio_console",
-        "the console of an srsRAN program without its trace (type 't' there, or log longer)",
-        _radio_console,
-    ),
+    ("radio_console", "the console of an srsRAN program without its trace (type 't' there, or log longer)",
+     _radio_console),
     ("positions", "a list of positions without times", _places),
     ("document", "a page of text", _document),
     ("flight_script", "the console of a flight script, without positions", _flight_talk),
-    (
-        "cell_search",
-        "a cell search of srsRAN: cells at one moment, without times",
-        _CELL_SEARCH,
-    ),
-    (
-        "flight_plan",
-        "a planned route, not a flight: 'aerpaw-cmp predict' reads it",
-        _PLAN,
-    ),
+    ("cell_search", "a cell search of srsRAN: cells at one moment, without times",
+     _CELL_SEARCH),
+    ("flight_plan", "a planned route, not a flight: 'aerpaw-cmp predict' reads it",
+     _PLAN),
     ("flight_yaml", "a flight file of settings, not a log: give it to 'report'", _yaml),
-)
+)  # fmt: skip
 
 READERS: tuple[Reader, ...] = tuple(
     Reader(name=name, title=what, kinds=(), sample="", sniff=_sniffer(test), read=_refuse(what))

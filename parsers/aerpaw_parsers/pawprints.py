@@ -21,6 +21,7 @@ from . import _cells, _json, _pose
 
 _MARKS = (b'"cells"', b'"nr_signal_strength"', b'"connected_pci"', b'"companion_abs_time"')
 
+# A second START on a line is that of the next reading behind a torn one, whose time is another.
 _TEXT = re.compile(rb"^CELL_LOG_START,(\d{13}),(?:(?!CELL_LOG_START).)*?,?CELL_LOG_STOP[ \t]*\r?$", re.MULTILINE)
 _BLOCK = re.compile(rb"BS_INFO_START,([^\n]*?),?BS_INFO_STOP")
 # Places in a block by its technology; LTE with all quantities switched on in the app, as it is delivered.

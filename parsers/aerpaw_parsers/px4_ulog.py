@@ -45,6 +45,7 @@ _WANTED = (
     "home_position",
 )
 _FIELD = re.compile(r"(\w+)(?:\[(\d{1,4})\])? (\w+)")
+# Kinds of message of the format, by their letters.
 _KINDS = frozenset(b"BFIMPQADLCSORT")
 
 
@@ -77,7 +78,7 @@ def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int
     bodies: dict[str, list[bytes]] = {name: [] for name in _WANTED}
     numbers: dict[str, list[int]] = {name: [] for name in _WANTED}
     damaged: list[RejectedLine] = []
-    count, at = 0, 16
+    count, at = 0, 16  # behind the mark, the version and the time of the start
     while at + 3 <= len(data):
         size, kind = struct.unpack_from("<HB", data, at)
         if kind not in _KINDS or at + 3 + size > len(data):

@@ -62,6 +62,6 @@ READER = _text.reader(
         rb"^\[[^\]\n]{19,40}\] *(?:(?:cc|rat) +pci +rsrp +pl +cfo +\||cc +rsrp +pl +cfo +mcs +snr)", re.MULTILINE
     ),
     row=_ROW,
-    torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:\d{1,2}|lte|nr) +\d{1,4} +-?\d"),
+    torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:\d{1,2}|lte|nr) +\d{1,4} +[^ a-zA-Z]"),
     streams=_streams,
 )

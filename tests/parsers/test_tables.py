@@ -261,3 +261,18 @@ def test_two_phone_lines_glued_by_a_torn_one_are_rejected() -> None:
     first, second = samples.PAWPRINTS_TEXT.split(b"\n")[:2]
     result = read("pawprints", first[:60] + second + b"\n" + second + b"\n")
     assert (result.accepted, [line.number for line in result.rejected]) == (1, [1])
+
+
+def test_rows_that_a_bare_decimal_comma_shifts_are_rejected() -> None:
+    """They have a field more; where the last column is empty the row would fit with every value in the next column."""
+    head = "Time,Latitude,Longitude,Altitude (m),RSRP (dBm),Note\n"
+    rows = [f"2025-03-02 10:00:0{i},25,35.72,-78.69,30,-8{i},{'' if i % 2 else 'x'}" for i in range(6)]
+    result = drive_test((head + "\n".join(rows) + "\n").encode())
+    assert (result.accepted, result.rejected_count) == (0, 6)
+
+
+def test_an_empty_field_more_in_every_row_is_nothing() -> None:
+    data = six_rows(GOOD + ",")
+    assert column_of(drive_test(data), "rss", "rss_db") == column_of(drive_test(six_rows(GOOD)), "rss", "rss_db")
+    odd_row = drive_test(six_rows(GOOD) + b"2025-03-02 10:00:06,35.72,-78.69,30,-86,\n")
+    assert (odd_row.accepted, [line.number for line in odd_row.rejected]) == (6, [8])

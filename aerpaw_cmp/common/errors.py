@@ -31,7 +31,7 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
-def printable(text: str) -> str:
+def _printable(text: str) -> str:
     r"""Text that may have lines and holds nothing that a terminal takes for a command: a file's words may be in it.
 
     Examples
@@ -113,7 +113,7 @@ class AerpawCmpError(Exception):
             text += f"; expected {self.expected}"
         if self.cause:
             text += f". Likely cause: {self.cause}"
-        return printable(text)
+        return _printable(text)
 
 
 @contextmanager

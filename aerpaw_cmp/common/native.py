@@ -3,7 +3,7 @@
 Libraries of these formats are C code that follows the file: to other files that it names (external storage and links,
 virtual data sets, VRT), into endless loops, and sometimes over the end of a buffer. The child gets the bytes of the
 file, loads its library, and then gives up the right to any further descriptor (RLIMIT_NOFILE 0: no file, socket or
-process pipe can be opened, by whatever code), to more than ``MOST_MEMORY`` and to more than ``SECONDS`` of processor
+process pipe can be opened, by whatever code), to more than ``_MOST_MEMORY`` and to more than ``SECONDS`` of processor
 time. Only then does it look at the bytes. What comes back is a list of plain arrays.
 
 Where there is no ``resource`` module (Windows) the limits do not hold; what a file may contain is checked all the same.
@@ -28,8 +28,8 @@ MOST_BYTES = 1 << 30
 MOST_RATIO = 200
 # A file may declare so many bytes, and ``MOST_RATIO`` times its own size: text compresses to a hundredth.
 FREE_BYTES = 1 << 26
-MOST_ITEMS = 100_000
-MOST_MEMORY = 4 << 30
+_MOST_ITEMS = 100_000
+_MOST_MEMORY = 4 << 30
 SECONDS = 60
 _REFUSED = 3
 _NAMES = {"hdf5": "HDF5", "matlab": "MATLAB 7.3", "geotiff": "GeoTIFF"}
@@ -124,7 +124,7 @@ def give_up_rights() -> None:
         import resource
     except ImportError:
         return
-    limits = (("RLIMIT_NOFILE", 0), ("RLIMIT_AS", MOST_MEMORY), ("RLIMIT_CPU", SECONDS), ("RLIMIT_CORE", 0))
+    limits = (("RLIMIT_NOFILE", 0), ("RLIMIT_AS", _MOST_MEMORY), ("RLIMIT_CPU", SECONDS), ("RLIMIT_CORE", 0))
     for name, most in limits:
         resource.setrlimit(getattr(resource, name), (most, most))
 
@@ -192,8 +192,8 @@ class _Items:
             if not isinstance(link, h5py.HardLink):
                 raise _lies_elsewhere(f"{place!r} is a link, not data")
             item = group[name]
-            if len(self._seen) > MOST_ITEMS:
-                raise InputError(f"the file has more than {MOST_ITEMS} items", expected="a log", cause="no log")
+            if len(self._seen) > _MOST_ITEMS:
+                raise InputError(f"the file has more than {_MOST_ITEMS} items", expected="a log", cause="no log")
             address = h5py.h5o.get_info(item.id).addr
             if address in self._seen:
                 continue  # a second name, or a circle

@@ -9,7 +9,7 @@ from importlib import metadata
 
 from .. import __version__
 
-PACKAGES = ("numpy", "scipy", "pandas", "pyproj", "shapely", "sionna-rt", "mitsuba", "drjit")
+_PACKAGES = ("numpy", "scipy", "pandas", "pyproj", "shapely", "sionna-rt", "mitsuba", "drjit")
 
 
 NOT_INSTALLED = "not installed"
@@ -31,4 +31,6 @@ def utc_now() -> str:
 
 def versions() -> dict[str, str]:
     """Versions by name; "not installed" where a package is not."""
-    return {"aerpaw-cmp": __version__, "python": platform.python_version()} | {name: version(name) for name in PACKAGES}
+    return {"aerpaw-cmp": __version__, "python": platform.python_version()} | {
+        name: version(name) for name in _PACKAGES
+    }

@@ -4,7 +4,7 @@
 
 YAML is read by the core schema of YAML 1.2, because 1.1 (PyYAML's default) turns ``11:48:16`` into the number
 42496, ``no`` into False and leaves ``1e6`` a word. No tag builds an object. Duplicate keys, several documents,
-aliases that unfold to more than :data:`MAX_NODES` nodes and nesting deeper than :data:`MAX_DEPTH` are refused.
+aliases that unfold to more than :data:`_MAX_NODES` nodes and nesting deeper than :data:`_MAX_DEPTH` are refused.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from .files import read_bounded
 MAX_BYTES = 32 * 1024 * 1024
 
 # Scalars, lists and mappings, aliases counted unfolded: an alias bomb stops here.
-MAX_NODES = 4_000_000
+_MAX_NODES = 4_000_000
 
 # Nesting of lists and mappings.
-MAX_DEPTH = 64
+_MAX_DEPTH = 64
 
 _TAG = "tag:yaml.org,2002:"
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # events only: nothing is constructed by PyYAML
@@ -219,7 +219,7 @@ def _tab_indents(text: str, mark: Any) -> bool:
 
 
 class _Builder:
-    """Values from parser events; :data:`MAX_DEPTH` bounds the recursion, so that no input can overflow the stack."""
+    """Values from parser events; :data:`_MAX_DEPTH` bounds the recursion, so that no input can overflow the stack."""
 
     def __init__(self, path: str | Path | None) -> None:
         self.path = path
@@ -245,8 +245,8 @@ class _Builder:
 
     def _count(self, nodes: int, event: Any) -> None:
         self.nodes += nodes
-        if self.nodes > MAX_NODES:
-            self._fail(event, f"the file unfolds to more than {MAX_NODES} values (aliases of aliases?)")
+        if self.nodes > _MAX_NODES:
+            self._fail(event, f"the file unfolds to more than {_MAX_NODES} values (aliases of aliases?)")
 
     def _value(self, event: Any, location: Location) -> Any:
         """Scalar, list or mapping that begins with an event; an anchor is known from its end on."""
@@ -264,8 +264,8 @@ class _Builder:
         return value
 
     def _collection(self, event: Any, location: Location) -> list[Any] | dict[str, Any]:
-        if len(location) >= MAX_DEPTH:
-            self._fail(event, f"nested deeper than {MAX_DEPTH} levels")
+        if len(location) >= _MAX_DEPTH:
+            self._fail(event, f"nested deeper than {_MAX_DEPTH} levels")
         is_map = isinstance(event, yaml.MappingStartEvent)
         if event.tag not in (None, "!", _TAG + ("map" if is_map else "seq")):
             self._fail(event, f"the tag '{event.tag}' is not allowed here")

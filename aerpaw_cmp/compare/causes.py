@@ -2,7 +2,7 @@
 
 Each trouble changes the predicted level in its own way. Its free numbers are searched, the offset is fitted, and the
 residual counts as first-order autoregressive noise, so that slow fading is no trouble. A trouble is named where it
-raises the log likelihood by more than ``MARGIN`` beyond the cost of its numbers (Schwarz) and takes a tenth off the
+raises the log likelihood by more than ``_MARGIN`` beyond the cost of its numbers (Schwarz) and takes a tenth off the
 RMSE. Intervals hold the values
 whose log likelihood lies within 1.92 of the best.
 
@@ -33,11 +33,11 @@ from ..common.units import BoolArray, FloatArray
 
 # Samples are averaged over so long [s].
 BIN_S = 1.0
-FEWEST_BINS = 60
+_FEWEST_BINS = 60
 # Log likelihood that a trouble must gain beyond its cost.
-MARGIN = 4.0
+_MARGIN = 4.0
 # A trouble that takes less than this share off the RMSE is not the cause of the error.
-LEAST_SHARE = 0.1
+_LEAST_SHARE = 0.1
 # Half of the 95 % point of chi-squared with one degree of freedom.
 _NEAR = 1.92
 _Estimate = tuple[float, float, float]
@@ -98,7 +98,7 @@ class Cause:
     gain: float = 0.0
 
 
-NO_CAUSE = Cause(name="none")
+_NO_CAUSE = Cause(name="none")
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ def likely_cause(evidence: LevelEvidence) -> Cause:
     """
     binned = _binned(evidence)
     if binned is None:
-        return NO_CAUSE
+        return _NO_CAUSE
     plain = _fitted(binned.measured_db - binned.predicted_db)
     unit = 0.5 * math.log(len(binned.time_s))
     scored = [
@@ -133,8 +133,8 @@ def likely_cause(evidence: LevelEvidence) -> Cause:
         scored, key=lambda trial: trial[0], default=(0.0, "none", _NOTHING, "", plain)
     )
     rmse, rmse_with = (float(np.sqrt(np.mean(model.residual_db**2))) for model in (plain, fit))
-    if gain < MARGIN or rmse_with > (1.0 - LEAST_SHARE) * rmse:
-        return NO_CAUSE
+    if gain < _MARGIN or rmse_with > (1.0 - _LEAST_SHARE) * rmse:
+        return _NO_CAUSE
     value, low, high = estimate
     return Cause(
         name=name,
@@ -154,7 +154,7 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
         return None
     _, place = np.unique(np.floor(evidence.time_s[finite] / BIN_S), return_inverse=True)
     count = np.bincount(place).astype(np.float64)
-    if len(count) < FEWEST_BINS:
+    if len(count) < _FEWEST_BINS:
         return None
 
     def mean(values: FloatArray) -> FloatArray:
@@ -195,7 +195,7 @@ def _fitted(residual: FloatArray, columns: FloatArray | None = None) -> _Fit:
     return _Fit(best.log_likelihood, centred)
 
 
-# Of six harmonics; with ``MARGIN`` chance reaches it in fewer than one of a thousand.
+# Of six harmonics; with ``_MARGIN`` chance reaches it in fewer than one of a thousand.
 _PATTERN_COST = 3.0
 _Trouble = tuple[str, _Estimate, str, _Fit]
 

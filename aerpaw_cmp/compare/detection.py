@@ -13,7 +13,7 @@ from .offset import STEP_DB, OffsetFit, offset_grid
 from .receiver import out_of_group
 
 # Held-out segments of a flight, equally long.
-SEGMENTS = 10
+_SEGMENTS = 10
 
 _PENALTY = 1.0
 _SPAN_DB = 60.0
@@ -191,7 +191,9 @@ def score_detection(
 
 def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> tuple[FloatArray, FloatArray]:
     """Probabilities (n, 2) of each segment from the others: by the level, and of a constant."""
-    segment = np.minimum((time_s - time_s.min()) / max(np.ptp(time_s), 1e-9) * SEGMENTS, SEGMENTS - 1).astype(np.int64)
+    segment = np.minimum((time_s - time_s.min()) / max(np.ptp(time_s), 1e-9) * _SEGMENTS, _SEGMENTS - 1).astype(
+        np.int64
+    )
     stated = out_of_group(level_db[:, None], outcome, segment, _PENALTY)[:, :2]
     stated = stated / stated.sum(axis=1, keepdims=True)  # two outcomes of the four that a receiver of ranks knows
     constant = np.zeros_like(stated)

@@ -23,17 +23,17 @@ from ..common.gaussian import gaussian_kernel
 from ..common.units import BoolArray, FloatArray, IntArray
 
 Frame = Literal["body", "mast", "pair", "world", "place"]
-Sharing = Literal["all", "antenna"]
+_Sharing = Literal["all", "antenna"]
 
 # Prior of each offset in standard deviations of the noise: free in effect, and still a proper covariance.
-OFFSET_SD = 100.0
+_OFFSET_SD = 100.0
 
 # Means that a fit rests on (a matrix of 72 MB); of more flights they are over longer times.
 MOST_ROWS = 3000
 
 # Of the tower's gains against the UAV's: the likelier one is taken. Nothing else is chosen on flights: a length of the
 # nuisance by likelihood and its strength by flights left out, of 0.5 to 4, left 0.06 dB more on dataset 12.
-TOWER_FACTORS = (1.0, 0.5)
+_TOWER_FACTORS = (1.0, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,7 @@ class Term:
     """
 
     frame: Frame
-    per: Sharing
+    per: _Sharing
     length: float
     sd_db: float
 
@@ -221,7 +221,7 @@ def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> Floa
         block = slice(start, start + len(samples))
         distance = cdist(samples.position_m, samples.position_m)
         out[block, block] += model.own_sd_db**2 * np.exp(-distance / model.own_length_m)
-        out[block, block] += (OFFSET_SD * model.noise_sd_db) ** 2
+        out[block, block] += (_OFFSET_SD * model.noise_sd_db) ** 2
         start = block.stop
     out[np.diag_indices(len(out))] += model.noise_sd_db**2
     return out
@@ -439,7 +439,7 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     """
     from scipy.linalg import cho_solve
 
-    model, rows = binned_series(series, model or GainModel())
+    model, rows = _binned_series(series, model or GainModel())
     lower = factor_of(_covariance_of_levels(model, rows))
     target = np.concatenate([s.residual_db - s.residual_db.mean() for s in rows])
     weights = cho_solve((lower, True), target, check_finite=False)
@@ -465,12 +465,12 @@ def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) ->
         fit_gain(series, dataclasses.replace(model, terms=tuple(
             dataclasses.replace(t, sd_db=t.sd_db * factor) if t.frame == "mast" else t for t in model.terms
         ))).scaled()
-        for factor in (TOWER_FACTORS if any(mast) and not all(mast) else (1.0,))
+        for factor in (_TOWER_FACTORS if any(mast) and not all(mast) else (1.0,))
     ]  # fmt: skip
     return max(fits, key=lambda fit: fit.log_evidence)
 
 
-def binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[GainModel, list[LinkSamples]]:
+def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[GainModel, list[LinkSamples]]:
     """Means over bins of each series that has any, and the model with the bins used; InputError if none has."""
     binned = [s.binned(model.bin_s) for s in series]
     longer = math.ceil(sum(map(len, binned)) / MOST_ROWS)
@@ -505,7 +505,7 @@ def column_forms(
     """
     from scipy.linalg import solve_triangular
 
-    model, rows = binned_series(series, model)
+    model, rows = _binned_series(series, model)
     values = np.concatenate([columns(s, model.bin_s) for s in series if len(s.binned(model.bin_s))])
     inside = solve_triangular(factor_of(_covariance_of_levels(model, rows)), values, lower=True)
     return np.asarray(inside.T @ inside)

@@ -13,7 +13,7 @@ from .rss import local_mean_db
 from .statistics import bootstrap_means
 
 # Length of the blocks that are resampled [s].
-BLOCK_S = 20.0
+_BLOCK_S = 20.0
 
 # Averaging window of the second error [s].
 WINDOW_S = 4.0
@@ -59,9 +59,9 @@ class LevelSeries:
 
     @property
     def block(self) -> int:
-        """Samples in :data:`BLOCK_S`, at least one."""
+        """Samples in :data:`_BLOCK_S`, at least one."""
         span = float(np.ptp(self.time_s))
-        return max(1, min(len(self.time_s), round(BLOCK_S * (len(self.time_s) - 1) / span))) if span > 0.0 else 1
+        return max(1, min(len(self.time_s), round(_BLOCK_S * (len(self.time_s) - 1) / span))) if span > 0.0 else 1
 
 
 def crps_normal(error_db: FloatArray, sd_db: FloatArray) -> FloatArray:
@@ -123,7 +123,7 @@ REPLICATES, SEED = 2000, 20240715
 
 
 def rmse_replicates(series: Sequence[LevelSeries]) -> FloatArray:
-    """Mean RMSE (replicates,) over series whose blocks of :data:`BLOCK_S` are drawn anew [dB].
+    """Mean RMSE (replicates,) over series whose blocks of :data:`_BLOCK_S` are drawn anew [dB].
 
     Blocks of one series are the same for every entrant, so differences of replicates are paired.
     """

@@ -17,7 +17,7 @@ from .rank import MAX_RANK, cohen_kappa, kappa_of_means, one_hot, total_variatio
 from .statistics import NO_INTERVAL, REPLICATES, Interval, autocorrelation, bootstrap_means, interval
 
 # What a rank counts in the log score that a forecast held impossible.
-LEAST_PROBABILITY = 1e-6
+_LEAST_PROBABILITY = 1e-6
 
 
 def log_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
@@ -32,14 +32,14 @@ def log_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
 
     Notes
     -----
-    Good (1952), doi:10.1111/j.2517-6161.1952.tb00104.x. Probabilities below :data:`LEAST_PROBABILITY` count as that.
+    Good (1952), doi:10.1111/j.2517-6161.1952.tb00104.x. Probabilities below :data:`_LEAST_PROBABILITY` count as that.
 
     Examples
     --------
     >>> log_losses(np.array([[0.5, 0.5]]), np.array([2])).round(4).tolist()
     [0.6931]
     """
-    return np.asarray(-np.log(np.maximum(probability[np.arange(len(rank)), rank - 1], LEAST_PROBABILITY)))
+    return np.asarray(-np.log(np.maximum(probability[np.arange(len(rank)), rank - 1], _LEAST_PROBABILITY)))
 
 
 def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:

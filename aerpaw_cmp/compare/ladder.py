@@ -18,10 +18,10 @@ from ..common.units import BoolArray, FloatArray, IntArray
 from .statistics import NO_INTERVAL, Interval, PairedDifference, paired_difference
 
 # Places or stretches that a flight is cut into.
-BLOCKS = 8
+_BLOCKS = 8
 
 # A model that has no level at more than a fifth of the samples cannot be compared with the others.
-LEAST_COVERED = 0.8
+_LEAST_COVERED = 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,12 +90,12 @@ class Ladder:
     """RMSE of the recommended model and of free space on other flights, where these chose it [dB]."""
 
 
-def stretches_of(samples: int, blocks: int = BLOCKS) -> IntArray:
+def stretches_of(samples: int, blocks: int = _BLOCKS) -> IntArray:
     """Stretch of each sample (n,): equally many neighbouring samples each."""
     return np.asarray(np.arange(samples) * blocks // max(samples, 1), dtype=np.int64)
 
 
-def places_of(position_m: FloatArray, blocks: int = BLOCKS) -> IntArray:
+def places_of(position_m: FloatArray, blocks: int = _BLOCKS) -> IntArray:
     """Place of each sample (n,): cells of equally many samples, made by halving along the longer side of the plan.
 
     A place that a flight comes back to is one place, and is left out as a whole; stretches of time would leave its
@@ -136,7 +136,7 @@ def _halves(cell: IntArray, position_m: FloatArray) -> tuple[IntArray, IntArray]
 
 
 def climb(
-    measured_db: Sequence[FloatArray], time_s: Sequence[FloatArray], rungs: Sequence[Rung], *, blocks: int = BLOCKS,
+    measured_db: Sequence[FloatArray], time_s: Sequence[FloatArray], rungs: Sequence[Rung], *, blocks: int = _BLOCKS,
     position_m: Sequence[FloatArray] | None = None,
 ) -> Ladder:  # fmt: skip
     """Score the rungs of a ladder, given from the simplest to the most complex model.
@@ -224,7 +224,7 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[Ladd
 
 
 def held_out_error_db(
-    measured_db: FloatArray, level_db: FloatArray, keep: BoolArray, blocks: int = BLOCKS,
+    measured_db: FloatArray, level_db: FloatArray, keep: BoolArray, blocks: int = _BLOCKS,
     place: IntArray | None = None, regressor_db: FloatArray | None = None,
 ) -> FloatArray:  # fmt: skip
     """Measured minus predicted (n,), each stretch with the offset of all the others [dB]; NaN where not ``keep``.
@@ -292,7 +292,7 @@ def held_out_lines(values: FloatArray, x: FloatArray, block: IntArray, blocks: i
 
 
 def log_distance_level_db(
-    measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray, blocks: int = BLOCKS
+    measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray, blocks: int = _BLOCKS
 ) -> FloatArray:
     """Log-distance level (n,) about its mean [dB], each place by the slope of the other places.
 
@@ -340,7 +340,7 @@ def _as_good(error: FloatArray, best: FloatArray) -> bool:
 def _covers(measured: Sequence[FloatArray], rung: Rung) -> bool:
     measurements = sum(int(np.isfinite(m).sum()) for m in measured)
     pairs = (int((np.isfinite(m) & np.isfinite(x)).sum()) for m, x in zip(measured, rung.level_db, strict=True))
-    return sum(pairs) >= LEAST_COVERED * max(measurements, 1)
+    return sum(pairs) >= _LEAST_COVERED * max(measurements, 1)
 
 
 def _shared(measured: FloatArray, levels: Sequence[FloatArray]) -> BoolArray:

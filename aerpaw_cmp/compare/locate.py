@@ -16,24 +16,24 @@ from numpy.typing import ArrayLike
 from ..common.units import BoolArray, FloatArray
 
 # Exponent of the distance before a level was seen, and its standard deviation.
-SLOPE, SLOPE_SD = 3.0, 1.0
+_SLOPE, _SLOPE_SD = 3.0, 1.0
 
 # Gain that two antennas and the ground add over the elevation.
-ELEVATION_SD_DB = 5.0
+_ELEVATION_SD_DB = 5.0
 
 # Shadowing, how long it is remembered, and scatter of medians over some seconds.
 #
 # With them the regions hold the surveyed rover on the six AFAR and sounder flights that docs/formats.md names.
-SHADOW_SD_DB, SHADOW_S, SCATTER_SD_DB = 8.0, 30.0, 4.0
+_SHADOW_SD_DB, _SHADOW_S, _SCATTER_SD_DB = 8.0, 30.0, 4.0
 
 # Standard deviation per axis of what the model cannot see (a tilted antenna, a wall), of the same flights.
 SYSTEMATIC_M = 20.0
 
 # Medians are taken over at least so many seconds, and there are at most so many.
-WINDOW_S, MOST_BINS = 4.0, 120
+WINDOW_S, _MOST_BINS = 4.0, 120
 
 # Heights of the antenna that are tried, and their prior: a rover, a tower.
-HEIGHTS_M = {1.5: 0.7, 10.0: 0.3}
+_HEIGHTS_M = {1.5: 0.7, 10.0: 0.3}
 
 # Bins of a level that a search needs.
 FEWEST = 20
@@ -108,7 +108,7 @@ def level_track(
     Returns
     -------
     LevelTrack
-        At most :data:`MOST_BINS` of them.
+        At most :data:`_MOST_BINS` of them.
     """
     time, place, level = (np.asarray(v, dtype=np.float64) for v in (time_s, position_m, level_db))
     finite = np.isfinite(level) & np.isfinite(place).all(axis=1) & np.isfinite(time)
@@ -116,7 +116,7 @@ def level_track(
     if not len(time):
         return LevelTrack(time, place, level, floor_db)
     # a little longer, or the last instant would have a bin of its own
-    window = max(WINDOW_S, float(np.ptp(time)) / MOST_BINS * 1.001)
+    window = max(WINDOW_S, float(np.ptp(time)) / _MOST_BINS * 1.001)
     groups = np.unique(((time - time.min()) // window).astype(np.int64), return_inverse=True)[1]
     order = np.argsort(groups, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
@@ -162,10 +162,10 @@ def fit_places(track: LevelTrack, places_m: ArrayLike) -> Fits:
 def _shadowing(track: LevelTrack) -> tuple[FloatArray, float]:
     """Leading terms (n, k) of the shadowing's covariance, and the standard deviation of what else scatters."""
     lag = np.abs(track.time_s[:, None] - track.time_s)
-    variance, vectors = np.linalg.eigh(SHADOW_SD_DB**2 * np.exp(-lag / SHADOW_S))
+    variance, vectors = np.linalg.eigh(_SHADOW_SD_DB**2 * np.exp(-lag / _SHADOW_S))
     terms = vectors[:, -_TERMS:] * np.sqrt(np.maximum(variance[-_TERMS:], 0.0))
     unresolved = max(float(variance[:-_TERMS].sum()), 0.0) / len(lag)
-    return terms, float(np.hypot(SCATTER_SD_DB, np.sqrt(unresolved)))
+    return terms, float(np.hypot(_SCATTER_SD_DB, np.sqrt(unresolved)))
 
 
 def _features(track: LevelTrack, places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -176,11 +176,11 @@ def _features(track: LevelTrack, places: FloatArray) -> tuple[FloatArray, FloatA
     elevation = np.arctan2(ray[..., 2], across)
     columns = [
         np.full(across.shape, _FREE_DB),
-        -10.0 * SLOPE_SD * decades,
-        ELEVATION_SD_DB * np.sin(elevation) ** 2,
-        0.5 * ELEVATION_SD_DB * np.cos(4.0 * elevation),
+        -10.0 * _SLOPE_SD * decades,
+        _ELEVATION_SD_DB * np.sin(elevation) ** 2,
+        0.5 * _ELEVATION_SD_DB * np.cos(4.0 * elevation),
     ]
-    mean = _middle(track) - 10.0 * SLOPE * decades
+    mean = _middle(track) - 10.0 * _SLOPE * decades
     if track.airframe_db is not None:
         mean = mean + track.airframe_db(-ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9))
     return mean, np.stack(columns, axis=-1)
@@ -207,8 +207,8 @@ def _fit(track: LevelTrack, places: FloatArray, shadow: FloatArray, noise: float
     if track.below.any():  # else the weight is that of the noise wherever the levels lie
         precision = eye + terms.swapaxes(1, 2) @ (weight[:, :, None] * terms)
     evidence = value - 0.5 * (coefficient**2).sum(axis=1) - 0.5 * np.linalg.slogdet(precision)[1]
-    slope_sd = SLOPE_SD * np.sqrt(np.linalg.inv(precision)[:, 1, 1])
-    return evidence, SLOPE + SLOPE_SD * coefficient[:, 1], slope_sd
+    slope_sd = _SLOPE_SD * np.sqrt(np.linalg.inv(precision)[:, 1, 1])
+    return evidence, _SLOPE + _SLOPE_SD * coefficient[:, 1], slope_sd
 
 
 _LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
@@ -278,14 +278,14 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
 
     Notes
     -----
-    Evidence over a grid of places at :data:`HEIGHTS_M`; the posterior is blurred by :data:`SYSTEMATIC_M`.
+    Evidence over a grid of places at :data:`_HEIGHTS_M`; the posterior is blurred by :data:`SYSTEMATIC_M`.
     """
     from scipy.special import logsumexp
 
     if len(track.level_db) < FEWEST:
         raise ValueError(f"{len(track.level_db)} levels: a search for a node wants {FEWEST}")
     grid = _grid(track)
-    places = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in HEIGHTS_M])
+    places = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
     evidence = fit_places(track, places).evidence + _log_prior(places)
     candidates = np.asarray(candidates_m, dtype=np.float64).reshape(-1, 3)
     log_odds = _log_odds(track, candidates, float(logsumexp(evidence)) - np.log(len(grid)))
@@ -298,7 +298,7 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
     apart = np.hypot(*(places[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1))
     density = np.exp(-0.5 * (apart / SYSTEMATIC_M) ** 2) @ share
     best = int(np.lexsort((-share, -density.round(12)))[0])
-    heights = [h for h in HEIGHTS_M if share[places[:, 2] == h].sum() > 0.05]
+    heights = [h for h in _HEIGHTS_M if share[places[:, 2] == h].sum() > 0.05]
     return NodeEstimate(
         place_m=places[best],
         radius90_m=_radius(apart[best], share),
@@ -312,7 +312,7 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
 
 def _log_prior(places: FloatArray) -> FloatArray:
     """Of the height of places (m, 3)."""
-    return np.log([HEIGHTS_M[height] for height in places[:, 2].tolist()])
+    return np.log([_HEIGHTS_M[height] for height in places[:, 2].tolist()])
 
 
 def _grid(track: LevelTrack) -> FloatArray:

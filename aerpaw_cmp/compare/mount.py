@@ -18,7 +18,7 @@ STEP_DEG = 10.0
 # Least squares: a covariance with learned gains, or with shadowing correlated over place, takes for itself the broad
 # shape over azimuth that tells a mount. On dataset 12 the azimuth at the UAV then jumps between flights (320 and 120
 # deg, in place of 270 and 270).
-MOUNT_NOISE_DB = 10.0
+_MOUNT_NOISE_DB = 10.0
 
 # Samples are averaged over this time [s].
 BIN_S = 4.0
@@ -151,7 +151,7 @@ def _quadratic_forms(
         return np.asarray(out - out.mean(axis=0), dtype=np.float64)
 
     rows = np.concatenate([candidates(s) for s in series])
-    return _Forms(rows.T @ rows / MOUNT_NOISE_DB**2, columns)
+    return _Forms(rows.T @ rows / _MOUNT_NOISE_DB**2, columns)
 
 
 def _best_together(forms: _Forms) -> tuple[dict[str, int], dict[str, FloatArray]]:

@@ -22,7 +22,7 @@ from .statistics import NO_INTERVAL, Interval, correlation, error_intervals, spr
 SAME_PLACE_M = 2.0
 
 # Largest difference of the headings of such samples, where headings count.
-HEADING_WITHIN_DEG = 20.0
+_HEADING_WITHIN_DEG = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Visit:
 
 def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> tuple[IntArray, IntArray]:
     """Indices into both passes: samples with a value, and the nearest ones of the other pass within a radius [m]."""
-    return first.places.partners(second.places, radius_m, HEADING_WITHIN_DEG)
+    return first.places.partners(second.places, radius_m, _HEADING_WITHIN_DEG)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

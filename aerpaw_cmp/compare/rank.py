@@ -484,7 +484,7 @@ def _central(values: FloatArray, k: FloatArray) -> Interval:
 
 
 # Of the condition number at which srsUE reports two layers.
-LIMIT_DB = 17.0
+_LIMIT_DB = 17.0
 
 
 def condition_number_rank(sigma: ArrayLike) -> IntArray:
@@ -494,7 +494,7 @@ def condition_number_rank(sigma: ArrayLike) -> IntArray:
     in ``lib/src/phy/ue/ue_dl.c``); for more ports the same limit is put on each singular value, 20 log10 of the
     ratio. In terms of K that is 10^(17/20) = 7.08.
     """
-    return rank_from_singular_values(sigma, float(amplitude_from_db(LIMIT_DB)))
+    return rank_from_singular_values(sigma, float(amplitude_from_db(_LIMIT_DB)))
 
 
 def capacity_rank(h: ArrayLike, sinr_db: ArrayLike) -> IntArray:

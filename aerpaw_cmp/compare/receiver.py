@@ -29,10 +29,10 @@ from .statistics import REPLICATES, autocorrelation, bootstrap_means, interval
 FLOOR_DB = -40.0
 
 # Ridge penalties to choose from, on coefficients of standardised features (log likelihood of the whole flight).
-PENALTIES = (1.0, 3.0, 10.0, 30.0, 100.0)
+_PENALTIES = (1.0, 3.0, 10.0, 30.0, 100.0)
 
 # Ridge penalty while geometries are chosen.
-CHOICE_PENALTY = 10.0
+_CHOICE_PENALTY = 10.0
 
 # Training samples below which nothing is fitted.
 FEWEST = 50
@@ -423,7 +423,7 @@ class ReceiverMixture:
 
 
 def fit_mixture(
-    features: FloatArray, rank: ArrayLike, groups: IntArray, *, penalties: Sequence[float] = PENALTIES
+    features: FloatArray, rank: ArrayLike, groups: IntArray, *, penalties: Sequence[float] = _PENALTIES
 ) -> ReceiverMixture:
     """Fit one receiver per geometry, with the penalty and the decision that suit the mean of their forecasts.
 
@@ -547,18 +547,18 @@ def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> flo
         [nat].
     """
     x, y, group = _training(features, rank, groups)
-    return float(log_losses(out_of_group(x, y, group, CHOICE_PENALTY).mean(axis=0), y).mean())
+    return float(log_losses(out_of_group(x, y, group, _CHOICE_PENALTY).mean(axis=0), y).mean())
 
 
 def _own_losses(x: FloatArray, rank: IntArray) -> FloatArray:
     z = _standardised(x)
-    weights = _fit_multinomial(z, rank, np.ones(len(rank)), CHOICE_PENALTY, steps=6)
+    weights = _fit_multinomial(z, rank, np.ones(len(rank)), _CHOICE_PENALTY, steps=6)
     p = _softmax(_design(z) @ np.swapaxes(weights, -1, -2))
     return np.array([log_losses(item, rank).mean() for item in p])
 
 
 def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray) -> FloatArray:
-    return np.stack([log_losses(item, rank) for item in out_of_group(x, rank, groups, CHOICE_PENALTY)])
+    return np.stack([log_losses(item, rank) for item in out_of_group(x, rank, groups, _CHOICE_PENALTY)])
 
 
 def _not_worse(difference: FloatArray, replicates: int) -> bool:

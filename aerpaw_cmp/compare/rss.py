@@ -29,7 +29,7 @@ from .statistics import (
 # Two channels of one receiver "part" where they differ by more than this [dB].
 PART_DB = 10.0
 # Over means of so long [s].
-PART_S = 1.0
+_PART_S = 1.0
 
 
 def seconds(time: ArrayLike) -> FloatArray:
@@ -704,7 +704,9 @@ def channel_difference(
     difference = first - second
     mean = float(difference[ok].mean())
     residual = difference - mean
-    spans = error_spans(time_s, residual, position_m=position_m, context=context, window_s=PART_S, threshold_db=PART_DB)
+    spans = error_spans(
+        time_s, residual, position_m=position_m, context=context, window_s=_PART_S, threshold_db=PART_DB
+    )
     return ChannelDifference(
         n=int(ok.sum()),
         mean_db=mean,

@@ -16,7 +16,7 @@ from .statistics import autocorrelation
 FEWEST_FLIGHTS = 3
 
 # From so many flights on, how alike neighbouring flights are is estimated and counted.
-MANY_FLIGHTS = 20
+_MANY_FLIGHTS = 20
 
 Verdict = Literal["first", "worse", "not significant", "no interval"]
 
@@ -110,7 +110,7 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
 
     Notes
     -----
-    Student's t over n flights; from :data:`MANY_FLIGHTS` on over the effective number of
+    Student's t over n flights; from :data:`_MANY_FLIGHTS` on over the effective number of
     :func:`~aerpaw_cmp.compare.statistics.autocorrelation`, so that a season that drifts has no narrower interval than
     its flights bear.
     """
@@ -125,7 +125,7 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     if n < FEWEST_FLIGHTS:
         return MeanOfFlights(n=n, mean=mean, low=np.nan, high=np.nan)
     independent = float(n)
-    if n >= MANY_FLIGHTS and np.ptp(array) > 0:
+    if n >= _MANY_FLIGHTS and np.ptp(array) > 0:
         known = autocorrelation(array).n_effective
         independent = float(np.clip(known, FEWEST_FLIGHTS, n)) if np.isfinite(known) else independent
     reach = float(stdtrit(independent - 1.0, 0.975)) * float(array.std(ddof=1)) / independent**0.5
@@ -151,7 +151,7 @@ class Trend:
 
 
 # Slopes are per so many days.
-DAYS = 30.0
+_DAYS = 30.0
 
 
 def trend(days: ArrayLike, values: ArrayLike) -> Trend:
@@ -178,7 +178,7 @@ def trend(days: ArrayLike, values: ArrayLike) -> Trend:
 
     when, level = np.asarray(days, dtype=np.float64), np.asarray(values, dtype=np.float64)
     dated = np.isfinite(when) & np.isfinite(level)
-    t, y = when[dated] / DAYS, level[dated]
+    t, y = when[dated] / _DAYS, level[dated]
     if len(t) < FEWEST_FLIGHTS or np.ptp(t) <= 0:
         return Trend(n=len(t), slope=np.nan, low=np.nan, high=np.nan, scatter=np.nan)
     t = t - t.mean()

@@ -19,11 +19,11 @@ SHARES = (0.5, 0.9, 0.95)
 BAND = 0.9
 
 # Beyond it the expansion of :meth:`Spread.half_width_db` is no longer one of a bell.
-MOST_KURTOSIS = 2.0
+_MOST_KURTOSIS = 2.0
 
 
 # Squared skewness of fading in dB for each unit of excess kurtosis: 1.30 / 2.40 of Rayleigh's.
-FADE_SKEWNESS2 = 0.54
+_FADE_SKEWNESS2 = 0.54
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,8 +67,8 @@ class Spread:
         total = self.total_db(gain_sd_db)
         z = float(ndtri(0.5 + 0.5 * share))
         with np.errstate(invalid="ignore", divide="ignore"):
-            k = np.clip(self.fading_kurtosis * (self.fading_sd_db / total) ** 4, -MOST_KURTOSIS, MOST_KURTOSIS)
-            skew2 = FADE_SKEWNESS2 * np.maximum(k, 0.0) * (self.fading_sd_db / total) ** 2
+            k = np.clip(self.fading_kurtosis * (self.fading_sd_db / total) ** 4, -_MOST_KURTOSIS, _MOST_KURTOSIS)
+            skew2 = _FADE_SKEWNESS2 * np.maximum(k, 0.0) * (self.fading_sd_db / total) ** 2
         third, fifth = z**3 - 3.0 * z, z**5 - 10.0 * z**3 + 15.0 * z
         return np.asarray(total * (z + third * k / 24.0 + fifth * skew2 / 72.0))
 

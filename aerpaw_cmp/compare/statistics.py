@@ -31,7 +31,7 @@ _LONGER = 2.0
 _RUN = 5
 
 # Fewer independent samples than this give no interval: how long such a sequence remembers cannot be told from it.
-FEWEST_INDEPENDENT = 10.0
+_FEWEST_INDEPENDENT = 10.0
 
 # The variance is widened by this over the independent samples, for what the estimate of the memory leaves open (chosen
 # on simulated flights).
@@ -84,8 +84,8 @@ class Autocorrelation:
 
     @property
     def enough(self) -> bool:
-        """True if an interval can be given at all: at least :data:`FEWEST_INDEPENDENT` independent samples."""
-        return bool(self.n_effective >= FEWEST_INDEPENDENT)
+        """True if an interval can be given at all: at least :data:`_FEWEST_INDEPENDENT` independent samples."""
+        return bool(self.n_effective >= _FEWEST_INDEPENDENT)
 
 
 def autocovariance(values: ArrayLike, lags: int) -> FloatArray:
@@ -299,7 +299,7 @@ def interval(
     Returns
     -------
     (low, high)
-        NaN ("no interval") below :data:`FEWEST_INDEPENDENT` independent samples. Where resampling biases the
+        NaN ("no interval") below :data:`_FEWEST_INDEPENDENT` independent samples. Where resampling biases the
         statistic (distances, RMSE), the same bias sits in the estimate and is taken off.
     """
     good = replicates[np.isfinite(replicates)]

@@ -1,7 +1,7 @@
 """Decisions that the first sentences of a page are chosen from: effect, 95 % interval and likely cause.
 
 The report's own causes are those of :mod:`.causes`. A cause is named only where its interval excludes "no effect";
-where several could be named, chance names any of them in at most :data:`FALSE_ALARMS` of the cases.
+where several could be named, chance names any of them in at most :data:`_FALSE_ALARMS` of the cases.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from .season import mean_of_flights
 from .statistics import NO_INTERVAL, Interval, PairedDifference, mean_interval, paired_verdict, spread_interval
 
 # Share of sound campaigns in which a cause is named, over all that are tried together.
-FALSE_ALARMS = 0.02
+_FALSE_ALARMS = 0.02
 
 # Flights below which none of a campaign is called unlike the others.
-FEWEST_TO_COMPARE = 5
+_FEWEST_TO_COMPARE = 5
 
 # An offset that differs by less [dB] costs no decision, whatever its interval.
 LEAST_DB = 2.0
@@ -87,7 +87,7 @@ def campaign_verdict(
     """
     shifts = [shift for shift in _shifts(errors_db, offsets_db, order) if math.isfinite(shift.chance)]
     best = min(shifts, key=lambda candidate: candidate.chance, default=None)
-    if best is None or best.chance * len(shifts) >= FALSE_ALARMS:
+    if best is None or best.chance * len(shifts) >= _FALSE_ALARMS:
         return Verdict()
     small = best.verdict.cause != "outlying error" and abs(best.verdict.effect) < LEAST_DB
     return Verdict() if small else best.verdict
@@ -127,7 +127,7 @@ def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interva
     from scipy.special import stdtr, stdtrit  # scipy.stats would load for 0.2 s what two functions need
 
     freedom, n = len(values) - 2, int(inside.sum())
-    if len(values) < FEWEST_TO_COMPARE or not 0 < n < len(values):
+    if len(values) < _FEWEST_TO_COMPARE or not 0 < n < len(values):
         return math.nan, math.nan, NO_INTERVAL
     within, without = values[inside], values[~inside]
     effect = float(within.mean() - without.mean())
@@ -208,7 +208,7 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
 _TWO_TRIED = 1.3
 
 # Errors that are less than this times larger or smaller than stated are as stated.
-LEAST_RATIO = 1.15
+_LEAST_RATIO = 1.15
 
 
 def stated_errors(error_db: FloatArray, sd_db: FloatArray, common_db: FloatArray | float = 0.0) -> Verdict:
@@ -243,9 +243,9 @@ def stated_errors(error_db: FloatArray, sd_db: FloatArray, common_db: FloatArray
     spread = Verdict(effect=effect, interval=(low, max(effect, math.sqrt(high**2 + allowed))))
     if abs(mean) > _TWO_TRIED * reach and mean**2 > (within**2 - 1.0) * float(np.mean(sd**2)):
         return bias
-    if low > 1.0 and within > LEAST_RATIO:
+    if low > 1.0 and within > _LEAST_RATIO:
         return Verdict(cause="narrow", effect=within, interval=(low, high))
-    if spread.interval[1] < 1.0 and spread.effect < 1.0 / LEAST_RATIO:
+    if spread.interval[1] < 1.0 and spread.effect < 1.0 / _LEAST_RATIO:
         return Verdict(cause="wide", effect=spread.effect, interval=spread.interval)
     return spread
 
@@ -253,7 +253,7 @@ def stated_errors(error_db: FloatArray, sd_db: FloatArray, common_db: FloatArray
 # --- map ------------------------------------------------------------------------------------------------------------
 
 # A map with less than this share of its positions in coverage has gaps that a sentence explains.
-COVERED = 0.95
+_COVERED = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,7 +283,7 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
     Verdict
         Effect: share covered at the height with the least. Causes: ``extrapolated`` (most positions lie beyond the
         flights), ``threshold`` or ``no path`` (nothing is covered), ``level``, ``trees``, ``blocked`` (what takes most
-        of the gaps), ``none`` (at least :data:`COVERED`). A computed share has no interval.
+        of the gaps), ``none`` (at least :data:`_COVERED`). A computed share has no interval.
     """
     if not heights:
         return Verdict()
@@ -297,7 +297,7 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
         cause = "extrapolated"
     elif worst.covered == 0.0:
         cause = "threshold" if gap["level"] > 0.0 else "no path"
-    elif worst.covered >= COVERED:
+    elif worst.covered >= _COVERED:
         cause = NONE
     else:
         cause = max(gap, key=lambda name: gap[name])

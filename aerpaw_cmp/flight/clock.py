@@ -25,10 +25,10 @@ OK, SHIFTED, CANNOT_TELL = "ok", "shifted", "cannot tell"
 EVIDENCE_NAT = 4.0
 
 # Lags up to this are no shift [s]: positions, models and time stamps of real flights are no better.
-SAME_S = 0.5
+_SAME_S = 0.5
 
 # Clocks agree where every lag beyond this is excluded [s].
-AGREE_S = 1.0
+_AGREE_S = 1.0
 
 # Autopilots and loggers stamp their rows no better [s]: the interval is wider by this on either side.
 STAMPS_S = 0.25
@@ -134,7 +134,7 @@ class ClockEstimate:
     n : int
         Means of the level that count.
     against_zero_nat : float
-        Log likelihood of the best lag above that of the best lag within :data:`SAME_S`.
+        Log likelihood of the best lag above that of the best lag within :data:`_SAME_S`.
     """
 
     radio_minus_telemetry_s: float
@@ -203,7 +203,7 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
         if (b := _Bins.of(group, features[place], window_s)) is not None
     }
     if not bins:
-        return _nothing(NO_OVERLAP, window_s)
+        return _nothing(_NO_OVERLAP, window_s)
     lags = _symmetric(window_s, _STEP_S)
     first = np.sum([b.likelihood(lags, [[_START]] * len(names)).sum(axis=0) for names, b in bins.items()], axis=0)
     starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # of each model, and of clocks that agree
@@ -220,12 +220,12 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     estimate = replace(estimate, model=models[int(total.argmax())], n=n)
     explained = total.max() - sum(b.constant() for b in bins.values())
     if explained < EVIDENCE_NAT + np.log(len(lags)):  # so much is had by trying as many lags
-        return replace(estimate, verdict=CANNOT_TELL, reason=NO_DEPENDENCE)
+        return replace(estimate, verdict=CANNOT_TELL, reason=_NO_DEPENDENCE)
     return estimate
 
 
-NO_OVERLAP = "too few samples at which the telemetry gives a position for every lag of the window"
-NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
+_NO_OVERLAP = "too few samples at which the telemetry gives a position for every lag of the window"
+_NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
 
 
 def _at_one_time(channels: Sequence[ClockChannel]) -> dict[tuple[Hashable, ...], list[ClockChannel]]:
@@ -278,13 +278,13 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
     # the nearest that are excluded
     first, last = lags[max(near[0] - 1, 0)], lags[min(near[-1] + 1, len(lags) - 1)]
     low, high = max(float(first) - STAMPS_S, -window_s), min(float(last) + STAMPS_S, window_s)
-    against = -float(total[np.abs(lags) <= SAME_S + 1e-9].max())
+    against = -float(total[np.abs(lags) <= _SAME_S + 1e-9].max())
     verdict, reason = CANNOT_TELL, f"lags from {low:+.1f} to {high:+.1f} s explain the level about as well"
     if against > EVIDENCE_NAT and (near[0] == 0 or near[-1] == len(lags) - 1):
         reason = f"the best lag lies near the edge of the window ({window_s:g} s): widen rss.advanced.lag_window_s"
     elif against > EVIDENCE_NAT and not low <= 0.0 <= high:
         verdict, reason = SHIFTED, ""
-    elif first >= -AGREE_S and last <= AGREE_S:
+    elif first >= -_AGREE_S and last <= _AGREE_S:
         verdict, reason = OK, ""
     return ClockEstimate(
         radio_minus_telemetry_s=float(lags[total.argmax()]),

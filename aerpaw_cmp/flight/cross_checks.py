@@ -28,7 +28,7 @@ _OF_THE_DAY = timedelta(hours=36)
 _OF_THE_MINUTE = timedelta(minutes=15)
 
 # A track whose lowest height [m] is farther from 0 does not begin at its take-off.
-GROUND_M = 5.0
+_GROUND_M = 5.0
 
 
 def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | None) -> list[str]:
@@ -56,7 +56,7 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     if any(s.attributes.get("height_from") == "assumed" for s in streams):
         texts.append(f"the heights are read as {_source(streams, 'height') or 'above take-off'}: right?")
     for stream in streams:
-        if stream.kind == "telemetry" and (low := _lowest_m(stream)) is not None and abs(low) > GROUND_M:
+        if stream.kind == "telemetry" and (low := _lowest_m(stream)) is not None and abs(low) > _GROUND_M:
             texts.append(f"the lowest height is {low:.0f} m, expected 0 m: does the track begin in the air?")
     return list(dict.fromkeys(texts))
 

@@ -684,7 +684,7 @@ def _check_overlap(data: FlightData) -> None:
 
 
 # A log that ends before counts from a zero of its own.
-FIRST_YEAR = 2000
+_FIRST_YEAR = 2000
 
 
 def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: str | None = None) -> None:
@@ -698,7 +698,7 @@ def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: 
     expected = "logs of the same flight"
     if node is not None:
         of, expected = "the track of this tower", "positions of the node during the flight"
-        if pd.Timestamp(end).year < FIRST_YEAR:
+        if pd.Timestamp(end).year < _FIRST_YEAR:
             cause = "relative times: they want 'time_origin' beside the log"
         cause = cause.replace("beside the log", f"beside 'path' in towers.{node}.track")
     raise InputError(f"no overlap in time: {what} spans {shown}, {of} {flown}", expected=expected, cause=cause)

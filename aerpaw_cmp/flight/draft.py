@@ -41,7 +41,7 @@ LINK = (
     f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: true,"
     " bandwidth_hz: 20e6}  # out of coverage below the noise of this bandwidth; all as in your experiment?\n"
 )
-NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
+_NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
 RANK = (
     "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz, above the noise of 20 MHz, unless link.rank names"
     " others: is that your modem?\n"
@@ -120,7 +120,7 @@ def draft(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = D
     if options.timezone:
         parts.append(f"timezone: {options.timezone}\n")
     parts += ["logs:\n", *entries.lines.values()]
-    parts += [NO_TRACK] if entries.without_track else []
+    parts += [_NO_TRACK] if entries.without_track else []
     parts += [f"  # left out: {remark}\n" for remark in entries.out]
     known = _remembered(entries, site, folder)
     parts += _learned_lines(known) if "rss" in entries.kinds else []
@@ -207,17 +207,17 @@ def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = 
 MINIMUM_HEIGHT_M = 5
 
 # A flight that never got higher has no part that is better than its start.
-FLOWN_ABOVE_M = 15.0
+_FLOWN_ABOVE_M = 15.0
 
 
 # Links that the audit of a first report checks.
-QUICK_AUDIT = 24
+_QUICK_AUDIT = 24
 
 _QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers to publish"
 
 
 # A node that is placed this well is seen from a flight some hundred metres away within some tens of degrees.
-SURE_M = 100.0
+_SURE_M = 100.0
 
 
 def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
@@ -246,7 +246,7 @@ def _learned_lines(known: Proposal) -> list[str]:
 def _settings(entries: _Entries, known: Proposal) -> list[str]:
     """Lines for ``rt``, ``rss`` and ``rank`` that real logs ask for."""
     lines = _replay_lines(entries, known)
-    low: dict[str, Any] = {"minimum_height_m": MINIMUM_HEIGHT_M} if entries.highest_m() > FLOWN_ABOVE_M else {}
+    low: dict[str, Any] = {"minimum_height_m": MINIMUM_HEIGHT_M} if entries.highest_m() > _FLOWN_ABOVE_M else {}
     for kind in sorted(entries.kinds & {"rss", "rank"}, reverse=True):
         chosen: dict[str, Any] = dict(low)
         reasons = ["without take-off and landing"] if low else []
@@ -272,12 +272,12 @@ def _replay_lines(entries: _Entries, known: Proposal) -> list[str]:
     if "rank" in entries.kinds:
         return [
             "# rt.attitude: logged needs link.rank.uav mounted as seen from the aircraft's nose.\n",
-            f"rt: {{audit_links: {QUICK_AUDIT}}}{_QUICK}\n",
+            f"rt: {{audit_links: {_QUICK_AUDIT}}}{_QUICK}\n",
         ]
     if _has_attitude(entries.flown[0].frame):
-        return [f"rt: {{attitude: logged{alone}, audit_links: {QUICK_AUDIT}}}{_QUICK}\n"]
+        return [f"rt: {{attitude: logged{alone}, audit_links: {_QUICK_AUDIT}}}{_QUICK}\n"]
     return [
-        f"rt: {{attitude: level{alone}, audit_links: {QUICK_AUDIT}}}"
+        f"rt: {{attitude: level{alone}, audit_links: {_QUICK_AUDIT}}}"
         "  # a quick audit; no attitude in the telemetry: the nose points along the track?\n"
     ]
 
@@ -312,7 +312,7 @@ def _has_attitude(frame: Any) -> bool:
     return set(names) <= set(frame.columns) and bool(frame[names].notna().all(axis=1).mean() > 0.5)
 
 
-CLIPPED_SHARE = 0.01
+_CLIPPED_SHARE = 0.01
 
 
 def receiver_floor_db(levels: Sequence[Stream]) -> float | None:
@@ -324,7 +324,7 @@ def receiver_floor_db(levels: Sequence[Stream]) -> float | None:
     for stream in levels:
         level = stream.frame["rss_db"].to_numpy(np.float64)
         level = level[np.isfinite(level)]
-        if len(level) and np.sum(level == level.min()) >= max(10.0, CLIPPED_SHARE * len(level)) and np.ptp(level) > 0:
+        if len(level) and np.sum(level == level.min()) >= max(10.0, _CLIPPED_SHARE * len(level)) and np.ptp(level) > 0:
             floors.append(float(level.min()))
     return max(floors) if floors else None
 
@@ -410,7 +410,7 @@ class _Entries:
         refused = self._refused(streams, entry, shown, dated=origin is not None)
         compared = [s for s in streams if s.name not in refused]
         reasons = list(dict.fromkeys(refused.values()))
-        if not compared and reasons == [RATIO] and all(may_lose_lock(s) for s in streams):
+        if not compared and reasons == [_RATIO] and all(may_lose_lock(s) for s in streams):
             comment = "  # says when the receiver was in lock"
             skip = [s.name for s in streams]
             self.lines[file.path] = (
@@ -420,7 +420,7 @@ class _Entries:
         if not compared:
             self.out.append(f"{shown}: {'; '.join(reasons) or 'no samples'}")
             return
-        self.out += [f"{shown}: {name}: {reason}" for name, reason in refused.items() if reason != RATIO]
+        self.out += [f"{shown}: {name}: {reason}" for name, reason in refused.items() if reason != _RATIO]
         if all(s.kind == "telemetry" for s in compared):
             entry, comment = {"path": path, "reader": file.result.reader}, ""
         if self.options.time_origin and any("clock" in s.attributes for s in compared):
@@ -511,7 +511,7 @@ class _Entries:
                 continue
             if place.tower is not None:
                 self.towers[place.node] = place.tower, place.question
-                self.sure |= {place.node} if place.radius_m <= SURE_M else set()
+                self.sure |= {place.node} if place.radius_m <= _SURE_M else set()
             if pci is None:
                 entry["node"] = place.node
                 return f"  # {place.question}" if place.tower is None and place.question else ""
@@ -607,10 +607,10 @@ class _Entries:
             return "its times are relative; read it again with --time-origin"
         if self.flown is not None and not relative and not _meet(span, self.flown[1]):
             return _late(span, self.flown[1], self.options.timezone)
-        return RATIO if self.has_level and is_ratio(stream) else None
+        return _RATIO if self.has_level and is_ratio(stream) else None
 
 
-RATIO = "a ratio to the noise, no level"
+_RATIO = "a ratio to the noise, no level"
 
 
 def _late(span: Span, flown: Span, timezone: str | None = None) -> str:

@@ -53,7 +53,7 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     ----------
     files : sequence of IngestedFile
     """
-    timed = [(file, span) for file in files if (span := span_of(file)) is not None]
+    timed = [(file, span) for file in files if (span := _span_of(file)) is not None]
     groups: list[Flight] = []
     for file, span in sorted(timed, key=lambda entry: (not _has_track(entry[0]), entry[1][0])):
         place = _place(file)
@@ -68,12 +68,12 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
             flight.span = (min(flight.span[0], span[0]), max(flight.span[1], span[1]))
             flight.place = flight.place or place
     for file in files:
-        if span_of(file) is None:
+        if _span_of(file) is None:
             _home(file, groups).files.append(file)
     return sorted(groups, key=lambda group: (group.span is None, (group.span or ())[:1]))
 
 
-def span_of(file: IngestedFile) -> Span | None:
+def _span_of(file: IngestedFile) -> Span | None:
     """First and last time of a file's streams; None where it has no wall clock."""
     spans = [span for stream in file.result.streams if (span := stream_span(stream)) is not None]
     first = min((begin for begin, _ in spans), default=None)

@@ -12,7 +12,7 @@ from ..compare.serving import at_times
 from ..logs.records import Stream
 
 # Quality [dB] at perfect lock (the peak of 4095 chips), and below which the receiver has lost it.
-LOCK_QUALITY_DB, LOST_QUALITY_DB = 20.0 * float(np.log10(4095.0)), 60.0
+_LOCK_QUALITY_DB, _LOST_QUALITY_DB = 20.0 * float(np.log10(4095.0)), 60.0
 
 # Level [dB re full scale] below which the receiver loses its lock: what it then writes is noise.
 LOCK_FLOOR_DB = -15.0
@@ -26,8 +26,8 @@ def may_lose_lock(stream: Stream) -> bool:
     if stream.kind != "rss" or stream.name != "quality":
         return False
     quality = stream.frame["rss_db"].to_numpy(np.float64)
-    locked = quality[quality > LOST_QUALITY_DB]
-    return bool(len(locked)) and abs(float(np.median(locked)) - LOCK_QUALITY_DB) < 3.0
+    locked = quality[quality > _LOST_QUALITY_DB]
+    return bool(len(locked)) and abs(float(np.median(locked)) - _LOCK_QUALITY_DB) < 3.0
 
 
 def is_sounder_power(stream: Stream) -> bool:
@@ -68,7 +68,7 @@ def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | N
             order = np.argsort(at, kind="stable")  # a log may have been put together of parts
             quality = at_times(time, at[order], quality[order], within_s=_WITHIN_S)
         if np.isfinite(quality).any():
-            return np.where(np.isfinite(quality), (quality > LOST_QUALITY_DB).astype(np.float64), np.nan), remark
+            return np.where(np.isfinite(quality), (quality > _LOST_QUALITY_DB).astype(np.float64), np.nan), remark
     return None, ""
 
 

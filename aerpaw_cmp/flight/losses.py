@@ -15,14 +15,14 @@ from ..site.site import Site, Trees
 from .settings import RtSettings
 
 
-def crowns_reflect(trees: Trees, rt: RtSettings) -> bool:
+def _crowns_reflect(trees: Trees, rt: RtSettings) -> bool:
     """Check whether crowns reflect: those of ``foliage: opaque``, unless ``rt.advanced.crown_reflections`` is off."""
     return rt.foliage == "opaque" and rt.advanced.crown_reflections and len(trees) > 0
 
 
 def reflecting_crowns(trees: Trees, rt: RtSettings) -> Crowns | None:
     """Crowns that reflect, or None."""
-    return Crowns(trees) if crowns_reflect(trees, rt) else None
+    return Crowns(trees) if _crowns_reflect(trees, rt) else None
 
 
 def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
@@ -62,11 +62,11 @@ def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
 
 
 # A reflection this near to a ground plane of the site is one off the ground.
-ON_GROUND_M = 1e-6
+_ON_GROUND_M = 1e-6
 
 
 # The same over an elevation model, whose specular points are found by iteration.
-NEAR_TERRAIN_M = 0.01
+_NEAR_TERRAIN_M = 0.01
 
 
 def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
@@ -111,12 +111,12 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
         total, ray_start = np.zeros(len(paths)), sources_m[paths.tower]
         for step in range(paths.vertices_m.shape[1]):
             corner = paths.vertices_m[:, step]
-            on = np.abs(corner[:, 2:] - heights).min(axis=1) < ON_GROUND_M  # NaN where the path has no such corner
+            on = np.abs(corner[:, 2:] - heights).min(axis=1) < _ON_GROUND_M  # NaN where the path has no such corner
             if site.dem is not None:
-                on |= np.abs(corner[:, 2] - site.dem.ground_m(corner[:, 0], corner[:, 1])) < NEAR_TERRAIN_M
+                on |= np.abs(corner[:, 2] - site.dem.ground_m(corner[:, 0], corner[:, 1])) < _NEAR_TERRAIN_M
             on &= paths.tree[:, step] < 0
             ray = corner[on] - ray_start[on]
-            sine = np.abs(ray[:, 2]) / np.maximum(np.linalg.norm(ray, axis=1), ON_GROUND_M)
+            sine = np.abs(ray[:, 2]) / np.maximum(np.linalg.norm(ray, axis=1), _ON_GROUND_M)
             total[on] += 40.0 * np.log10(np.e) * (2.0 * np.pi / wavelength * sigma * sine) ** 2
             ray_start = np.where(np.isfinite(corner), corner, ray_start)
         return total

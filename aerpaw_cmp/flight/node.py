@@ -21,19 +21,19 @@ from .scored import unscored
 from .track import Track
 
 # Log odds from which on a tower of the site is taken; the surveyed flights give 2.8 to 4.7, others at most 1.0.
-TOWER_ODDS = 2.0
+_TOWER_ODDS = 2.0
 
 # Log evidence by which another tower must explain the levels better before a named one is doubted.
 CONTRADICTED = 8.0
 
 # Places of a list whose log odds differ by less are both named.
-UNDECIDED = 3.0
+_UNDECIDED = 3.0
 
 # Of the link that a draft proposes.
 CARRIER_HZ, POWER_DBM = 3.3e9, 40.0
 
 # Below it an airframe on the ground decides the level.
-LOW_M = 5.0
+_LOW_M = 5.0
 
 # A place of a list that is farther from the track is not of this flight.
 NEAR_M = 5000.0
@@ -110,7 +110,7 @@ class Placer:
         """Levels of a log where the UAV flew, with the gain of its airframe where it is known."""
         frame = stream.frame[~unscored(stream.frame)]
         poses = self.track.pose_at(frame["time"])
-        place = np.where((poses.position_m[:, 2] > self.track.ground_m + LOW_M)[:, None], poses.position_m, np.nan)
+        place = np.where((poses.position_m[:, 2] > self.track.ground_m + _LOW_M)[:, None], poses.position_m, np.nan)
         time = frame["time"].to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
         level = frame["rss_db"].to_numpy(np.float64)
         below_floor = frame["flag"].astype(str).str.contains("out_of_coverage").to_numpy()
@@ -134,15 +134,15 @@ class Placer:
         at = [np.asarray(tower.position_m) for tower in towers] + [self._local(place) for place in listed]
         estimate = locate(track, np.array(at))
         odds_tower, odds_listed = estimate.log_odds[: len(towers)], estimate.log_odds[len(towers) :]
-        if len(listed) and odds_listed.max() >= max(TOWER_ODDS, odds_tower.max()):
+        if len(listed) and odds_listed.max() >= max(_TOWER_ODDS, odds_tower.max()):
             order = np.argsort(-odds_listed)
-            place, least = listed[order[0]], odds_listed[order[0]] - UNDECIDED
+            place, least = listed[order[0]], odds_listed[order[0]] - _UNDECIDED
             undecided = [listed[i] for i in order[1:] if odds_listed[i] > least]
             also = "".join(f" or line {tie.line}" for tie in undecided)
             about = f"line {place.line} of {place.file}{also}: is the node there?"
             return self._node(self._local(place), place.latitude_deg, place.longitude_deg, 1.5, about)
         best = int(odds_tower.argmax())
-        if odds_tower[best] >= TOWER_ODDS:
+        if odds_tower[best] >= _TOWER_ODDS:
             return Placement(towers[best].name, None, f"the levels fit {towers[best].name} best: is it this tower?")
         latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
         apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]

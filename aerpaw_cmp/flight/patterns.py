@@ -25,16 +25,16 @@ NOSES: tuple[Nose, ...] = ("along", "four headings", "fixed")
 MARGIN_M = 3.0
 
 # Shorter legs are left out.
-LEAST_LEG_M = 40.0
+_LEAST_LEG_M = 40.0
 
 # Least spacing of legs.
-CLOSEST_M = 15.0
+_CLOSEST_M = 15.0
 
-TURN_STEPS = 8
+_TURN_STEPS = 8
 # A slow turn holds each eighth of the compass for this long.
-TURN_HOLD_S = 8.0
+_TURN_HOLD_S = 8.0
 
-TURN_POINTS = 4
+_TURN_POINTS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,7 +157,7 @@ def lawnmower(area: Any, azimuth_deg: float, spacing_m: float) -> list[FloatArra
     legs, up = [], True
     for x in at:
         cut = turned.intersection(shapely.LineString([(x, south - 1.0), (x, north + 1.0)]))
-        pieces = [p for p in getattr(cut, "geoms", [cut]) if p.length >= LEAST_LEG_M]
+        pieces = [p for p in getattr(cut, "geoms", [cut]) if p.length >= _LEAST_LEG_M]
         pieces.sort(key=lambda p: p.bounds[1], reverse=not up)
         for piece in pieces:
             back = shapely.affinity.rotate(piece, -azimuth_deg, origin=centre)
@@ -177,7 +177,7 @@ def cross(area: Any, azimuth_deg: float) -> list[FloatArray]:
         step = reach * np.array([math.sin(math.radians(course)), math.cos(math.radians(course))])
         centre = np.array([middle.x, middle.y])
         cut = area.intersection(shapely.LineString([centre - step, centre + step]))
-        pieces = [p for p in getattr(cut, "geoms", [cut]) if p.distance(middle) < 1e-6 and p.length >= LEAST_LEG_M]
+        pieces = [p for p in getattr(cut, "geoms", [cut]) if p.distance(middle) < 1e-6 and p.length >= _LEAST_LEG_M]
         legs += [np.array(p.coords)[[0, -1]] for p in pieces]
     return legs
 
@@ -236,12 +236,12 @@ def waypoints_of(legs: Sequence[FloatArray], area: Any, height_m: float, nose: N
 
 def with_turns(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
     """The route with a slow turn through all headings at some of its points."""
-    at = set(spread_out(len(waypoints), TURN_POINTS).tolist())
+    at = set(spread_out(len(waypoints), _TURN_POINTS).tolist())
     out: list[Waypoint] = []
     for i, w in enumerate(waypoints):
         if i in at:
-            turns = [(w.yaw_deg + 360.0 / TURN_STEPS * k) % 360.0 for k in range(TURN_STEPS)]
-            out += [replace(w, yaw_deg=yaw, hold_s=TURN_HOLD_S) for yaw in turns]
+            turns = [(w.yaw_deg + 360.0 / _TURN_STEPS * k) % 360.0 for k in range(_TURN_STEPS)]
+            out += [replace(w, yaw_deg=yaw, hold_s=_TURN_HOLD_S) for yaw in turns]
         out.append(w)
     return out
 
@@ -264,7 +264,7 @@ class Pattern:
             "fixed": "nose to the north",
             "four headings": "nose turned by 90 deg per leg",
         }
-        turns = f", slow turn at {TURN_POINTS} points" if self.turns else ""
+        turns = f", slow turn at {_TURN_POINTS} points" if self.turns else ""
         return f"{self.shape} with legs at {self.azimuth_deg:g} deg, {self.height_m:g} m, {nose[self.nose]}{turns}"
 
 
@@ -295,7 +295,7 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
     def made(legs: Sequence[FloatArray]) -> Route:
         if not legs:
             raise UsageError(
-                f"no route fits: no leg of {LEAST_LEG_M:g} m lies within the geofence",
+                f"no route fits: no leg of {_LEAST_LEG_M:g} m lies within the geofence",
                 expected="an area of some hundred metres outside no-fly areas and circles around towers",
             )
         points = waypoints_of(legs, area, pattern.height_m, pattern.nose)
@@ -308,7 +308,7 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
             more += [leg[::-1] for leg in legs] if (len(more) // max(len(legs), 1)) % 2 else list(legs)
             route = made(more)
         return cut(route, most_s, speed_mps)
-    low, high = CLOSEST_M, widest
+    low, high = _CLOSEST_M, widest
     for _ in range(14):
         middle = math.sqrt(low * high)
         longer = made(lawnmower(area, pattern.azimuth_deg, middle)).duration_s > most_s

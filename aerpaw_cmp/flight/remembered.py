@@ -71,7 +71,7 @@ def remembered(site: str | Path) -> dict[str, Remembered]:
 
 
 # Tower, channel (``rank`` of rank) and reader of a series of the draft.
-SeriesKey = tuple[str, str, str]
+_SeriesKey = tuple[str, str, str]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +93,7 @@ class Nodes:
     fixed: Sequence[str] = ()
 
 
-def propose(known: learned.Learned, site: str, series: Sequence[SeriesKey], nodes: Nodes = Nodes()) -> Proposal:
+def propose(known: learned.Learned, site: str, series: Sequence[_SeriesKey], nodes: Nodes = Nodes()) -> Proposal:
     """The entry that fits most series: tower antennas where the tower fits too, else the airframe alone.
 
     The antenna of a node that flights placed themselves goes with any such node: it was learned over several places.
@@ -220,14 +220,14 @@ def _placed(s: learned.LearnedSeries, tower: str, nodes: Nodes) -> bool:
     return tower in nodes.placed and s.tower not in nodes.fixed
 
 
-def _alike(s: learned.LearnedSeries, key: SeriesKey, nodes: Nodes) -> bool:
+def _alike(s: learned.LearnedSeries, key: _SeriesKey, nodes: Nodes) -> bool:
     """Check whether a series has the channel and the receiver of one that was learned from, whatever its tower."""
     tower, channel, reader = key
     same = s.reader == reader or (_placed(s, tower, nodes) and {s.reader, reader} <= SOUNDER)
     return s.channel == channel and same
 
 
-def _fits(entry: learned.Entry, series: Sequence[SeriesKey], nodes: Nodes) -> tuple[int, int]:
+def _fits(entry: learned.Entry, series: Sequence[_SeriesKey], nodes: Nodes) -> tuple[int, int]:
     """Series of an entry that fit exactly, and those of another tower."""
     exact = sum((s.tower, s.channel, s.reader) in series for s in entry.series)
     return exact, sum(any(_alike(s, key, nodes) for key in series) for s in entry.series)

@@ -220,10 +220,10 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
 BLOCK = 100_000
 
 # Sampling of the prediction that a clock is judged by [s]; longer flights take wider steps.
-CLOCK_STEP_S, CLOCK_INSTANTS = 0.05, 40_000
+_CLOCK_STEP_S, _CLOCK_INSTANTS = 0.05, 40_000
 
 # The same of a tower that moves: each place is traced for itself.
-MOVING_CLOCK_STEP_S = 0.25
+_MOVING_CLOCK_STEP_S = 0.25
 
 
 def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[ClockChannel]:
@@ -235,8 +235,8 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
     assert data.track is not None
     channels = [series for series in channels if series.unit != "dB"] or channels
     start, end = data.track.start_ns, data.track.end_ns
-    step = MOVING_CLOCK_STEP_S if channels[0].tower in data.nodes else CLOCK_STEP_S
-    step = max(step, (end - start) * 1e-9 / CLOCK_INSTANTS)
+    step = _MOVING_CLOCK_STEP_S if channels[0].tower in data.nodes else _CLOCK_STEP_S
+    step = max(step, (end - start) * 1e-9 / _CLOCK_INSTANTS)
     instants = (start + np.round(np.arange(0.0, (end - start) * 1e-9, step) * 1e9).astype(np.int64)).astype(
         "datetime64[ns]"
     )

@@ -35,11 +35,11 @@ from .settings import FlightFile, LogSettings, PlanSettings, files_of
 from .track import interpolated
 
 # What was planted.
-TRUTH = "truth.json"
+_TRUTH = "truth.json"
 # The flight file, beside the logs that it names.
 FLIGHT = "flight.yaml"
 # Below this the simulated level is no signal.
-LOWEST_DBM = -400.0
+_LOWEST_DBM = -400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Trajectory:
 
 
 # Of one simulated log: 140 h at ten a second.
-MAXIMUM_SAMPLES = 5_000_000
+_MAXIMUM_SAMPLES = 5_000_000
 
 
 def plan_trajectory(plan: PlanSettings) -> Trajectory:
@@ -98,10 +98,10 @@ def plan_trajectory(plan: PlanSettings) -> Trajectory:
             times.append(times[-1] + point.hold_s)
             positions.append(corner)
     shortest = min(plan.telemetry_interval_s, plan.rss_interval_s, plan.rank_interval_s)
-    if times[-1] / shortest > MAXIMUM_SAMPLES:
+    if times[-1] / shortest > _MAXIMUM_SAMPLES:
         raise UsageError(
             f"the plan lasts {times[-1]:.3g} s, with a sample every {shortest:g} s",
-            expected=f"at most {MAXIMUM_SAMPLES} samples of a log",
+            expected=f"at most {_MAXIMUM_SAMPLES} samples of a log",
             cause="a misplaced waypoint, a speed or an interval with too few digits",
         )
     if len(times) < 2:
@@ -156,7 +156,7 @@ def telemetry_frame(
     latitude, longitude = frame.to_geographic(position[:, 0], position[:, 1])
     records: pd.DataFrame = pd.DataFrame(
         {
-            "time": times_after(start_utc, time_s),
+            "time": _times_after(start_utc, time_s),
             "latitude_deg": latitude,
             "longitude_deg": longitude,
             "altitude_m": position[:, 2],
@@ -173,7 +173,7 @@ def telemetry_frame(
     return records
 
 
-def times_after(start_utc: pd.Timestamp, seconds: FloatArray) -> pd.Series:
+def _times_after(start_utc: pd.Timestamp, seconds: FloatArray) -> pd.Series:
     """UTC times, naive, rounded to the microsecond that the log formats hold."""
     stamps: pd.Series = pd.Series(
         start_utc + pd.to_timedelta(np.round(np.asarray(seconds) * 1e6).astype(np.int64), unit="us")
@@ -299,7 +299,7 @@ class FlightSimulator:
             self.truth_["plan"] = plan.model_dump(mode="json")
             contents |= {
                 FLIGHT: dump_yaml(self._flight_file()).encode("utf-8"),
-                TRUTH: (json.dumps(self.truth_, indent=1) + "\n").encode("utf-8"),
+                _TRUTH: (json.dumps(self.truth_, indent=1) + "\n").encode("utf-8"),
             }
             with output.filling() as folder:
                 for name, content in contents.items():
@@ -321,7 +321,7 @@ class FlightSimulator:
             place = Path(os.path.normpath(out / name))
             if Path(name).is_absolute() or Path(os.path.normpath(out)) not in place.parents:
                 raise UsageError(f"log {name!r} lies outside the folder of the logs", expected="a path below it")
-            if names.count(name) > 1 or name in (TRUTH, FLIGHT, SUMS):
+            if names.count(name) > 1 or name in (_TRUTH, FLIGHT, SUMS):
                 raise UsageError(f"two files of this flight are named {name!r}", expected="a name of its own for each")
 
     def _log_bytes(self, log: LogSettings) -> bytes:
@@ -371,7 +371,7 @@ class FlightSimulator:
         )
         if plan.noise_floor_db is not None:
             level = np.fmax(level, plan.noise_floor_db)
-        out_of_coverage = ~np.isfinite(level) | (level < LOWEST_DBM)
+        out_of_coverage = ~np.isfinite(level) | (level < _LOWEST_DBM)
         shift = plan.clock_shift_s.get(log.node, 0.0) + plan.clock_drift_s_per_s.get(log.node, 0.0) * time_s
         self.truth_["rss"].setdefault(log.node, {})[log.channel] = {
             "offset_db": offset,
@@ -382,7 +382,7 @@ class FlightSimulator:
             "out_of_coverage": int(out_of_coverage.sum()),
         }
         return format_power_log(
-            times_after(self.start_utc, time_s + shift),
+            _times_after(self.start_utc, time_s + shift),
             np.where(out_of_coverage, np.nan, level),
             str(log.timezone or self.settings.timezone),
         )
@@ -405,7 +405,7 @@ class FlightSimulator:
         }
         records = pd.DataFrame(
             {
-                "time": times_after(self.start_utc, time_s),
+                "time": _times_after(self.start_utc, time_s),
                 "rank": reported,
                 "latitude_deg": latitude,
                 "longitude_deg": longitude,

@@ -12,9 +12,9 @@ from ..logs.records import Stream, has_wall_clock
 from .track import interpolated
 
 # Two receivers on one aircraft tell places this near each other, in the median.
-AGREE_M = 12.0
+_AGREE_M = 12.0
 # The second-best origin, a minute away or farther, must be so many times worse.
-UNIQUE = 1.8
+_UNIQUE = 1.8
 _POINTS = 240
 _METRES = 111_320.0
 
@@ -68,7 +68,7 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     distance = float(np.nanmin(finer))
     second = float(np.nanmin(misses[apart])) if np.isfinite(misses[apart]).any() else np.inf
     # like with like: the other places were tried each second, and between two seconds an aircraft flies some metres
-    if distance > AGREE_M or second < UNIQUE * max(float(misses[best]), 1.0):
+    if distance > _AGREE_M or second < _UNIQUE * max(float(misses[best]), 1.0):
         return None
     origin_s = zero_s + float(fine[int(np.nanargmin(finer))])
     return Origin(np.datetime64(round(origin_s * 1000), "ms").astype("datetime64[ns]"), distance)

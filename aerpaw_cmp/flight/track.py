@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     import pandas as pd
 
 # Telemetry gaps longer than this are not bridged [s]; vehicleOut rows come every 1.0 s.
-MAXIMUM_GAP_S = 3.0
+_MAXIMUM_GAP_S = 3.0
 
 # Below this ground speed the course says nothing about the heading [m/s].
-COURSE_SPEED_MPS = 1.0
+_COURSE_SPEED_MPS = 1.0
 
 # Instants whose poses are computed at once: bounds memory on flights of more than half an hour.
 AT_ONCE = 100_000
 
 # Positions this long before and after give a velocity that is not logged [s].
-COURSE_SPAN_S = 2.0
+_COURSE_SPAN_S = 2.0
 
 # Why a pose is not valid; index 0 is a valid pose.
 REASONS = (
@@ -250,7 +250,7 @@ class Track:
         telemetry: pd.DataFrame,
         frame: SiteFrame,
         *,
-        maximum_gap_s: float = MAXIMUM_GAP_S,
+        maximum_gap_s: float = _MAXIMUM_GAP_S,
         minimum_height_m: float = MINIMUM_HEIGHT_M,
         ground_m: float = 0.0,
     ) -> None:
@@ -430,7 +430,7 @@ def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> Floa
     """
     if len(t) < 2:
         return np.where(np.isfinite(logged), logged, 0.0)
-    early, late = np.maximum(t - COURSE_SPAN_S, t[0]), np.minimum(t + COURSE_SPAN_S, t[-1])
+    early, late = np.maximum(t - _COURSE_SPAN_S, t[0]), np.minimum(t + _COURSE_SPAN_S, t[-1])
     early, late = np.minimum(early, np.append(t[0], t[:-1])), np.maximum(late, np.append(t[1:], t[-1]))
     moved = np.column_stack([np.interp(late, t, p) - np.interp(early, t, p) for p in position.T])
     derived = moved / (late - early)[:, None]
@@ -443,7 +443,7 @@ def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> Floa
 def _courses(velocity: FloatArray) -> FloatArray:
     """Course over ground [deg clockwise from north]; at rest the last one holds (before the first: the first)."""
     course = np.degrees(np.arctan2(velocity[:, 0], velocity[:, 1]))
-    moving = np.flatnonzero(np.hypot(velocity[:, 0], velocity[:, 1]) >= COURSE_SPEED_MPS)
+    moving = np.flatnonzero(np.hypot(velocity[:, 0], velocity[:, 1]) >= _COURSE_SPEED_MPS)
     if not len(moving):
         return np.zeros(len(velocity))
     last = np.searchsorted(moving, np.arange(len(velocity)), side="right") - 1

@@ -46,16 +46,16 @@ def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, 
 
 
 # Readings of a run; marks that a learned file keeps of a log; marks that two logs share if one is of the other.
-RUN, MARKS, SHARED = 32, 32, 3
+_RUN, MARKS, _SHARED = 32, 32, 3
 
 # The same of ranks: in a run, and how many of them must differ. Of 4 000 random reports no two of 8 850 pairs share a
 # run; two real flights have 103 and 167 and share none, any half of one shares 8 and more of the 32 that are kept.
-HOLDS, DIFFERING = 12, 6
+_HOLDS, _DIFFERING = 12, 6
 
 # Runs that are hashed at a time: bounds the memory.
 AT_ONCE = 8192
 
-_WEIGHTS = np.array([pow(0x9E3779B97F4A7C15, j, 2**64) for j in range(1, RUN + 1)], dtype=np.uint64)
+_WEIGHTS = np.array([pow(0x9E3779B97F4A7C15, j, 2**64) for j in range(1, _RUN + 1)], dtype=np.uint64)
 
 
 def marks(series: RssSeries | RankSeries) -> AnyArray:
@@ -64,9 +64,9 @@ def marks(series: RssSeries | RankSeries) -> AnyArray:
     Readings are levels, or, of ranks, which mostly repeat, for how many reports each holds.
     """
     if isinstance(series, RssSeries):
-        return _hashes(np.round(10.0 * series.measured_db), RUN, RUN // 4 + 1)
+        return _hashes(np.round(10.0 * series.measured_db), _RUN, _RUN // 4 + 1)
     rank = series.rank[np.isfinite(series.rank)]
-    return _hashes(np.diff(np.flatnonzero(np.diff(rank))).astype(np.float64), HOLDS, DIFFERING)
+    return _hashes(np.diff(np.flatnonzero(np.diff(rank))).astype(np.float64), _HOLDS, _DIFFERING)
 
 
 def _hashes(readings: FloatArray, run: int, differing: int) -> AnyArray:
@@ -99,7 +99,7 @@ def learned_of(series: RssSeries, patterns: Iterable[SpherePattern]) -> bool:
 
 def shared(learned: Iterable[str], readings: Iterable[str]) -> bool:
     """Check whether the marks of some readings are those that something was learned from."""
-    return len({*learned} & {*readings}) >= SHARED
+    return len({*learned} & {*readings}) >= _SHARED
 
 
 def common(logs: Sequence[str], learned: Iterable[Iterable[str]]) -> tuple[str, ...]:
@@ -124,7 +124,7 @@ def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[
             remarks.append(f"{name} holds the same log as {first} (SHA-256 {digest[:12]}...): it is counted once")
         marked = [(s, logs_of(data, s), marks(s)) for _, s in data.series]
         for _, logs, ours in marked:
-            earlier = [flight for flight, earlier_marks in known if len(np.intersect1d(earlier_marks, ours)) >= SHARED]
+            earlier = [flight for flight, earlier_marks in known if len(np.intersect1d(earlier_marks, ours)) >= _SHARED]
             if earlier and not set(logs) & set(again):
                 remarks.append(f"{name} holds readings of {earlier[0]} in another log: they are counted once")
                 again |= dict.fromkeys(logs, earlier[0])

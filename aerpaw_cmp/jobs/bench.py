@@ -28,13 +28,13 @@ from ..propagation.scene import Scene
 from ..site.site import Building, Site, Tower
 
 # Reflections of the reference and of the Sionna rows.
-DEPTH = 2
+_DEPTH = 2
 
 # Poses per PathSolver call.
 BATCH = 50
 
 # The same with explicit arrays, which multiply sources and targets.
-EXPLICIT_BATCH = 10
+_EXPLICIT_BATCH = 10
 
 # Lines of a real channel-sounder flight.
 LINES = 20_523
@@ -136,7 +136,7 @@ def speed_against_error(
         ``rss_rms_error_db`` over links that both cover (None without one), ``coverage_differs`` (links that one covers)
         and ``rank_disagreement`` by K.
     """
-    case = _Case(site, link, poses, replay(site, link, poses, Search(max_depth=DEPTH)))
+    case = _Case(site, link, poses, replay(site, link, poses, Search(max_depth=_DEPTH)))
     rows = []
     for depth in depths:
         progress(f"image engine, depth {depth}")
@@ -147,7 +147,7 @@ def speed_against_error(
             chosen = spread_out(len(poses), len(poses) if kind == "synthetic" else explicit_poses)
             rows.append(case.own_arrays(count, kind, chosen))
         progress(f"sionna, {count} samples")
-        rows.append(case.replayed(Search("sionna", max_depth=DEPTH, samples=count, batch=BATCH)))
+        rows.append(case.replayed(Search("sionna", max_depth=_DEPTH, samples=count, batch=BATCH)))
     return rows
 
 
@@ -180,7 +180,7 @@ class _Case:
         from ..propagation.search.sionna import Rays, own_channels
 
         explicit = kind == "explicit"
-        rays = Rays(max_depth=DEPTH, samples=samples, batch=EXPLICIT_BATCH if explicit else BATCH)
+        rays = Rays(max_depth=_DEPTH, samples=samples, batch=_EXPLICIT_BATCH if explicit else BATCH)
         poses = _take(self.poses, chosen)
         scene = Scene.of(self.site, self.link, poses)
 
@@ -209,7 +209,7 @@ class _Case:
         )
 
     def _row(self, difference: Difference, spent: Mapping[str, Any], poses: int | None = None, **about: Any) -> Row:
-        plain: dict[str, Any] = {"engine": "image", "samples": None, "arrays": "float64", "depth": DEPTH}
+        plain: dict[str, Any] = {"engine": "image", "samples": None, "arrays": "float64", "depth": _DEPTH}
         links = (len(self.poses) if poses is None else poses) * len(self.link.tower_arrays)
         errors = {name: getattr(difference, name) for name in ("rss_max_error_db", "rss_rms_error_db")}
         return {
@@ -264,7 +264,7 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
 
     def search() -> float:
         started = time.perf_counter()
-        mirror.find_paths(scene.faces, scene.links_to(some), max_depth=DEPTH)
+        mirror.find_paths(scene.faces, scene.links_to(some), max_depth=_DEPTH)
         return time.perf_counter() - started
 
     search()
@@ -285,7 +285,7 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
         "samples": samples,
         "batch": BATCH,
         "faces": len(scene.faces),
-        "depth": DEPTH,
+        "depth": _DEPTH,
         "versions": sionna.engine_versions(),
     }
 

@@ -22,7 +22,7 @@ from ..report.diff.data import Entry, InputEntry, ReportDiff, ReportSide
 from ..report.names import RANK_COLUMNS, RSS_COLUMNS, links_of
 
 # Differences up to this count as none: the tables hold four decimals, offsets one.
-TOLERANCE_DB = 0.01
+_TOLERANCE_DB = 0.01
 
 _NEEDED = ("flight", "versions", "inputs", "settings", "rss", "rank")
 _SIMULATED = "simulated_rank_k"
@@ -43,7 +43,7 @@ class ReadReport:
 
 
 def run_diff(
-    first: Path, second: Path, *, out: Path | None = None, tolerance_db: float = TOLERANCE_DB, force: bool = False
+    first: Path, second: Path, *, out: Path | None = None, tolerance_db: float = _TOLERANCE_DB, force: bool = False
 ) -> ReportDiff:
     """Compare two reports; with ``out`` also write ``diff.html`` and ``diff.json`` there.
 
@@ -72,14 +72,14 @@ def run_diff(
     """
     if not tolerance_db >= 0:
         raise UsageError(f"a tolerance of {tolerance_db} dB", expected="0 or more")
-    first_report, second_report = read_report(first), read_report(second)
+    first_report, second_report = _read_report(first), _read_report(second)
     _same_flight(first_report, second_report)
     if out is None:
-        return compare_reports(first_report, second_report, tolerance_db)
+        return _compare_reports(first_report, second_report, tolerance_db)
     from ..report.diff.html import write_diff
 
     with OutputFolder(out, job="diff", inputs=[*first_report.files, *second_report.files], force=force) as output:
-        diff = compare_reports(first_report, second_report, tolerance_db)
+        diff = _compare_reports(first_report, second_report, tolerance_db)
         with output.filling() as place:
             write_diff(diff, place)
     return diff
@@ -88,7 +88,7 @@ def run_diff(
 # --- reading --------------------------------------------------------------------------------------------------------
 
 
-def read_report(place: Path) -> ReadReport:
+def _read_report(place: Path) -> ReadReport:
     """Read what a report wrote.
 
     Raises
@@ -242,7 +242,7 @@ def _same_flight(first: ReadReport, second: ReadReport) -> None:
 # --- comparing ------------------------------------------------------------------------------------------------------
 
 
-def compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float = TOLERANCE_DB) -> ReportDiff:
+def _compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float = _TOLERANCE_DB) -> ReportDiff:
     """Everything that differs between two reports."""
     levels, residuals = _levels(first, second)
     first_warnings, second_warnings = (list(side.metrics.get("warnings", ())) for side in (first, second))

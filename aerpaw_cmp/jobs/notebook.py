@@ -33,7 +33,7 @@ from .reporting.compare_flight import compare_flight
 Series = tuple[str, str]
 
 
-RANK_NUMBERS = "agreement kappa total_variation wasserstein"
+_RANK_NUMBERS = "agreement kappa total_variation wasserstein"
 
 
 def open_flight(
@@ -348,7 +348,7 @@ class Comparison:
     def rank_to_frame(self) -> pd.DataFrame:
         """One row per tower and K: ``tower k n agreement kappa total_variation wasserstein``."""
         rows = [
-            {"tower": item.tower, "k": k, "n": item.score.n, **named(fit, RANK_NUMBERS)}
+            {"tower": item.tower, "k": k, "n": item.score.n, **named(fit, _RANK_NUMBERS)}
             for item in self.result.rank
             for k, fit in item.score.simulated.items()
         ]

@@ -27,7 +27,7 @@ from ..site.siteyaml import load_site
 MEASURED = "CPU seconds of reading and replay, tried on a few poses now; a stage with a dash was not tried"
 
 # Of the two replays that a time is extrapolated from, and of the tiles of a map.
-TRIED_POSES, TRIED_TILES = (32, 160), 4
+TRIED_POSES, _TRIED_TILES = (32, 160), 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +214,7 @@ def _tiles(site: Site, settings: Any, tiling: Any) -> PlannedStage:
     from .mapping.coverage_map import SiteChannels, TileOrder
 
     channels = SiteChannels(site, settings)
-    some = spread_out(len(tiling), TRIED_TILES).tolist()
+    some = spread_out(len(tiling), _TRIED_TILES).tolist()
     orders = [TileOrder(site="", settings=settings, cells=tiling.cells, number=number) for number in some]
     seconds = _cpu_seconds(lambda: [channels.tile(order) for order in orders]) * len(tiling) / len(some)
     return PlannedStage("maps in tiles", f"{len(tiling)} tiles of {tiling.cells} x {tiling.cells} positions", seconds)

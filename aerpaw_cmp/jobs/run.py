@@ -185,10 +185,10 @@ class ReportOptions:
     export: Sequence[str] = ()
 
 
-AS_IT_COMES = ReportOptions()
+_AS_IT_COMES = ReportOptions()
 
 
-def run_report(flight: Path, chosen: ReportOptions = AS_IT_COMES, options: RunOptions = DEFAULT) -> JobOutcome:
+def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunOptions = DEFAULT) -> JobOutcome:
     """Replay a flight, calibrate, compare, report.
 
     Parameters
@@ -270,7 +270,7 @@ def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> 
     return settings, inputs, options.out or Path("reports") / settings.flight.name
 
 
-def plan_report(flight: Path, chosen: ReportOptions = AS_IT_COMES, options: RunOptions = DEFAULT) -> Any:
+def plan_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunOptions = DEFAULT) -> Any:
     """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing."""
     from .plan import report_plan
 
@@ -549,7 +549,7 @@ def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
     return line[np.isfinite(line).all(axis=1)], settings.flight.name
 
 
-def outcomes_folder() -> Path:
+def _outcomes_folder() -> Path:
     """Folder where outcomes are kept by default: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
     return Path(os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp") / "outcomes"
 
@@ -599,7 +599,7 @@ def run_campaign(
     formats = chosen_formats(campaign.export, export)
     inputs = [path, *inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)]
     folder = options.out or Path("reports") / campaign.campaign
-    store = None if fresh else campaign_keep(campaign, path, keep)
+    store = None if fresh else _campaign_keep(campaign, path, keep)
     note = f"finished tasks are kept in {store}, and the same command computes the rest" if store else "nothing is kept"
     with OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output, noting_interrupts(note):
         data = run_all(campaign, path.parent, options, keep=store, stages=stages)
@@ -607,23 +607,23 @@ def run_campaign(
         with stages("report"), output.filling() as place:
             finished = replace(data, stages_s=dict(stages.seconds))
             write_campaign(finished, place, exports=formats, progress=options.progress)
-            write_tracebacks(data.failures, place)
+            _write_tracebacks(data.failures, place)
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
     failed += [text for text in warnings(data) if "edge of the searched span" in text]
     metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=tuple(failed))
 
 
-def campaign_keep(campaign: Any, path: Path, keep: Path | None = None) -> Path:
+def _campaign_keep(campaign: Any, path: Path, keep: Path | None = None) -> Path:
     """Folder of outcomes: as asked, else as campaign.yaml says, else in the user's cache."""
     if keep is None:
-        keep = outcomes_folder() if campaign.keep is None else path.parent / Path(campaign.keep).expanduser()
+        keep = _outcomes_folder() if campaign.keep is None else path.parent / Path(campaign.keep).expanduser()
     if ":/" in str(keep):  # a path has one slash there
         raise UsageError(f"outcomes in {keep}", expected="a folder", cause="object stores are not written any more")
     return keep
 
 
-def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
+def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
     """A file per failed task in ``failures/``: its message, and where in the program it came from."""
     from ..report.names import safe_name
 
@@ -657,7 +657,7 @@ def campaign_status(path: Path, options: RunOptions = DEFAULT, *, keep: Path | N
 
     campaign = load_campaign(path)
     tasks, _, failures = campaign_tasks(campaign, path.parent, options.logs_root)
-    store = None if fresh else outcome_store(campaign_keep(campaign, path, keep))
+    store = None if fresh else outcome_store(_campaign_keep(campaign, path, keep))
     return campaign_plan.campaign_status(campaign.campaign, tasks, failures, store, workers=options.workers)
 
 

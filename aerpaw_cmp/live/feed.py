@@ -26,18 +26,18 @@ from .session import TapStatus
 
 # Rows that stay: two hours at 10 Hz, ten at 2 Hz.
 ROWS = 72_000
-PENDING = 20_000
+_PENDING = 20_000
 # Rows in one message, so that a slow link refills step by step.
 CHUNK = 4_000
-ALARMS = 300
-LONGEST_TEXT = 300
+_ALARMS = 300
+_LONGEST_TEXT = 300
 RATE_WINDOW_S = 10.0
 STALE_S = 3.0
-GPS_LOST_S = 5.0
-CLOCK_OFF_S = 2.0
-DISK_LOW_BYTES = 200 * 2**20
-STEP_SHOWN_S = 30.0
-POINTS_AHEAD = 40
+_GPS_LOST_S = 5.0
+_CLOCK_OFF_S = 2.0
+_DISK_LOW_BYTES = 200 * 2**20
+_STEP_SHOWN_S = 30.0
+_POINTS_AHEAD = 40
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
 PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
@@ -154,10 +154,10 @@ class Feed:
         self.epoch = secrets.token_hex(4)
         self.start_ns = self._steady_ns()
         self._modems = [_Modem(name, shift_ns=shift, predicted=Rows(len(PREDICTED))) for name in names]
-        self._pending: deque[tuple[int, Record | TapStatus]] = deque(maxlen=PENDING)
+        self._pending: deque[tuple[int, Record | TapStatus]] = deque(maxlen=_PENDING)
         self._changed = threading.Condition()
         self._version = 0
-        self._alarms: deque[Alarm] = deque(maxlen=ALARMS)
+        self._alarms: deque[Alarm] = deque(maxlen=_ALARMS)
         self._alarm_count = 0
         self._ended: Mapping[str, Any] | None = None
 
@@ -344,7 +344,7 @@ class Feed:
         self._raise(modem, kind, text).end_s = now
 
     def _raise(self, modem: _Modem, kind: str, text: str) -> Alarm:
-        alarm = Alarm(self._alarm_count, self._modems.index(modem), kind, text[:LONGEST_TEXT], self.now(), version=-1)
+        alarm = Alarm(self._alarm_count, self._modems.index(modem), kind, text[:_LONGEST_TEXT], self.now(), version=-1)
         self._alarm_count += 1
         self._alarms.append(alarm)
         return alarm
@@ -371,7 +371,7 @@ def _finite(value: Any) -> float | None:
 def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
     """Alarms that hold at this moment, by kind."""
     alarms: dict[str, str] = {}
-    stale_s, lost_s = max(STALE_S, 3 * modem.period_s), max(GPS_LOST_S, 3 * modem.period_s)
+    stale_s, lost_s = max(STALE_S, 3 * modem.period_s), max(_GPS_LOST_S, 3 * modem.period_s)
     if modem.gap_text:
         alarms["gap"] = modem.gap_text
     elif modem.connected and now - modem.rank_s > stale_s:
@@ -385,11 +385,11 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
             alarms["gps"] = f"no position for more than {lost_s:g} s: the telemetry log does not reach the present"
     if modem.disk_fault:
         alarms["disk"] = f"the log cannot be written: {modem.disk_fault}; records wait in memory"
-    elif modem.disk_free_bytes is not None and modem.disk_free_bytes < DISK_LOW_BYTES:
-        alarms["disk"] = f"less than {DISK_LOW_BYTES // 2**20} MiB left on the log's disk"
-    if modem.step_s is not None and now - modem.step_s < STEP_SHOWN_S:
+    elif modem.disk_free_bytes is not None and modem.disk_free_bytes < _DISK_LOW_BYTES:
+        alarms["disk"] = f"less than {_DISK_LOW_BYTES // 2**20} MiB left on the log's disk"
+    if modem.step_s is not None and now - modem.step_s < _STEP_SHOWN_S:
         alarms["step"] = modem.step_text
-    if modem.delay_s is not None and (modem.delay_s < -CLOCK_OFF_S / 4 or modem.delay_s > CLOCK_OFF_S):
+    if modem.delay_s is not None and (modem.delay_s < -_CLOCK_OFF_S / 4 or modem.delay_s > _CLOCK_OFF_S):
         ahead = "ahead of" if modem.delay_s < 0 else "behind"
         alarms["clock"] = f"the telemetry's clock is {abs(modem.delay_s):.1f} s {ahead} this computer's"
     elif modem.unsynchronised:
@@ -400,7 +400,7 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
 def _rest_of_route(rest: Mapping[str, Any]) -> dict[str, Any]:
     """Rest of a route as the page shows it; ValueError where a level is no number."""
     level, (low, high) = float(rest["level_dbm"]), map(float, rest["interval_dbm"])
-    points = [[float(v) for v in point[:5]] for point in rest["points"][:POINTS_AHEAD]]
+    points = [[float(v) for v in point[:5]] for point in rest["points"][:_POINTS_AHEAD]]
     if not all(map(math.isfinite, [level, low, high, *(v for point in points for v in point)])):
         raise ValueError("a level that is no number")
     return {"trend": str(rest["trend"])[:20], "level": level, "interval": [low, high], "points": points}

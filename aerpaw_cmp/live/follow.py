@@ -17,9 +17,9 @@ from ..common.errors import InputError
 from ..logs.readers import Reader, ReadOptions, identify
 from .predict import Predict, Prediction
 
-MAX_AGE_S = 2.0
+_MAX_AGE_S = 2.0
 # Of a log that is long already, only its end is read.
-TAIL_BYTES = 65_536
+_TAIL_BYTES = 65_536
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class TelemetrySample:
 
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "fix")
 # Looks at the log over which its least delay is taken: a line may wait some time before it is written.
-DELAYS = 20
+_DELAYS = 20
 
 
 class TelemetryFollower:
@@ -68,7 +68,7 @@ class TelemetryFollower:
         self._reader = reader
         self._keep_ns = int(keep_s * 1e9)
         self._samples: deque[TelemetrySample] = deque()
-        self._delays: deque[float] = deque(maxlen=DELAYS)
+        self._delays: deque[float] = deque(maxlen=_DELAYS)
         self._position = 0
         self._identity: tuple[int, int] | None = None
 
@@ -124,13 +124,13 @@ class TelemetryFollower:
         return self._samples[-1] if self._samples else None
 
     def at(self, utc_ns: int) -> TelemetrySample | None:
-        """The sample nearest in time, None if it is further away than :data:`MAX_AGE_S`."""
+        """The sample nearest in time, None if it is further away than :data:`_MAX_AGE_S`."""
         if not self._samples:
             return None
         samples = list(self._samples)
         index = bisect_left(samples, utc_ns, key=lambda sample: sample.utc_ns)
         near = min(samples[max(0, index - 1) : index + 1], key=lambda sample: abs(sample.utc_ns - utc_ns))
-        return near if abs(near.utc_ns - utc_ns) <= MAX_AGE_S * 1e9 else None
+        return near if abs(near.utc_ns - utc_ns) <= _MAX_AGE_S * 1e9 else None
 
     def _new_lines(self) -> bytes:
         """Complete lines since the last call."""
@@ -153,7 +153,7 @@ class TelemetryFollower:
         identity = (state.st_dev, state.st_ino)
         if identity == self._identity and state.st_size >= self._position:
             return
-        self._identity, self._position = identity, max(0, state.st_size - TAIL_BYTES)
+        self._identity, self._position = identity, max(0, state.st_size - _TAIL_BYTES)
         if self._position:
             file.seek(self._position)
             self._position += len(file.readline())

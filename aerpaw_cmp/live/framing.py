@@ -16,8 +16,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-MAX_LINE_BYTES = 65_536
-MAX_LINES = 256
+_MAX_LINE_BYTES = 65_536
+_MAX_LINES = 256
 
 Status = Literal["ok", "error", "cme", "cms", "timeout", "lost", "cut"]
 
@@ -88,7 +88,7 @@ _GLUED_OK = re.compile(r"[0-9\"\-]OK$")
 _ECHO = re.compile(r"AT(?:[+$&#*%^][A-Z]|[A-Z]?\d?$)", re.IGNORECASE)
 
 
-def final_result(text: str) -> tuple[Status, str | None] | None:
+def _final_result(text: str) -> tuple[Status, str | None] | None:
     """Status and code if the whole line is a final result, else None (3GPP TS 27.007, clause 9; TS 27.005, 3.2.5).
 
     Examples
@@ -147,7 +147,7 @@ class LineBuffer:
         Longer lines keep this many bytes; the rest is counted in :attr:`Line.dropped`.
     """
 
-    def __init__(self, max_line_bytes: int = MAX_LINE_BYTES) -> None:
+    def __init__(self, max_line_bytes: int = _MAX_LINE_BYTES) -> None:
         self._max = max_line_bytes
         self._buffer = bytearray()
         self._dropped = 0
@@ -223,7 +223,7 @@ class Framer:
     ('+QNWCFG: "nr5g_csi",13,2,8,896',)
     """
 
-    def __init__(self, *, max_line_bytes: int = MAX_LINE_BYTES, max_lines: int = MAX_LINES) -> None:
+    def __init__(self, *, max_line_bytes: int = _MAX_LINE_BYTES, max_lines: int = _MAX_LINES) -> None:
         self._buffer = LineBuffer(max_line_bytes)
         self._max_lines = max_lines
         self._open: _Open | None = None
@@ -316,7 +316,7 @@ class Framer:
 
     def _line(self, line: Line, events: list[Event]) -> None:
         text = line.text
-        final = final_result(text)
+        final = _final_result(text)
         if final is not None:
             self._final(final[0], final[1], events)
             return
@@ -398,7 +398,7 @@ class TranscriptFramer:
     ['ATI', 'AT']
     """
 
-    def __init__(self, *, max_line_bytes: int = MAX_LINE_BYTES, max_lines: int = MAX_LINES) -> None:
+    def __init__(self, *, max_line_bytes: int = _MAX_LINE_BYTES, max_lines: int = _MAX_LINES) -> None:
         self._buffer = LineBuffer(max_line_bytes)
         self._max_lines = max_lines
         self._command: str | None = None
@@ -430,7 +430,7 @@ class TranscriptFramer:
             self._piece(text, events)
 
     def _piece(self, text: str, events: list[Event]) -> None:
-        final = final_result(text)
+        final = _final_result(text)
         if final is not None:
             self._end(final[0], final[1], events, even_empty=True)
             return

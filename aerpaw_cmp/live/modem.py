@@ -58,10 +58,10 @@ class Decoded:
 _FIELD = re.compile(r'\s*("[^"]*"?|[^,]*)\s*(?:,|$)')
 
 # Quectel's "no value", and the same after a division by ten.
-INVALID = (-32768, -3276)
+_INVALID = (-32768, -3276)
 
 
-def split_fields(payload: str) -> list[str | None]:
+def _split_fields(payload: str) -> list[str | None]:
     """Comma-separated fields without quotes; ``-`` and nothing are None.
 
     Examples
@@ -84,7 +84,7 @@ def split_fields(payload: str) -> list[str | None]:
     return fields
 
 
-def payload_of(line: str, prefix: str) -> str | None:
+def _payload_of(line: str, prefix: str) -> str | None:
     """Text after ``prefix`` if the line starts with it, blanks and case of the colon aside."""
     if not line.startswith(prefix):
         return None
@@ -97,18 +97,18 @@ class Range:
 
     low: float
     high: float
-    missing: tuple[int, ...] = INVALID
+    missing: tuple[int, ...] = _INVALID
 
 
 # TS 38.214 table 5.1.3.1 (mcs), TS 38.133 10.1.6-10.1.16 (rsrp, rsrq, sinr), TS 38.104 5.4.2.1 (arfcn).
 RANGES: Mapping[str, Range] = {
     "mcs": Range(0, 31),
     "ri_raw": Range(0, 8),
-    "cqi": Range(0, 15, (255, *INVALID)),
+    "cqi": Range(0, 15, (255, *_INVALID)),
     "pmi": Range(0, 65_535),
     "mcc": Range(1, 999),
     "mnc": Range(0, 999),
-    "pcid": Range(0, 1007, (65_535, *INVALID)),
+    "pcid": Range(0, 1007, (65_535, *_INVALID)),
     "arfcn": Range(0, 3_279_165),
     "band": Range(1, 1024),
     "rsrp_dbm": Range(-156, -31),
@@ -123,8 +123,8 @@ RANGES: Mapping[str, Range] = {
     "tx_power_tenth_dbm": Range(-600, 300),
 }
 
-NR_BANDWIDTH_MHZ = (5, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 200, 400, 35, 45)
-LTE_BANDWIDTH_MHZ = (1.4, 3, 5, 10, 15, 20)
+_NR_BANDWIDTH_MHZ = (5, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 200, 400, 35, 45)
+_LTE_BANDWIDTH_MHZ = (1.4, 3, 5, 10, 15, 20)
 
 
 def number(name: str, text: str | None, flags: list[str], *, prefix: str = "") -> int | None:
@@ -183,22 +183,22 @@ def _named(names: Sequence[str], fields: Sequence[str | None], flags: list[str],
 def _fields_of(lines: Sequence[str], prefix: str, flags: list[str]) -> Iterator[list[str | None]]:
     """Fields of the lines that start with a prefix; a flag for each that does not."""
     for line in lines:
-        payload = payload_of(line, prefix)
+        payload = _payload_of(line, prefix)
         if payload is None:
             flags.append("foreign_line")
         else:
-            yield split_fields(payload)
+            yield _split_fields(payload)
 
 
 # answers ------------------------------------------------------------------------------------------------------
 
 
-def decode_csi(lines: Sequence[str], flags: list[str], which: str) -> Values:
+def _decode_csi(lines: Sequence[str], flags: list[str], which: str) -> Values:
     """``+QNWCFG: "nr5g_csi",<mcs>,<ri>,<cqi>,<pmi>``; RI 0 is no CSI, so ``rank`` is None."""
     rows = []
     for line in lines:
-        payload = payload_of(line, "+QNWCFG")
-        fields = [] if payload is None else split_fields(payload)
+        payload = _payload_of(line, "+QNWCFG")
+        fields = [] if payload is None else _split_fields(payload)
         if fields and fields[0] == which:
             rows.append(fields[1:])
     if not rows:
@@ -234,7 +234,7 @@ _LTE = (
 def _nr(names: Sequence[str], fields: Sequence[str | None], flags: list[str]) -> Values:
     values = _named(names, fields, flags, "nr.")
     code = values.get("bandwidth_code")
-    values["bandwidth_mhz"] = None if code is None else NR_BANDWIDTH_MHZ[code]
+    values["bandwidth_mhz"] = None if code is None else _NR_BANDWIDTH_MHZ[code]
     scs = values.get("scs_code")
     values["scs_khz"] = None if scs is None else 15 * 2**scs
     if values.get("pcid") is None and values.get("rsrp_dbm") is None:
@@ -246,11 +246,11 @@ def _lte(fields: Sequence[str | None], flags: list[str]) -> Values:
     # 'sinr_raw': dB or 5 X - 20 by firmware, the manual does not decide; so no unit
     values = _named(_LTE, fields, flags, "lte.")
     code = values["bandwidth_code"]
-    values["bandwidth_mhz"] = LTE_BANDWIDTH_MHZ[code] if code is not None and code < len(LTE_BANDWIDTH_MHZ) else None
+    values["bandwidth_mhz"] = _LTE_BANDWIDTH_MHZ[code] if code is not None and code < len(_LTE_BANDWIDTH_MHZ) else None
     return values
 
 
-def decode_servingcell(lines: Sequence[str], flags: list[str]) -> Values:
+def _decode_servingcell(lines: Sequence[str], flags: list[str]) -> Values:
     """``+QENG`` of SA, EN-DC (three lines) and LTE, told apart by the token of each line."""
     values: Values = {"state": None, "rat": None}
     for fields in _fields_of(lines, "+QENG", flags):
@@ -271,7 +271,7 @@ def decode_servingcell(lines: Sequence[str], flags: list[str]) -> Values:
     return values
 
 
-def decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind: str) -> Values:
+def _decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind: str) -> Values:
     """``+QRSRP: <PRX>,<DRX>,<RX2>,<RX3>[,<sysmode>]``, one line per radio access technology.
 
     Parameters
@@ -303,7 +303,7 @@ def decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind: 
     return values
 
 
-def decode_rows(lines: Sequence[str], flags: list[str], command: str, names: Sequence[str]) -> Values:
+def _decode_rows(lines: Sequence[str], flags: list[str], command: str, names: Sequence[str]) -> Values:
     """Rows of text fields under names; for answers kept for the record, not computed with.
 
     Parameters
@@ -331,7 +331,7 @@ def decode_rows(lines: Sequence[str], flags: list[str], command: str, names: Seq
     return {"rows": rows}
 
 
-def decode_csi_ctrl(lines: Sequence[str], flags: list[str]) -> Values:
+def _decode_csi_ctrl(lines: Sequence[str], flags: list[str]) -> Values:
     """``+QNWCFG: "csi_ctrl",<lte>,<nr5g>``."""
     for line in lines:
         match = re.match(r'\+QNWCFG: ?"csi_ctrl", ?([01]), ?([01])$', line)
@@ -341,7 +341,7 @@ def decode_csi_ctrl(lines: Sequence[str], flags: list[str]) -> Values:
     return {}
 
 
-def decode_identity(lines: Sequence[str], flags: list[str]) -> Values:
+def _decode_identity(lines: Sequence[str], flags: list[str]) -> Values:
     """``ATI``: maker, model, ``Revision:``."""
     values: Values = {"text": [line for line in lines if not line.startswith("Revision:")]}
     for line in lines:
@@ -352,7 +352,7 @@ def decode_identity(lines: Sequence[str], flags: list[str]) -> Values:
     return values
 
 
-def decode_nothing(_lines: Sequence[str], _flags: list[str]) -> Values:
+def _decode_nothing(_lines: Sequence[str], _flags: list[str]) -> Values:
     """For commands without information lines."""
     return {}
 
@@ -361,27 +361,27 @@ def decode_nothing(_lines: Sequence[str], _flags: list[str]) -> Values:
 QUERIES: Mapping[str, Query] = {
     query.name: query
     for query in (
-        Query("sync", "AT", (), decode_nothing),
-        Query("identity", "ATI", None, decode_identity),
+        Query("sync", "AT", (), _decode_nothing),
+        Query("identity", "ATI", None, _decode_identity),
         Query("firmware", "AT+CGMR", None, lambda lines, _flags: {"text": list(lines)}),
-        Query("csi_ctrl", 'AT+QNWCFG="csi_ctrl"', ('+QNWCFG:"csi_ctrl"',), decode_csi_ctrl),
-        Query("nr5g_csi", 'AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',), partial(decode_csi, which="nr5g_csi")),
-        Query("lte_csi", 'AT+QNWCFG="lte_csi"', ('+QNWCFG:"lte_csi"',), partial(decode_csi, which="lte_csi")),
-        Query("servingcell", 'AT+QENG="servingcell"', ("+QENG:",), decode_servingcell),
-        Query("qrsrp", "AT+QRSRP", ("+QRSRP:",), partial(decode_antennas, command="+QRSRP", kind="rsrp_dbm")),
-        Query("qrsrq", "AT+QRSRQ", ("+QRSRQ:",), partial(decode_antennas, command="+QRSRQ", kind="rsrq_db")),
-        Query("qsinr", "AT+QSINR", ("+QSINR:",), partial(decode_antennas, command="+QSINR", kind="sinr_db")),
+        Query("csi_ctrl", 'AT+QNWCFG="csi_ctrl"', ('+QNWCFG:"csi_ctrl"',), _decode_csi_ctrl),
+        Query("nr5g_csi", 'AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',), partial(_decode_csi, which="nr5g_csi")),
+        Query("lte_csi", 'AT+QNWCFG="lte_csi"', ('+QNWCFG:"lte_csi"',), partial(_decode_csi, which="lte_csi")),
+        Query("servingcell", 'AT+QENG="servingcell"', ("+QENG:",), _decode_servingcell),
+        Query("qrsrp", "AT+QRSRP", ("+QRSRP:",), partial(_decode_antennas, command="+QRSRP", kind="rsrp_dbm")),
+        Query("qrsrq", "AT+QRSRQ", ("+QRSRQ:",), partial(_decode_antennas, command="+QRSRQ", kind="rsrq_db")),
+        Query("qsinr", "AT+QSINR", ("+QSINR:",), partial(_decode_antennas, command="+QSINR", kind="sinr_db")),
         Query(
             "qnwinfo",
             "AT+QNWINFO",
             ("+QNWINFO:",),
-            partial(decode_rows, command="+QNWINFO", names=("act", "operator", "band", "channel")),
+            partial(_decode_rows, command="+QNWINFO", names=("act", "operator", "band", "channel")),
         ),
         Query(
             "qcainfo",
             "AT+QCAINFO",
             ("+QCAINFO:",),
-            partial(decode_rows, command="+QCAINFO", names=("role", "arfcn", "bandwidth", "band")),
+            partial(_decode_rows, command="+QCAINFO", names=("role", "arfcn", "bandwidth", "band")),
         ),
     )
 }

@@ -14,7 +14,7 @@ from .log import BadLine, read_log
 from .stop import Stop
 
 # Time between two records beyond this (the tap was off) is passed at once, in seconds of the log.
-LONGEST_PAUSE_S = 10.0
+_LONGEST_PAUSE_S = 10.0
 
 
 class Player:
@@ -54,7 +54,7 @@ class Player:
         while self._next is not None and not stop.count:
             due, modem, record = self._next
             ahead_s = (due - self.steady_ns()) / 1e9
-            if ahead_s > LONGEST_PAUSE_S:
+            if ahead_s > _LONGEST_PAUSE_S:
                 self._at_ns, self._since = due, time.monotonic()
             elif ahead_s > 0:
                 stop.wait(min(ahead_s / self._speed, 0.2))

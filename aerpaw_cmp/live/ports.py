@@ -25,9 +25,9 @@ from pathlib import Path
 
 from ..common.errors import AerpawCmpError, InputError, UsageError
 
-QUECTEL_VENDOR = "2c7c"
+_QUECTEL_VENDOR = "2c7c"
 # Of 2c7c:0800: 00 is DIAG, 01 NMEA, 02 and 03 take AT commands (ModemManager's 77-mm-quectel-port-types.rules).
-AT_INTERFACES = ("02", "03")
+_AT_INTERFACES = ("02", "03")
 
 _GONE = {errno.ENOENT, errno.ENXIO, errno.EIO, errno.ENODEV, errno.ENOTCONN, errno.ESHUTDOWN}
 
@@ -107,18 +107,18 @@ def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
     """AT ports of Quectel modems, the likeliest first: by-id names, then USB interface numbers, then PCIe nodes."""
     roots = roots or Roots()
     ports: list[PortInfo] = []
-    for interface in AT_INTERFACES:
+    for interface in _AT_INTERFACES:
         for link in _entries(roots.dev / "serial/by-id", f"*[Qq]uectel*-if{interface}*"):
             if link.exists():
                 usb = _usb_of(link.resolve().name, roots)
                 ports.append(PortInfo(link, link.resolve(), "by-id", interface, usb[0] if usb else None))
     known = {port.device for port in ports}
     ttys = sorted(_entries(roots.sys / "class/tty", "ttyUSB*"), key=lambda p: (len(p.name), p.name))
-    for interface in AT_INTERFACES:
+    for interface in _AT_INTERFACES:
         for tty in ttys:
             usb = _usb_of(tty.name, roots)
             node = roots.dev / tty.name
-            if usb and usb[0].startswith(QUECTEL_VENDOR) and usb[1] == interface and node.resolve() not in known:
+            if usb and usb[0].startswith(_QUECTEL_VENDOR) and usb[1] == interface and node.resolve() not in known:
                 ports.append(PortInfo(node, node.resolve(), "usb", interface, usb[0]))
     for name in ("mhi_DUN", "smd11"):
         if (roots.dev / name).exists():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 # A slot that is late by at most so many periods is still polled, at once; older ones are missed and counted.
-CATCH_UP = 2
+_CATCH_UP = 2
 
 
 class Schedule:
@@ -41,7 +41,7 @@ class Schedule:
         """A poll begins; slots that cannot be caught up any more are missed."""
         period = self._periods[name]
         late = max(0, (now_ns - self._due[name]) // period)
-        skipped = late if late > CATCH_UP else 0
+        skipped = late if late > _CATCH_UP else 0
         self.missed[name] += skipped
         self._due[name] += (skipped + 1) * period
 

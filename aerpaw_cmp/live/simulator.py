@@ -32,7 +32,7 @@ from .ports import make_raw
 from .stop import Stop
 
 # Lines up to and with the final result; None: say nothing.
-Reply = tuple[str, ...] | None
+_Reply = tuple[str, ...] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,14 +145,14 @@ class Served:
 # where answers come from --------------------------------------------------------------------------------------
 
 
-def flight_rank(seconds: float) -> int:
+def _flight_rank(seconds: float) -> int:
     """Rank of the built-in flight: 1 to 4 in slow turns, now and then no CSI."""
     if seconds % 120.0 > 118.0:
         return 0
     return 1 + round(1.5 + 1.5 * math.sin(seconds / 20.0))
 
 
-def flight_rsrp(seconds: float) -> float:
+def _flight_rsrp(seconds: float) -> float:
     """RSRP of the built-in flight [dBm]."""
     return -85.0 - 12.0 * (1.0 + math.sin(seconds / 31.0))
 
@@ -171,16 +171,16 @@ class FlightModem:
 
     def __init__(
         self,
-        rank: Callable[[float], int] = flight_rank,
+        rank: Callable[[float], int] = _flight_rank,
         csi_on: bool = True,
-        rsrp: Callable[[float], float] = flight_rsrp,
+        rsrp: Callable[[float], float] = _flight_rsrp,
     ) -> None:
         self._rank, self._rsrp = rank, rsrp
         self.csi = [int(csi_on), int(csi_on)]
         self._start = time.monotonic()
         self._asked = 0
 
-    def reply(self, command: str) -> Reply:
+    def reply(self, command: str) -> _Reply:
         """Lines for a command."""
         now = time.monotonic() - self._start
         rank = self._rank(now) if self.csi[1] else 0
@@ -239,7 +239,7 @@ class RecordedModem:
         """Commands that have recorded answers."""
         return tuple(self._by_command)
 
-    def reply(self, command: str) -> Reply:
+    def reply(self, command: str) -> _Reply:
         """The next recorded answer; identity and ``AT`` are always answered, the rest is ERROR."""
         recorded = self._by_command.get(command.upper())
         if recorded is None:
@@ -373,7 +373,7 @@ class ModemSimulator:
         if self.settings.source is not None:
             self._modem = load_source(self.settings.source)
         else:
-            rank, rsrp = self.settings.rank or flight_rank, self.settings.rsrp or flight_rsrp
+            rank, rsrp = self.settings.rank or _flight_rank, self.settings.rsrp or _flight_rsrp
             self._modem = FlightModem(rank, self.settings.csi_on, rsrp)
         self._random = random.Random(self.settings.faults.seed)
         self._master = -1
@@ -584,7 +584,7 @@ class ModemSimulator:
             if not sent and self.keep_journal:
                 self.journal.pop()
 
-    def _spoil(self, number: int, reply: Reply) -> tuple[bytes, tuple[str, ...]]:
+    def _spoil(self, number: int, reply: _Reply) -> tuple[bytes, tuple[str, ...]]:
         """Bytes of an answer with the faults of its number, and its lines without final result."""
         faults = self.settings.faults
 

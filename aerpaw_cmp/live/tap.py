@@ -34,18 +34,18 @@ from .writer import LogWriter
 __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
 
 # A jump of the wall clock against the monotonic one beyond this is recorded.
-CLOCK_STEP_NS = 50_000_000
+_CLOCK_STEP_NS = 50_000_000
 # Gets each record once the log has it, and each status, in the polling thread: it must neither wait nor raise.
 Watch = Callable[["Record | TapStatus"], None]
 
 RATE_WINDOW_S = 10.0
-NOISE_LINES_PER_S = 50
+_NOISE_LINES_PER_S = 50
 
 
 _NMEA = re.compile(rb"\$[A-Z]{4,5},[^\r\n]*\*[0-9A-F]{2}")
 
 
-def not_a_modem(path: Path, received: bytes) -> InputError:
+def _not_a_modem(path: Path, received: bytes) -> InputError:
     """The error for a port that does not answer ``AT``, by what was received on it."""
     expected = "an answer to 'AT' (interface 02 or 03 of the modem)"
     if _NMEA.search(received):
@@ -296,7 +296,7 @@ class Tap:
         try:
             # the second probe only where the first gets no answer
             if not any(self._probe() for _ in range(2)):
-                raise not_a_modem(info.path, bytes(self._first_bytes))
+                raise _not_a_modem(info.path, bytes(self._first_bytes))
         finally:
             self._first_bytes = None
         self._info = info
@@ -536,7 +536,7 @@ class Tap:
             self._record({"kind": "late", "lines": lines, "status": event.status, "code": event.code, **self._now()})
         elif isinstance(event, Unsolicited):
             self._noise["lines"] += 1
-            if self._noise["lines"] > NOISE_LINES_PER_S and not is_unsolicited(event.text):
+            if self._noise["lines"] > _NOISE_LINES_PER_S and not is_unsolicited(event.text):
                 self._noise["bytes"] += len(event.text) + event.dropped
                 self._noise["not_kept"] += 1
                 return
@@ -577,7 +577,7 @@ class Tap:
                 self._say(text)
             self._log_predictions()
         offset = self._clock.utc_ns() - now
-        if abs(offset - self._offset_ns) > CLOCK_STEP_NS:
+        if abs(offset - self._offset_ns) > _CLOCK_STEP_NS:
             self._record({"kind": "clock", "step_ns": offset - self._offset_ns, **self._now()})
         self._offset_ns = offset
         if now - self._noise_ns > 1_000_000_000:

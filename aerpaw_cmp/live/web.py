@@ -34,7 +34,7 @@ from .ports import holders_of_sockets
 DEFAULT = "127.0.0.1:8765"
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
 # Bytes handed to a browser's socket at once: each piece has its own time limit, so a slow link is no dead one.
-PIECE = 16_384
+_PIECE = 16_384
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +265,7 @@ class _Handler(BaseHTTPRequestHandler):
     def setup(self) -> None:
         super().setup()
         self.connection.settimeout(self.server.web.limits.send_s)
-        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 * PIECE)
+        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 * _PIECE)
 
     def do_GET(self) -> None:
         """Answer with the page or the events."""
@@ -355,8 +355,8 @@ class _Handler(BaseHTTPRequestHandler):
         self._pieces(body)
 
     def _pieces(self, data: bytes) -> None:
-        for start in range(0, len(data), PIECE):
-            self.wfile.write(data[start : start + PIECE])
+        for start in range(0, len(data), _PIECE):
+            self.wfile.write(data[start : start + _PIECE])
 
     def log_message(self, format: str, *args: Any) -> None:
         """Print nothing: the terminal belongs to the tap."""

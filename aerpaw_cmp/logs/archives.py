@@ -23,7 +23,7 @@ MOST_MEMBERS = 20_000
 # Of one member after decompression.
 MOST_BYTES = 2**31
 # Of all members together.
-MOST_IN_ALL = 2**35
+_MOST_IN_ALL = 2**35
 # Of all members together to the archive, beyond ``_FREE_BYTES``: logs shrink to a fifth, the most even to a 50th.
 MOST_RATIO = 100
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
@@ -153,7 +153,7 @@ def _leads_out(path: str | Path, _most: int | None) -> bytes:
 
 def most_bytes(size: int) -> int:
     """Bytes that an archive or packed file of ``size`` bytes may unpack to."""
-    return min(MOST_IN_ALL, MOST_RATIO * size + _FREE_BYTES)
+    return min(_MOST_IN_ALL, MOST_RATIO * size + _FREE_BYTES)
 
 
 def _check(entries: list[Member], size: int, path: str | Path) -> None:
@@ -163,7 +163,7 @@ def _check(entries: list[Member], size: int, path: str | Path) -> None:
     if total > most_bytes(size):
         raise InputError(
             f"the archive of {size} bytes unpacks to {total} bytes",
-            expected=f"at most {MOST_RATIO} times its size and {_FREE_BYTES >> 20} MiB, and {MOST_IN_ALL >> 30} GiB",
+            expected=f"at most {MOST_RATIO} times its size and {_FREE_BYTES >> 20} MiB, and {_MOST_IN_ALL >> 30} GiB",
             cause="no data set: an archive made to fill a disk or the memory",
             path=path,
         )

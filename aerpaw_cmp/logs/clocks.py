@@ -18,8 +18,8 @@ from ..common.units import AnyArray, BoolArray, IntArray
 from .lines import add_flag
 from .readers import ReadOptions
 
-AMBIGUOUS = "ambiguous_local_time"
-NONEXISTENT = "nonexistent_local_time"
+_AMBIGUOUS = "ambiguous_local_time"
+_NONEXISTENT = "nonexistent_local_time"
 # Wall clock as AERPAW tools write it (bytes pattern, no group).
 TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
 # Optional offset behind :data:`TIME`.
@@ -53,8 +53,8 @@ class Instants:
 
     def flag(self, column: AnyArray) -> None:
         """Add the reasons to a flag column, in place."""
-        add_flag(column, self.ambiguous, AMBIGUOUS)
-        add_flag(column, self.nonexistent, NONEXISTENT)
+        add_flag(column, self.ambiguous, _AMBIGUOUS)
+        add_flag(column, self.nonexistent, _NONEXISTENT)
 
 
 def zone(name: str | None, *, needed_by: str) -> tzinfo:
@@ -126,11 +126,11 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     if ambiguous.any():
         warnings.append(
             f"{int(ambiguous.sum())} times lie in the hour that {name} had twice: read as daylight time "
-            f"until the log's clock steps back; flagged {AMBIGUOUS}"
+            f"until the log's clock steps back; flagged {_AMBIGUOUS}"
         )
     if nonexistent.any():
         warnings.append(
-            f"{int(nonexistent.sum())} times lie in the hour that {name} skipped: wrong zone? flagged {NONEXISTENT}"
+            f"{int(nonexistent.sum())} times lie in the hour that {name} skipped: wrong zone? flagged {_NONEXISTENT}"
         )
     return Instants(utc, ambiguous, nonexistent, tuple(warnings))
 
@@ -295,10 +295,10 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
         Times that are none are False, and 1970-01-01 in ``instants``.
     """
     wall, valid, offset, zoned = parse_texts(column)
-    return parsed_to_utc(wall, valid, offset, zoned, options, needed_by=needed_by), valid
+    return _parsed_to_utc(wall, valid, offset, zoned, options, needed_by=needed_by), valid
 
 
-def parsed_to_utc(
+def _parsed_to_utc(
     wall: IntArray, valid: BoolArray, offset_s: IntArray, zoned: BoolArray, options: ReadOptions, *, needed_by: str
 ) -> Instants:
     """Convert the result of :func:`parse_texts` to UTC.

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from ..common.units import AnyArray
 
 FORMAT = "aerpaw-cmp flight"
-VERSION = 1
+_VERSION = 1
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _SEAL = b"AERPAWCS"
 _DIGEST_BYTES = 32
@@ -92,7 +92,7 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
     sink = _Sink(stream)
     try:
         with h5py.File(sink, "w") as book:
-            book.attrs["format"], book.attrs["version"] = FORMAT, VERSION
+            book.attrs["format"], book.attrs["version"] = FORMAT, _VERSION
             shelf = book.create_group("files")
             for i, file in enumerate(files):
                 _write_file(shelf.create_group(f"{i:05d}"), file, sink)
@@ -287,9 +287,9 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
     form, version = notes["attributes"].get("format"), notes["attributes"].get("version")
     if form != FORMAT:
         raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)
-    if version != VERSION:
+    if version != _VERSION:
         raise InputError(
-            f"flight file of version {version}", expected=f"version {VERSION}", cause="a newer tool", path=path
+            f"flight file of version {version}", expected=f"version {_VERSION}", cause="a newer tool", path=path
         )
     try:
         return [_read_file(items, name) for name in _numbered(items, "files/")]

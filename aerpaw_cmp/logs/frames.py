@@ -49,7 +49,7 @@ class Logs(dict[str, pd.DataFrame]):
             key = stream.name if names.count(stream.name) == 1 else f"{file_name}:{stream.name}"
             if key in frames:  # two files of one name in two folders
                 key = f"{file.path}:{stream.name}"
-            frame = in_utc(stream.frame)
+            frame = _in_utc(stream.frame)
             frame.attrs.update(stream.attributes)
             frame.attrs |= {"kind": stream.kind, "reader": file.result.reader, "file": file.path}
             frames[key] = frame
@@ -110,7 +110,7 @@ def _line(name: str, frame: pd.DataFrame) -> str:
     return f"{name}: {frame.attrs['kind']}, {_count(len(frame), 'record')} ({frame.attrs['reader']})"
 
 
-def in_utc(frame: pd.DataFrame) -> pd.DataFrame:
+def _in_utc(frame: pd.DataFrame) -> pd.DataFrame:
     """The frame with ``time`` as instants of UTC: records hold UTC without a zone."""
     out: pd.DataFrame = frame.copy(deep=False)
     out["time"] = pd.to_datetime(out["time"]).dt.tz_localize("UTC")

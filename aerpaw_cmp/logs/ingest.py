@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 MAX_BYTES = 2**32
 
 # Rejected lines of a file that a summary quotes.
-FIRST_REJECTED = 3
+_FIRST_REJECTED = 3
 
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 __all__ = ["Ingested", "IngestedFile", "Skipped", "ingest", "read_bytes", "read_file", "summary"]
 
-OptionsFor = ReadOptions | Callable[[Path], ReadOptions]
+_OptionsFor = ReadOptions | Callable[[Path], ReadOptions]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ def _raw(place: Path, limit: int | None = None) -> bytes:
 def ingest(
     paths: Sequence[str | Path] | str | Path,
     *,
-    options: OptionsFor | None = None,
+    options: _OptionsFor | None = None,
     reader: str | None = None,
 ) -> Ingested:
     """Read files and folders.
@@ -133,7 +133,7 @@ def ingest(
     return Ingested(files, skipped)
 
 
-def _below(place: Path, options: OptionsFor | None, chosen: Reader | None) -> tuple[list[IngestedFile], list[Skipped]]:
+def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> tuple[list[IngestedFile], list[Skipped]]:
     """Logs of a file, a folder, an archive or a flight file, and the files that are none."""
     if (is_folder := _is_folder(place)) or _is_archive(place):
         inside, skipped = (_folder if is_folder else _archive)(place, options, chosen)
@@ -296,7 +296,7 @@ def _is_archive(place: Path) -> bool:
 
 
 def _archive(
-    place: Path, options: OptionsFor | None, chosen: Reader | None
+    place: Path, options: _OptionsFor | None, chosen: Reader | None
 ) -> tuple[list[IngestedFile], list[Skipped]]:
     """All logs of an archive; what cannot be read is reported, not fatal."""
     files: list[IngestedFile] = []
@@ -315,7 +315,7 @@ def _member(
     path: Path,
     member: archives.Member,
     content: Mapping[str, archives.Member],
-    options: OptionsFor | None,
+    options: _OptionsFor | None,
     chosen: Reader | None,
 ) -> IngestedFile:
     """One file of an archive; what its first bytes show to be no log is not unpacked."""
@@ -350,7 +350,7 @@ def _is_folder(place: Path) -> bool:
         return False  # an impossible path: read_bytes says so
 
 
-def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Reader | None = None) -> IngestedFile:
+def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: Reader | None = None) -> IngestedFile:
     """Read one file, or one member of an archive; see :func:`ingest`."""
     place = Path(path)
     if (part := None if _present(place) else archives.inside(place)) is not None:
@@ -420,7 +420,7 @@ def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedF
     return named[0]
 
 
-def _in_pieces(place: Path, reader: Reader, options: OptionsFor | None) -> IngestedFile | None:
+def _in_pieces(place: Path, reader: Reader, options: _OptionsFor | None) -> IngestedFile | None:
     """A log of a reader that takes pieces; None for text in UTF-16, which is turned as one."""
     if reader.read_pieces is None or _raw(place, 2) in _UTF_16:
         return None
@@ -431,7 +431,7 @@ def _in_pieces(place: Path, reader: Reader, options: OptionsFor | None) -> Inges
     return IngestedFile(str(place), digest.hexdigest(), result)
 
 
-def _options(path: Path, options: OptionsFor | None, neighbour: Callable[[str], bytes | None]) -> ReadOptions:
+def _options(path: Path, options: _OptionsFor | None, neighbour: Callable[[str], bytes | None]) -> ReadOptions:
     chosen = options(path) if callable(options) else options or ReadOptions()
     return replace(chosen, file_name=path.name, neighbour=neighbour)
 
@@ -451,7 +451,7 @@ def _read(
     data: bytes,
     digest: str,
     reader: Reader,
-    options: OptionsFor | None,
+    options: _OptionsFor | None,
     neighbour: Callable[[str], bytes | None] | None = None,
 ) -> IngestedFile:
     chosen = _options(path, options, neighbour or _neighbour_reader(path))
@@ -476,7 +476,7 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
 
 
 def _folder(
-    folder: Path, options: OptionsFor | None, chosen: Reader | None
+    folder: Path, options: _OptionsFor | None, chosen: Reader | None
 ) -> tuple[list[IngestedFile], list[Skipped]]:
     """All logs below a folder; what cannot be read is reported, not fatal."""
     files: list[IngestedFile] = []
@@ -512,7 +512,7 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
             "lines": file.result.lines,
             "accepted": file.result.accepted,
             "rejected": file.result.rejected_count,
-            "first_rejected": [asdict(line) for line in file.result.rejected[:FIRST_REJECTED]],
+            "first_rejected": [asdict(line) for line in file.result.rejected[:_FIRST_REJECTED]],
             "blank": file.result.blank,
             "streams": [
                 {"kind": stream.kind, "name": stream.name, "rows": len(stream.frame), **_span(stream.frame)}

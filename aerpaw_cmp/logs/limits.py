@@ -63,14 +63,14 @@ LIMITS: tuple[Limit, ...] = (
 LEVEL_DB = {"dBm": (-200.0, 50.0), "dB": (-200.0, 200.0)}
 
 # Levels re full scale, gain taken off: real sounder logs reach 33 dB.
-LEVEL_OTHER_DB = (-200.0, 100.0)
+_LEVEL_OTHER_DB = (-200.0, 100.0)
 
 # A few rows further than a day from all others have a damaged stamp: no log is silent for a day and goes on.
-APART_S = 86_400.0
+_APART_S = 86_400.0
 
-FEW_SHARE = 0.01
+_FEW_SHARE = 0.01
 # At most this share, or this many, are "a few".
-FEW_ROWS = 3
+_FEW_ROWS = 3
 
 # Flags of rows that no comparison scores (`flight/scored.py`). The other flags void the doubtful value itself.
 UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports", "no_number", "unterminated_line")
@@ -108,7 +108,7 @@ def _checked(stream: Stream, warnings: list[str]) -> Stream:
 def _limits_of(stream: Stream) -> tuple[Limit, ...]:
     if stream.kind != "rss":
         return LIMITS
-    bounds = LEVEL_DB.get(str(stream.attributes.get("unit")), LEVEL_OTHER_DB)
+    bounds = LEVEL_DB.get(str(stream.attributes.get("unit")), _LEVEL_OTHER_DB)
     return (*LIMITS, Limit(("rss_db",), (bounds,), "level_out_of_range"))
 
 
@@ -171,14 +171,14 @@ def _near_in_time(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> p
     if len(stamp) < 2 or _one_run(stamp):
         return frame
     timed = ~np.isnat(frame["time"].to_numpy("datetime64[ns]"))
-    if timed.sum() < 2 or float(stamp[timed].max()) - float(stamp[timed].min()) <= APART_S * 1e9:
+    if timed.sum() < 2 or float(stamp[timed].max()) - float(stamp[timed].min()) <= _APART_S * 1e9:
         return frame
     order = np.argsort(np.where(timed, stamp, np.iinfo(np.int64).max), kind="stable")[: int(timed.sum())]
-    group = np.concatenate(([0], np.cumsum(np.diff(stamp[order].astype(np.float64)) > APART_S * 1e9)))
+    group = np.concatenate(([0], np.cumsum(np.diff(stamp[order].astype(np.float64)) > _APART_S * 1e9)))
     size = np.bincount(group)
     if 2 * size.max() <= len(order):
         return frame  # no main part: two flights in one file, not a few bad stamps
-    few = size <= max(FEW_ROWS, FEW_SHARE * len(order))
+    few = size <= max(_FEW_ROWS, _FEW_SHARE * len(order))
     few[int(np.argmax(size))] = False
     bad = np.zeros(len(frame), dtype=np.bool_)
     bad[order[few[group]]] = True
@@ -196,12 +196,12 @@ def _one_run(stamp: IntArray) -> bool:
     low, high = int(stamp.min()), int(stamp.max())
     if low == np.iinfo(np.int64).min:  # a record without a time
         return False
-    if high - low <= APART_S * 1e9:
+    if high - low <= _APART_S * 1e9:
         return True
     step = 1 << 20
     for first in range(0, len(stamp) - 1, step):
         part = np.diff(stamp[first : first + step + 1].astype(np.float64))
-        if np.abs(part).max() > APART_S * 1e9:
+        if np.abs(part).max() > _APART_S * 1e9:
             return False
     return True
 

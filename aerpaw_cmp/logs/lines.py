@@ -98,14 +98,14 @@ class Lines:
 
 
 # Bytes that a look at each byte takes at a time: they stay in the processor's cache.
-SLICE = 1 << 17
+_SLICE = 1 << 17
 
 
 def places(buffer: AnyArray, byte: int, alternative: int | None = None) -> IntArray:
     """Places where one of two bytes stands, shape (n,)."""
     parts = []
-    for first in range(0, len(buffer), SLICE):
-        piece = buffer[first : first + SLICE]
+    for first in range(0, len(buffer), _SLICE):
+        piece = buffer[first : first + _SLICE]
         mask = piece == byte
         if alternative is not None:
             mask |= piece == alternative

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 # A file with more records than this in a stream is a log of its own.
-PIECE_RECORDS = 50
+_PIECE_RECORDS = 50
 
 
 def join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
@@ -24,7 +24,7 @@ def join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
     kinds = {reader.name for reader in catalogue() if reader.pieces}
     groups: dict[tuple[str, str], list[IngestedFile]] = {}
     for file in files:
-        if file.result.reader in kinds and all(len(s.frame) <= PIECE_RECORDS for s in file.result.streams):
+        if file.result.reader in kinds and all(len(s.frame) <= _PIECE_RECORDS for s in file.result.streams):
             groups.setdefault((str(Path(file.path).parent), file.result.reader), []).append(file)
     joined: dict[str, IngestedFile | None] = {}
     for (folder, _), group in groups.items():

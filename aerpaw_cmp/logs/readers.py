@@ -22,7 +22,7 @@ HEAD_BYTES = 65_536
 DEEP_BYTES = 4 << 20
 
 # Reads a log from pieces of whole lines: the same result whatever their size.
-ReadPieces = Callable[[Iterable[bytes], "ReadOptions"], ReadResult]
+_ReadPieces = Callable[[Iterable[bytes], "ReadOptions"], ReadResult]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ class Reader:
     sniff: Callable[[bytes], bool]
     read: Callable[[bytes, ReadOptions], ReadResult]
     pieces: bool = False
-    read_pieces: ReadPieces | None = None
+    read_pieces: _ReadPieces | None = None
     clock_from: str = "assumed: local wall time"
     height_from: str = "assumed: above take-off"
 

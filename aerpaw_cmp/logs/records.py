@@ -116,7 +116,7 @@ class RejectedReason:
 KEPT_REJECTED = 1000
 
 
-def reasons_of(rejected: Iterable[RejectedLine]) -> tuple[RejectedReason, ...]:
+def _reasons_of(rejected: Iterable[RejectedLine]) -> tuple[RejectedReason, ...]:
     """Rejected lines counted by reason, in the order of their first lines."""
     by_reason: dict[str, RejectedReason] = {}
     for line in rejected:
@@ -162,7 +162,7 @@ class ReadResult:
 
     def __post_init__(self) -> None:
         if not self.reasons:
-            object.__setattr__(self, "reasons", reasons_of(self.rejected))
+            object.__setattr__(self, "reasons", _reasons_of(self.rejected))
         if len(self.rejected) > KEPT_REJECTED:
             object.__setattr__(self, "rejected", self.rejected[:KEPT_REJECTED])
         if self.lines != self.accepted + self.rejected_count + self.blank:

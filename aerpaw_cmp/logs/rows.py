@@ -21,7 +21,7 @@ from . import make_frames as _frames
 from .readers import ReadOptions
 from .records import Attribute, Kind, ReadResult, RejectedLine, Stream
 
-NO_DATE = "the time stamp is no date of the calendar"
+_NO_DATE = "the time stamp is no date of the calendar"
 NO_TIME = "the time is beyond any flight"
 _DECIMAL = re.compile(_lines.NUMBER)
 _SI = {b"k": 1e3, b"M": 1e6, b"G": 1e9, b"m": 1e-3, b"u": 1e-6, b"n": 1e-9}
@@ -277,7 +277,7 @@ def built(
     if comment.any():
         rows, column = rows[~comment], {name: cells[~comment] for name, cells in column.items()}
     relative, instants, valid = times(column.pop("time"), options, clock=clock, reader=reader)
-    rejected += lines.reject_all(rows[~valid], NO_DATE if clock == "wall" else NO_TIME)
+    rejected += lines.reject_all(rows[~valid], _NO_DATE if clock == "wall" else NO_TIME)
     flag = _lines.flags(len(rows))
     instants.flag(flag)
     if lines.unterminated:

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 # 20 log10 of the smallest normal float32: what the sounder's logarithm gives without a signal.
-FLT_MIN_DB = -758.5956
+_FLT_MIN_DB = -758.5956
 # Default gain that the sounder takes off its levels.
-RX_GAIN_DB = 30.0
+_RX_GAIN_DB = 30.0
 
 
 def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]:
@@ -134,7 +134,7 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str, *, foot
     Samples equal to the one before are suppressed: one ``*`` for the run, as ``od`` does without ``-v``.
     """
     level = np.asarray(rss_db, dtype=np.float64)
-    level = np.where(np.isnan(level), FLT_MIN_DB - RX_GAIN_DB, level).astype(np.float32)
+    level = np.where(np.isnan(level), _FLT_MIN_DB - _RX_GAIN_DB, level).astype(np.float32)
     stamps = local_text(times, timezone)
     if len(stamps) != len(level):
         raise ValueError(f"{len(stamps)} times and {len(level)} levels")

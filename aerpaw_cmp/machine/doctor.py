@@ -22,10 +22,10 @@ from . import llvm
 Status = Literal["ok", "warn", "fail"]
 
 # A report of 10 000 poses and 5 towers stays below this.
-MEMORY_NEEDED_BYTES = 2 * 1024**3
+_MEMORY_NEEDED_BYTES = 2 * 1024**3
 
 # Reports, flight files and the path cache of a day in the field.
-DISK_NEEDED_BYTES = 1024**3
+_DISK_NEEDED_BYTES = 1024**3
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Check:
 
 def checks() -> list[Check]:
     """All checks, in the order in which a newcomer meets them. Takes a few seconds: LLVM is tried, not believed."""
-    gpu = gpu_check()
+    gpu = _gpu_check()
     compilers = list(llvm_checks())
     if "tried" in gpu.found and gpu.status == "ok":  # a GPU that works needs no LLVM
         compilers = [replace(check, status="warn") if check.status == "fail" else check for check in compilers]
@@ -61,9 +61,9 @@ def checks() -> list[Check]:
         *package_checks(),
         *compilers,
         gpu,
-        cores_check(),
+        _cores_check(),
         memory_check(),
-        disk_check(Path.cwd()),
+        _disk_check(Path.cwd()),
         cache_check(llvm.cache_folder()),
         readers_check(),
         *serial_checks(),
@@ -129,7 +129,7 @@ def llvm_checks() -> Iterator[Check]:
             yield Check("LLVM", "warn" if works else "fail", f"{name}: {trial.reason}", remedy)
 
 
-def gpu_check() -> Check:
+def _gpu_check() -> Check:
     """Mitsuba variant that a replay would use; a GPU is tried the same way as LLVM, in a child process."""
     if shutil.which("nvidia-smi") is None and not Path("/proc/driver/nvidia").exists():
         return Check("GPU", "ok", "none found: replays use llvm_ad_mono_polarized")
@@ -140,7 +140,7 @@ def gpu_check() -> Check:
     return Check("GPU", "warn", f"an NVIDIA driver is there, but {trial.reason}", remedy)
 
 
-def cores_check() -> Check:
+def _cores_check() -> Check:
     """Processor cores that this process may use."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return Check("CPU", "ok", f"{cores} core{'s' if cores > 1 else ''}, {platform.machine()}")
@@ -169,16 +169,16 @@ def memory_check(available: int | None = None) -> Check:
     if available is None:
         return Check("Memory", "warn", "unknown on this system", "have 2 GiB free for a report")
     free = f"{available / 1024**3:.1f} GiB free"
-    if available < MEMORY_NEEDED_BYTES:
+    if available < _MEMORY_NEEDED_BYTES:
         return Check("Memory", "warn", free, "a report needs up to 2 GiB: close other programs")
     return Check("Memory", "ok", free)
 
 
-def disk_check(folder: Path) -> Check:
+def _disk_check(folder: Path) -> Check:
     """Enough room where reports are written."""
     free = shutil.disk_usage(folder).free
     room = f"{free / 1024**3:.1f} GiB free in {folder}"
-    if free < DISK_NEEDED_BYTES:
+    if free < _DISK_NEEDED_BYTES:
         return Check("Disk", "warn", room, "free some space, or write reports elsewhere with '-o FOLDER'")
     return Check("Disk", "ok", room)
 

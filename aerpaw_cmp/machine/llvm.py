@@ -35,7 +35,7 @@ LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 # Folders to look into instead of the system's, separated as in PATH.
 FOLDERS_VARIABLE = "AERPAW_CMP_LLVM_FOLDERS"
 
-TRIAL_TIMEOUT_S = 300.0
+_TRIAL_TIMEOUT_S = 300.0
 
 # Dr.Jit's wheel links libatomic.so.1, which a minimal Debian does not have.
 APT_RUNTIME = "libatomic1"
@@ -89,7 +89,7 @@ print(json.dumps({"right": right, "found_m": found, "llvm": llvm}))
 """
 
 # The same for ``doctor`` and ``make setup``, which name a Sionna RT that cannot be loaded, too.
-SIONNA_LOADS = f"""{TRIAL_PROGRAM}
+_SIONNA_LOADS = f"""{TRIAL_PROGRAM}
 import typing, typing_extensions
 typing.__dict__.setdefault("Self", typing_extensions.Self)
 import sionna.rt
@@ -249,8 +249,8 @@ def try_library(
     library: Library,
     *,
     python: str = sys.executable,
-    program: str = SIONNA_LOADS,
-    timeout_s: float = TRIAL_TIMEOUT_S,
+    program: str = _SIONNA_LOADS,
+    timeout_s: float = _TRIAL_TIMEOUT_S,
 ) -> Trial:
     """Trace two paths with this library in a child process (about 2 s with Sionna); never raises, never crashes.
 
@@ -278,7 +278,7 @@ def try_library(
     return _verdict(library, reason or _too_old(library.version))
 
 
-def try_variant(variant: str, *, python: str = sys.executable, timeout_s: float = TRIAL_TIMEOUT_S) -> Trial:
+def try_variant(variant: str, *, python: str = sys.executable, timeout_s: float = _TRIAL_TIMEOUT_S) -> Trial:
     """Trace two paths with another Mitsuba variant (``cuda_ad_mono_polarized``) in a child process."""
     return _verdict(None, _run_trial(None, variant, python, TRIAL_PROGRAM, timeout_s)[0])
 
@@ -346,7 +346,7 @@ def _trials() -> tuple[Trial, ...]:
     return tuple(first_that_works(candidates(), _remembered_trial))
 
 
-def llvm_library() -> Path | None:
+def _llvm_library() -> Path | None:
     """The newest LLVM that passed its trial on this machine, or None."""
     trials = _trials()
     if trials and trials[-1].ok and trials[-1].library:
@@ -367,7 +367,7 @@ def prepare_llvm() -> Path:
     CheckError
         If no usable LLVM is found; the message holds the line that installs one.
     """
-    path = llvm_library()
+    path = _llvm_library()
     if path is None:
         line = INSTALL_AGAIN if sionna_fails(_trials()) else install_line()
         raise CheckError(f"{explain(_trials())}. Mend it with: {line}")

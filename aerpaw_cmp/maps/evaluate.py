@@ -92,7 +92,7 @@ def leave_one_out_estimate(model: Predictor, points_m: ArrayLike, values: ArrayL
     return estimate.reshape(data.shape), variance.reshape(data.shape)
 
 
-def held_out_estimate(
+def _held_out_estimate(
     model: Predictor, points_m: ArrayLike, values: ArrayLike, test: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Train on the positions outside ``test`` (n,), predict those inside; NaN elsewhere; shape of ``values``.
@@ -176,7 +176,7 @@ def _group_estimate(model: Predictor, points_m: ArrayLike, values: FloatArray, g
     estimate = np.full_like(values, np.nan)
     for number in np.unique(group):
         test = group == number
-        estimate[test] = held_out_estimate(model, points_m, values, test)[0][test]
+        estimate[test] = _held_out_estimate(model, points_m, values, test)[0][test]
     return estimate
 
 
@@ -241,7 +241,7 @@ def along_trajectory(model: Predictor, grid: Grid, values: ArrayLike, trajectory
     test = np.ones(len(grid), dtype=bool)
     test[visited] = False
     data = np.asarray(values, dtype=np.float64)
-    return score(data[test], held_out_estimate(model, grid.points_m, data, test)[0][test])
+    return score(data[test], _held_out_estimate(model, grid.points_m, data, test)[0][test])
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +304,7 @@ def interval_coverage(
 
 
 # Random orders of a learning curve.
-REPEATS = 3
+_REPEATS = 3
 
 
 def learning_curve(
@@ -344,13 +344,13 @@ def learning_curve(
     if wrong:
         raise UsageError(f"sample sizes {wrong} for {len(points)} positions", expected="at least one left to predict")
     generator = np.random.default_rng(seed)
-    error = np.empty((REPEATS, len(sizes), *data.shape[1:]))
-    for repeat in range(REPEATS):
+    error = np.empty((_REPEATS, len(sizes), *data.shape[1:]))
+    for repeat in range(_REPEATS):
         order = generator.permutation(len(points))
         for row, size in enumerate(sizes):
             test = np.ones(len(points), dtype=bool)
             test[order[:size]] = False
-            error[repeat, row] = score(data[test], held_out_estimate(model, points, data, test)[0][test]).mae
+            error[repeat, row] = score(data[test], _held_out_estimate(model, points, data, test)[0][test]).mae
     known = np.isfinite(error)
     total = np.where(known, error, 0.0).sum(axis=0)
     return np.asarray(np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan))

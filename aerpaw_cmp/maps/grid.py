@@ -18,7 +18,7 @@ from ..common.units import AnyArray, FloatArray, IntArray
 # Horizontal interval d_rx of the UAV positions.
 PAPER_SPACING_M = 30.0
 
-MAXIMUM_CELLS_A_SIDE = 10_000
+_MAXIMUM_CELLS_A_SIDE = 10_000
 
 # How plots and tables name a position without any path.
 OUT_OF_COVERAGE = "Z"
@@ -76,10 +76,10 @@ class Grid:
                     f"a map of {high - low:g} m with a spacing of {spacing_m:g} m has no cell",
                     expected="a positive spacing smaller than the area",
                 )
-            if cells > MAXIMUM_CELLS_A_SIDE:
+            if cells > _MAXIMUM_CELLS_A_SIDE:
                 raise UsageError(
                     f"a map of {high - low:g} m in steps of {spacing_m:g} m has too many cells",
-                    expected=f"at most {MAXIMUM_CELLS_A_SIDE}",
+                    expected=f"at most {_MAXIMUM_CELLS_A_SIDE}",
                     cause="a spacing with too few digits",
                 )
             axes.append((low + high) / 2 + spacing_m * (np.arange(cells) - (cells - 1) / 2))

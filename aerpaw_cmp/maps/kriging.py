@@ -46,7 +46,7 @@ Correlation = Callable[[FloatArray], FloatArray]
 
 CONDITION_LIMIT = 1e10
 # Targets whose neighbours' offsets agree to this share one set of weights.
-SHARE_M = 1e-9
+_SHARE_M = 1e-9
 # Below this bound of the condition number a Cholesky solution has 9 digits and more, and needs no second look.
 SOUND_CONDITION = 1e6
 # Targets that may share weights; bounds the memory.
@@ -524,7 +524,7 @@ def _same_geometry(offset_m: FloatArray) -> tuple[IntArray | slice, IntArray | s
     alone = slice(None), slice(None)
     if len(np.unique(np.round(offset_m[:, 0].sum(axis=0) / choose.TIE_M))) == t:
         return alone  # scattered samples: seen at a tenth of the cost
-    offset = np.round(offset_m.reshape(-1, t) / SHARE_M).astype(np.int64)
+    offset = np.round(offset_m.reshape(-1, t) / _SHARE_M).astype(np.int64)
     # one number tells a target: the sum with random odd factors, modulo 2^64
     factors = np.random.default_rng(0).integers(1, 2**62, len(offset), dtype=np.int64) | 1
     _, example, group = np.unique(factors @ offset, return_index=True, return_inverse=True)

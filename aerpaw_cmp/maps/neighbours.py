@@ -112,7 +112,7 @@ def by_rule(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntA
     Neighbours
     """
     if rule.selection == "random":
-        return random_within(samples_m, targets_m, rule.neighbours, rule.radius_m, rule.seed, skip)
+        return _random_within(samples_m, targets_m, rule.neighbours, rule.radius_m, rule.seed, skip)
     return nearest(samples_m, targets_m, rule.neighbours, rule.radius_m, skip)
 
 
@@ -177,7 +177,7 @@ def _tie_order(distance: FloatArray, who: IntArray, samples_m: FloatArray, targe
     return np.lexsort((who, *keys, _in_micrometres(distance)), axis=-1)
 
 
-def random_within(
+def _random_within(
     samples_m: FloatArray,
     targets_m: FloatArray,
     m: int,

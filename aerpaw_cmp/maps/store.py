@@ -25,7 +25,7 @@ from .netcdf import maps_dataset
 from .tiles import PLANES, Tiling, over_grid
 
 LEDGER = "tile_paths"
-NOT_COMPUTED = -1
+_NOT_COMPUTED = -1
 _JOB = "aerpaw_cmp_job"
 # Files of a store of Zarr 3, as names below its folder.
 _OURS = re.compile(r"zarr\.json|\w+/(zarr\.json|c(/\d+)*)")
@@ -122,7 +122,7 @@ class TileStore:
                 self._make(part, maps_dataset(empty, frame, about))
                 part.rename(self.path)
             self._group = self._zarr.open_group(self.path, mode="r+")
-            return [int(number) for number in np.flatnonzero(self.paths()[..., 0] == NOT_COMPUTED)]
+            return [int(number) for number in np.flatnonzero(self.paths()[..., 0] == _NOT_COMPUTED)]
 
     def _make(self, part: Path, like: Any) -> None:
         grid = self.tiling.grid
@@ -145,7 +145,7 @@ class TileStore:
                 dimension_names=variable.dims, attributes=plain,
             )  # fmt: skip
         group.create_array(
-            LEDGER, shape=(*self.tiling.shape, 2), chunks=(1, 1, 2), dtype=np.int64, fill_value=NOT_COMPUTED,
+            LEDGER, shape=(*self.tiling.shape, 2), chunks=(1, 1, 2), dtype=np.int64, fill_value=_NOT_COMPUTED,
             dimension_names=("tile_y", "tile_x", "kind"),
             attributes={"long_name": "paths of each tile, and those off crowns", "comment": "-1: not computed yet"},
         )  # fmt: skip

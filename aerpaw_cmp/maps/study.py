@@ -157,7 +157,7 @@ class HeldOutStudy:
     learning_mae: FloatArray
 
 
-LEARNING_SIZES = (25, 50, 100, 200, 400, 800, 1600)
+_LEARNING_SIZES = (25, 50, 100, 200, 400, 800, 1600)
 
 
 def held_out_study(
@@ -192,7 +192,7 @@ def held_out_study(
     -------
     HeldOutStudy
         Scores by block, by altitude and along the flight, and the learning curve at those of
-        :data:`LEARNING_SIZES` below the number of positions.
+        :data:`_LEARNING_SIZES` below the number of positions.
     """
     points = grid.points_m
     wide = OrdinaryKriging(fit, neighbours, outside="nearest")
@@ -202,7 +202,7 @@ def held_out_study(
     varies = np.isfinite(across.correlation[1:]).any()
     scale = variogram.fit_vertical_scale(in_space, across) if varies else 1.0
     space = OrdinaryKriging(in_space, neighbours, np.inf, vertical_scale=scale)
-    sizes = tuple(size for size in LEARNING_SIZES if size < len(grid))
+    sizes = tuple(size for size in _LEARNING_SIZES if size < len(grid))
     return HeldOutStudy(
         blocked=evaluate.blocked(wide, points, values, block_m),
         altitude_held_out=evaluate.altitude_held_out(space, points, altitudes_m, values),

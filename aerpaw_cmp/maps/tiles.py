@@ -32,7 +32,7 @@ from .job import MapResult
 NEAR_M = 0.01
 
 # How far several paths may lift a level over that of free space [dB]: ten as strong as the direct one, in phase.
-IN_PHASE_DB = 20.0
+_IN_PHASE_DB = 20.0
 
 # Fields of a :class:`~aerpaw_cmp.maps.job.MapResult` with a value per position.
 PLANES = ("rss_siso_dbm", "rss_mimo_dbm", "level_sd_db", "rank", "spread_db", "condition_db")
@@ -109,8 +109,8 @@ class Budget:
 
     @property
     def range_m(self) -> float:
-        """Distance beyond which no sum of paths reaches the floor: free space and :data:`IN_PHASE_DB`."""
-        spare_db = self.transmit_power_dbm + self.gain_db + IN_PHASE_DB - self.floor_dbm
+        """Distance beyond which no sum of paths reaches the floor: free space and :data:`_IN_PHASE_DB`."""
+        spare_db = self.transmit_power_dbm + self.gain_db + _IN_PHASE_DB - self.floor_dbm
         return float(wavelength_m(self.carrier_hz) / (4 * np.pi) * 10 ** (spare_db / 20))
 
 

@@ -45,11 +45,11 @@ __all__ = [
 # Positions per block of the pair products; bounds the memory to BLOCK x positions.
 BLOCK = 256
 
-PAPER_WIDTH_M = 30.0
-PAPER_MAXIMUM_M = 500.0
-HEIGHT_BIN_M = 10.0
+_PAPER_WIDTH_M = 30.0
+_PAPER_MAXIMUM_M = 500.0
+_HEIGHT_BIN_M = 10.0
 # Fewest components that a pair of positions must share where some are missing.
-MINIMUM_COMMON = 3
+_MINIMUM_COMMON = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +89,8 @@ def vector_correlation(
     points_m: ArrayLike,
     vectors: ArrayLike,
     *,
-    width_m: float = PAPER_WIDTH_M,
-    maximum_m: float = PAPER_MAXIMUM_M,
+    width_m: float = _PAPER_WIDTH_M,
+    maximum_m: float = _PAPER_MAXIMUM_M,
     missing: Literal["drop", "pairwise"] = "drop",
 ) -> BinnedCorrelation:
     """Pearson correlation of the positions' vectors, binned by horizontal distance (the paper's Steps 1 to 4).
@@ -114,7 +114,7 @@ def vector_correlation(
     """
     points, data = _points_and_vectors(points_m, vectors)
     present = np.isfinite(data)
-    lacking = ~present.all(axis=1) if missing == "drop" else present.sum(axis=1) < MINIMUM_COMMON
+    lacking = ~present.all(axis=1) if missing == "drop" else present.sum(axis=1) < _MINIMUM_COMMON
     constant = ~lacking & _is_constant(data, present)
     varying = ~(lacking | constant)
     if missing == "drop" or present[varying].all():
@@ -124,12 +124,12 @@ def vector_correlation(
             points[varying], lambda rows, columns: np.clip(unit[rows] @ unit[columns].T, -1.0, 1.0), width_m, maximum_m
         )
     else:
-        bins = _bin_pairs(points[varying], _PairwisePearson(data[varying], MINIMUM_COMMON), width_m, maximum_m)
+        bins = _bin_pairs(points[varying], _PairwisePearson(data[varying], _MINIMUM_COMMON), width_m, maximum_m)
     return BinnedCorrelation(*bins, int(varying.sum()), int(constant.sum()), int(lacking.sum()))
 
 
 def field_correlation(
-    points_m: ArrayLike, fields: ArrayLike, *, width_m: float = PAPER_WIDTH_M, maximum_m: float = PAPER_MAXIMUM_M
+    points_m: ArrayLike, fields: ArrayLike, *, width_m: float = _PAPER_WIDTH_M, maximum_m: float = _PAPER_MAXIMUM_M
 ) -> BinnedCorrelation:
     """Horizontal correlation of fields (n, ...), each standardised over the positions; mean over pairs and fields.
 
@@ -197,8 +197,8 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
         excluded += int((~usable).sum())
         table = _PairwisePearson(np.where(usable[:, None], rows, np.nan), 2)(np.arange(levels), np.arange(levels))
         value[:, field] = table[first, second]
-    n = int(np.floor(gap.max(initial=0.0) / HEIGHT_BIN_M + 0.5)) + 1
-    sums = _Sums(n, HEIGHT_BIN_M)
+    n = int(np.floor(gap.max(initial=0.0) / _HEIGHT_BIN_M + 0.5)) + 1
+    sums = _Sums(n, _HEIGHT_BIN_M)
     sums.add(np.repeat(gap, fields), value.ravel())
     return BinnedCorrelation(*sums.means(), levels, excluded, 0)
 
@@ -269,7 +269,7 @@ class Variogram:
     True
     """
 
-    def __init__(self, width_m: float = PAPER_WIDTH_M, maximum_m: float = PAPER_MAXIMUM_M) -> None:
+    def __init__(self, width_m: float = _PAPER_WIDTH_M, maximum_m: float = _PAPER_MAXIMUM_M) -> None:
         self.width_m = width_m
         self.maximum_m = maximum_m
 

@@ -163,7 +163,7 @@ def rotation_from_aircraft(roll_deg: FloatArray, pitch_deg: FloatArray, yaw_deg:
 
 # Ports of the measurement comparison in arXiv 2502.10324, section VII-D
 # Positions along the tower array: spacings 60 mm, 1.68 m, 60 mm.
-TOWER_PORTS_M = (0.0, 0.060, 1.740, 1.800)
+_TOWER_PORTS_M = (0.0, 0.060, 1.740, 1.800)
 
 
 def _centred_line(along_m: FloatArray) -> FloatArray:
@@ -188,7 +188,7 @@ def tower_comparison_array(
     yaw_deg: float = 45.0, slant_deg: tuple[float, ...] = (45.0, -45.0, 45.0, -45.0), pattern: Pattern | None = None
 ) -> Array:
     """Tower array of the comparison: 4 ports, 60 mm / 1.68 m / 60 mm, horizontal, ports slanted alternately."""
-    return _mounted(_centred_line(np.array(TOWER_PORTS_M)), slant_deg, pattern, yaw_deg)
+    return _mounted(_centred_line(np.array(_TOWER_PORTS_M)), slant_deg, pattern, yaw_deg)
 
 
 def uav_comparison_array(

@@ -93,7 +93,7 @@ def switch() -> str:
     return value
 
 
-def source_hash() -> str:
+def _source_hash() -> str:
     """Hash of the sources, of numba's version and of Python's."""
     digest = sha256(f"{version('numba')} {sys.version_info[:3]}".encode())
     for name in SOURCES:
@@ -107,7 +107,7 @@ def cache_folder() -> Path | None:
     named = os.environ.get("NUMBA_CACHE_DIR")
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     for base in (Path(named),) if named else (ROOM / "__pycache__", home / "aerpaw-cmp" / "compiled"):
-        folder = base / f"kernels-{source_hash()}"
+        folder = base / f"kernels-{_source_hash()}"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):

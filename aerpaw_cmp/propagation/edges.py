@@ -18,13 +18,13 @@ from .surfaces import Surfaces
 NEAREST_M = 0.01
 
 # Faces of triangles that meet at less than this make no edge: they are facets of a bowed surface.
-BEND_RAD = np.radians(2.0)
+_BEND_RAD = np.radians(2.0)
 
 # Corners of triangles nearer than this are one [m].
 WELD_M = 1e-4
 
 # Exterior angles nearer than this to 180 degrees [rad] are a plane.
-SHARPEST = 1e-6
+_SHARPEST = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +186,7 @@ def _widest(run: IntArray, along: FloatArray, inward: FloatArray, owner: IntArra
     gap = np.diff(angle[order], append=angle[order[0]] + 2.0 * np.pi)
     widest = int(np.argmax(gap))
     first, last = run[order[widest]], run[order[(widest + 1) % len(run)]]
-    if gap[widest] < np.pi + BEND_RAD or (len(run) > 1 and owner[first] == owner[last]):
+    if gap[widest] < np.pi + _BEND_RAD or (len(run) > 1 and owner[first] == owner[last]):
         return None
     return int(first), int(last), float(gap[widest])
 
@@ -208,7 +208,7 @@ def _of_solid(faces: Faces, solid: int, ground_m: float) -> list[tuple[FloatArra
         low = max(float(faces.lower[wall, 1]), ground_m)
         if following is None or top <= low:
             continue
-        if np.cross(faces.along[wall], faces.along[following])[2] > np.sin(SHARPEST):
+        if np.cross(faces.along[wall], faces.along[following])[2] > np.sin(_SHARPEST):
             # t lies in the wall, away from the corner
             rows.append((_point(faces, wall, 1, low), _point(faces, wall, 1, top), (wall, following)))
     return rows

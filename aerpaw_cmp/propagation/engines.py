@@ -23,7 +23,7 @@ from .search.effort import Estimate
 from .search.samples import Choice, enough_samples, spread
 
 # A search that will take longer is a warning where nobody asked to be told.
-LONG_SEARCH_S = 60.0
+_LONG_SEARCH_S = 60.0
 
 # Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same.
 MANY_FACES = 400
@@ -155,7 +155,7 @@ def _links(scene: Scene, run: Run) -> int:
 
 
 def _long_search(estimate: Estimate) -> None:
-    if estimate.seconds > LONG_SEARCH_S:
+    if estimate.seconds > _LONG_SEARCH_S:
         warnings.warn(f"the path search takes {estimate}", RuntimeWarning, stacklevel=2)
 
 

@@ -21,10 +21,10 @@ from ..site.site import Building, Site
 from .paths import Faces
 
 # Walls start this far below the lower of their base and the site ground.
-WALL_FOOT_M = 0.5
+_WALL_FOOT_M = 0.5
 
 # Sine of the angle between two edges below which they are one wall.
-COLLINEAR = 1e-9
+_COLLINEAR = 1e-9
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -112,7 +112,7 @@ def _corners(ring: shapely.LinearRing) -> FloatArray:
         after = np.roll(points, -1, axis=0) - points
         length = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
         turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-        flat = np.abs(turn) <= COLLINEAR * length
+        flat = np.abs(turn) <= _COLLINEAR * length
         if not flat.any():
             break
         points = np.delete(points, np.flatnonzero(flat)[0], axis=0)  # one at a time: neighbours change
@@ -120,7 +120,7 @@ def _corners(ring: shapely.LinearRing) -> FloatArray:
 
 
 def _walls(building: Building, footprint: Polygon, solid: int) -> list[_Face]:
-    foot = min(building.base_m, 0.0) - WALL_FOOT_M
+    foot = min(building.base_m, 0.0) - _WALL_FOOT_M
     top = building.base_m + building.height_m
     faces: list[_Face] = []
     for ring in (footprint.exterior, *footprint.interiors):

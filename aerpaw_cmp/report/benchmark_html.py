@@ -9,7 +9,7 @@ from typing import Any
 
 from .html import rendered
 
-LEVEL_COLUMNS = {
+_LEVEL_COLUMNS = {
     "rmse_db": ("RMSE", "dB"),
     "rmse_4s_db": ("RMSE over 4 s", "dB"),
     "bias_db": ("Mean offset", "dB"),
@@ -85,7 +85,7 @@ def task_table(name: str, about: Mapping[str, Any], scores: Mapping[str, Mapping
     scores : mapping of entrant to scores
     """
     rank = about["kind"] == "rank"
-    key, columns = ("log_score", RANK_COLUMNS) if rank else ("rmse_db", LEVEL_COLUMNS)
+    key, columns = ("log_score", RANK_COLUMNS) if rank else ("rmse_db", _LEVEL_COLUMNS)
     order = sorted(scores, key=lambda e: scores[e][key])
     ends = [scores[e].get(f"{key}_ci95", scores[e].get("rmse_ci95_db")) or (math.nan, math.nan) for e in order]
     reach = max([1e-9, *(scores[e][key] for e in order), *(h for _, h in ends if h is not None and math.isfinite(h))])

@@ -62,7 +62,7 @@ def report_data(
         site=data.site,
         generated=utc_now(),
         versions=versions(),
-        inputs=(*inputs_of(settings.logs, data.files), *other_inputs),
+        inputs=(*_inputs_of(settings.logs, data.files), *other_inputs),
         track=track_of(data),
         waypoints=waypoints_of(data),
         paths=tuple(paths),
@@ -80,11 +80,11 @@ def report_data(
 def clock_warnings(clocks: Mapping[str, ClockResult]) -> tuple[str, ...]:
     """Clocks that were corrected, should be, or cannot be judged; a correction that was not made comes first."""
     receivers = sorted(clocks, key=lambda receiver: clocks[receiver].applied != NOT_APPLIED)
-    sentences = {receiver: clock_warning(clocks[receiver]) for receiver in receivers}
+    sentences = {receiver: _clock_warning(clocks[receiver]) for receiver in receivers}
     return tuple(f"{receiver}: {text}" for receiver, text in sentences.items() if text)
 
 
-def clock_warning(clock: ClockResult) -> str:
+def _clock_warning(clock: ClockResult) -> str:
     """Sentence on what one receiver's clock does to its numbers; "" when there is nothing to know."""
     if clock.applied == NOT_APPLIED:
         return f"rss.lag: apply was asked for, but the radio clock was not corrected: {clock.reason}."
@@ -130,7 +130,7 @@ def rank_warnings(result: RankResult) -> tuple[str, ...]:
 # --- the flight ----------------------------------------------------------------------------------------------------
 
 
-def inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tuple[record.InputFile, ...]:
+def _inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tuple[record.InputFile, ...]:
     """The account of every log."""
     return tuple(
         record.InputFile(

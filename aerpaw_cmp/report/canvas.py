@@ -41,8 +41,8 @@ BASELINE = {
 }
 OUT_OF_COVERAGE = "#BBBBBB"
 TOWER = "#C1121F"
-BUILDING = "#8A8A8A"
-FOREST = "#B9D8B0"
+_BUILDING = "#8A8A8A"
+_FOREST = "#B9D8B0"
 WAYPOINT = "#555555"
 
 RANK_MARKER = {0: "x", 1: "o", 2: "s", 3: "^", 4: "D"}
@@ -50,8 +50,8 @@ RANK_HATCH = {1: "", 2: "///", 3: "xx", 4: ".."}
 
 POINTS_PER_LINE = 3000
 POINTS_PER_CLOUD = 30_000
-RASTER_DPI = 130
-WIDE = (9.2, 4.2)
+_RASTER_DPI = 130
+_WIDE = (9.2, 4.2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ FORMATS = ("png", "svg", "pdf")
 INLINE = "png of few colours"
 
 # Width of two columns of an IEEE page.
-IEEE_WIDTH_IN = 7.16
+_IEEE_WIDTH_IN = 7.16
 
 
 @contextmanager
@@ -114,7 +114,7 @@ def style(kind: str = "screen") -> Iterator[None]:
         "legend.fontsize": 8.0,
         "hatch.linewidth": 0.5,
         "figure.dpi": 100.0,
-        "savefig.dpi": RASTER_DPI,
+        "savefig.dpi": _RASTER_DPI,
         "svg.fonttype": "path",  # the page must look the same where the font is missing
         "svg.hashsalt": "aerpaw-cmp",  # same numbers, same bytes
         "path.simplify": True,
@@ -134,7 +134,7 @@ def style(kind: str = "screen") -> Iterator[None]:
         yield
 
 
-def figure(size: tuple[float, float] = WIDE) -> Figure:
+def figure(size: tuple[float, float] = _WIDE) -> Figure:
     """An empty figure [inch] whose parts do not overlap."""
     from matplotlib.figure import Figure
 
@@ -157,8 +157,8 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
 
     if kind == "paper":
         width, height = fig.get_size_inches()
-        fig.set_size_inches(IEEE_WIDTH_IN, height * IEEE_WIDTH_IN / width)
-    dots_per_inch = 300.0 if kind == "paper" else RASTER_DPI
+        fig.set_size_inches(_IEEE_WIDTH_IN, height * _IEEE_WIDTH_IN / width)
+    dots_per_inch = 300.0 if kind == "paper" else _RASTER_DPI
     fig.set_dpi(dots_per_inch)
     images = {name: io.BytesIO() for name in formats}
     # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
@@ -248,7 +248,7 @@ def start_of(data: ReportData) -> np.datetime64:
 _CLOCK_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 86400)
 
 
-def clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 7) -> tuple[FloatArray, list[str]]:
+def _clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 7) -> tuple[FloatArray, list[str]]:
     """Ticks at round times of day.
 
     Parameters
@@ -285,7 +285,7 @@ def time_axis(ax: Axes, start: np.datetime64) -> None:
         return
     ax.set_xlabel(f"Time of day, {str(start)[:10]} (UTC)")
     low, high = ax.get_xlim()
-    ax.set_xticks(*clock_ticks(low, high, start))
+    ax.set_xticks(*_clock_ticks(low, high, start))
     ax.set_xlim(low, high)
 
 
@@ -529,14 +529,14 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None) -> N
     invented = " (illustrative)" if site.illustrative else ""
     for number, forest in enumerate(site.forests):
         patch(
-            forest.area, facecolor=FOREST, edgecolor="#7FA873", hatch="..", linewidth=0.6, alpha=0.7, zorder=0.3,
+            forest.area, facecolor=_FOREST, edgecolor="#7FA873", hatch="..", linewidth=0.6, alpha=0.7, zorder=0.3,
             label=f"forest{invented}" if number == 0 else None,
         )  # fmt: skip
     if len(site.trees):
         _draw_crowns(ax, site.trees, f"tree{invented}")
     for number, building in enumerate(drawn_buildings(site)):
         patch(
-            building.footprint, facecolor=BUILDING, edgecolor="black", linewidth=0.7, zorder=0.6,
+            building.footprint, facecolor=_BUILDING, edgecolor="black", linewidth=0.7, zorder=0.6,
             label=f"building{invented}" if number == 0 else None,
         )  # fmt: skip
     for number, fence in enumerate(site.geofences):

@@ -29,7 +29,7 @@ from .words import nearest_k, pretty
 # Samples of all series together that the page holds; beyond them each series is thinned, extremes kept.
 POINTS = 50_000
 
-TREES = 1500
+_TREES = 1500
 TRACK_POINTS = 4000
 
 
@@ -156,7 +156,7 @@ def _paths(paths: PosePaths, start: np.datetime64) -> dict[str, Any]:
     }
 
 
-def scene(site: Site, most_trees: int = TREES) -> dict[str, Any]:
+def scene(site: Site, most_trees: int = _TREES) -> dict[str, Any]:
     """Towers, buildings, trees and forests as plain lists, rounded to 0.1 m."""
     trees, pick = site.trees, spread_out(len(site.trees), most_trees)
     columns = ("east_m", "north_m", "ground_m", "height_m", "crown_diameter_m", "crown_base_m")

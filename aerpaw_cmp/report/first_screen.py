@@ -59,7 +59,7 @@ def _training(data: ReportData) -> str:
 
 def _baseline_sentence(panels: Sequence[RssResult]) -> str:
     """Sentence on what a model without anything learned leaves on the panels of a training flight."""
-    best = best_baseline([panel for panel in panels if panel.training])
+    best = _best_baseline([panel for panel in panels if panel.training])
     return "" if best is None else f"For comparison, {words.pretty(best[0])}: RMSE {best[1]:.1f} dB."
 
 
@@ -67,7 +67,7 @@ def _scored(panels: Sequence[RssResult]) -> list[RssResult]:
     return [panel for panel in panels if panel.score.n >= FEWEST and math.isfinite(panel.score.rmse_db)]
 
 
-def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
+def _baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
     """Pooled RMSE [dB] of each baseline that all of these series have."""
     errors = {}
     for name in panels[0].baselines if panels else ():
@@ -77,9 +77,9 @@ def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
     return errors
 
 
-def best_baseline(panels: Sequence[RssResult]) -> tuple[str, float] | None:
+def _best_baseline(panels: Sequence[RssResult]) -> tuple[str, float] | None:
     """Name and pooled RMSE [dB] of the baseline with the smallest error; None without one that all have."""
-    return min(baseline_errors(panels).items(), key=lambda item: item[1], default=None)
+    return min(_baseline_errors(panels).items(), key=lambda item: item[1], default=None)
 
 
 def _pooled(panels: Sequence[RssResult]) -> float:
@@ -98,7 +98,7 @@ def judged(panels: Sequence[RssResult]) -> words.Judged | None:
         return None
     scored = [(p.score.rmse_db, p.score.n) for p in panels]
     verdicts = [{name: pair.verdict for name, pair in p.further.compared_with.items()} for p in panels]
-    return judge(scored, baseline_errors(panels), verdicts)
+    return judge(scored, _baseline_errors(panels), verdicts)
 
 
 def judge(
@@ -130,10 +130,10 @@ def judge(
         decided = [row[name] for row in verdicts if row.get(name, "no interval") != "no interval"]
         every.append(words.Judged(ray_db=total, channels=count_of, name=name, other_db=error, judged=len(decided),
                             better=decided.count("better"), worse=decided.count("worse"), unit=unit))  # fmt: skip
-    return most_telling(every) if every else words.Judged(ray_db=total, channels=count_of, unit=unit)
+    return _most_telling(every) if every else words.Judged(ray_db=total, channels=count_of, unit=unit)
 
 
-def most_telling(every: Sequence[words.Judged]) -> words.Judged:
+def _most_telling(every: Sequence[words.Judged]) -> words.Judged:
     """The comparison to be said first: the best baseline that ray tracing loses to, else the best one."""
     lost = [entry for entry in every if entry.worse > entry.better]
     return min(lost or every, key=lambda comparison: comparison.other_db)
@@ -246,7 +246,7 @@ def _audit(audit: AuditResult) -> Headline:
 
 
 def _error(panels: Sequence[RssResult]) -> Headline:
-    total, best = _pooled(panels), best_baseline(panels)
+    total, best = _pooled(panels), _best_baseline(panels)
     return Headline(
         label="RMSE of the level" if len(panels) == 1 else f"RMSE of the level, {len(panels)} channels",
         value=f"{total:.1f} dB",

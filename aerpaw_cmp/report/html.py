@@ -31,11 +31,11 @@ from .first_screen import headlines, verdict
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
 # Rejected lines shown per file; the flight file holds all.
-REJECTED_SHOWN = 20
+_REJECTED_SHOWN = 20
 
 # ``script``: 'none', or the digest of the page's one script. Lets a browser refuse whatever would be loaded or run
 # besides, should a hostile log ever get past the escaping.
-CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {script}"
+_CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {script}"
 
 
 def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
@@ -152,7 +152,7 @@ def coded(text: str) -> Markup:
 
 def policy(script: str = "") -> str:
     """The content policy of a page with one script, or none."""
-    return CONTENT_POLICY.format(script=digest(script) if script else "'none'")
+    return _CONTENT_POLICY.format(script=digest(script) if script else "'none'")
 
 
 def digest(text: str) -> str:
@@ -245,7 +245,7 @@ def by_section(pictures: Sequence[Picture]) -> dict[str, list[Picture]]:
     return sections
 
 
-def ladder_table(ladder: Sequence[LadderRow]) -> list[tuple[str, bool, float, dict[str, LadderRow]]]:
+def _ladder_table(ladder: Sequence[LadderRow]) -> list[tuple[str, bool, float, dict[str, LadderRow]]]:
     """Model, whether recommended, seconds, and its rows by tower and channel."""
     table: dict[str, dict[str, LadderRow]] = {}
     for row in ladder:
@@ -287,11 +287,11 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         headline=words.headline(data),
         verdicts=words.verdicts(data.rss, data.rank),
         ladder_verdict=words.ladder_verdict(data.ladder),
-        ladder=ladder_table(data.ladder),
+        ladder=_ladder_table(data.ladder),
         warnings=words.warnings(data),
         baselines=list(dict.fromkeys(name for item in data.rss for name in item.baselines)),
         rss_columns=RSS_COLUMNS,
         rank_columns=RANK_COLUMNS,
-        rejected_shown=REJECTED_SHOWN,
+        rejected_shown=_REJECTED_SHOWN,
         pretty=words.pretty,
     )

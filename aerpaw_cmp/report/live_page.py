@@ -16,7 +16,7 @@ from .html import digest, environment, script
 from .names import k_key
 from .packed import PackedArrays
 
-POLICY = (
+_POLICY = (
     "default-src 'none'; script-src {script}; style-src {style}; connect-src 'self'; img-src data:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'"
 )
@@ -95,4 +95,4 @@ def live_page(background: LiveMap | None, title: str) -> tuple[bytes, str]:
             scene=Markup(as_json(background.content() if background else {})),
         )
     )
-    return text.encode(), POLICY.format(script=digest(code), style=digest(style))
+    return text.encode(), _POLICY.format(script=digest(code), style=digest(style))

@@ -48,7 +48,7 @@ class PackedArrays:
 
     def add_steps(self, values: FloatArray, step: float) -> int:
         """Values as 16-bit multiples of ``step``; what is not finite is none."""
-        return self.add(steps_of(values, step), "i2")
+        return self.add(_steps_of(values, step), "i2")
 
     def content(self) -> dict[str, Any]:
         """``{"data": base64 of the deflated block, "arrays": [[kind, offset, length], ...]}``."""
@@ -56,7 +56,7 @@ class PackedArrays:
         return {"data": base64.b64encode(block).decode("ascii"), "arrays": [list(entry) for entry in self._table]}
 
 
-def steps_of(values: FloatArray, step: float) -> AnyArray:
+def _steps_of(values: FloatArray, step: float) -> AnyArray:
     """Values as multiples of ``step``, those beyond 16 bits at the end of the range; NaN and infinities are none.
 
     Examples

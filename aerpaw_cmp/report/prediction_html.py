@@ -91,7 +91,7 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
 
 
 # Rows of prediction.csv that are rounded and written together: bounds the memory.
-ROWS_AT_ONCE = 100_000
+_ROWS_AT_ONCE = 100_000
 
 
 def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], list[str]]:
@@ -113,8 +113,8 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
     digits = {c: 3 for c in data.table.columns if c.endswith(("_db", "_m", "_deg", "_s"))}
     digits |= {c: 4 for c in data.table.columns if c.startswith("p_")}
     with (folder / "prediction.csv").open("w", encoding="utf-8", newline="") as book:
-        for start in range(0, len(data.table), ROWS_AT_ONCE):
-            part = guarded(data.table.iloc[start : start + ROWS_AT_ONCE].round(digits))
+        for start in range(0, len(data.table), _ROWS_AT_ONCE):
+            part = guarded(data.table.iloc[start : start + _ROWS_AT_ONCE].round(digits))
             part.to_csv(book, index=False, header=not start, lineterminator="\n")
     written.append(folder / "prediction.csv")
     try:
@@ -174,7 +174,7 @@ def _map_spec(data: PredictionPage, name: str, part: pd.DataFrame, height: str =
 
 
 # Points of a map that are drawn.
-MOST_DOTS = 50_000
+_MOST_DOTS = 50_000
 
 
 def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
@@ -188,7 +188,7 @@ def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
         for line in data.flown.values():
             ax.plot(line[0], line[1], color="0.7", linewidth=0.6, zorder=1)
         if data.shape is None:
-            some = slice(None, None, -(-len(values) // MOST_DOTS))
+            some = slice(None, None, -(-len(values) // _MOST_DOTS))
             shown = ax.scatter(east[some], north[some], c=values[some], s=7, cmap=colours, zorder=2, rasterized=True)
         else:
             grid = [v.reshape(data.shape) for v in (east, north, values)]

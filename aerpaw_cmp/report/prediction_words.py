@@ -121,9 +121,9 @@ def first_words(correction: Correction, outside: float, expected_db: float) -> s
         f"On {over}: {correction.rmse_db[key]:.1f} dB{baseline}.",
     ]
     if free in correction.rmse_db and key != free:
-        texts.append(said_of(against_free_space(correction), AGAINST_FREE_SPACE))
+        texts.append(said_of(_against_free_space(correction), AGAINST_FREE_SPACE))
     error, sd = correction.held_out[key]
-    inside = 100.0 * inside_share(error, sd)
+    inside = 100.0 * _inside_share(error, sd)
     texts.append(said_of(stated_errors(error, sd), STATED, inside=inside))
     texts.append(f"Model: {TITLES[correction.base]}.")
     texts.append(said_of(field(correction), FIELD))
@@ -170,13 +170,13 @@ def memory_words(known: Sequence[tuple[Entry, LearnedSeries, float]], outside: f
     return " ".join(filled(texts, learned=learned, sd=sd, percent=100.0 * outside))
 
 
-def inside_share(error: FloatArray, sd: FloatArray) -> float:
+def _inside_share(error: FloatArray, sd: FloatArray) -> float:
     """Share of errors inside their 90 % interval."""
     good = np.isfinite(error)
     return float(np.mean(np.abs(error[good]) <= 1.6449 * sd[good])) if good.any() else float("nan")
 
 
-def against_free_space(correction: Correction) -> Verdict:
+def _against_free_space(correction: Correction) -> Verdict:
     """The chosen model and free space on the same samples that were left out."""
     error, free_space = (
         correction.held_out[key][0] for key in ((correction.base, correction.title), ("free space", OFF))

@@ -72,7 +72,7 @@ def plan(site: Site, track: Track | None = None) -> Figure:
     return fig
 
 
-def view_of(site: Site, track: Track | None = None) -> dict[str, Any]:
+def _view_of(site: Site, track: Track | None = None) -> dict[str, Any]:
     """The site as plain lists for the page, rounded to 0.1 m."""
     flight: list[Any] = []
     if track is not None and len(track.time):
@@ -91,7 +91,7 @@ def view_of(site: Site, track: Track | None = None) -> dict[str, Any]:
 
 def viewer(site: Site, track: Track | None = None) -> str:
     """The page that shows the site in 3-D."""
-    content = view_of(site, track)
+    content = _view_of(site, track)
     return rendered(
         "site_view",
         site=site,

@@ -283,7 +283,7 @@ def _missing_paths(data: ReportData) -> int:
 DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
     (lambda d: any(p.score.at_edge for p in d.rss), "an offset lies at the edge of its search"),
     (lambda d: any(not p.score.n and not p.training for p in d.rss), "a channel could not be scored"),
-    (lambda d: any(moved_by_outliers(p) for p in d.rss), "{outliers}"),
+    (lambda d: any(_moved_by_outliers(p) for p in d.rss), "{outliers}"),
     (lambda d: d.engine is not None and d.engine.audit is None, "no audit"),
     (lambda d: _missing_paths(d) > 0, "the audit misses {missing} paths"),
     (lambda d: _field_failures(d) > 0, "the audit of the field failed {failed} times"),
@@ -325,18 +325,18 @@ def next_step(data: ReportData) -> str:
 
 
 # Outlying samples that move an RMSE by more than this [dB] are named in the first words.
-MOVED_DB = 0.3
+_MOVED_DB = 0.3
 
 
-def moved_by_outliers(panel: RssResult) -> float:
-    """By how much outlying samples raise the RMSE of a channel [dB]; 0 below :data:`MOVED_DB`."""
+def _moved_by_outliers(panel: RssResult) -> float:
+    """By how much outlying samples raise the RMSE of a channel [dB]; 0 below :data:`_MOVED_DB`."""
     moved = panel.score.rmse_db - panel.further.rmse_without_outliers_db
-    return float(moved) if moved > MOVED_DB else 0.0  # NaN moves nothing
+    return float(moved) if moved > _MOVED_DB else 0.0  # NaN moves nothing
 
 
 def _outliers_in_words(data: ReportData) -> str:
-    panel = max(data.rss, key=moved_by_outliers, default=None)
-    if panel is None or not moved_by_outliers(panel):
+    panel = max(data.rss, key=_moved_by_outliers, default=None)
+    if panel is None or not _moved_by_outliers(panel):
         return ""
     n, without = panel.further.n_outliers, panel.further.rmse_without_outliers_db
     change = f"its RMSE from {without:.1f} to {panel.score.rmse_db:.1f} dB"

@@ -27,13 +27,13 @@ from ..common.units import AnyArray, ComplexArray, FloatArray, amplitude_from_db
 from ..logs.matfile import read_arrays
 
 # Peak directivity of a half-wave dipole (2.15 dBi): 4 / Cin(2 pi).
-HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
+_HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 
 # Mean gain over the sphere that a file may have: no antenna radiates more than it gets, 0.5 dB is calibration.
-MAXIMUM_EFFICIENCY = 1.12
+_MAXIMUM_EFFICIENCY = 1.12
 
 # A mean gain below -20 dB is a field in other units, or normalised; measured antennas lie near 0.5.
-MINIMUM_EFFICIENCY = 0.01
+_MINIMUM_EFFICIENCY = 0.01
 
 # No element has more gain; a file that says so holds something else.
 HIGHEST_DBI = 60.0
@@ -71,7 +71,7 @@ class HalfWaveDipole:
         sine = np.sin(theta)
         safe = np.where(np.abs(sine) < 1e-9, 1.0, sine)
         shape = np.where(np.abs(sine) < 1e-9, 0.0, np.cos(np.pi / 2 * np.cos(theta)) / safe)
-        return zeros + math.sqrt(HALF_WAVE_DIPOLE_GAIN) * shape, zeros
+        return zeros + math.sqrt(_HALF_WAVE_DIPOLE_GAIN) * shape, zeros
 
 
 @dataclass(frozen=True, slots=True)
@@ -456,11 +456,11 @@ def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
 
 
 def _check_power(pattern: MeasuredPattern, path: Path) -> None:
-    if not MINIMUM_EFFICIENCY <= pattern.efficiency <= MAXIMUM_EFFICIENCY:
+    if not _MINIMUM_EFFICIENCY <= pattern.efficiency <= _MAXIMUM_EFFICIENCY:
         raise InputError(
             f"the mean gain over the sphere is {float(db_from_power(pattern.efficiency)):.1f} dB "
             f"(peak {pattern.peak_gain_dbi:.1f} dBi)",
-            expected=f"a mean of {float(db_from_power(MINIMUM_EFFICIENCY)):g} to 0 dB",
+            expected=f"a mean of {float(db_from_power(_MINIMUM_EFFICIENCY)):g} to 0 dB",
             cause="the values are not gain over isotropic",
             path=path,
         )

@@ -23,10 +23,10 @@ from .siteyaml import SiteModel
 LOWEST_M, HIGHEST_M = 3.0, 120.0
 
 # Smaller areas are single trees; smaller still, nothing.
-SMALLEST_STAND_M2, SMALLEST_CROWN_M2 = 200.0, 2.0
+_SMALLEST_STAND_M2, _SMALLEST_CROWN_M2 = 200.0, 2.0
 
 # Distances from a wall between which a surface model shows the ground.
-RING_M = (2.0, 12.0)
+_RING_M = (2.0, 12.0)
 
 
 def with_canopy(model: SiteModel, path: Path) -> tuple[SiteModel, list[str]]:
@@ -96,10 +96,10 @@ def canopy_of(chm: Dem) -> tuple[list[Forest], list[SingleTree], list[str]]:
         corner = np.array([part[1].start, part[0].start])
         polygons = _outlines(chm, mine, corner)
         area = sum(polygon.area for polygon in polygons)
-        if area >= SMALLEST_STAND_M2:
+        if area >= _SMALLEST_STAND_M2:
             tall = round(float(height[mine].mean()), 1)
             forests += [Forest(f"stand {len(forests) + k + 1}", p, height_m=tall) for k, p in enumerate(polygons)]
-        elif area >= SMALLEST_CROWN_M2:
+        elif area >= _SMALLEST_CROWN_M2:
             row, column = (at.mean() for at in np.nonzero(mine))
             east, north = chm.place(column + corner[0], row + corner[1])
             width = 2.0 * float(np.sqrt(area / np.pi))
@@ -156,7 +156,7 @@ def building_heights(surface: Dem, footprints: Sequence[Polygon]) -> FloatArray:
     measured = shapely.union_all(list(footprints))
     heights = np.full(len(footprints), np.nan)
     for number, footprint in enumerate(footprints):
-        ring = footprint.buffer(RING_M[1]).difference(footprint.buffer(RING_M[0])).difference(measured)
+        ring = footprint.buffer(_RING_M[1]).difference(footprint.buffer(_RING_M[0])).difference(measured)
         roof, ground = (_sampled(surface, shape) for shape in (footprint, ring))
         if len(roof) and len(ground):
             heights[number] = np.median(roof) - np.percentile(ground, 10)

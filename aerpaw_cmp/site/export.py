@@ -16,7 +16,7 @@ from .meshes import Mesh, site_meshes
 from .site import Site
 
 # Thickness given to ground in the export, a slab from which no echo of its second face returns; and to crowns.
-HALF_SPACE_THICKNESS_M, CROWN_THICKNESS_M = 1.0, 2.5
+HALF_SPACE_THICKNESS_M, _CROWN_THICKNESS_M = 1.0, 2.5
 
 
 def export_scene(site: Site, folder: str | Path, *, trees: bool = True) -> list[Path]:
@@ -47,7 +47,7 @@ def export_scene(site: Site, folder: str | Path, *, trees: bool = True) -> list[
         (folder / "meshes").mkdir(exist_ok=True)
         for title, name, mesh in parts:
             written.append(folder / "meshes" / f"{title}.ply")
-            write_ply(mesh, written[-1])
+            _write_ply(mesh, written[-1])
             lines.append(
                 f'<shape type="ply" id={quoteattr("mesh-" + title)}>'
                 f'<string name="filename" value="meshes/{title}.ply"/>'
@@ -99,7 +99,7 @@ def _bsdf_id(name: str) -> str:
 
 def _bsdf(name: str) -> str:
     what = face_material(name)
-    of_half_space = CROWN_THICKNESS_M if name == CROWN else HALF_SPACE_THICKNESS_M
+    of_half_space = _CROWN_THICKNESS_M if name == CROWN else HALF_SPACE_THICKNESS_M
     thickness = {"thickness": of_half_space if what.thickness_m is None else what.thickness_m}
     if name == CROWN or name.startswith(CONSTANT):
         values = {
@@ -118,7 +118,7 @@ def _floats(values: Mapping[str, float]) -> str:
     return "".join(f'<float name="{name}" value="{value:.9g}"/>' for name, value in values.items())
 
 
-def write_ply(mesh: Mesh, path: Path) -> None:
+def _write_ply(mesh: Mesh, path: Path) -> None:
     """A binary little-endian PLY, float32 (0.1 mm at 2 km)."""
     head = (
         "ply\nformat binary_little_endian 1.0\n"

@@ -32,32 +32,32 @@ from .site import Building, Forest, Geofence
 from .siteyaml import SiteModel, extent_m, site_model
 from .tags import Kind, is_part, kind_of, levels_of, main_tag, material_of, metres, positive_metres
 
-LEVEL_M = 3.0
-DEFAULT_HEIGHT_M = 6.0
+_LEVEL_M = 3.0
+_DEFAULT_HEIGHT_M = 6.0
 TALLEST_M = 300.0
 # Outlines farther from the origin are not of this site.
 FAR_M = 20_000.0
 
 # Coordinates are rounded to this.
-GRID_M = 0.001
+_GRID_M = 0.001
 
 # Areas narrower than this everywhere are drawing errors; vertices closer to a straight line are dropped too.
-SLIVER_M = 0.3
+_SLIVER_M = 0.3
 
-MINIMUM_AREA_M2 = 2.0
-SAME_HEIGHT_M = 0.25
+_MINIMUM_AREA_M2 = 2.0
+_SAME_HEIGHT_M = 0.25
 
 # Formats whose data are OpenStreetMap's.
-OSM_KINDS = ("OSM XML", "Overpass JSON")
+_OSM_KINDS = ("OSM XML", "Overpass JSON")
 
 # Forests are cut off this far outside the area of the site: trees there shadow nothing.
-FOREST_MARGIN_M = 1000.0
+_FOREST_MARGIN_M = 1000.0
 
-TALLEST_TREE_M = 120.0
+_TALLEST_TREE_M = 120.0
 # Distance of the trees of a row without a tagged crown diameter: the default crowns touch.
-ROW_SPACING_M = 10.0
+_ROW_SPACING_M = 10.0
 
-MAXIMUM_ROW_TREES = 10_000
+_MAXIMUM_ROW_TREES = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ def import_footprints(
     frame: SiteFrame,
     *,
     untagged: Kind | None = None,
-    default_height_m: float = DEFAULT_HEIGHT_M,
+    default_height_m: float = _DEFAULT_HEIGHT_M,
     trees_per_hectare: float = 100.0,
     minimum_spacing_m: float = 4.0,
     area_m: tuple[float, float, float, float] | None = None,
@@ -125,7 +125,7 @@ def import_footprints(
     trees_per_hectare, minimum_spacing_m : float
         Of all forests found.
     area_m : (east_min, east_max, north_min, north_max), optional
-        Of the site; forests are cut off :data:`FOREST_MARGIN_M` outside.
+        Of the site; forests are cut off :data:`_FOREST_MARGIN_M` outside.
 
     Returns
     -------
@@ -146,7 +146,7 @@ def import_footprints(
         content = read_map_file(path)
         _check_place(content, frame, Path(path))
         result.actions += content.notes
-        if content.kind in OSM_KINDS:
+        if content.kind in _OSM_KINDS:
             result.credits.append(f"{Path(path).name}: (c) OpenStreetMap contributors, ODbL")
         _sort(
             content=content,
@@ -160,7 +160,7 @@ def import_footprints(
         for tree in content.trees:
             result.trees += _single_trees(tree, frame, result.actions)
     _warn_of_feet(shapes["building"], result.actions)
-    near = None if area_m is None else box(area_m[0], area_m[2], area_m[1], area_m[3]).buffer(FOREST_MARGIN_M)
+    near = None if area_m is None else box(area_m[0], area_m[2], area_m[1], area_m[3]).buffer(_FOREST_MARGIN_M)
     shapes["forest"] = _cut_off(shapes["forest"], near, result.actions)
     _fill(result, shapes, trees_per_hectare, minimum_spacing_m)
     if not (result.buildings or result.forests or result.geofences or result.trees):
@@ -204,7 +204,7 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
     """A tree with its tagged sizes, or those of a row, a crown's diameter apart."""
     notes: list[str] = []
     height = positive_metres(tree.tags, ("height", "est_height"), notes)
-    if height is not None and height > TALLEST_TREE_M:
+    if height is not None and height > _TALLEST_TREE_M:
         notes.append(f"a tree {height:g} m high; feet or centimetres? The site's default holds")
         height = None
     crown = positive_metres(tree.tags, ("diameter_crown", "crown_diameter"), notes)
@@ -215,8 +215,8 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
         actions.append(f"{tree.source}: a tree left out, it does not stand at the site")
         return []
     if len(points) > 1:
-        points = _along(points, crown or ROW_SPACING_M)
-        notes.append(f"{len(points)} trees were placed along the row, {crown or ROW_SPACING_M:g} m apart")
+        points = _along(points, crown or _ROW_SPACING_M)
+        notes.append(f"{len(points)} trees were placed along the row, {crown or _ROW_SPACING_M:g} m apart")
     actions += [f"{tree.source}: {note}" for note in notes]
     trunk = None if girth is None else girth / math.pi
     return [SingleTree(float(east), float(north), height, crown, trunk) for east, north in points]
@@ -225,7 +225,7 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
 def _along(line_m: FloatArray, spacing_m: float) -> FloatArray:
     """Points (n, 2) on a line (corners, 2) from its beginning to its end, about ``spacing_m`` apart."""
     line = LineString(line_m)
-    count = min(max(round(line.length / max(spacing_m, 0.5)), 1), MAXIMUM_ROW_TREES)
+    count = min(max(round(line.length / max(spacing_m, 0.5)), 1), _MAXIMUM_ROW_TREES)
     return np.asarray(shapely.get_coordinates(line.interpolate(np.linspace(0.0, 1.0, count + 1), normalized=True)))
 
 
@@ -237,7 +237,7 @@ def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> 
         if inside.area < 0.999 * shape.area.area:
             lost = (shape.area.area - inside.area) / 1e4
             actions.append(
-                f"{shape.source}: {lost:.0f} ha more than {FOREST_MARGIN_M:g} m outside the site's area were cut away"
+                f"{shape.source}: {lost:.0f} ha more than {_FOREST_MARGIN_M:g} m outside the site's area were cut away"
             )
             shape.area = inside
         if not inside.is_empty:
@@ -385,7 +385,7 @@ def _describe(shape: _Shape, outline: Outline, default_m: float, path: Path, act
     levels = levels_of(tags, notes)
     shape.stated = height is not None
     if height is None:
-        height = levels * LEVEL_M if levels else default_m
+        height = levels * _LEVEL_M if levels else default_m
         notes = [f"{note}; it is drawn {height:g} m high" for note in notes]
     lowest = tags.get("min_height", tags.get("building:min_level", "0"))
     if (metres(lowest) or 0.0) > 0:
@@ -400,7 +400,7 @@ def _describe(shape: _Shape, outline: Outline, default_m: float, path: Path, act
         )
     shape.height_m = height
     shape.material = material_of(tags)
-    if height > 2 * LEVEL_M and levels and 2.7 <= height / (levels * LEVEL_M) <= 4.5:
+    if height > 2 * _LEVEL_M and levels and 2.7 <= height / (levels * _LEVEL_M) <= 4.5:
         shape.stated = False  # counted by _warn_of_feet
         actions.append(f"warning: {shape.source}: {height:g} m for {levels:g} levels; are these feet?")
 
@@ -496,7 +496,7 @@ def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 
 def _alike(first: _Shape, second: _Shape) -> bool:
-    return abs(first.height_m - second.height_m) <= SAME_HEIGHT_M and first.material == second.material
+    return abs(first.height_m - second.height_m) <= _SAME_HEIGHT_M and first.material == second.material
 
 
 def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
@@ -520,11 +520,13 @@ def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, 
     used: set[str] = set()
     for shape in shapes:
         # rounded here to what site.yaml keeps: rounding coordinates one by one can make a ring cross itself
-        for part in shapely.get_parts(_areas_only(shapely.set_precision(shape.area, GRID_M))):
-            plain = part.simplify(SLIVER_M / 2)
+        for part in shapely.get_parts(_areas_only(shapely.set_precision(shape.area, _GRID_M))):
+            plain = part.simplify(_SLIVER_M / 2)
             plain = plain if isinstance(plain, Polygon) and plain.is_valid and not plain.is_empty else part
-            plain = Polygon(plain.exterior, [hole for hole in plain.interiors if Polygon(hole).area >= MINIMUM_AREA_M2])
-            if plain.area < MINIMUM_AREA_M2 or plain.buffer(-SLIVER_M / 2).is_empty:
+            plain = Polygon(
+                plain.exterior, [hole for hole in plain.interiors if Polygon(hole).area >= _MINIMUM_AREA_M2]
+            )
+            if plain.area < _MINIMUM_AREA_M2 or plain.buffer(-_SLIVER_M / 2).is_empty:
                 actions.append(f"{shape.source}: a sliver of {part.area:.1f} m2 was left out")
                 continue
             name, number = shape.name, 1

@@ -19,7 +19,7 @@ from ..common.errors import InputError, UsageError
 from ..common.files import LARGEST_TABLE, read_bounded, write_whole
 from ..common.yamlfile import StrictModel, dump_yaml, load_yaml
 
-INDEX = "learned.yaml"
+_INDEX = "learned.yaml"
 # Since 2 the comments of a tower's table may hold the gain towards both ends at once (:mod:`.pair_gain`).
 FORMAT: Literal["aerpaw-cmp learned 2"] = "aerpaw-cmp learned 2"
 
@@ -160,7 +160,7 @@ def read_learned(site: str | Path) -> Learned:
     UsageError
         An index that is damaged, or of another version.
     """
-    index = folder_of(site) / INDEX
+    index = folder_of(site) / _INDEX
     return load_yaml(index, Learned) if index.is_file() else Learned()
 
 
@@ -187,10 +187,10 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
         write_whole(folder / file, gzip.compress(content, 9, mtime=0))
     entries = {**memory.entries, name: entry}
     text = dump_yaml(Learned(entries=dict(sorted(entries.items()))).model_dump(mode="json", exclude_none=True))
-    write_whole(folder / INDEX, text)
+    write_whole(folder / _INDEX, text)
     for file in sorted(files_of(old) - set(files)) if old is not None else ():
         (folder / file).unlink(missing_ok=True)
-    return [folder / INDEX, *(folder / file for file in files)]
+    return [folder / _INDEX, *(folder / file for file in files)]
 
 
 def memory_lines(site: str | Path) -> list[str]:
@@ -201,7 +201,7 @@ def memory_lines(site: str | Path) -> list[str]:
         what += [f"rank receiver at {r.tower}" for r in entry.receivers]
         source = ", ".join(part for part in (entry.source.title, entry.source.doi, entry.source.licence) if part)
         lines.append(f"{name}: {', '.join(what)}; {entry.about()}; airframe: {entry.source.airframe}")
-        lines.append(f"  source: {source}; {len(entry.trained_on)} logs, SHA-256 in {folder_of(site).name}/{INDEX}")
+        lines.append(f"  source: {source}; {len(entry.trained_on)} logs, SHA-256 in {folder_of(site).name}/{_INDEX}")
         lines.append(f"  made {entry.made} by: {entry.command}")
     return lines
 
@@ -277,5 +277,5 @@ def find_named(name: str, folder: Path) -> Named:
         f"nothing learned is called {name!r}",
         expected="SITE/ENTRY_uav, SITE/ENTRY_TOWER.CHANNEL or SITE/ENTRY, with one of the entries "
         + (", ".join(memory.entries) or "(there are none)"),
-        path=folder_of(place) / INDEX,
+        path=folder_of(place) / _INDEX,
     )

@@ -126,7 +126,7 @@ CROWN = "vegetation"
 
 CROWN_PERMITTIVITY = 1.1
 # Leaves and air, averaged. P.833 gives losses only; the permittivity decides the reflection, the loss hardly does.
-CROWN_ATTENUATION_DB_PER_M = 0.5
+_CROWN_ATTENUATION_DB_PER_M = 0.5
 
 
 def lossy_conductivity_s_per_m(permittivity: float, gamma_db_per_m: float) -> float:
@@ -135,7 +135,7 @@ def lossy_conductivity_s_per_m(permittivity: float, gamma_db_per_m: float) -> fl
     return 2 * math.sqrt(permittivity) * neper_per_m * VACUUM_PERMITTIVITY_F_PER_M * SPEED_OF_LIGHT_MPS
 
 
-_CROWN_S_PER_M = lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, CROWN_ATTENUATION_DB_PER_M)
+_CROWN_S_PER_M = lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, _CROWN_ATTENUATION_DB_PER_M)
 # Crowns as a half-space, 30 MHz to 100 GHz (the scope of P.833).
 VEGETATION = Material(CROWN, ((0.03, 100.0, CROWN_PERMITTIVITY, 0.0, _CROWN_S_PER_M, 0.0),))
 

@@ -21,10 +21,10 @@ from .site import Building, Site, Trees
 WALL_DEPTH_M = 0.5
 
 # The ground reaches this far beyond the area: reflections must not fall off its edge.
-GROUND_MARGIN_M = 3000.0
+_GROUND_MARGIN_M = 3000.0
 
 CROWN_SIDES = 8
-TRUNK_SIDES = 6
+_TRUNK_SIDES = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,11 +116,11 @@ def crown_corners_m(trees: Trees) -> tuple[FloatArray, FloatArray]:
     return corners[:, :CROWN_SIDES], corners[:, CROWN_SIDES]
 
 
-def ground_mesh(site: Site) -> tuple[FloatArray, IntArray]:
+def _ground_mesh(site: Site) -> tuple[FloatArray, IntArray]:
     """The flat ground, up = 0: two triangles that face upwards."""
     west, east, south, north = site.area_m
     corners = [(west, south), (east, south), (east, north), (west, north)]
-    out = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * GROUND_MARGIN_M
+    out = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * _GROUND_MARGIN_M
     vertices = np.column_stack([np.array(corners) + out, np.zeros(4)])
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
 
@@ -141,7 +141,7 @@ def site_meshes(site: Site, *, trees: bool = True) -> Mapping[str, Mesh]:
         Materials of ITU-R P.2040, and ``vegetation``.
     """
     pieces: dict[str, list[tuple[str, FloatArray, IntArray]]] = {}
-    pieces[material(site.ground_material).name] = [("ground", *ground_mesh(site))]
+    pieces[material(site.ground_material).name] = [("ground", *_ground_mesh(site))]
     for building in site.buildings:
         name = material(building.material).name
         pieces.setdefault(name, []).append((building.name, *building_mesh(building)))
@@ -152,7 +152,7 @@ def site_meshes(site: Site, *, trees: bool = True) -> Mapping[str, Mesh]:
         trunk = t.crown_base_m > 0
         if trunk.any():
             foot = t.ground_m[trunk] - WALL_DEPTH_M
-            body = _bodies(centre[trunk], foot, base[trunk], t.trunk_diameter_m[trunk] / 2, TRUNK_SIDES, pointed=False)
+            body = _bodies(centre[trunk], foot, base[trunk], t.trunk_diameter_m[trunk] / 2, _TRUNK_SIDES, pointed=False)
             pieces.setdefault("wood", []).append(("trunks", *body))
         pieces[CROWN] = [("crowns", *_crowns(t))]
     return {name: _joined(parts) for name, parts in pieces.items()}

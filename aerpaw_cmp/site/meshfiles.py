@@ -16,13 +16,13 @@ from ..common.files import read_input
 from ..common.units import FloatArray, IntArray
 
 # Bytes within which a PLY header ends; a longer one is no header.
-LARGEST_HEADER = 65_536
+_LARGEST_HEADER = 65_536
 
 # Bytes of one mesh file.
-LARGEST_FILE = 2**30
+_LARGEST_FILE = 2**30
 
 # A polygon whose corners depart further [m] from the plane of its first three is not flat.
-FLAT_M = 1e-3
+_FLAT_M = 1e-3
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -56,8 +56,8 @@ def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
     InputError
         No such file, too large, or damaged.
     """
-    data = read_input(path, LARGEST_FILE, "a mesh")
-    mesh = read_obj(data, path) if path.suffix.lower() == ".obj" else read_ply(data, path)
+    data = read_input(path, _LARGEST_FILE, "a mesh")
+    mesh = _read_obj(data, path) if path.suffix.lower() == ".obj" else read_ply(data, path)
     return check(mesh, path), data
 
 
@@ -93,7 +93,7 @@ def read_ply(data: bytes, path: Path) -> RawMesh:
             vertices, place = _vertices(element, data[start:], words, place, order, path)
         elif element.name == "face":
             polygons, place = _polygons(element, data[start:], words, place, order, path)
-            triangles, bent = fans(polygons, vertices, path)
+            triangles, bent = _fans(polygons, vertices, path)
         else:
             place = _skip(element, data[start:], words, place, order, path)
     return RawMesh(vertices, triangles, bent)
@@ -102,10 +102,10 @@ def read_ply(data: bytes, path: Path) -> RawMesh:
 def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
     if not data.startswith(b"ply"):
         raise InputError("it does not begin with 'ply'", expected="a PLY mesh", path=path)
-    end = data.find(b"end_header", 0, LARGEST_HEADER)
+    end = data.find(b"end_header", 0, _LARGEST_HEADER)
     if end < 0:
         raise InputError(
-            f"no 'end_header' in its first {LARGEST_HEADER} bytes", expected="a PLY mesh", cause="a damaged file",
+            f"no 'end_header' in its first {_LARGEST_HEADER} bytes", expected="a PLY mesh", cause="a damaged file",
             path=path,
         )  # fmt: skip
     start = data.find(b"\n", end) + 1
@@ -250,7 +250,7 @@ def _skip(element: _Element, data: bytes, words: list[bytes], place: int, order:
     return place
 
 
-def fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[IntArray, int]:
+def _fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[IntArray, int]:
     """Triangles (n, 3) of polygons, and how many of those are not flat."""
     triangles: list[IntArray] = []
     bent = 0
@@ -262,7 +262,7 @@ def fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[In
             normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
             size = np.linalg.norm(normal, axis=1, keepdims=True)
             height = np.einsum("pki,pi->pk", points - points[:, :1], normal / np.where(size > 0.0, size, 1.0))
-            bent += int((np.abs(height).max(axis=1) > FLAT_M).sum())
+            bent += int((np.abs(height).max(axis=1) > _FLAT_M).sum())
         for k in range(1, corners - 1):
             triangles.append(group[:, [0, k, k + 1]])
     return (np.concatenate(triangles) if triangles else np.zeros((0, 3), dtype=np.int64)), bent
@@ -279,7 +279,7 @@ def _corners(words: list[str], vertices: int) -> list[int]:
     return [number - 1 if number > 0 else vertices + number for number in numbers]
 
 
-def read_obj(data: bytes, path: Path) -> RawMesh:
+def _read_obj(data: bytes, path: Path) -> RawMesh:
     """Vertices and faces of a Wavefront OBJ file; its normals, textures and materials are not read."""
     vertices: list[list[float]] = []
     faces: dict[int, list[list[int]]] = {}
@@ -294,5 +294,5 @@ def read_obj(data: bytes, path: Path) -> RawMesh:
         except (ValueError, IndexError):
             raise InputError(f"'{line.strip()[:60]}'", expected="an OBJ mesh", path=path, line=number) from None
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    triangles, bent = fans([np.array(group, dtype=np.int64) for group in faces.values()], points, path)
+    triangles, bent = _fans([np.array(group, dtype=np.int64) for group in faces.values()], points, path)
     return RawMesh(points, triangles, bent)

@@ -24,10 +24,10 @@ from .meshfiles import RawMesh, read_mesh
 from .xmlfiles import xml_root
 
 # Of a slab without a stated thickness, as in Sionna RT.
-DEFAULT_THICKNESS_M = 0.1
+_DEFAULT_THICKNESS_M = 0.1
 
-LARGEST_XML = 256 * 2**20
-MOST_TRIANGLES = 20_000_000
+_LARGEST_XML = 256 * 2**20
+_MOST_TRIANGLES = 20_000_000
 
 _SHAPES = ("ply", "obj", "rectangle", "cube", "merge")
 
@@ -140,7 +140,7 @@ def _gathered(reading: _Reading, notes: list[str]) -> TriangleScene:
 
 
 def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
-    data = read_input(path, LARGEST_XML, "a scene")
+    data = read_input(path, _LARGEST_XML, "a scene")
     root = xml_root(data, path, "a plain Mitsuba scene")
     if root.tag != "scene":
         raise InputError(f"XML of '{root.tag}'", expected="a Mitsuba scene ('scene')", path=path)
@@ -197,7 +197,7 @@ def _materials(
 def _radio_material(bsdf: ElementTree.Element, name: str, path: Path) -> str | None:
     """Name of the radio material that a bsdf is, None where it says nothing about radio."""
     kind, plain = bsdf.get("type", ""), name.removeprefix("mat-")
-    thickness = _float(bsdf, "thickness", DEFAULT_THICKNESS_M, path)
+    thickness = _float(bsdf, "thickness", _DEFAULT_THICKNESS_M, path)
     stated = bsdf.find("string[@name='type']")
     if kind == "itu-radio-material" or plain.startswith(("itu_", "itu-")):
         itu = plain[4:] if plain.startswith(("itu_", "itu-")) else plain
@@ -262,9 +262,9 @@ def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, st
     turn = _to_world(shape, reading.path)
     vertices = mesh.vertices @ turn[:3, :3].T + turn[:3, 3]
     reading.total += len(mesh.triangles)
-    if reading.total > MOST_TRIANGLES:
+    if reading.total > _MOST_TRIANGLES:
         raise InputError(
-            f"more than {MOST_TRIANGLES} triangles",
+            f"more than {_MOST_TRIANGLES} triangles",
             expected="a scene that fits into memory",
             cause="a terrain or scan that is finer than a wavelength asks for: simplify it first",
             path=reading.path,

@@ -13,7 +13,7 @@ from ..common.gaussian import gaussian_kernel
 from ..common.units import FloatArray
 
 # Share of the variance by which rounded values may miss the function.
-NUGGET = 1e-3
+_NUGGET = 1e-3
 
 _HEAD = re.compile(r"^# pair: length (\S+) sd_db (\S+)$", re.MULTILINE)
 _ROW = re.compile(r"^# pair: (\S+,\S+,\S+,\S+,\S+,\S+)$", re.MULTILINE)
@@ -48,7 +48,7 @@ class PairGain:
         from scipy.linalg import cholesky
 
         matrix = gaussian_kernel(self.directions, self.directions, self.length)
-        matrix[np.diag_indices(len(matrix))] += NUGGET
+        matrix[np.diag_indices(len(matrix))] += _NUGGET
         return np.asarray(cholesky(matrix, lower=True))
 
     def at(self, directions: FloatArray, apart_sd_db: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,7 @@ from ..common.files import LARGEST_TABLE, read_input
 from ..common.units import FloatArray, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, read_pattern_text
 
-DBI_OF_DBD = 2.15
+_DBI_OF_DBD = 2.15
 STEP_DEG = 3.0
 _PLANET = re.compile(r"(?im)^\s*(HORIZONTAL|VERTICAL)\s+(\d{1,4})\s*$")
 _GAIN = re.compile(r"(?im)^\s*GAIN\s+([-+]?\d{1,3}(?:\.\d{1,6})?)\s*(dBd|dBi)?\s*$")
@@ -70,7 +70,7 @@ def _planet(text: str, path: Path) -> dict[str, FloatArray]:
     gain = _GAIN.search(text)
     if gain is None:
         raise InputError("no line 'GAIN value dBi'", expected="GAIN in dBi or dBd", path=path)
-    peak = float(gain[1]) + (0.0 if (gain[2] or "dBd").lower() == "dbi" else DBI_OF_DBD)
+    peak = float(gain[1]) + (0.0 if (gain[2] or "dBd").lower() == "dbi" else _DBI_OF_DBD)
     cuts: dict[str, FloatArray] = {}
     for cut in _PLANET.finditer(text):
         rows = _pairs(text[cut.end() :].split("\n"), int(cut[2]), path)
@@ -86,7 +86,7 @@ def _nsma(text: str, path: Path) -> dict[str, FloatArray]:
     if gain is None:
         raise InputError("no gain", expected="a line such as 'MDGAIN:,16.5' [dBi]", path=path)
     unit = fields.get("GUNITS", "DBI").upper().partition("/")[0]
-    peak = float(gain) + (DBI_OF_DBD if "DBD" in unit else 0.0)
+    peak = float(gain) + (_DBI_OF_DBD if "DBD" in unit else 0.0)
     cuts: dict[str, FloatArray] = {}
     for cut in _NSMA.finditer(text):
         kind = "HORIZONTAL" if cut[1].upper() in ("AZ", "H") else "VERTICAL"

@@ -18,7 +18,7 @@ from .mitsuba import TriangleScene, read_scene
 from .site import Building, Site
 
 # A ground plane that is added reaches this many times the size of the scene beyond it.
-PLANE_MARGIN = 10.0
+_PLANE_MARGIN = 10.0
 
 # A scene whose level surfaces cover less of its plan than this has no ground.
 GROUND_SHARE = 0.5
@@ -81,7 +81,7 @@ def placed_scene(
 def with_ground(scene: TriangleScene, name: str) -> TriangleScene:
     """The scene on a level rectangle at its lowest point, which reaches far beyond it."""
     low, high = bounds(scene)
-    reach = PLANE_MARGIN * float(max(*(high - low)[:2], 100.0))
+    reach = _PLANE_MARGIN * float(max(*(high - low)[:2], 100.0))
     corners = [(low[0] - reach, low[1] - reach), (high[0] + reach, low[1] - reach)]
     corners += [(high[0] + reach, high[1] + reach), (low[0] - reach, high[1] + reach)]
     vertices = np.array([(east, north, low[2]) for east, north in corners])
@@ -148,15 +148,15 @@ def ground_share(scene: TriangleScene) -> float:
     return float(covered.mean())
 
 
-DRAWN_SIMPLER_M = 0.5
-DRAWN_M2 = 10.0
-DRAWN_TALLER_M = 1.0
+_DRAWN_SIMPLER_M = 0.5
+_DRAWN_M2 = 10.0
+_DRAWN_TALLER_M = 1.0
 # Of the prisms that stand for a scene in pictures: how much simpler, from which area and height
 # on, and how many at most.
-DRAWN_MOST = 3000
+_DRAWN_MOST = 3000
 
 # A part of a shape that covers more of the plan than this is ground, however hilly.
-GROUND_PART = 0.25
+_GROUND_PART = 0.25
 
 
 def drawn_buildings(site: Site) -> tuple[Building, ...]:
@@ -183,16 +183,16 @@ def _outlines(scene: TriangleScene) -> tuple[Building, ...]:
         part, row = shapely.STRtree(shapely.centroid(plan[rows])).query(parts, predicate="contains")
         for number, outline in enumerate(parts):
             mine = corners[rows[row[part == number]]][:, :, 2]
-            simple = outline.simplify(DRAWN_SIMPLER_M)
-            if mine.size and simple.geom_type == "Polygon" and DRAWN_M2 < simple.area < GROUND_PART * ground_m2:
+            simple = outline.simplify(_DRAWN_SIMPLER_M)
+            if mine.size and simple.geom_type == "Polygon" and _DRAWN_M2 < simple.area < _GROUND_PART * ground_m2:
                 outlines.append((scene.shapes[shape], simple, float(mine.max())))
-    outlines = sorted(outlines, key=lambda drawn: -drawn[1].area)[:DRAWN_MOST]
+    outlines = sorted(outlines, key=lambda drawn: -drawn[1].area)[:_DRAWN_MOST]
     # down to the lowest corner of anything under it: roofs are often shapes of their own
     feet = np.array([top for *_, top in outlines])
     boxes = shapely.buffer([outline for _, outline, _ in outlines], 0.5)
     box, corner = shapely.STRtree(shapely.points(scene.vertices_m[:, :2])).query(boxes, predicate="contains")
     np.minimum.at(feet, box, scene.vertices_m[corner, 2])
     tall = [
-        (drawn, float(foot)) for drawn, foot in zip(outlines, feet, strict=True) if drawn[2] - foot > DRAWN_TALLER_M
+        (drawn, float(foot)) for drawn, foot in zip(outlines, feet, strict=True) if drawn[2] - foot > _DRAWN_TALLER_M
     ]
     return tuple(Building(name, outline, top - foot, foot) for (name, outline, top), foot in tall)

@@ -36,10 +36,10 @@ from .trees import Distribution, TreeSizes, join_trees, place_trees, trees_at, w
 PACKAGED = ("lake_wheeler",)
 
 # A tower farther from the origin and from the area is refused.
-FAR_TOWER_M = 10_000.0
+_FAR_TOWER_M = 10_000.0
 
 # An outline that reaches farther from the origin is refused.
-FAR_POLYGON_M = 100_000.0
+_FAR_POLYGON_M = 100_000.0
 
 # Buildings that overlap by less, everywhere, are not told of.
 OVERLAP_M = 0.5
@@ -53,7 +53,7 @@ TALLEST_M = 1000.0
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+_NotNegative = Annotated[float, Field(ge=0)]
 Ground = Literal["flat", "offsets", "dem"]
 Area = tuple[float, float, float, float]
 Ring = Annotated[list[tuple[float, float]], Field(min_length=3)]
@@ -65,7 +65,7 @@ def _not_too_high(height_m: float) -> float:
     return height_m
 
 
-Structure = Annotated[Positive, AfterValidator(_not_too_high)]
+_Structure = Annotated[Positive, AfterValidator(_not_too_high)]
 
 
 def _known_material(name: str) -> str:
@@ -76,7 +76,7 @@ def _known_material(name: str) -> str:
     return name
 
 
-MaterialName = Annotated[str, AfterValidator(_known_material)]
+_MaterialName = Annotated[str, AfterValidator(_known_material)]
 
 
 def _problem(shape: Polygon) -> str | None:
@@ -120,7 +120,7 @@ class PositionModel(StrictModel):
 
     latitude_deg: Latitude
     longitude_deg: Longitude
-    antenna_height_m: Structure | None = None
+    antenna_height_m: _Structure | None = None
     source: str = ""
 
 
@@ -131,7 +131,7 @@ class TowerModel(StrictModel):
     longitude_deg: Longitude | None = None
     source: str = ""
     positions: dict[str, PositionModel] = Field(default_factory=dict)
-    antenna_height_m: Structure | None = None
+    antenna_height_m: _Structure | None = None
     antenna: HeightModel | None = None
     ground_offset_m: float | None = None
     ground: HeightModel | None = None
@@ -184,19 +184,19 @@ class PolygonModel(StrictModel):
 class BuildingModel(PolygonModel):
     """A building with a flat roof."""
 
-    height_m: Structure
+    height_m: _Structure
     base_m: float = 0.0
-    material: MaterialName = "concrete"
+    material: _MaterialName = "concrete"
     source: str = ""
 
 
 class ForestModel(PolygonModel):
     """A wooded area; with a height a medium in place of single trees."""
 
-    trees_per_hectare: NotNegative = 100.0
-    minimum_spacing_m: NotNegative = 4.0
+    trees_per_hectare: _NotNegative = 100.0
+    minimum_spacing_m: _NotNegative = 4.0
     source: str = ""
-    height_m: Structure | None = None
+    height_m: _Structure | None = None
 
 
 OutlineT = TypeVar("OutlineT", bound=PolygonModel)
@@ -206,8 +206,8 @@ class DistributionModel(StrictModel):
     """A size drawn from a normal distribution between limits."""
 
     mean: Positive
-    deviation: NotNegative = 0.0
-    minimum: NotNegative = 0.0
+    deviation: _NotNegative = 0.0
+    minimum: _NotNegative = 0.0
     maximum: Annotated[float, Field(gt=0, allow_inf_nan=True)] = math.inf
 
 
@@ -273,7 +273,7 @@ class SceneModel(StrictModel):
     sha256: str | None = None
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_deg: float = 0.0
-    materials: dict[str, MaterialName] = Field(default_factory=dict)
+    materials: dict[str, _MaterialName] = Field(default_factory=dict)
     merge_m: Annotated[float, Field(gt=0, le=0.1)] = 1e-3
     ground_plane: bool = False
 
@@ -288,7 +288,7 @@ class SiteModel(StrictModel):
     tower_ground: Ground | None = None
     dem: DemModel | None = None
     scene: SceneModel | None = None
-    ground_material: MaterialName = "medium_dry_ground"
+    ground_material: _MaterialName = "medium_dry_ground"
     area_m: tuple[float, float, float, float] | None = None
     buildings: list[BuildingModel] = Field(default_factory=list)
     forests: list[ForestModel] = Field(default_factory=list)
@@ -489,11 +489,11 @@ def _check_tower(tower: Tower, area: Area | None, frame: SiteFrame) -> None:
     away = math.hypot(tower.east_m, tower.north_m)
     if area is not None:
         away = min(away, math.hypot(_outside(tower.east_m, *area[:2]), _outside(tower.north_m, *area[2:])))
-    if not away <= FAR_TOWER_M:
+    if not away <= _FAR_TOWER_M:
         raise UsageError(
             f"tower '{tower.name}' ({tower.latitude_deg:.5f}, {tower.longitude_deg:.5f}) lies {away / 1000:.1f} km "
             f"from its site",
-            expected=f"at most {FAR_TOWER_M / 1000:g} km",
+            expected=f"at most {_FAR_TOWER_M / 1000:g} km",
             cause=_why_far(tower, frame),
         )
 
@@ -505,7 +505,7 @@ def _why_far(tower: Tower, frame: SiteFrame) -> str:
         ("the sign of the longitude is wrong: west is negative", (latitude, -longitude)),
         ("the sign of the latitude is wrong: south is negative", (-latitude, longitude)),
     ):
-        if abs(position[0]) <= 90 and float(np.hypot(*frame.to_local(*position))) <= FAR_TOWER_M:
+        if abs(position[0]) <= 90 and float(np.hypot(*frame.to_local(*position))) <= _FAR_TOWER_M:
             return cause
     return "a digit is wrong, or it belongs to another site"
 
@@ -681,7 +681,7 @@ def _checked_area(area: Area | None, east: list[float], north: list[float]) -> A
 
 def _check_near(points_m: list[tuple[float, float]], name: str) -> None:
     away = max(math.hypot(*point) for point in points_m)
-    if away > FAR_POLYGON_M:
+    if away > _FAR_POLYGON_M:
         raise UsageError(
             f"'{name}' reaches {away / 1000:.0f} km from the site's origin",
             expected="metres east and north of the origin",
@@ -700,13 +700,13 @@ def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: 
     latitude, longitude = np.array(ring).T
     east, north = frame.to_local(latitude, longitude)
     away = float(np.hypot(east, north).max())
-    if away > FAR_POLYGON_M:
+    if away > _FAR_POLYGON_M:
         wraps = len(ring) > 1 and float(np.abs(np.diff(longitude)).max()) > 180
         swapped = frame.to_local(longitude, latitude) if np.abs(longitude).max() <= 90 else (math.inf, math.inf)
         cause = "a digit is wrong, or it belongs to another site"
         if wraps:
             cause = "it crosses the antimeridian (180 deg)"
-        elif float(np.hypot(*swapped).max()) < FAR_POLYGON_M:
+        elif float(np.hypot(*swapped).max()) < _FAR_POLYGON_M:
             cause = "latitude and longitude are swapped"
         raise UsageError(f"'{name}' reaches {away / 1000:.0f} km from the site's origin", cause=cause)
     return list(zip(east.tolist(), north.tolist(), strict=True))

@@ -9,13 +9,13 @@ from typing import Literal
 
 from .materials import MATERIALS
 
-FOOT_M = 0.3048
+_FOOT_M = 0.3048
 
 Kind = Literal["building", "forest", "geofence"]
 
 _FOREST_TAGS = (("landuse", "forest"), ("natural", "wood"), ("landcover", "trees"))
 _NOT = ("no", "", "none", "false", "0")
-_UNITS_M = {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT_M}
+_UNITS_M = {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": _FOOT_M}
 _UNIT_WORDS = {"metre": "m", "meter": "m", "foot": "ft", "feet": "ft"}
 _MATERIAL_WORDS = {
     "steel": "metal",
@@ -85,7 +85,7 @@ def metres(text: str) -> float | None:
         unit = match.group(2) or "m"
         return float(match.group(1)) * _UNITS_M[_UNIT_WORDS.get(unit, unit)]
     if match := re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:'|ft)\s*(?:(\d+(?:\.\d+)?)\s*(?:\"|in))?", text):
-        return (float(match.group(1)) + float(match.group(2) or 0) / 12) * FOOT_M
+        return (float(match.group(1)) + float(match.group(2) or 0) / 12) * _FOOT_M
     return None
 
 

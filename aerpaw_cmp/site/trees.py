@@ -22,7 +22,7 @@ from ..common.units import BoolArray, FloatArray
 from .site import Forest, Trees
 
 # Of one forest.
-MAXIMUM_TREES = 2_000_000
+_MAXIMUM_TREES = 2_000_000
 
 _STALLED_ROUNDS = 12  # batches of darts in a row that add less than a thousandth: the forest is full
 
@@ -179,10 +179,10 @@ def _scatter(area: BaseGeometry, count: int, spacing_m: float, random: np.random
     placed = np.zeros((0, 2))
     if count <= 0 or area.is_empty:
         return placed
-    if count > MAXIMUM_TREES:
+    if count > _MAXIMUM_TREES:
         raise UsageError(
             f"a forest of {area.area / 1e4:.0f} ha asks for {count} trees",
-            expected=f"at most {MAXIMUM_TREES}",
+            expected=f"at most {_MAXIMUM_TREES}",
             cause="trees_per_hectare is too high, or the outline reaches far outside the site",
         )
     shapely.prepare(area)

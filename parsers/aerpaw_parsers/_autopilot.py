@@ -17,7 +17,7 @@ from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
 # An attitude farther in time than this from a position is not that of the position.
-NEAR_S = 0.5
+_NEAR_S = 0.5
 # GPS week 0 as UTC seconds of 1970, leap seconds since 2017 taken off.
 _GPS_EPOCH_S = 315_964_800 - 18
 
@@ -38,7 +38,7 @@ class Series:
         before = np.maximum(after - 1, 0)
         before_is_nearer = np.abs(self.time_s[before] - time_s) <= np.abs(self.time_s[after] - time_s)
         best = np.where(before_is_nearer, before, after)
-        return np.where(np.abs(self.time_s[best] - time_s) <= NEAR_S, self.columns[name][best], np.nan)
+        return np.where(np.abs(self.time_s[best] - time_s) <= _NEAR_S, self.columns[name][best], np.nan)
 
 
 # Autopilots count seconds since 1970 or since they were switched on; more is damage, and no room for it in ns.

@@ -16,7 +16,7 @@ from aerpaw_cmp.logs.records import Stream
 RATS = ("", "lte", "nr")
 QUALITIES = ("rsrq_db", "rssi_dbm", "sinr_db", "pathloss_db")
 # RSRP beyond these is a sentinel (2147483647, 0) or a mistake.
-RANGE_DBM = (-170.0, -1.0)
+_RANGE_DBM = (-170.0, -1.0)
 
 
 @dataclass(frozen=True)
@@ -172,11 +172,12 @@ def _stream(rows: _rows.Rows, columns: Table, pick: IntArray, served: FloatArray
     """Readings of one cell, in the order of the log."""
     row, level = columns.row[pick], columns.rsrp_dbm[pick]
     flag = rows.flag[row]
-    outside = ~((level >= RANGE_DBM[0]) & (level <= RANGE_DBM[1]))
+    outside = ~((level >= _RANGE_DBM[0]) & (level <= _RANGE_DBM[1]))
     if 2 * outside.sum() > len(level):
         rows.warnings.append(
-            f"{cell.name}: {outside.sum()} of {len(level)} levels lie outside {RANGE_DBM[0]:g} .. {RANGE_DBM[1]:g} dBm "
-            f"(the first: {level[outside][0]:g}; another unit, or an index?): read as out of coverage"
+            f"{cell.name}: {outside.sum()} of {len(level)} levels lie outside {_RANGE_DBM[0]:g} .. "
+            f"{_RANGE_DBM[1]:g} dBm (the first: {level[outside][0]:g}; another unit, or an index?): "
+            "read as out of coverage"
         )
     _lines.add_flag(flag, outside, "out_of_coverage")
     _lines.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")

@@ -16,7 +16,7 @@ from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
 # What Android and modems write for 'unavailable'.
-SENTINELS = (2147483647, -2147483648, 9223372036854775807, 268435455, 65535)
+_SENTINELS = (2147483647, -2147483648, 9223372036854775807, 268435455, 65535)
 
 
 _MOST_LINES = 5000
@@ -139,7 +139,7 @@ def number(value: Any) -> float:
         converted = float(value)
     except (TypeError, ValueError, OverflowError):
         return float("nan")
-    return float("nan") if converted in SENTINELS or abs(converted) > 1e300 else converted
+    return float("nan") if converted in _SENTINELS or abs(converted) > 1e300 else converted
 
 
 def column(entries: list[dict[str, Any]], *names: str) -> FloatArray:

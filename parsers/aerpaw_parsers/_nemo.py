@@ -12,7 +12,7 @@ from aerpaw_cmp.logs.records import Stream
 
 _NAMES = b"index rel_time_ms lat lon alt_m pdsch_rank nr_rsrp_dbm nr_sinr_db wb_cqi".split()
 HEADER = re.compile(rb"(?:\xef\xbb\xbf)?" + b", ?".join(_NAMES) + rb"[ \t]*\r?")
-NO_RANK = "no_rank_in_row"
+_NO_RANK = "no_rank_in_row"
 
 
 def sniff(head: bytes) -> bool:
@@ -25,7 +25,7 @@ def pdsch_rank(rows: _rows.Rows, values: dict[str, FloatArray]) -> Stream | None
     raw = values["ri_raw"]
     missing = np.isnan(raw)
     odd = ~missing & ~((raw >= 1) & (raw <= 8) & (raw == np.round(raw)))
-    rows.mark(missing, NO_RANK)
+    rows.mark(missing, _NO_RANK)
     rows.mark(odd & (raw != 0), "rank_out_of_range")
     rows.mark(odd & (raw == 0), "no_csi")
     values["rank"] = np.where(missing | odd, np.nan, raw)

@@ -13,13 +13,13 @@ from aerpaw_cmp.logs.records import Stream
 from . import _sheet
 
 LATITUDE = (r"(osd |gps )?(lat|latitude)( deg| degrees)?", r".* (lat|latitude)")
-LONGITUDE = (r"(osd |gps )?(lon|lng|long|longitude)( deg| degrees)?", r".* (lon|lng|longitude)")
+_LONGITUDE = (r"(osd |gps )?(lon|lng|long|longitude)( deg| degrees)?", r".* (lon|lng|longitude)")
 _LENGTH = r"( m| meters| metres| ft| feet)?"
 ABOVE_TAKEOFF = (
     rf"height above takeoff{_LENGTH}", rf"osd height{_LENGTH}", rf"(rel|relative) (alt|altitude|height){_LENGTH}",
     rf"(altitude ?relative|relalt){_LENGTH}", rf"height{_LENGTH}", rf"ascent{_LENGTH}", r"alt m",
 )  # fmt: skip
-ALTITUDE = (
+_ALTITUDE = (
     rf"(gps )?(alt|altitude|ele|elevation){_LENGTH}",
     rf"osd altitude{_LENGTH}",
     r"altitude above ?sea ?level.*",
@@ -48,17 +48,17 @@ _OF_PHONES = {"networktech", "networkmode"}
 # PX4's receiver: positions in 1e-7 degrees, altitudes in mm, where they are whole numbers.
 _PX4_GPS = "time utc usec"
 _REST_S, _REST_M, _REST_RISE_M = 5.0, 2.0, 0.3
-ANGLES = {
+_ANGLES = {
     "roll_deg": (r"(osd |gimbal )?roll( deg| degrees| rad)?",),
     "pitch_deg": (r"(osd )?pitch( deg| degrees| rad)?",),
     "yaw_deg": (r"(osd )?yaw( deg| degrees| rad)?", r"compass heading( degrees)?", r"heading( deg)?", r"bearing"),
 }
-VELOCITIES = {
+_VELOCITIES = {
     "velocity_north_mps": (r"velocity ?(north|x)( mps)?", r"vn", r"vel n m s", r"(osd )?x ?speed.*", r"speed ?x"),
     "velocity_east_mps": (r"velocity ?(east|y)( mps)?", r"ve", r"vel e m s", r"(osd )?y ?speed.*", r"speed ?y"),
     "velocity_down_mps": (r"velocity ?(down|z)( mps)?", r"vd", r"vz", r"vel d m s", r"(osd )?z ?speed.*", r"speed ?z"),
 }
-COUNTS = {
+_COUNTS = {
     "fix": (r"(gps )?fix( type)?", r"gpsfix", r"gps lock"),
     "satellites": (
         r"(number of satellites?|satellites( used)?|num ?sat|osd gpsnum|nsats|numberofsatellites|gps count)",
@@ -72,7 +72,7 @@ _MOST = 1e9
 
 def has_position(names: list[str]) -> bool:
     """Check whether plain names hold a latitude and a longitude."""
-    return all(any(_sheet.matches(name, form[:1]) for name in names) for form in (LATITUDE, LONGITUDE))
+    return all(any(_sheet.matches(name, form[:1]) for name in names) for form in (LATITUDE, _LONGITUDE))
 
 
 def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> Stream | None:
@@ -87,7 +87,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     name, source : str
         Of the stream, and where its pose comes from.
     """
-    latitude, longitude = sheet.find(*LATITUDE), sheet.find(*LONGITUDE)
+    latitude, longitude = sheet.find(*LATITUDE), sheet.find(*_LONGITUDE)
     if latitude is None or longitude is None:
         return None
     scale = 1e-7 if _is_px4_gps(sheet, latitude) else 1.0
@@ -98,10 +98,10 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     lost = clean(rows, values)
     values["altitude_m"] = _altitude(rows, sheet, lost)
     values |= _angles(rows, sheet)
-    for key, form in VELOCITIES.items():
+    for key, form in _VELOCITIES.items():
         if (column := sheet.find(*form)) is not None:
             values[key] = sheet.numbers(column)
-    for key, form in COUNTS.items():
+    for key, form in _COUNTS.items():
         if (column := sheet.find(*form)) is not None:
             count = sheet.numbers(column)
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
@@ -151,7 +151,7 @@ _TAKEN_OFF = "altitudes are above sea level: {:.1f} m, that of the first positio
 
 
 def _altitude(rows: _rows.Rows, sheet: _sheet.Sheet, lost: BoolArray) -> FloatArray:
-    above, column = sheet.find(*ABOVE_TAKEOFF), sheet.find(*ALTITUDE)
+    above, column = sheet.find(*ABOVE_TAKEOFF), sheet.find(*_ALTITUDE)
     if above is not None and not (column is not None and _OF_PHONES & set(sheet.plain)):  # there a height of the floor
         rows.height_from = "written"
         return sheet.numbers(above)
@@ -184,7 +184,7 @@ def _begins_at_rest(rows: _rows.Rows, sheet: _sheet.Sheet, altitude: FloatArray,
     early = np.flatnonzero(~lost & np.isfinite(altitude) & (seconds <= _REST_S))
     if len(early) < 3:
         return False
-    columns = [sheet.find(*form) for form in (LATITUDE, LONGITUDE)]
+    columns = [sheet.find(*form) for form in (LATITUDE, _LONGITUDE)]
     moved = [np.ptp(sheet.numbers(i)[early]) * _DEGREE_M for i in columns if i is not None]
     return bool(max(moved) < _REST_M and np.ptp(altitude[early]) < _REST_RISE_M)
 
@@ -194,7 +194,7 @@ _DEGREE_M = 111_000.0
 
 def _angles(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
     """Angles: degrees, unless no column names a unit and no yaw of the log is beyond 2 pi."""
-    columns = {key: column for key, form in ANGLES.items() if (column := sheet.find(*form)) is not None}
+    columns = {key: column for key, form in _ANGLES.items() if (column := sheet.find(*form)) is not None}
     values = {key: sheet.numbers(column) for key, column in columns.items()}
     named = any(sheet.unit(c) or sheet.plain[c].endswith((" deg", " degrees", " rad")) for c in columns.values())
     yaw = np.abs(values.get("yaw_deg", np.full(1, np.nan)))

@@ -85,14 +85,14 @@ def in_common_words(names: list[str]) -> list[str]:
         (_GNETTRACK, {"level", "qual"} <= present and not present.isdisjoint(OF_GNETTRACK)),
         (_SRSUE, present >= SRSUE),
         (_CELLMAPPER, {"signal", "psc or pci"} <= present),
-        (_BARE, "rank" in present and any(is_level(name) for name in names)),
+        (_BARE, "rank" in present and any(_is_level(name) for name in names)),
     )
     for pattern, word in next((table for table, applies in programs if applies), {}).items():
         names = [re.sub(f"^{pattern}$", word, name) for name in names]
     return names
 
 
-def is_level(name: str) -> bool:
+def _is_level(name: str) -> bool:
     """Check whether a name is that of a level."""
     meaning = quantity(name)
     return meaning is not None and meaning.kind == "rss"

@@ -44,7 +44,7 @@ _READ_IN = {
 }  # fmt: skip
 _FACTORS = {written: (unit, factor) for unit, units in _READ_IN.items() for written, factor in units.items()}
 
-IsHeader = Callable[[list[str]], bool]
+_IsHeader = Callable[[list[str]], bool]
 
 
 def split_row(line: bytes, separator: str) -> list[str]:
@@ -58,7 +58,7 @@ def split_row(line: bytes, separator: str) -> list[str]:
         return text.split(separator)
 
 
-def header_of(lines: Sequence[bytes], is_header: IsHeader) -> tuple[int, str, list[str]] | None:
+def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, list[str]] | None:
     """Place, separator and names of the first line that is a header.
 
     Parameters
@@ -78,10 +78,10 @@ def header_of(lines: Sequence[bytes], is_header: IsHeader) -> tuple[int, str, li
     return None
 
 
-def starts(head: bytes, is_header: IsHeader) -> bool:
+def starts(head: bytes, is_header: _IsHeader) -> bool:
     """Check whether a file begins with such a header, title lines aside, and a row of its width soon follows."""
     lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
-    header = header_of(lines, is_header)
+    header = _header_of(lines, is_header)
     if header is None:
         return False
     at, separator, names = header
@@ -227,9 +227,9 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
     return _compiled(patterns)[0].fullmatch(name) is not None
 
 
-def read(data: bytes, is_header: IsHeader) -> Sheet | None:
+def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
     """The table of a file, None where none of its first lines is its header."""
-    header = header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
+    header = _header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
     if header is None:
         return None
     return cut(_lines.split(data), *header)

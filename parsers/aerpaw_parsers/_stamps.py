@@ -37,7 +37,7 @@ _IN_NAME = (
 )
 
 
-def date_in_name(name: str) -> str | None:
+def _date_in_name(name: str) -> str | None:
     """The date that a file name carries.
 
     Examples
@@ -97,7 +97,7 @@ def _day_first(texts: Iterable[str]) -> bool | None:
 
 def _first_by_name(texts: Sequence[str], name: str) -> bool | None:
     """Check whether the day stands first if the first date is to be that of the file name; None where it is no help."""
-    date = date_in_name(name)
+    date = _date_in_name(name)
     fits = [first for first in (True, False) if date and (_dated(texts[0], first) or b"").startswith(date.encode())]
     return fits[0] if len(fits) == 1 else None
 
@@ -233,7 +233,7 @@ def _hours_off(seconds: FloatArray, name: str) -> int:
 
 def _on_a_date(seconds: FloatArray, options: ReadOptions, warnings: list[str]) -> tuple[str, AnyArray, list[str]]:
     """Seconds of the first day; relative where nothing says which day that is."""
-    date = options.time_origin[:10] if options.time_origin else date_in_name(options.file_name)
+    date = options.time_origin[:10] if options.time_origin else _date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
         return "relative_s", seconds, [*warnings, "the times have no date and the file name has none either"]
     cells = _wall_cells(np.datetime64(date, "us"), seconds)

@@ -30,7 +30,7 @@ from aerpaw_cmp.logs.matfile import MAGIC_73, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
-TELEMETRY = {
+_TELEMETRY = {
     "mX": "longitude_deg",
     "mY": "latitude_deg",
     "mZ": "altitude_m",
@@ -63,13 +63,13 @@ LEVELS = {
     "RSRP_s": "RSRP",
     "power_all": "power",
 }
-KPIS = {"RSRQ": ("RSRQ", "dB")}
+_KPIS = {"RSRQ": ("RSRQ", "dB")}
 _TEXTS = ("timestamp_power_for_csv", "timestamp_for_csv")
 _EPOCHS = ("timestamp_power", "timestamp_meas")
 _UTC, _DECODED = "timestamp_meas", "succes"
 # Levels of files without a clock, and the seconds between rows of the flights that they were made of.
 _PROCESSED = {"RSRP_s": 0.1, "power_all": 0.03276}
-_NAMES = {*TELEMETRY, *LEVELS, *KPIS, *_TEXTS, *_EPOCHS, "mSpeed"}
+_NAMES = {*_TELEMETRY, *LEVELS, *_KPIS, *_TEXTS, *_EPOCHS, "mSpeed"}
 # Names that only a flight has.
 _SURE = {*LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
 # Raw positions of the LTE flights, which stand in front of their levels; the interpolated ones are read.
@@ -155,7 +155,7 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
     for name, step_s in _PROCESSED.items():
         if name in table:
             count = np.arange(len(table[name]))
-            return np.round(count * step_s * 1e9).astype(np.int64), count >= 0, COUNTED
+            return np.round(count * step_s * 1e9).astype(np.int64), count >= 0, _COUNTED
     raise InputError(
         "the MATLAB file has no clock",
         expected=f"a variable {', '.join((*_TEXTS, *_EPOCHS))}",
@@ -164,7 +164,7 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
 
 
 # Clock of files that have none.
-COUNTED = "row number"
+_COUNTED = "row number"
 
 
 def _instants(
@@ -173,7 +173,7 @@ def _instants(
     """UTC of each row: text and epoch both hold local wall clock unless ``clock: utc`` says otherwise."""
     warnings: list[str] = []
     none = np.zeros(len(wall), dtype=bool)
-    if clock == COUNTED:
+    if clock == _COUNTED:
         origin = _time.origin_ns(options, needed_by="flight_mat")
         text = "the file has no clock: its rows are counted at the rate of the raw flight"
         warnings.append(text if origin is not None else text + ", from 1970-01-01T00:00")
@@ -200,7 +200,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         If no time zone is given.
     """
     table = _load(data)
-    if not any(name in table for name in (*LEVELS, *TELEMETRY)):
+    if not any(name in table for name in (*LEVELS, *_TELEMETRY)):
         raise InputError(
             "the MATLAB file holds no flight", expected=f"variables such as {', '.join(sorted(_NAMES)[:5])}"
         )
@@ -218,7 +218,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         flag=_lines.flags(len(keep)),
         rejected=[RejectedLine(int(i) + 1, "the row has no time", "") for i in np.flatnonzero(~valid)],
         warnings=[*warnings, *instants.warnings],
-        relative=clock == COUNTED and options.time_origin is None,
+        relative=clock == _COUNTED and options.time_origin is None,
     )
     instants.flag(rows.flag)
     return rows.result([_track(rows, timed, clock), *_measured(rows, timed)])
@@ -236,7 +236,7 @@ def _common_length(table: dict[str, AnyArray]) -> int:
 
 
 def _track(rows: _rows.Rows, table: dict[str, AnyArray], clock: str) -> Stream | None:
-    values = {column: _numeric(table[name], name) for name, column in TELEMETRY.items() if name in table}
+    values = {column: _numeric(table[name], name) for name, column in _TELEMETRY.items() if name in table}
     if not values:
         return None
     if "ori_s" in table:  # radians, reckoned from the track
@@ -263,7 +263,7 @@ def _measured(rows: _rows.Rows, table: dict[str, AnyArray]) -> Iterator[Stream |
             quantity = channel.rstrip("2") if channel.startswith("RS") else None
             about = {"channel": channel, "unit": unit, "quantity": quantity}
             yield rows.stream("rss", channel, {"rss_db": level}, flag=flag, about=about)
-    for name, (quantity, unit) in KPIS.items():
+    for name, (quantity, unit) in _KPIS.items():
         if name in table:
             yield rows.stream("kpi", name, {"value": _numeric(table[name], name)}, quantity=quantity, unit=unit)
 

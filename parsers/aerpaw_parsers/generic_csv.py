@@ -23,9 +23,9 @@ from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, Stream
 
 from . import _sheet, _stamps
 
-EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
+_EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
 # What may stand beside a rank, or beside a level: the positions of a table merged by hand are its track.
-_COMPANIONS: dict[str, tuple[str, ...]] = {"rank": EXTRA, "rss": (*COLUMNS["telemetry"][:-2], "sinr_db")}
+_COMPANIONS: dict[str, tuple[str, ...]] = {"rank": _EXTRA, "rss": (*COLUMNS["telemetry"][:-2], "sinr_db")}
 # Columns that a record of a kind is about.
 _VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": ("rss_db",), "rank": ("ri_raw",)}
 

@@ -29,7 +29,7 @@ from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 from . import _json, _stamps
 
 _MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
-BURST_S = 0.02
+_BURST_S = 0.02
 _SAMPLES = {
     "cf64": ("f8", 1.0), "cf32": ("f4", 1.0), "ci32": ("i4", 2.0**31), "ci16": ("i2", 2.0**15), "ci8": ("i1", 2.0**7),
     "cu8": ("u1", 2.0**7), "rf64": ("f8", 1.0), "rf32": ("f4", 1.0), "ri16": ("i2", 2.0**15),
@@ -201,7 +201,7 @@ def _powers(
     rate = _json.number(_json.inside(meta, "global").get("core:sample_rate"))
     if samples is None or not rate > 0:
         return
-    size = max(1, round(BURST_S * rate))
+    size = max(1, round(_BURST_S * rate))
     texts: list[str] = []
     powers: list[FloatArray] = []
     starts = [min(max(_integer(item.get("core:sample_start"), 0), 0), len(samples)) for item in captures]

@@ -35,7 +35,7 @@ from aerpaw_cmp.logs.records import Attribute, Kind, ReadResult, RejectedLine, S
 from . import _json
 
 # RSRP and SINR older than this do not stand beside a rank.
-COMPANION_S = 2.0
+_COMPANION_S = 2.0
 
 Columns = dict[str, AnyArray]
 # Line of the log, its record, what was decoded of it, its flags.
@@ -274,7 +274,7 @@ def _with_serving_cell(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.Data
         at = np.searchsorted(times[order], rank["time"].to_numpy(), side="right") - 1
         last = order[np.maximum(at, 0)]
         age_s = (rank["time"].to_numpy() - times[last]) / np.timedelta64(1, "s")
-        fresh = (at >= 0) & (age_s <= COMPANION_S)
+        fresh = (at >= 0) & (age_s <= _COMPANION_S)
         rsrp_dbm = np.where(fresh, rsrp["rss_db"].to_numpy()[last], np.nan)
         sinr_db = np.where(fresh, rsrp["sinr_db"].to_numpy()[last], np.nan)
     rank["rsrp_dbm"], rank["sinr_db"] = rsrp_dbm, sinr_db

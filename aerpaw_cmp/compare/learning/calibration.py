@@ -22,12 +22,12 @@ from ..spread import Spread, StatedSpread, fading_of, inside_shares
 
 SECTORS = 6
 # Directions this near a left-out sector are not learned from either.
-GUARD_DEG = 10.0
+_GUARD_DEG = 10.0
 
 STRETCHES = 8
 GUARD_S = 20.0
-CRUISE_M = 5.0
-LEAST_SAMPLES = 50
+_CRUISE_M = 5.0
+_LEAST_SAMPLES = 50
 
 # Fields of :class:`Score` that a learned model is held against, with their titles.
 BASELINES = {f"{name}_rmse_db": BASELINE_TITLE[name] for name in ("free_space", "log_distance", "constant")}
@@ -143,12 +143,12 @@ class Learned:
 
 
 # A UAV hardly turns within this time [s].
-FINE_S = 0.5
+_FINE_S = 0.5
 
 
 def _mean_along(fit: GainFit, samples: LinkSamples) -> FloatArray:
-    """Gain (n,) along a flight [dB]: at means over :data:`FINE_S`, and linear between them."""
-    at = dataclasses.replace(samples, residual_db=np.zeros(len(samples))).binned(FINE_S)
+    """Gain (n,) along a flight [dB]: at means over :data:`_FINE_S`, and linear between them."""
+    at = dataclasses.replace(samples, residual_db=np.zeros(len(samples))).binned(_FINE_S)
     if not len(at):
         return np.full(len(samples), np.nan)
     gain = np.interp(samples.time_s, at.time_s, fit.mean(at))
@@ -239,7 +239,7 @@ def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None)
     s = observed.samples
     free = np.zeros(len(s)) if simple is None else simple.free_db
     finite = np.isfinite(s.residual_db - gain_db) & np.isfinite(free)
-    if finite.sum() < LEAST_SAMPLES:
+    if finite.sum() < _LEAST_SAMPLES:
         return None
     time, level, error = s.time_s[finite], observed.free_space_db[finite], (s.residual_db - gain_db)[finite]
     measured = s.residual_db[finite] + level
@@ -347,7 +347,7 @@ def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]
 
 
 # Samples of a series at which standard deviations are checked: each costs a thousand times what its mean does.
-SPREAD_SAMPLES = 400
+_SPREAD_SAMPLES = 400
 
 
 def _scored_with(o: Observed, learned: Learned, offset_db: float, *, spread: bool) -> Score | None:
@@ -357,7 +357,7 @@ def _scored_with(o: Observed, learned: Learned, offset_db: float, *, spread: boo
     if fitted is None:
         return None
     if spread and learned.fit is not None:
-        some = spread_out(len(gain), SPREAD_SAMPLES)
+        some = spread_out(len(gain), _SPREAD_SAMPLES)
         stated = StatedSpread(
             gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
         )
@@ -367,12 +367,12 @@ def _scored_with(o: Observed, learned: Learned, offset_db: float, *, spread: boo
 
 
 # Of more flights, this many are scored part by part, evenly over their order.
-MOST_SCORED = 6
+_MOST_SCORED = 6
 
 
 def spread_flights(flights: Sequence[str]) -> list[str]:
-    """The flights, or :data:`MOST_SCORED` of them, the first and the last among them."""
-    return [flights[i] for i in spread_out(len(flights), MOST_SCORED)]
+    """The flights, or :data:`_MOST_SCORED` of them, the first and the last among them."""
+    return [flights[i] for i in spread_out(len(flights), _MOST_SCORED)]
 
 
 # ``parts(scored, other)``: per part the samples (n,) of the scored series in it, and those (m,) of another series that
@@ -419,7 +419,7 @@ def parts_left_out(
         for flight, mine in of.items():
             sources = list(observed) if own_rest else [o for o in observed if o.samples.flight != flight]
             train = [o.part(parts(mine[0], o)[k][1]).samples for o in sources]
-            train = [s for s in train if np.isfinite(s.residual_db).sum() >= LEAST_SAMPLES]
+            train = [s for s in train if np.isfinite(s.residual_db).sum() >= _LEAST_SAMPLES]
             if not train or not any(parts(o, o)[k][0].any() for o in mine):
                 continue
             try:
@@ -433,7 +433,7 @@ def parts_left_out(
                     continue
                 gain = learned.mean(o.samples)
                 error = (o.samples.residual_db - gain)[outside]
-                if np.isfinite(error).sum() >= LEAST_SAMPLES:
+                if np.isfinite(error).sum() >= _LEAST_SAMPLES:
                     predicted[inside] = gain[inside] + np.nanmean(error)
                     baselines.predict(o, inside, outside)
     out = [
@@ -449,8 +449,8 @@ def altitude_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, 
     height = scored.samples.position_m[:, 2]
     heights, count = np.unique(np.round(height), return_counts=True)
     cruise = float(heights[count.argmax()])
-    mine = np.abs(height - cruise) < CRUISE_M
-    return [(mine, np.abs(source.samples.position_m[:, 2] - cruise) >= CRUISE_M)]
+    mine = np.abs(height - cruise) < _CRUISE_M
+    return [(mine, np.abs(source.samples.position_m[:, 2] - cruise) >= _CRUISE_M)]
 
 
 def sector_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
@@ -459,12 +459,12 @@ def sector_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, Bo
     def azimuth(o: Observed) -> FloatArray:
         return np.degrees(np.arctan2(o.samples.at_tower[:, 1], o.samples.at_tower[:, 0]))
 
-    return _angular(azimuth(scored), azimuth(source), SECTORS, GUARD_DEG)
+    return _angular(azimuth(scored), azimuth(source), SECTORS, _GUARD_DEG)
 
 
 def heading_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
     """Eighths of the compass for the nose, with a guard."""
-    return _angular(scored.heading_deg, source.heading_deg, 8, GUARD_DEG)
+    return _angular(scored.heading_deg, source.heading_deg, 8, _GUARD_DEG)
 
 
 def _angular(mine: FloatArray, sources: FloatArray, count: int, guard_deg: float) -> list[tuple[BoolArray, BoolArray]]:

@@ -28,7 +28,7 @@ Predictor = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
 # Learns from samples whose residual is measured minus free space.
 Base = Callable[[Sequence[LinkSamples]], Predictor]
 
-HeldOut = tuple[FloatArray, FloatArray]
+_HeldOut = tuple[FloatArray, FloatArray]
 
 # Residuals are means over this time [s].
 BIN_S = 4.0
@@ -38,7 +38,7 @@ BLOCK_M = 300.0
 
 # Of more flights than :data:`~.calibration.MOST_GROUPS`, so many groups are left out in turn, and the strengths of a
 # residual field that are learned without the first serve for all: one flight among many hardly moves them.
-SCORED_GROUPS = 3
+_SCORED_GROUPS = 3
 
 OFF = "no correction"
 
@@ -98,7 +98,7 @@ class Correction:
     flights: tuple[str, ...]
     crps_db: Mapping[tuple[str, str], float]
     rmse_db: Mapping[tuple[str, str], float]
-    held_out: Mapping[tuple[str, str], HeldOut] = field(default_factory=dict)
+    held_out: Mapping[tuple[str, str], _HeldOut] = field(default_factory=dict)
     sd_factor: float = 1.0
     fits: dict[str, FieldFit] = field(default_factory=dict, repr=False, compare=False)
     """Solved fields by antenna."""
@@ -214,7 +214,7 @@ def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
     if len(names) > 1:
         return [
             _Fold([s for s in series if s.flight not in group], [s for s in series if s.flight in group])
-            for group in groups_of(names)[: None if len(names) <= MOST_GROUPS else SCORED_GROUPS]
+            for group in groups_of(names)[: None if len(names) <= MOST_GROUPS else _SCORED_GROUPS]
         ]
     cells = [np.floor(s.position_m[:, :2] / BLOCK_M).astype(np.int64) for s in series]
     every, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
@@ -228,7 +228,7 @@ def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
 
 
 def _score_fold(
-    fold: _Fold, base: Base, models: dict[str, FieldModel | None], tallies: Mapping[str, list[HeldOut]], *, keep: bool
+    fold: _Fold, base: Base, models: dict[str, FieldModel | None], tallies: Mapping[str, list[_HeldOut]], *, keep: bool
 ) -> None:
     """Add the errors of every residual field of a base; new flights count about their own mean.
 
@@ -301,7 +301,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
     if not series:
         raise InputError("no sample has a level and a pose", expected="RSS with positions")
     folds, titles = _folds(series), titles or tuple(_STARTS)
-    tallies: dict[tuple[str, str], list[HeldOut]] = {(base, title): [] for base in bases for title in titles}
+    tallies: dict[tuple[str, str], list[_HeldOut]] = {(base, title): [] for base in bases for title in titles}
     for name, base in bases.items():
         models: dict[str, FieldModel | None] = dict.fromkeys(titles)
         for fold in folds:
@@ -332,7 +332,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
     )
 
 
-def crps_difference(held_out: Mapping[tuple[str, str], HeldOut], key: tuple[str, str]) -> FloatArray:
+def crps_difference(held_out: Mapping[tuple[str, str], _HeldOut], key: tuple[str, str]) -> FloatArray:
     """CRPS of a base with a residual field minus that of the base alone, where both have an error [dB]."""
     difference = crps_normal(*held_out[key]) - crps_normal(*held_out[key[0], OFF])
     return np.asarray(difference[np.isfinite(difference)])
@@ -344,7 +344,7 @@ def _sd_factor(error: FloatArray, sd: FloatArray) -> float:
     return min(max(math.sqrt(ratio), 0.8), 1.6) if math.isfinite(ratio) else 1.0
 
 
-def _joined(parts: Sequence[HeldOut]) -> HeldOut:
+def _joined(parts: Sequence[_HeldOut]) -> _HeldOut:
     error, sd = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return error, sd
 

@@ -31,16 +31,16 @@ PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
 MEAN_SD_DB = 100.0
 
 # Rows of the exact solution: one matrix of 72 MB.
-EXACT_ROWS = 3000
+_EXACT_ROWS = 3000
 
 # Rows squared times targets: beyond it (some ten seconds) only the nearest rows of a target are used.
-EXACT_WORK = 2.0e11
+_EXACT_WORK = 2.0e11
 
 # Rows of the approximation for a single target, and at most for targets that share them.
-NEAREST, MOST_NEAREST = 40, 160
+_NEAREST, _MOST_NEAREST = 40, 160
 
 # Side of the cells in scaled space whose targets share their rows.
-TOGETHER = 0.25
+_TOGETHER = 0.25
 
 # Rows of one channel from which scales are learned.
 FIT_ROWS = 700
@@ -238,7 +238,7 @@ class FieldFit:
         parts : collection of str
             Which parts of the residual: those of ``("place", "drift")`` are a flight about its own mean.
         exact : bool, optional
-            By default where the matrices fit (:data:`EXACT_ROWS`, :data:`EXACT_WORK`); else the nearest rows alone.
+            By default where the matrices fit (:data:`_EXACT_ROWS`, :data:`_EXACT_WORK`); else the nearest rows alone.
 
         Returns
         -------
@@ -247,7 +247,7 @@ class FieldFit:
         Notes
         -----
         Beyond the exact solution the common mean and each flight's offset come from evenly thinned rows, and each
-        target from its :data:`NEAREST` rows in the scaled space (Vecchia's conditioning; Datta et al. 2016,
+        target from its :data:`_NEAREST` rows in the scaled space (Vecchia's conditioning; Datta et al. 2016,
         doi 10.1080/01621459.2015.1044091). Targets of one cell share the rows nearest to their middle, the more of
         them the more targets there are (Guinness 2018, doi 10.1080/00401706.2018.1437476).
         """
@@ -263,7 +263,7 @@ class FieldFit:
 
     def fits(self, targets: int) -> bool:
         """Check whether so many targets have the exact solution."""
-        return len(self.rows) <= EXACT_ROWS and len(self.rows) ** 2 * float(targets) <= EXACT_WORK
+        return len(self.rows) <= _EXACT_ROWS and len(self.rows) ** 2 * float(targets) <= _EXACT_WORK
 
     @cached_property
     def _whitened(self) -> tuple[FloatArray, FloatArray]:
@@ -301,7 +301,7 @@ class FieldFit:
         turned = math.isfinite(self.model.turn) and targets.direction.ndim == 2
         tree, places = cKDTree(self._scaled(self.rows, turned)), self._scaled(targets, turned)
         for part, shared in _cells(places, step):
-            most = min(NEAREST * len(part) ** (1 / 3), MOST_NEAREST) if shared else NEAREST
+            most = min(_NEAREST * len(part) ** (1 / 3), _MOST_NEAREST) if shared else _NEAREST
             count = np.arange(1, min(round(most), len(self.rows)) + 1)
             index = tree.query(places[part].mean(axis=0) if shared else places[part], k=count)[1]
             rows, some = self.rows.part(index), targets.part(part)
@@ -329,7 +329,7 @@ class FieldFit:
         out, sd = np.zeros((2, len(targets)))
         if not level_parts:
             return out, sd
-        thinned = spread_out(len(self.rows), EXACT_ROWS // 2)
+        thinned = spread_out(len(self.rows), _EXACT_ROWS // 2)
         fit = FieldFit(self.model, self.rows.part(thinned), None if self.value_db is None else self.value_db[thinned])
         _, first, member = np.unique(targets.flight, return_index=True, return_inverse=True)
         mean_of, sd_of = fit.predict(targets.part(first), level_parts, exact=True)
@@ -342,7 +342,7 @@ FEWEST_TOGETHER = 8
 
 def _cells(places: FloatArray, step: int) -> Iterator[tuple[IntArray, bool]]:
     """At most ``step`` targets (n, k) at a time: those of one cell, and then all others; True for those of one cell."""
-    cell = np.floor(places / TOGETHER).astype(np.int64)
+    cell = np.floor(places / _TOGETHER).astype(np.int64)
     _, member, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     member = member.ravel()
     many = count[member] >= FEWEST_TOGETHER
@@ -379,7 +379,7 @@ def left_out(
     ----------
     model : FieldModel
     rows : Rows
-        At most :data:`EXACT_ROWS`.
+        At most :data:`_EXACT_ROWS`.
     value_db : (n,)
     block : (n,) int
         Rows of one code are left out together.
@@ -423,7 +423,7 @@ def fit_field(
     channels : sequence of (Rows, (n,))
         Rows and residuals [dB] of each channel; they share the model, not the field.
     start : FieldModel, optional
-        Where the search starts, and what is not learned: the offset between flights is :func:`offset_sd_of` them.
+        Where the search starts, and what is not learned: the offset between flights is :func:`_offset_sd_of` them.
     learn : collection of str
         Names of :data:`BOUNDS`.
 
@@ -442,7 +442,7 @@ def fit_field(
     if not used:
         raise InputError("fewer than three samples", expected="flights with levels at known poses")
     start = start or FieldModel()
-    start = dataclasses.replace(start, offset_sd_db=offset_sd_of(used, start.offset_sd_db))
+    start = dataclasses.replace(start, offset_sd_db=_offset_sd_of(used, start.offset_sd_db))
     names = list(learn)
     apart = [_Apart.of(rows, rows) for rows, _ in used]
 
@@ -475,7 +475,7 @@ def _evenly(rows: Rows, value: FloatArray) -> tuple[Rows, FloatArray]:
     return rows.part(keep), value[keep]
 
 
-def offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], otherwise_db: float) -> float:
+def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], otherwise_db: float) -> float:
     """Standard deviation of the means of flights of one channel [dB], shrunk towards a prior guess.
 
     Two flights say little: the guess counts as two more (the mean of an inverse-gamma posterior).

@@ -12,10 +12,10 @@ import numpy as np
 from .calibration import Observed, Recipe, flights_of, learn, score
 
 # Of each number of flights; where there are more subsets, those of neighbouring flights are taken.
-MOST_FITS = 6
+_MOST_FITS = 6
 
 # Numbers of flights that are tried.
-MOST_SIZES = 6
+_MOST_SIZES = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +59,7 @@ def learning_curve(observed: Sequence[Observed], recipe: Recipe) -> tuple[CurveP
     flights = flights_of(observed)
     if len(flights) < 3:
         return ()
-    sizes = np.unique(np.linspace(1, len(flights) - 1, min(len(flights) - 1, MOST_SIZES)).round().astype(int))
+    sizes = np.unique(np.linspace(1, len(flights) - 1, min(len(flights) - 1, _MOST_SIZES)).round().astype(int))
     errors: dict[int, dict[tuple[str, str], list[tuple[float, float]]]] = {}
     fits: dict[int, int] = {}
     for size in map(int, sizes):
@@ -88,10 +88,10 @@ def learning_curve(observed: Sequence[Observed], recipe: Recipe) -> tuple[CurveP
 
 def _subsets(flights: Sequence[str], size: int) -> list[set[str]]:
     """All subsets of a size, or runs of neighbours round the list, evenly begun."""
-    if math.comb(len(flights), size) <= MOST_FITS:
+    if math.comb(len(flights), size) <= _MOST_FITS:
         return [set(subset) for subset in itertools.combinations(flights, size)]
     twice = [*flights, *flights]
-    begins = np.unique(np.linspace(0, len(flights), min(len(flights), MOST_FITS), endpoint=False).round().astype(int))
+    begins = np.unique(np.linspace(0, len(flights), min(len(flights), _MOST_FITS), endpoint=False).round().astype(int))
     return [set(twice[begin : begin + size]) for begin in begins]
 
 

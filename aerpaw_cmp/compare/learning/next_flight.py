@@ -18,7 +18,7 @@ from ..direction_gain import GainFit, GainModel, LinkSamples, fit_gain
 from .field_gp import NEW_FLIGHT, FieldFit, FieldModel, Part, Rows
 
 # Name of the flight to come.
-PLANNED = "planned"
+_PLANNED = "planned"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ class Known:
         dict of str to (targets,)
             Of antennas and field, without nuisance and noise of a later flight, which no route lowers.
         """
-        planned = [dataclasses.replace(s, flight=PLANNED, residual_db=np.zeros(len(s))) for s in route]
+        planned = [dataclasses.replace(s, flight=_PLANNED, residual_db=np.zeros(len(s))) for s in route]
         rows = [*self.series, *planned]
         fit = fit_gain(rows, self.model) if rows else None
         return {antenna: self._deviation_db(antenna, target, rows, fit) for antenna, target in targets.items()}

@@ -23,7 +23,7 @@ LEAST = 8
 AHEAD_S = 20.0
 
 # Weight of an older error against that of the next bin.
-FORGET = 0.98
+_FORGET = 0.98
 
 LENGTHS_M = (30.0, 120.0)
 SPEED_MPS = 8.0
@@ -147,7 +147,7 @@ class RouteAhead:
             for name, (mean, sd) in zip(self._trends, moments, strict=True):
                 score = float(crps_normal(level - trends[name] - mean, sd)[0])
                 total, weight = self._scores.get((name, length), (0.0, 0.0))
-                self._scores[name, length] = (FORGET * total + score, FORGET * weight + 1.0)
+                self._scores[name, length] = (_FORGET * total + score, _FORGET * weight + 1.0)
 
     def _moments(
         self, model: FieldModel, known: int, place: FloatArray, time_s: FloatArray, names: Sequence[str]

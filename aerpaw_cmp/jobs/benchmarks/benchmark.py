@@ -32,7 +32,7 @@ from ...flight.settings import FlightFile
 from ..learning.calibrate import observe
 from ..learning.calibrate_rank import RankSamples, rank_samples
 
-LARGEST_ENTRY = 2**30
+_LARGEST_ENTRY = 2**30
 
 SECTORS, SECTOR_GUARD_DEG = 6, 10.0
 BLOCK_M, BLOCK_GUARD_M = 300.0, 20.0
@@ -42,7 +42,7 @@ KEY = ["task", "flight", "tower", "channel", "time"]
 RANKS = ["p_rank1", "p_rank2", "p_rank3", "p_rank4"]
 BASELINES = ("free_space", "log_distance")
 
-Split = Literal["flights", "sectors", "blocks", "stretches"]
+_Split = Literal["flights", "sectors", "blocks", "stretches"]
 
 
 class FileEntry(StrictModel):
@@ -70,7 +70,7 @@ class Task(StrictModel):
 
     title: str
     kind: Literal["level", "rank"] = "level"
-    split: Split = "flights"
+    split: _Split = "flights"
     train: list[str] = Field(default_factory=list)
     test: Annotated[list[str], Field(min_length=1)]
 
@@ -229,7 +229,7 @@ class Bench:
 # --- splits --------------------------------------------------------------------------------------------------------
 
 
-def folds_of(split: Split, observed: Observed) -> IntArray:
+def _folds_of(split: _Split, observed: Observed) -> IntArray:
     """Fold (n,) of each test sample: those of one fold are predicted together."""
     samples = observed.samples
     if split == "sectors":
@@ -244,7 +244,7 @@ def folds_of(split: Split, observed: Observed) -> IntArray:
     return np.zeros(len(samples), dtype=np.int64)
 
 
-def may_know(split: Split, known: Observed, fold: Observed, *, same_flight: bool) -> BoolArray:
+def _may_know(split: _Split, known: Observed, fold: Observed, *, same_flight: bool) -> BoolArray:
     """Samples of ``known`` that a prediction of one fold may use.
 
     Parameters
@@ -289,18 +289,18 @@ def questions(bench: Bench, task: str, flight: str) -> Iterator[Question]:
     """The folds of one test flight."""
     spec = bench.manifest.tasks[task]
     tests = bench.observed(flight)
-    folds = [folds_of(spec.split, o) for o in tests]
+    folds = [_folds_of(spec.split, o) for o in tests]
     for fold in np.unique(np.concatenate(folds)):
         rows = [np.flatnonzero(f == fold) for f in folds]
         targets = [o.part(r) for o, r in zip(tests, rows, strict=True)]
         some = next(o for o in targets if len(o.samples))
         train = [
-            o.part(may_know(spec.split, o, some, same_flight=False))
+            o.part(_may_know(spec.split, o, some, same_flight=False))
             for name in spec.train
             for o in bench.observed(name)
         ]
         if not spec.own_offset:
-            train += [o.part(may_know(spec.split, o, some, same_flight=True)) for o in tests]
+            train += [o.part(_may_know(spec.split, o, some, same_flight=True)) for o in tests]
         yield Question([o for o in train if len(o.samples)], targets, rows)
 
 
@@ -366,7 +366,7 @@ def _level_rows(bench: Bench, task: str, flight: str) -> Iterator[pd.DataFrame]:
         rotation = data.poses_at(np.array([t.removesuffix("Z") for t in frame["time"]], "datetime64[ns]")).rotation
         tower = data.site.towers[s.tower].position_m if o.tower_m is None else o.tower_m.T
         yield _geometry(frame, s.position_m, rotation, np.round(tower, 3)).assign(
-            fold=folds_of(split, o),
+            fold=_folds_of(split, o),
             **dict(zip(("body_forward", "body_left", "body_up"), s.at_uav.T.round(6), strict=True)),
             carrier_hz=series.link.carrier_hz,
             measured=s.residual_db + o.free_space_db,
@@ -415,7 +415,7 @@ def read_entry(path: Path) -> Entry:
         Unreadable, no table, columns missing, rows twice, values that are no numbers.
     """
     try:
-        text = read_input(path, LARGEST_ENTRY, "a CSV of predictions").decode()
+        text = read_input(path, _LARGEST_ENTRY, "a CSV of predictions").decode()
     except UnicodeDecodeError:
         raise InputError("not a text file", expected="a CSV of predictions in UTF-8", path=path) from None
     lines = text.splitlines()
@@ -617,7 +617,7 @@ def read_leaderboard(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     try:
-        rows = json.loads(read_input(path, LARGEST_ENTRY, "a leaderboard"))
+        rows = json.loads(read_input(path, _LARGEST_ENTRY, "a leaderboard"))
         if not isinstance(rows, list) or not all(isinstance(r, dict) and "scores" in r for r in rows):
             raise ValueError("no list of rows")
     except (ValueError, UnicodeDecodeError) as error:

@@ -47,7 +47,7 @@ def open_bench(data: Path, manifest: Path | None = None) -> benchmark.Bench:
     return benchmark.Bench(benchmark.load_manifest(manifest), data)
 
 
-def chosen_tasks(manifest: benchmark.Manifest, names: Sequence[str]) -> list[str]:
+def _chosen_tasks(manifest: benchmark.Manifest, names: Sequence[str]) -> list[str]:
     """The named tasks, or all; UsageError for an unknown one."""
     for name in names:
         if name not in manifest.tasks:
@@ -89,7 +89,7 @@ def run_benchmark(
         if name not in known:
             raise UsageError(f"unknown entrant {name!r}", expected=", ".join(known))
     names = list(only) or [name for name in known if name not in entrants.ONLY_ON_DEMAND]
-    chosen = chosen_tasks(bench.manifest, tasks)
+    chosen = _chosen_tasks(bench.manifest, tasks)
     skipped = {task: lack for task in chosen if (lack := bench.skipped(task, training=True))}
     with OutputFolder(out, job="benchmark", inputs=list(bench.places.values()), force=force) as output:
         cost: dict[tuple[str, str], dict[str, float]] = {}
@@ -210,8 +210,8 @@ def score_predictions(
     bench = open_bench(data, manifest)
     entry = benchmark.read_entry(predictions)
     answered = list(dict.fromkeys(entry.frame["task"]))
-    chosen_tasks(bench.manifest, answered)
-    chosen = [task for task in chosen_tasks(bench.manifest, tasks) if task in answered]
+    _chosen_tasks(bench.manifest, answered)
+    chosen = [task for task in _chosen_tasks(bench.manifest, tasks) if task in answered]
     skipped = {task: bench.skipped(task, training=False) for task in chosen}
     benchmark.check_training(bench, entry, chosen)
     scores: Scores = {}
@@ -272,7 +272,7 @@ def write_template(
     import pandas as pd
 
     bench = open_bench(data, manifest)
-    chosen = chosen_tasks(bench.manifest, tasks)
+    chosen = _chosen_tasks(bench.manifest, tasks)
     test_parts = [benchmark.truth(bench, task) for task in chosen]
     train_parts = [benchmark.truth(bench, task, training=True) for task in chosen]
     test = pd.concat(test_parts, ignore_index=True).drop(columns="measured")

@@ -33,7 +33,7 @@ GainOf = Callable[[Observed], FloatArray]
 # Level and standard deviation (n,) [dB].
 Answer = tuple[FloatArray, FloatArray]
 
-Entrant = Callable[[Question, Bench], list[Answer]]
+_Entrant = Callable[[Question, Bench], list[Answer]]
 
 
 def anchored(question: Question, gain: GainOf) -> list[Answer]:
@@ -69,7 +69,7 @@ def _log_distance(question: Question, _: Bench) -> list[Answer]:
     return anchored(question, lambda o: slopes[o.samples.antenna] * o.free_space_db)
 
 
-def _by_gain(gain: Callable[[Observed, FlightData, RssSeries], FloatArray]) -> Entrant:
+def _by_gain(gain: Callable[[Observed, FlightData, RssSeries], FloatArray]) -> _Entrant:
     """Entrant of a gain that needs the flight and the series of the samples."""
 
     def answer(question: Question, bench: Bench) -> list[Answer]:
@@ -189,7 +189,7 @@ def _trees(question: Question, _: Bench) -> list[Answer]:
     return [(level, np.full(len(level), error_db.std())) for level, _ in answers]
 
 
-LEVEL: dict[str, Entrant] = {
+LEVEL: dict[str, _Entrant] = {
     "free_space": lambda question, _: anchored(question, lambda o: np.zeros(len(o.samples))),
     "constant": lambda question, _: anchored(question, lambda o: -o.free_space_db),
     "log_distance": _log_distance,

@@ -26,7 +26,7 @@ from .campaign_tasks import Task, counted_once, flight_data, outcome_store
 from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
 
 # Label of the only setting of a campaign that names none.
-AS_WRITTEN = "as written"
+_AS_WRITTEN = "as written"
 
 
 class CampaignFile(GroupedSettings):
@@ -98,7 +98,7 @@ def run(
     if options.scheduler is not None:  # workers may stand in another folder
         folder, logs_root = folder.absolute(), None if logs_root is None else logs_root.absolute()
     tasks, files, failures = campaign_tasks(campaign, folder, logs_root)
-    settings = campaign.settings or {AS_WRITTEN: {}}
+    settings = campaign.settings or {_AS_WRITTEN: {}}
     store = None if keep is None else outcome_store(keep)
     if store is not None:
         store.check()
@@ -152,7 +152,7 @@ def campaign_tasks(
     UsageError
         Overrides that no flight file could have, two flights of one name.
     """
-    settings = campaign.settings or {AS_WRITTEN: {}}
+    settings = campaign.settings or {_AS_WRITTEN: {}}
     files, failures = _flight_files(campaign, folder, settings)
     tasks = [
         Task(path, name, label, overrides, logs_root, reference=label == next(iter(settings)))

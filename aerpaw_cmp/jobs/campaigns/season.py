@@ -19,8 +19,8 @@ from ...compare import season
 from ...logs.records import has_wall_clock
 from ...report.campaign_data import CampaignData, Drift, PlaceMap, RssRow, Season, SettingRank, place_means
 
-DAY_NS = 86_400e9
-QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
+_DAY_NS = 86_400e9
+_QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 
 
 def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) -> CampaignData:
@@ -32,11 +32,11 @@ def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) ->
     reports : mapping of str to str, optional
         Address of the report of a flight, against the campaign's folder.
     """
-    rows = held_out_rows(data.rss)
+    rows = _held_out_rows(data.rss)
     data = dataclasses.replace(data, rss=tuple(rows))
     if not rows:
         return dataclasses.replace(data, season=Season(reports=dict(reports or {})))
-    started = started_of(rows)
+    started = _started_of(rows)
     order = sorted(data.flights, key=lambda name: (name not in started, started.get(name, 0)))
     links = list(dict.fromkeys(row.link for row in rows))
     ranking = rank_settings(rows, list(data.settings), order, "")
@@ -50,13 +50,13 @@ def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) ->
             started={name: _iso(ns) for name, ns in started.items()},
             ranking=tuple(ranking),
             drift=tuple(drifts(rows, started)),
-            places=place_map(data.reference_rows, data.cell_m),
+            places=_place_map(data.reference_rows, data.cell_m),
             reports=dict(reports or {}),
         ),
     )
 
 
-def started_of(rows: Iterable[RssRow]) -> dict[str, int]:
+def _started_of(rows: Iterable[RssRow]) -> dict[str, int]:
     """First instant of each flight [ns after 1970-01-01]; none where its logs have relative times only."""
     starts: dict[str, int] = {}
     for row in rows:
@@ -72,7 +72,7 @@ def _iso(ns: int) -> str:
 # --- held-out errors --------------------------------------------------------------------------------------------------
 
 
-def held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
+def _held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
     """Rows with the offset from the other flights of their setting, tower and channel, and what it leaves."""
     groups: dict[tuple[str, str, str, str], list[int]] = {}
     for i, row in enumerate(rows):
@@ -93,7 +93,7 @@ def held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
     return scored
 
 
-def error_of(row: RssRow) -> float:
+def _error_of(row: RssRow) -> float:
     """The error that settings are ranked by [dB]: held out, or own where there is no other flight."""
     return row.held_out_rmse_db if np.isfinite(row.held_out_rmse_db) else row.rmse_db
 
@@ -123,14 +123,14 @@ def rank_settings(
     """
     table: dict[str, dict[str, dict[str, float]]] = {name: {} for name in settings}
     for row in rows:
-        if np.isfinite(error_of(row)):
-            table[row.setting].setdefault(row.flight, {})[row.link] = error_of(row)
+        if np.isfinite(_error_of(row)):
+            table[row.setting].setdefault(row.flight, {})[row.link] = _error_of(row)
     means = {name: np.array([np.mean(list(by.values())) for by in table[name].values()]) for name in settings}
     known = sorted((name for name in settings if len(means[name])), key=lambda name: float(means[name].mean()))
     choices = []
     for name in known:
         difference = season.mean_of_flights(_paired(table[name], table[known[0]], flights))
-        low, *middle, high = (float(v) for v in np.quantile(means[name], (0.0, *QUANTILES, 1.0)))
+        low, *middle, high = (float(v) for v in np.quantile(means[name], (0.0, *_QUANTILES, 1.0)))
         choices.append(
             SettingRank(
                 setting=name,
@@ -165,7 +165,7 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
             groups.setdefault((row.setting, row.tower, row.channel), []).append(row)
     fitted = []
     for (setting, tower, channel), members in groups.items():
-        days = [started.get(row.flight, np.nan) / DAY_NS for row in members]
+        days = [started.get(row.flight, np.nan) / _DAY_NS for row in members]
         # not the offsets themselves: three flights whose rounded offsets lie on a line would have no uncertainty
         exact = np.array([row.moments.mean_db for row in members])
         offsets = np.array([row.offset_db for row in members])
@@ -188,7 +188,7 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
 # --- places -----------------------------------------------------------------------------------------------------------
 
 
-def place_map(rows: Sequence[RssRow], cell_m: float) -> PlaceMap | None:
+def _place_map(rows: Sequence[RssRow], cell_m: float) -> PlaceMap | None:
     """Mean residual of each cell of the plan over flights, towers and channels; None without a cell."""
     residuals: dict[tuple[int, int], list[float]] = {}
     for row in rows:

@@ -36,7 +36,7 @@ from .calibrate_lock import learned_locks, lock_words
 from .calibrate_rank import RankFitSettings
 
 # Heights of roughness that are tried [m]; infinite is no ground ray.
-ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
+_ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
 
 
 class PatternsSettings(StrictModel):
@@ -193,16 +193,16 @@ def calibrate(
             with_place = calibration.only_terms(recipe, (*recipe.model.terms, direction_gain.PLACE_TERM))
             place = calibration.learn(series, with_place)
     with stages("ground"):
-        ground = fit_ground(flights, observed, learned) if settings.fit.ground else None
+        ground = _fit_ground(flights, observed, learned) if settings.fit.ground else None
     fits: dict[str, Learned] = {}
     with stages("scores"):
-        scores = score_all(observed, recipe, stages, fits)
+        scores = _score_all(observed, recipe, stages, fits)
         stages.progress("scores: controls")
-        controls = controls_of(observed, recipe)
+        controls = _controls_of(observed, recipe)
         locks = learned_locks(observed, recipe, fits)
     with stages("curve"):
         curve = learning_curve(observed, recipe)
-    warnings += mount_warnings(learned)
+    warnings += _mount_warnings(learned)
     if score:
         with stages("score"):
             further_scores, remarks = _score_further(score, flights, logs_root, learned, observed)
@@ -413,7 +413,7 @@ def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
     return gain
 
 
-def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:
+def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:
     """Likelihood of a coherent ground ray of each roughness, the gains integrated out."""
     by_name = {data.settings.flight.name: data for data in flights}
     by_series = {(o.samples.flight, o.samples.antenna): o for o in observed}
@@ -425,7 +425,7 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
         tower = data.site.towers[samples.tower]
         place = tower.position_m[None, :] if o.tower_m is None else o.tower_m[:, None, :]
         out = [samples.binned(bin_s).residual_db]
-        for sigma in ROUGHNESS_M:
+        for sigma in _ROUGHNESS_M:
             level = two_ray_dbm(
                 place,
                 samples.position_m,
@@ -445,13 +445,13 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
     form = direction_gain.column_forms(unexplained, learned.model, columns)
     value = np.diag(form)[1:] - 2.0 * form[0, 1:]
     likelihood = -0.5 * (value - value[-1])
-    return GroundFit(roughness_m=ROUGHNESS_M, log_likelihood=tuple(map(float, likelihood)))
+    return GroundFit(roughness_m=_ROUGHNESS_M, log_likelihood=tuple(map(float, likelihood)))
 
 
 # --- scores --------------------------------------------------------------------------------------------------------
 
 
-def score_all(
+def _score_all(
     observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits: dict[str, Learned]
 ) -> dict[str, tuple[Score, ...]]:
     """Every split, on flights that had no part in the fit; fits of one are used by the next.
@@ -483,7 +483,7 @@ def score_all(
     return scores
 
 
-def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple[Score, ...]]:
+def _controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple[Score, ...]]:
     """Simpler and wrong models, each flight left out in turn."""
     if len(calibration.flights_of(observed)) < 2:
         return {}
@@ -502,7 +502,7 @@ def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple
     )
 
 
-def mount_warnings(learned: Learned) -> list[str]:
+def _mount_warnings(learned: Learned) -> list[str]:
     """A sentence for every mount that the data do not tell."""
     return [
         f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is likeliest, with a standard deviation of "

@@ -36,7 +36,7 @@ from ...site.learned import read_table
 FORMAT = "aerpaw-cmp receiver 1"
 
 # Ways to slant the four ports of a modem: two diagonals, two upright and two lying, all alike.
-SLANTS_DEG: tuple[tuple[float, ...], ...] = (
+_SLANTS_DEG: tuple[tuple[float, ...], ...] = (
     (45.0, -45.0, 45.0, -45.0), (45.0, -45.0, -45.0, 45.0), (45.0, 45.0, -45.0, -45.0),
     (-45.0, 45.0, -45.0, 45.0), (-45.0, 45.0, 45.0, -45.0), (-45.0, -45.0, 45.0, 45.0),
     (0.0, 90.0, 0.0, 90.0), (0.0, 90.0, 90.0, 0.0), (0.0, 0.0, 90.0, 90.0),
@@ -50,7 +50,7 @@ class RankFitSettings(StrictModel):
 
     yaw_step_deg: Annotated[float, Field(ge=5, le=90)] = 30.0
     uav_slant_deg: list[list[float]] | None = None
-    """Slants of the modem's ports to try; by default :data:`SLANTS_DEG`."""
+    """Slants of the modem's ports to try; by default :data:`_SLANTS_DEG`."""
     ground: list[Annotated[float, Field(ge=0, le=2)]] = Field(default_factory=lambda: [0.0, 0.2, 0.5, 1.0])
     """Amplitude factors on the ground reflection to try."""
     sum: Literal["power_sum", "coherent"] = "power_sum"
@@ -243,7 +243,7 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
     )
 
 
-def powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArray:
+def _powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArray:
     """Squares (geometries, n, 4) of the singular values of the modelled channels."""
     singular = singular_values_of(
         geometries, samples.link.tower_arrays[samples.tower], samples.tower_m, samples.link.uav_array, samples.poses,
@@ -254,7 +254,7 @@ def powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArra
 
 def features_of(geometries: Sequence[Geometry], samples: RankSamples, timing: Timing | None = None) -> FloatArray:
     """Features (geometries, n, 4) of the modelled channels."""
-    return _features(powers_of(geometries, samples), samples, timing or Timing())
+    return _features(_powers_of(geometries, samples), samples, timing or Timing())
 
 
 def _features(power: FloatArray, samples: RankSamples, timing: Timing) -> FloatArray:
@@ -268,7 +268,7 @@ def candidates(settings: RankFitSettings, samples: RankSamples) -> tuple[Geometr
     half, full = (np.arange(0.0, end, settings.yaw_step_deg) for end in (180.0, 360.0))
     mounts = [(float(y), 0.0, r) for r in (0.0, 90.0) for y in half] + [(float(y), 90.0, 0.0) for y in full]
     tower = tuple(np.degrees(samples.link.tower_arrays[samples.tower].slant_rad).round(9).tolist())
-    slants = [tuple(s) for s in settings.uav_slant_deg] if settings.uav_slant_deg else list(SLANTS_DEG)
+    slants = [tuple(s) for s in settings.uav_slant_deg] if settings.uav_slant_deg else list(_SLANTS_DEG)
     if any(len(s) != 4 for s in slants):
         raise UsageError(f"rank.uav_slant_deg {slants}", expected="four slants per way, one per port")
     return every_geometry(mounts, [tower], slants, settings.ground, (settings.sum,))
@@ -346,7 +346,7 @@ class Tried:
         """All candidates of the settings, for flights at one tower."""
         geometries = candidates(settings, samples[0])
         thinned = [sample.part(slice(None, None, settings.thin)) for sample in samples]
-        return cls(settings, samples, geometries, thinned, [powers_of(geometries, item) for item in thinned])
+        return cls(settings, samples, geometries, thinned, [_powers_of(geometries, item) for item in thinned])
 
     def fit(self, flights: Sequence[int] | range) -> FittedReceiver:
         """Choose geometries and timing, and fit, on some of the flights.

@@ -37,13 +37,13 @@ from .calibrate import Calibration, CalibrationFile
 from .calibrate_rank import RankCalibration
 
 # First words of calibrated.yaml, by which an own earlier output is known.
-MARK = "# aerpaw-cmp calibrate"
+_MARK = "# aerpaw-cmp calibrate"
 
 # Share of the variance over both directions that the stored directions leave, and their largest number.
-PAIR_SHARE, MOST_PAIRS = 0.01, 400
+_PAIR_SHARE, _MOST_PAIRS = 0.01, 400
 
 
-def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
+def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
     """Every antenna over the sphere, by ``(tower.channel, "uav" or "tower")``."""
     theta, azimuth, vectors = sphere_grid()
     flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
@@ -66,7 +66,7 @@ def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
     return out
 
 
-def antenna_files(
+def _antenna_files(
     calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float
 ) -> dict[str, str | bytes]:
     """Content of each file by its name: the full sphere with standard deviation, and cuts for planning tools.
@@ -109,17 +109,17 @@ def antenna_files(
 def _notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
     """Notes of an antenna file that its readers use: training logs and marks, spread, the gain towards both ends."""
     logs, marked = f"{KEY}: {' '.join(calibration.trained_on)}", marks_note(calibration.flights)
-    return (logs, marked, calibration.learned.spread(antenna).text(), *pair_notes(calibration, antenna, end))
+    return (logs, marked, calibration.learned.spread(antenna).text(), *_pair_notes(calibration, antenna, end))
 
 
-def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
+def _pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
     """Notes of the tower's file about the gain towards both ends at once; empty where none was learned."""
     fit = calibration.fit
     term = next((t for t in fit.model.terms if t.frame == "pair"), None)
     if term is None or end == "uav":
         return ()
     flown, length = fit.seen("pair", antenna), term.length
-    at = flown[determining(flown, lambda a, b: gaussian_kernel(a, b, length), PAIR_SHARE, MOST_PAIRS)]
+    at = flown[determining(flown, lambda a, b: gaussian_kernel(a, b, length), _PAIR_SHARE, _MOST_PAIRS)]
     return PairGain(
         directions=at,
         gain_db=fit.gain("pair", antenna, at)[0],
@@ -132,7 +132,7 @@ def pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str
 def settings_text(calibration: Calibration, folder_name: str) -> str:
     """calibrated.yaml: the part of a flight.yaml that names the learned antennas."""
     lines = [
-        f"{MARK}: {calibration.settings.calibration}. Learned from {', '.join(calibration.names)}.",
+        f"{_MARK}: {calibration.settings.calibration}. Learned from {', '.join(calibration.names)}.",
         *(f"# {text}" for text in calibration.words),
         "# Put this into a flight.yaml; files resolve against its folder, or --logs-root.",
         "# SHA-256 of the logs: nothing is scored on them",
@@ -162,7 +162,7 @@ def settings_text(calibration: Calibration, folder_name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def record_of(
+def _record_of(
     calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], text: str, stages_s: Mapping[str, float]
 ) -> CalibrationData:
     """All that the page shows.
@@ -257,20 +257,20 @@ def write_files(
     calibration, ranked = calibrated.calibration, calibrated.ranked
     rank, rank_warnings = (None, ()) if ranked is None else (ranked.metrics(), ranked.warnings)
     if calibration is not None:
-        maps = antenna_maps(calibration)
+        maps = _antenna_maps(calibration)
         carrier = next(s.link.carrier_hz for data in calibrated.flights for s in data.rss)
-        for file, content in antenna_files(calibration, maps, carrier).items():
+        for file, content in _antenna_files(calibration, maps, carrier).items():
             write_file(folder / file, content)
         text = settings_text(calibration, name)
         record = dataclasses.replace(
-            record_of(calibration, maps, text, stages_s),
+            _record_of(calibration, maps, text, stages_s),
             rank=rank,
             warnings=(*calibrated.remarks, *calibration.warnings, *rank_warnings),
         )
         write_calibration(record, folder)
         metrics = calibration_metrics(record)
     else:
-        text = MARK + "\n"
+        text = _MARK + "\n"
         metrics = {
             "scores": {}, "controls": {}, "words": [], "antennas": [], "calibration": calibrated.settings.calibration,
             "rank": rank, "warnings": [*calibrated.remarks, *rank_warnings], "flights": calibrated.settings.flights,
@@ -296,7 +296,7 @@ def site_entries(calibrated: Calibrated, command: str) -> list[tuple[str, Entry,
 
 def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str, bytes]]:
     """Entry that a site remembers of a calibration, and its tables by name."""
-    name, maps = calibration.settings.calibration, antenna_maps(calibration)
+    name, maps = calibration.settings.calibration, _antenna_maps(calibration)
     tables: dict[str, bytes] = {}
     series = []
     for antenna in calibration.fit.antennas:
@@ -308,12 +308,12 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
             tables[files[end]] = sphere_csv(gains.gain_dbi, gains.sd_db, notes, decimals=2).encode()
         samples = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
         first, ends = calibration.first_series(antenna), (maps[antenna, "uav"], maps[antenna, "tower"])
-        sds = np.concatenate([calibration.learned.predict(o.part(spread_out(len(o), SD_SAMPLES)))[1] for o in samples])
+        sds = np.concatenate([calibration.learned.predict(o.part(spread_out(len(o), _SD_SAMPLES)))[1] for o in samples])
         series.append(
             LearnedSeries(
                 tower=samples[0].tower,
                 channel=samples[0].channel,
-                reader=reader_of(*first),
+                reader=_reader_of(*first),
                 carrier_hz=first[1].link.carrier_hz,
                 tower_file=files["tower"],
                 uav_file=files["uav"],
@@ -334,10 +334,10 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
 
 
 # Of a series: their standard deviations stand for its mean.
-SD_SAMPLES = 200
+_SD_SAMPLES = 200
 
 # Between flights, before any was left out: counts as two flights.
-OFFSET_SD_DB = 1.5
+_OFFSET_SD_DB = 1.5
 
 
 def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
@@ -354,7 +354,7 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> Le
     ]
     return LearnedLevel(
         offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
-        sd_db=round(math.sqrt((2.0 * OFFSET_SD_DB**2 + sum(squares)) / (2 + len(squares))), 2),
+        sd_db=round(math.sqrt((2.0 * _OFFSET_SD_DB**2 + sum(squares)) / (2 + len(squares))), 2),
         transmit_power_dbm=sent,
         unit=series.unit,
     )
@@ -399,12 +399,12 @@ def receiver_entry(
         }
         link = first[0].settings.link.rank
         receivers.append(
-            LearnedReceiver(tower=tower, reader=reader_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
+            LearnedReceiver(tower=tower, reader=_reader_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
         )
     return Entry(**_provenance(settings, flights, command), receivers=receivers), {file: ranked.text().encode()}
 
 
-def reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:
+def _reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:
     """Reader of the log that holds a series."""
     return data.files[int(series.log[0]) if len(series.log) else 0].result.reader
 

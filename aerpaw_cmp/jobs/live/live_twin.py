@@ -31,14 +31,14 @@ from ...propagation.field.baselines import free_space_dbm
 from ...report.live_page import LiveMap
 from ...site.site import Site
 
-MAP_HEIGHTS_M = (10.0, 30.0, 50.0, 70.0, 90.0, 110.0)
+_MAP_HEIGHTS_M = (10.0, 30.0, 50.0, 70.0, 90.0, 110.0)
 # Cells on the longer side of the map behind the flight.
-MAP_CELLS = 70
-ROUTE_STEP_S = 2.0
+_MAP_CELLS = 70
+_ROUTE_STEP_S = 2.0
 # Points of the rest of the route in one record.
-ROUTE_SHOWN = 40
-DEMO_OFFSET_DB = -38.0
-DEMO_FADING_DB = 2.5
+_ROUTE_SHOWN = 40
+_DEMO_OFFSET_DB = -38.0
+_DEMO_FADING_DB = 2.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +89,7 @@ class LiveTwin:
         plan = self.settings.flight.plan
         if plan is None:
             return None
-        _, place, yaw = planned_poses(plan, self.site.datum.takeoff_ground_m, ROUTE_STEP_S)
+        _, place, yaw = planned_poses(plan, self.site.datum.takeoff_ground_m, _ROUTE_STEP_S)
         rotation = np.broadcast_to(np.eye(3), (len(place), 3, 3))
         if self.settings.rt.attitude != "ignored":
             rotation = rotation_from_aircraft(0.0 * yaw, 0.0 * yaw, yaw)
@@ -130,25 +130,25 @@ class LiveTwin:
         columns = columns[np.isfinite(columns).all(axis=1)]
         if not len(columns):
             return None
-        shown = columns[spread_out(len(columns), ROUTE_SHOWN)].round(1)
+        shown = columns[spread_out(len(columns), _ROUTE_SHOWN)].round(1)
         median, least, most = columns[:, 2:].mean(axis=0).round(1).tolist()
         return {"trend": forecast.trend, "level_dbm": median, "interval_dbm": [least, most], "points": shown.tolist()}
 
     def map(self) -> LiveMap:
         """Predicted rank and level over the site at several heights, the UAV level and heading north."""
         east_min, east_max, north_min, north_max = self.site.area_m
-        spacing = max(20.0, max(east_max - east_min, north_max - north_min) / MAP_CELLS)
+        spacing = max(20.0, max(east_max - east_min, north_max - north_min) / _MAP_CELLS)
         grid = Grid.over_area(self.site.area_m, spacing)
-        places = np.concatenate([grid.positions_m(height) for height in MAP_HEIGHTS_M])
+        places = np.concatenate([grid.positions_m(height) for height in _MAP_HEIGHTS_M])
         level = rotation_from_aircraft(np.asarray(0.0), np.asarray(0.0), np.asarray(0.0))
         rank, level_dbm = self._replayed(places, np.broadcast_to(level, (len(places), 3, 3)))
-        shape = (len(MAP_HEIGHTS_M), len(grid.north_m), len(grid.east_m))
+        shape = (len(_MAP_HEIGHTS_M), len(grid.north_m), len(grid.east_m))
         return LiveMap(
             title=self.settings.flight.title or self.settings.flight.name,
             site=self.site,
             tower=self.settings.rank.tower,
             k=self.k,
-            heights_m=MAP_HEIGHTS_M,
+            heights_m=_MAP_HEIGHTS_M,
             east_m=grid.east_m,
             north_m=grid.north_m,
             rank=rank.reshape(shape),
@@ -224,8 +224,8 @@ class FlownAgain:
         random = np.random.default_rng(7)
         fading = np.zeros(len(level))
         for i in range(1, len(fading)):
-            fading[i] = 0.6 * fading[i - 1] + 0.8 * DEMO_FADING_DB * random.standard_normal()
-        return np.asarray(np.nan_to_num(level + DEMO_OFFSET_DB + fading, nan=-140.0))
+            fading[i] = 0.6 * fading[i - 1] + 0.8 * _DEMO_FADING_DB * random.standard_normal()
+        return np.asarray(np.nan_to_num(level + _DEMO_OFFSET_DB + fading, nan=-140.0))
 
     @staticmethod
     def _rank_log(settings: FlightFile, folder: Path) -> Callable[[float], int] | None:

@@ -70,7 +70,7 @@ INTERPOLATORS = ("Kriging", "makima", "spline")
 
 # A map of more receivers (positions times heights) is written in tiles of so many positions a side (some 0.7 MB of
 # values per tower, height and foliage mode); so many positions of it are drawn and exported beside the store.
-TILED_ABOVE, TILE_CELLS, SHOWN_POSITIONS = 1_000_000, 128, 20_000
+_TILED_ABOVE, _TILE_CELLS, SHOWN_POSITIONS = 1_000_000, 128, 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,8 +106,8 @@ class MapSettings:
     seed : int
         Of random samples.
     tile_m : float, optional
-        Side of the tiles of a map that is written tile by tile. Default: :data:`TILE_CELLS` positions where there are
-        more than :data:`TILED_ABOVE` receivers, else the map is made in one piece.
+        Side of the tiles of a map that is written tile by tile. Default: :data:`_TILE_CELLS` positions where there are
+        more than :data:`_TILED_ABOVE` receivers, else the map is made in one piece.
     """
 
     foliage: tuple[str, ...] = FOLIAGE
@@ -150,7 +150,7 @@ class MapSettings:
         if self.tile_m is not None:
             return max(1, round(self.tile_m / self.spacing_m))
         receivers = len(grid) * len({*self.rss_altitudes_m, *self.rank_altitudes_m})
-        return TILE_CELLS if receivers > TILED_ABOVE else None
+        return _TILE_CELLS if receivers > _TILED_ABOVE else None
 
     @property
     def shown(self) -> str:
@@ -303,7 +303,7 @@ class SiteChannels:
         return siso + next(more), mimo + next(more)
 
     def _rss_dbm(self, h: ComplexArray) -> FloatArray:
-        level = rss_dbm(beam_power(h), self.settings.transmit_power_dbm)
+        level = rss_dbm(_beam_power(h), self.settings.transmit_power_dbm)
         with np.errstate(invalid="ignore"):
             return np.asarray(np.where(level >= self.settings.threshold_dbm, level, np.nan))
 
@@ -368,7 +368,7 @@ def _channels_of(site: str, settings: MapSettings) -> SiteChannels:
     return SiteChannels(load_site(site), settings)
 
 
-def beam_power(h: ComplexArray) -> FloatArray:
+def _beam_power(h: ComplexArray) -> FloatArray:
     """Received share of the transmit power of channels (..., n_rx, n_tx): equal feed in phase, mean over receivers."""
     amplitude = h.sum(axis=-1) / np.sqrt(h.shape[-1])
     return np.asarray((amplitude.real**2 + amplitude.imag**2).mean(axis=-1), dtype=np.float64)
@@ -465,7 +465,7 @@ def make_maps(
         evaluate = partial(channels.tile, progress=share if len(tiling) < 2 else None) if crew.count < 2 else map_tile
         order = partial(TileOrder, site=name, settings=settings, cells=tiling.cells)
         if store is not None and tile_cells:
-            book = TileStore(store, tiling, job_of(name, settings), force=force)
+            book = TileStore(store, tiling, _job_of(name, settings), force=force)
             _write_tiles(outcome, book, channels, partial(crew.run, evaluate), order, stages.progress)
             return outcome
         parts: dict[int, Mapping[str, job.MapResult]] = {}
@@ -494,7 +494,7 @@ def _write_tiles(
 ) -> None:
     """Compute the tiles that a store lacks, write each as it comes, and read some positions of all for the page."""
     empty, tiling = channels.empty(store.tiling.grid_of(0)), store.tiling
-    missing = store.begin(empty, outcome.site.frame, about_maps(outcome.site.name))
+    missing = store.begin(empty, outcome.site.frame, _about_maps(outcome.site.name))
     if len(missing) < len(tiling):
         progress(f"{len(tiling) - len(missing)} of {len(tiling)} tiles were computed before")
     lost: list[str] = []
@@ -523,7 +523,7 @@ def _write_tiles(
     }  # fmt: skip
 
 
-def job_of(site: str, settings: MapSettings) -> dict[str, Any]:
+def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
     """All that the values of a map depend on: settings, content of the site's files, program."""
     without = ("study", "neighbours", "radius_m", "block_m", "seed")
     chosen = {key: str(value) for key, value in asdict(settings).items() if key not in without}
@@ -553,14 +553,14 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
             "RSS": field_correlation(points, result.rss().T, width_m=width),
         }
     if outcome.trajectory_m is None:
-        outcome.trajectory_m, outcome.trajectory_name = tower_round(outcome.site)
+        outcome.trajectory_m, outcome.trajectory_name = _tower_round(outcome.site)
     with stages("held-out tests"):
         fit, line = outcome.studies["missing"].fit, outcome.trajectory_m
         outcome.held_out = held_out_study(
             result.grid, heights, rank, fit, trajectory_m=line, block_m=s.block_m, neighbours=s.neighbours, seed=s.seed
         )
         sizes = outcome.held_out.learning_sizes
-        for name, peer in wide_peers(result, s.neighbours).items():
+        for name, peer in _wide_peers(result, s.neighbours).items():
             outcome.peers.setdefault("blocks", {})[name] = blocked(peer, result.grid.points_m, rank, s.block_m)
             outcome.peers.setdefault("flight", {})[name] = along_trajectory(peer, result.grid, rank, line)
             if not isinstance(peer, ServingTowerMean):  # knows no height
@@ -569,7 +569,7 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
             outcome.learning[name] = learning_curve(peer, result.grid.points_m, rank, sizes, seed=s.seed)
 
 
-def wide_peers(result: job.MapResult, neighbours: int) -> dict[str, Predictor]:
+def _wide_peers(result: job.MapResult, neighbours: int) -> dict[str, Predictor]:
     """Interpolators that reach as far as they must, to stand beside Kriging where samples are far."""
     return {
         "nearest": Nearest(np.inf),
@@ -578,7 +578,7 @@ def wide_peers(result: job.MapResult, neighbours: int) -> dict[str, Predictor]:
     }
 
 
-def tower_round(site: Site) -> tuple[FloatArray, str]:
+def _tower_round(site: Site) -> tuple[FloatArray, str]:
     """A round over the first three towers and back, every 5 m: the shape of the paper's RSS flight."""
     corners = np.array([tower.position_m[:2] for tower in list(site.towers.values())[:3]])
     corners = np.vstack([corners, corners[:1]])
@@ -875,7 +875,7 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
     ]
     maps = dict(outcome.ordered())
     writers: tuple[Callable[[], Path], ...] = (
-        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, about_maps(site.name), flown),
+        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, _about_maps(site.name), flown),
         lambda: export.write_geotiff(folder / "maps.tif", all_joint),
     )
     for write in writers:
@@ -890,7 +890,7 @@ def _provenance() -> dict[str, str]:
     return {"generated": utc_now(), "version": versions()["aerpaw-cmp"]}
 
 
-def about_maps(title: str) -> dict[str, str]:
+def _about_maps(title: str) -> dict[str, str]:
     """Attributes of maps.nc and of a store of tiles."""
     return file_attributes(
         title=title,

@@ -19,7 +19,7 @@ from ...site.siteyaml import SceneModel, SiteModel, build_site, load_site, site_
 from ..options import JobOutcome
 from ..tasks.manifest import inputs_of_site
 
-LOCAL_NOTE = "this site has no georeference: latitude and longitude count from (0, 0), and no log of a flight fits it"
+_LOCAL_NOTE = "this site has no georeference: latitude and longitude count from (0, 0), and no log of a flight fits it"
 
 
 def is_scene(path: Path) -> bool:
@@ -116,8 +116,8 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
             )
         content.setdefault("area_m", [round(float(v), 2) for v in (low[0], high[0], low[1], high[1])])
         if facts.origin == "local":
-            content["notes"] = [*content.get("notes", []), LOCAL_NOTE]
-            actions.append(LOCAL_NOTE)
+            content["notes"] = [*content.get("notes", []), _LOCAL_NOTE]
+            actions.append(_LOCAL_NOTE)
         model = SiteModel.model_validate(content)
         build_site(model, out.resolve().parent)  # what does not fit is said now
         output.write(sealed(site_yaml(model, header=["made by 'aerpaw-cmp site import' from a scene", *actions])))

@@ -22,7 +22,7 @@ from ..learning.calibrate_rank import RankSamples, rank_samples
 from .predict import RANKS
 
 # A sample is scored by the nearest predicted point within these distances whose nose differs by less.
-NEAR_M, NEAR_UP_M, TURNED_DEG = 30.0, 15.0, 45.0
+NEAR_M, _NEAR_UP_M, _TURNED_DEG = 30.0, 15.0, 45.0
 
 FEWEST = 20
 
@@ -120,8 +120,8 @@ def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame
     """Predicted point (n,) of each sample, and which of them are near."""
     from scipy.spatial import cKDTree
 
-    scale = np.array([NEAR_M, NEAR_M, NEAR_UP_M, 1.0, 1.0])
-    turn = 2.0 * np.sin(np.radians(TURNED_DEG) / 2.0)
+    scale = np.array([NEAR_M, NEAR_M, _NEAR_UP_M, 1.0, 1.0])
+    turn = 2.0 * np.sin(np.radians(_TURNED_DEG) / 2.0)
 
     def coordinates(place: FloatArray, yaw_deg: FloatArray) -> FloatArray:
         yaw = np.radians(yaw_deg)

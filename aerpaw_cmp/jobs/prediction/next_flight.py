@@ -33,22 +33,22 @@ from .sources import NamedFlight, files_of, named_flights, sources_of
 from .where import TargetOptions, Targets, find_targets, level_samples, target_files
 
 # Target: all directions of the tower seen from the UAV, at all headings.
-SPHERE = "sphere"
+_SPHERE = "sphere"
 
-SPHERE_AWAY_M = 150.0
+_SPHERE_AWAY_M = 150.0
 # Per antenna, while candidates are ranked.
-MOST_TARGETS = 600
+_MOST_TARGETS = 600
 
 # At points of a target whose heading is open.
 HEADINGS = 4
 
 # A target that lies farther outside the geofence throughout, or a geofence outside the site, is refused.
-FARTHEST_M = 1000.0
+_FARTHEST_M = 1000.0
 
 # Of the battery, for what a longer flight buys.
 SHARES = (0.25, 0.5, 0.75, 1.0, 1.5)
 
-ALLOWED_OUTSIDE_M = 1.0
+_ALLOWED_OUTSIDE_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +102,7 @@ class Candidate:
         return {"name": self.route.name, "sd_db": self.sd_db, **length, "refused": self.refused}
 
 
-def plan_flight(
+def _plan_flight(
     target: str,
     flights: Sequence[NamedFlight],
     plan: PlanOptions,
@@ -136,7 +136,7 @@ def plan_flight(
     with stages("read"):
         datas, remarks = counted_once([flight.load(logs_root) for flight in flights])
         observed = observe(datas)[0] if datas else []
-        site, _ = site_of(None if target == SPHERE else Path(target), flights, datas, plan.target.site)
+        site, _ = site_of(None if target == _SPHERE else Path(target), flights, datas, plan.target.site)
         sources = sources_of(datas, observed) if datas else {}
         ends = {a: (s.tower, s.channel) for a, s in sources.items()} or _open_ends(site, plan)
         series = [o.samples for o in observed if o.samples.antenna in ends]
@@ -148,14 +148,14 @@ def plan_flight(
                 "no route fits: no pattern lies within the geofence",
                 expected="a larger area, or --route FILE",
             )
-        points = None if target == SPHERE else find_targets(Path(target), site, plan.target)
+        points = None if target == _SPHERE else find_targets(Path(target), site, plan.target)
         if points is not None:
             remarks += points.remarks
             _check_near("target", shapely.multipoints(points.position_m[points.known]), area, "that may be flown")
         targets = _targets(points, site, ends)
     with stages("learn"):
         known = _flown_knowledge(series)
-    few_targets = {a: _thinned(s, MOST_TARGETS) for a, s in targets.items()}
+    few_targets = {a: _thinned(s, _MOST_TARGETS) for a, s in targets.items()}
 
     def leaves_db(route: Route) -> float:
         return rms_db(known.sd_db(_samples(route, ends, site), few_targets))
@@ -165,7 +165,7 @@ def plan_flight(
     with stages("curve"):
         curve = _curve(ranked, leaves_db, site, area, plan)
     with stages("map"):
-        shown = {a: _thinned(s, 6 * MOST_TARGETS) for a, s in targets.items()}
+        shown = {a: _thinned(s, 6 * _MOST_TARGETS) for a, s in targets.items()}
         before, after = known.sd_db([], shown), known.sd_db(_samples(ranked[0].route, ends, site), shown)
     best, ways, speed = ranked[0], ranked[0].route.waypoints, plan.speed_mps
     return PlanPage(
@@ -307,7 +307,7 @@ def _raised(route: Route, site: Site) -> Route:
 
 def _leaves_area(route: Route, area: Any) -> bool:
     line = shapely.LineString(route.position_m[:, :2])
-    return not bool(shapely.covers(shapely.buffer(area, ALLOWED_OUTSIDE_M + 3.0), line))
+    return not bool(shapely.covers(shapely.buffer(area, _ALLOWED_OUTSIDE_M + 3.0), line))
 
 
 def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, str]]) -> dict[str, LinkSamples]:
@@ -318,10 +318,10 @@ def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, s
         if points is None:
             direction = _even_directions(800)
             direction = direction[(direction[:, 2] > 0.03) & (direction[:, 2] < 0.98)]
-            place, yaw = tower + SPHERE_AWAY_M * direction, 137.508 * np.arange(len(direction)) % 360.0
+            place, yaw = tower + _SPHERE_AWAY_M * direction, 137.508 * np.arange(len(direction)) % 360.0
         else:
             place, yaw = points.position_m[points.known], points.yaw_deg[points.known]
-            step = max(1, len(place) // (2 * MOST_TARGETS))
+            step = max(1, len(place) // (2 * _MOST_TARGETS))
             place, yaw = place[::step], yaw[::step]
             if np.isnan(yaw).any():
                 turns = np.arange(HEADINGS) * (360.0 / HEADINGS)
@@ -334,12 +334,12 @@ def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, s
 
 
 def _check_near(what: str, place: Any, area: Any, which: str) -> None:
-    """UsageError where a shape lies farther than :data:`FARTHEST_M` outside the area."""
+    """UsageError where a shape lies farther than :data:`_FARTHEST_M` outside the area."""
     distance_m = shapely.distance(area, place)
-    if distance_m > FARTHEST_M:
+    if distance_m > _FARTHEST_M:
         raise UsageError(
             f"the {what} lies {distance_m:.0f} m outside the area {which}",
-            expected=f"a {what} within {FARTHEST_M:g} m of it",
+            expected=f"a {what} within {_FARTHEST_M:g} m of it",
             cause="another site, or exchanged coordinates",
         )
 
@@ -382,7 +382,7 @@ def _rms_of_antennas(sd_db: Mapping[str, FloatArray]) -> FloatArray:
 
 
 # Candidates of which the best one counts at each length: a pattern of fewer legs may lie better.
-CURVE_OF = 3
+_CURVE_OF = 3
 
 
 def _curve(
@@ -390,7 +390,7 @@ def _curve(
 ) -> list[dict[str, float]]:
     """Standard deviations that shorter and longer flights of the best candidates leave; of files, shorter ones."""
     out: list[dict[str, float]] = []
-    best = [r for r in ranked if not r.refused][:CURVE_OF]
+    best = [r for r in ranked if not r.refused][:_CURVE_OF]
     for share in SHARES:
         tried = []
         for route in filter(None, (_of_length(item, share, area, plan) for item in best)):
@@ -434,7 +434,7 @@ def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: R
     stages = Stages(options.progress)
     folder = options.out or Path("reports") / f"plan-{safe_name(Path(target).stem)}"
     with OutputFolder(folder, job="plan", inputs=inputs, force=options.force) as output:
-        record = plan_flight(target, known, plan, logs_root=options.logs_root, stages=stages)
+        record = _plan_flight(target, known, plan, logs_root=options.logs_root, stages=stages)
         with output.filling() as place:
             options.progress("page")
             written = write_plan(record, place)

@@ -59,15 +59,15 @@ AT_ONCE = 50_000
 
 RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
 
-TILE_M = 100.0
+_TILE_M = 100.0
 
 # Targets at which the channel matrices of a receiver are evaluated.
 MOST_RANKED = 50_000
 
 # Distance that counts as much as a turn of 60 degrees, where a target stands for its neighbours.
-NOSE_M = 50.0
+_NOSE_M = 50.0
 
-FLAG_CODES = {name: code for code, name in enumerate(["", *FLAGS])}
+_FLAG_CODES = {name: code for code, name in enumerate(["", *FLAGS])}
 
 # Receiver of each tower, the link that says its arrays, and the folder of their files.
 Receivers = Mapping[str, tuple[FittedReceiver, LinkSettings, Path]]
@@ -370,7 +370,7 @@ def _table(
 
     def rows(tower: str, channel: str, flag: IntArray, index: Any, values: Mapping[str, FloatArray]) -> pd.DataFrame:
         names = {"tower": (tower, towers), "channel": (channel, channels)}
-        kinds = pd.CategoricalDtype(list(FLAG_CODES))
+        kinds = pd.CategoricalDtype(list(_FLAG_CODES))
         frame: pd.DataFrame = pd.DataFrame(
             {
                 "point": np.arange(len(targets), dtype=np.int32)[index],
@@ -396,9 +396,9 @@ def _table(
         values |= {"p_serving": serving[k], "slow_sd_db": slow[k]} | (
             dict.fromkeys(RANKS, nothing) if receivers else {}
         )
-        flag = np.where(guess[k], FLAG_CODES["outside_flown"], 0)
-        flag[~np.isfinite(level[k])] = FLAG_CODES["out_of_coverage"]
-        flag[~targets.known] = FLAG_CODES["no_position"]
+        flag = np.where(guess[k], _FLAG_CODES["outside_flown"], 0)
+        flag[~np.isfinite(level[k])] = _FLAG_CODES["out_of_coverage"]
+        flag[~targets.known] = _FLAG_CODES["no_position"]
         parts.append(rows(source.tower, source.channel, flag, slice(None), values))
     for tower, index, p in _ranks(targets, receivers, site, progress):
         values = dict(zip(RANKS, p.T, strict=True))
@@ -429,7 +429,7 @@ def _levels(
 def _in_parts(targets: Targets) -> Iterator[tuple[IntArray, float]]:
     """Targets that have a position, neighbours at a time, and the share that is then done."""
     known = np.flatnonzero(targets.known)
-    tile = np.floor(targets.position_m[known, :2] / TILE_M)
+    tile = np.floor(targets.position_m[known, :2] / _TILE_M)
     known = known[np.lexsort(tile.T)]
     for start in range(0, len(known), AT_ONCE):
         rows = known[start : start + AT_ONCE]
@@ -522,7 +522,7 @@ def _ranks(
 def _place_and_nose(targets: Targets, rows: IntArray) -> FloatArray:
     """Place and nose (n, 5) in units [m] in which ranks differ alike."""
     yaw = np.radians(np.nan_to_num(targets.yaw_deg[rows]))
-    return np.column_stack([targets.position_m[rows], NOSE_M * np.sin(yaw), NOSE_M * np.cos(yaw)])
+    return np.column_stack([targets.position_m[rows], _NOSE_M * np.sin(yaw), _NOSE_M * np.cos(yaw)])
 
 
 def run_predict(

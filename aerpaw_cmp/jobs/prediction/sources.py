@@ -28,7 +28,7 @@ from ..learning.calibrate import load_calibration
 from ..tasks.manifest import inputs_of_flight
 from .where import is_settings, level_samples
 
-REPLAYED_AT_ONCE = 20_000
+_REPLAYED_AT_ONCE = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +131,8 @@ class Source:
         known = self.rt.attitude != "ignored"
         rotation = rotation_from_aircraft(flat, flat, 90.0 - np.degrees(turn) if known else flat + 90.0)
         level = np.empty(len(samples))
-        for start in range(0, len(samples), REPLAYED_AT_ONCE):
-            part = slice(start, start + REPLAYED_AT_ONCE)
+        for start in range(0, len(samples), _REPLAYED_AT_ONCE):
+            part = slice(start, start + _REPLAYED_AT_ONCE)
             poses = Poses(samples.position_m[part], rotation[part])
             replayed = replay_poses(self.site, self.rt, link, poses)
             total = replayed.rss_dbm if self.rss.field == "coherent" else replayed.rss_power_dbm
@@ -162,7 +162,7 @@ def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dic
 # --- models --------------------------------------------------------------------------------------------------------
 
 # Targets further than this from every sample that is known are flagged, horizontally and in height.
-HULL_M, HULL_UP_M = 60.0, 20.0
+_HULL_M, _HULL_UP_M = 60.0, 20.0
 
 # Level above free space and standard deviation of 4 s means (n,) [dB], and where the model is a guess.
 Levels = tuple[FloatArray, FloatArray, BoolArray]
@@ -268,9 +268,9 @@ def memory_of(place: str | Path, site: Site) -> Memory:
 
 
 def outside(position_m: FloatArray, flown: Sequence[LinkSamples]) -> BoolArray:
-    """Targets (n,) that are further than :data:`HULL_M` or :data:`HULL_UP_M` from every sample."""
+    """Targets (n,) that are further than :data:`_HULL_M` or :data:`_HULL_UP_M` from every sample."""
     from scipy.spatial import cKDTree
 
-    scaled = np.array([HULL_M, HULL_M, HULL_UP_M])
+    scaled = np.array([_HULL_M, _HULL_M, _HULL_UP_M])
     places = np.concatenate([s.position_m for s in flown])
     return np.asarray(cKDTree(places / scaled).query(position_m / scaled, distance_upper_bound=1.0)[0] > 1.0)

@@ -28,7 +28,7 @@ STEP_M = 10.0
 # Of a route without times.
 SPEED_MPS = 8.0
 
-MOST_POINTS = 2_000_000
+_MOST_POINTS = 2_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -179,8 +179,8 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
         targets = local
     else:
         targets = _route(where, site, options)
-    if len(targets) > MOST_POINTS:
-        raise UsageError(f"{len(targets)} points", expected=f"at most {MOST_POINTS}", cause="too fine a spacing")
+    if len(targets) > _MOST_POINTS:
+        raise UsageError(f"{len(targets)} points", expected=f"at most {_MOST_POINTS}", cause="too fine a spacing")
     if not targets.known.any():
         raise InputError("no point has a position", expected="east, north and height, or latitude and longitude",
                          path=where)  # fmt: skip

@@ -36,18 +36,18 @@ from ...site.site import Site
 from .audit_raw import raw_checked
 
 # Logged attitudes that are turned into rotations a second time.
-ATTITUDE_ROWS = 200
+_ATTITUDE_ROWS = 200
 
 # Both are float64; telemetry instants are exact to a nanosecond.
-ATTITUDE_TOLERANCE_RAD = 1e-6
+_ATTITUDE_TOLERANCE_RAD = 1e-6
 
 # Of all series together, at least three each: some 0.1 s apiece.
-REFERENCE_LINKS_AT_MOST = 64
+_REFERENCE_LINKS_AT_MOST = 64
 
-TIMES = "The time of the engine is its share for the audited links; that of the reference includes its start-up."
+_TIMES = "The time of the engine is its share for the audited links; that of the reference includes its start-up."
 
 # What no audit of the replay can see.
-NOT_COVERED = (
+_NOT_COVERED = (
     "whether reflection off smooth half-spaces and flat walls is what the place does",
     "positions of footprints and trees; intervals",
     "geometry of paths off crowns; terrain that blocks",
@@ -102,7 +102,7 @@ def _audit(
     """One audit over all series: links are shared out in proportion to their poses."""
     ks = data.settings.rank.k
     total = sum(len(r.poses) for r in replays)
-    few = int(np.clip(REFERENCE_LINKS_AT_MOST // max(len(replays), 1), 3, REFERENCE_LINKS))
+    few = int(np.clip(_REFERENCE_LINKS_AT_MOST // max(len(replays), 1), 3, REFERENCE_LINKS))
     parts: list[Audit] = []
     for site, replayed, expected in standing(data, replays):
         count = len(replayed.poses)
@@ -128,8 +128,8 @@ def _audit(
         rank_disagreement={k: sum(p.rank_disagreement[k] * p.links for p in parts) / links for k in ks},
         seconds=sum(r.replay.seconds for r in replays) * links / max(total, 1),
         reference_seconds=sum(p.reference_seconds for p in parts),
-        note=" ".join([TIMES, *_rays(parts)]),
-        fields=dataclasses.replace(fields, not_covered=(*fields.not_covered, *NOT_COVERED)),
+        note=" ".join([_TIMES, *_rays(parts)]),
+        fields=dataclasses.replace(fields, not_covered=(*fields.not_covered, *_NOT_COVERED)),
     )
 
 
@@ -152,7 +152,7 @@ def _of_series(rt: RtSettings, site: Site, replayed: Replayed, second: Second) -
 
 
 # At so many moments a tower that moves is audited as one that stands where it was then; each is a scene of its own.
-MOMENTS = 6
+_MOMENTS = 6
 
 
 def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected]]:
@@ -163,7 +163,7 @@ def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Si
             continue
         (tower,) = replayed.link.tower_arrays
         count = len(replayed.poses)
-        for at in spread_out(count, MOMENTS).tolist():
+        for at in spread_out(count, _MOMENTS).tolist():
             pose = Poses(replayed.poses.position_m[at : at + 1], replayed.poses.rotation[at : at + 1])
             moment = dataclasses.replace(
                 replayed,
@@ -188,7 +188,7 @@ def _rays(parts: Sequence[Audit]) -> list[str]:
 def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected]:
     """For each replay what the settings say of its link and losses."""
     settings = [*(s.link for s in data.rss), *[data.settings.link.rank] * len(data.rank)]
-    loss = expected_loss(data.settings.rt)
+    loss = _expected_loss(data.settings.rt)
     if len(settings) != len(replays):  # part of the flight: from the links themselves
         return [Expected.of(r.link, loss) for r in replays]
     return [
@@ -197,7 +197,7 @@ def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected
     ]
 
 
-def expected_loss(rt: RtSettings) -> reference.ExpectedLoss:
+def _expected_loss(rt: RtSettings) -> reference.ExpectedLoss:
     """Foliage and reflection loss as ``rt`` has them."""
     return reference.ExpectedLoss(
         model=rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
@@ -268,7 +268,7 @@ def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudi
     times, angles = _logged_attitudes(data.files)
     if not len(times):
         return FieldAudit(not_covered=("the attitude: the telemetry has none",))
-    rows = spread_out(len(times), ATTITUDE_ROWS)
+    rows = spread_out(len(times), _ATTITUDE_ROWS)
     at = data.track.pose_at(times[rows])
     used = np.flatnonzero(at.valid & at.attitude_known)
     rotation = attitude_rotation(at, mode)
@@ -278,7 +278,7 @@ def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudi
         expected = np.array(reference.aircraft(*((roll, pitch) if mode == "logged" else (0.0, 0.0)), yaw))
         worst = max(worst, float(np.abs(expected - rotation[index]).max()))
     failures = (
-        (f"rotations differ from the logged attitude by {worst:.2g} rad",) if worst > ATTITUDE_TOLERANCE_RAD else ()
+        (f"rotations differ from the logged attitude by {worst:.2g} rad",) if worst > _ATTITUDE_TOLERANCE_RAD else ()
     )
     return FieldAudit(attitude_rows=len(used), attitude_max_rad=worst, failures=failures)
 

@@ -35,13 +35,13 @@ from ...site.site import Tower
 SAMPLES = 48
 
 # Larger logs are not read twice: a report of some gigabytes stays quick.
-LARGEST_LOG = 1 << 25
+_LARGEST_LOG = 1 << 25
 
 # From the site's origin; beyond it the plane of the second way parts from the geodesic.
-FURTHEST_M = 5_000.0
+_FURTHEST_M = 5_000.0
 
 # Largest differences by kind, with the unit. Coherent levels have more in fades, as much as 0.01 rad does there.
-TOLERANCES = {
+_TOLERANCES = {
     "time": (1e-3, "s"), "position": (0.005, "m"), "rotation": (1e-5, "rad"), "measured level": (1e-3, "dB"),
     "simulated level": (0.01, "dB"), "compared level": (1e-6, "dB"), "offset": (1e-6, "dB"), "RMSE": (1e-6, "dB"),
     "tower": (0.005, "m"), "rank": (0.5, ""), "clock": (1e-6, "s"),
@@ -62,7 +62,7 @@ class _Account:
         """One comparison; NaN is a failure, ``spare`` more than the tolerance is allowed."""
         off = difference if math.isfinite(difference) else math.inf
         self.count[kind] = self.count.get(kind, 0) + 1
-        self.failed[kind] = self.failed.get(kind, 0) + (off > TOLERANCES[kind][0] + spare)
+        self.failed[kind] = self.failed.get(kind, 0) + (off > _TOLERANCES[kind][0] + spare)
         if off > self.worst.get(kind, (-1.0, ""))[0]:
             self.worst[kind] = (off, where)
 
@@ -77,10 +77,10 @@ class _Account:
         for kind, count in self.failed.items():
             if count:
                 off, where = self.worst[kind]
-                shown = f"by {off:.3g} {TOLERANCES[kind][1]}" if math.isfinite(off) else "altogether"
+                shown = f"by {off:.3g} {_TOLERANCES[kind][1]}" if math.isfinite(off) else "altogether"
                 share = f"{count} of {self.count[kind]}"
                 failures.append(f"from raw bytes: {kind} differs {shown} at {where} ({share} differ)")
-        most = {kind: self.worst.get(kind, (0.0, ""))[0] for kind in TOLERANCES}
+        most = {kind: self.worst.get(kind, (0.0, ""))[0] for kind in _TOLERANCES}
         return FieldAudit(
             raw_samples=self.count.get("measured level", 0),
             raw_poses=self.count.get("rotation", 0),
@@ -162,12 +162,12 @@ def _log(data: FlightData, settings: LogSettings, file: IngestedFile, account: _
 def _content(path: Path, sha256: str) -> bytes | None:
     """The bytes that the report names by their hash."""
     try:
-        if path.stat().st_size > LARGEST_LOG:
+        if path.stat().st_size > _LARGEST_LOG:
             return None
         content = path.read_bytes()
         if content[:2] == b"\x1f\x8b":
             with gzip.open(path) as book:
-                content = book.read(LARGEST_LOG)
+                content = book.read(_LARGEST_LOG)
     except (OSError, EOFError):
         return None
     return content if hashlib.sha256(content).hexdigest() == sha256 else None
@@ -236,7 +236,7 @@ def _towers_checked(data: FlightData, account: _Account) -> dict[str, Tower]:
         apart_m = float(np.linalg.norm(ours.position_m - np.array([east, north, ground + height])))
         spare = 1e-6 * math.hypot(east, north)
         account.add(
-            "tower", apart_m, f"tower {name}", spare=spare if math.hypot(east, north) < FURTHEST_M else math.inf
+            "tower", apart_m, f"tower {name}", spare=spare if math.hypot(east, north) < _FURTHEST_M else math.inf
         )
         out[name] = replace(ours, east_m=east, north_m=north, ground_m=ground, antenna_height_m=height)
     return out
@@ -277,7 +277,7 @@ def _track_checked(data: FlightData, path: RawPath, account: _Account) -> None:
 
 def _pose_checked(pose: Pose, place: FloatArray, turn: FloatArray | None, where: str, account: _Account) -> None:
     horizontal_m = math.hypot(*pose.place_m[:2])
-    if horizontal_m < FURTHEST_M:
+    if horizontal_m < _FURTHEST_M:
         account.add("position", math.dist(pose.place_m, place.tolist()), where, spare=1e-6 * horizontal_m)
     if turn is not None and pose.turn is not None:
         account.add("rotation", float(np.abs(np.array(pose.turn) - turn).max()), where)
@@ -411,15 +411,15 @@ class _Series:
         if clock is None or self.path is None or reference is None or clock.result.applied != APPLIED:
             return
         ahead = clock.result.radio_minus_telemetry_s
-        if abs(ahead) < LEAST_AHEAD_S:
+        if abs(ahead) < _LEAST_AHEAD_S:
             return
         known = np.flatnonzero(self.replayed.valid & np.isfinite(self.series.measured_db))
-        rows = known[spread_out(len(known), CLOCK_SAMPLES)]
+        rows = known[spread_out(len(known), _CLOCK_SAMPLES)]
         spreads = []
         for sign in (-1.0, 1.0):
             error = [self._residual_db(reference, row, sign * ahead) for row in rows.tolist()]
-            spreads.append(float(np.nanstd(error)) if np.isfinite(error).sum() > CLOCK_SAMPLES // 2 else math.nan)
-        if spreads[1] < WRONG_SIGN * spreads[0]:
+            spreads.append(float(np.nanstd(error)) if np.isfinite(error).sum() > _CLOCK_SAMPLES // 2 else math.nan)
+        if spreads[1] < _WRONG_SIGN * spreads[0]:
             self.account.broken.append(
                 f"from raw bytes: the radio clock of {self.name}, {ahead:+.2f} s, has the wrong sign: the level varies "
                 f"by {spreads[0]:.1f} dB about the prediction with it, by {spreads[1]:.1f} dB with its opposite"
@@ -439,7 +439,7 @@ class _Series:
 
 
 # Clocks nearer to the telemetry's have no sign to see; samples; wrong is a sign whose opposite spreads a tenth less.
-LEAST_AHEAD_S, CLOCK_SAMPLES, WRONG_SIGN = 0.2, 60, 0.9
+_LEAST_AHEAD_S, _CLOCK_SAMPLES, _WRONG_SIGN = 0.2, 60, 0.9
 
 
 def _value(reading: Reading, series: RssSeries, log: LogSettings) -> float | None:

@@ -53,17 +53,17 @@ from .levels import Levels, at_samples, levels_of, stated_spread
 from .likely_cause import cause_of
 
 # Both sides are averaged over these windows to see how much of the error is fading.
-AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
+_AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
 
 # And over stretches of path, each of which counts once, however long the UAV hovered there.
-AVERAGING_WAVELENGTHS, AVERAGING_LENGTH_M = 40, 20.0
+_AVERAGING_WAVELENGTHS, _AVERAGING_LENGTH_M = 40, 20.0
 
 # Two passes of one place, first and second half of a flight, come this near.
-PASSES_WITHIN_M = 3.0
+_PASSES_WITHIN_M = 3.0
 
 
 # A shorter stretch of large error is a fade.
-SHORTEST_S = 5.0
+_SHORTEST_S = 5.0
 
 
 def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
@@ -81,7 +81,7 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
 
 
 # A prediction of another cell at most this long before or after stands for the moment: phones report once a second.
-SERVING_WITHIN_S = 1.5
+_SERVING_WITHIN_S = 1.5
 
 
 def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> ServingComparison | None:
@@ -105,7 +105,7 @@ def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> Ser
     for j, (cell, result) in enumerate(cells):
         order = np.argsort(cell.time, kind="stable")
         seconds = ((cell.time - start) / np.timedelta64(1, "s"))[order]
-        predicted[:, j] = at_times(at, seconds, result.simulated_dbm[order], within_s=SERVING_WITHIN_S)
+        predicted[:, j] = at_times(at, seconds, result.simulated_dbm[order], within_s=_SERVING_WITHIN_S)
     return compare_serving(np.concatenate(served), predicted, [f"{cell.tower} {cell.channel}" for cell, _ in cells])
 
 
@@ -180,7 +180,7 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
     geometry = link_geometry(data.site, series.tower, replayed, data.settings.rt)
     simple = {
         name: at_samples(series, replayed, level, settings)
-        for name, level in baseline_levels(data.site, series.tower, replayed).items()
+        for name, level in _baseline_levels(data.site, series.tower, replayed).items()
     }
     position = replayed.spread(replayed.poses.position_m)
     simple |= _fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
@@ -231,7 +231,7 @@ def _further(
         compared_with={},
         averaged={},
         explained_by=explained_by,
-        repeatability={name: repeatability(*pair, PASSES_WITHIN_M) for name, pair in passes.items()},
+        repeatability={name: repeatability(*pair, _PASSES_WITHIN_M) for name, pair in passes.items()},
         simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
         error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
         elsewhere=_elsewhere(case.data, series),
@@ -273,7 +273,7 @@ def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[st
     return parts | ({} if residual_db is None else inside_shares(residual_db, stated))
 
 
-def baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
+def _baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
     """Free space and two-ray (isotropic) at the replayed poses (n,) [dBm]."""
     place, link = site.towers[tower], replayed.link
     source, target = replayed.source_m(site), replayed.poses.position_m
@@ -321,10 +321,10 @@ def _averaged(
     }
     wavelength = wavelength_m(series.link.carrier_hz)
     lengths = {
-        f"{AVERAGING_WAVELENGTHS} wavelengths of path": AVERAGING_WAVELENGTHS * wavelength,
-        f"{AVERAGING_LENGTH_M:g} m of path": AVERAGING_LENGTH_M,
+        f"{_AVERAGING_WAVELENGTHS} wavelengths of path": _AVERAGING_WAVELENGTHS * wavelength,
+        f"{_AVERAGING_LENGTH_M:g} m of path": _AVERAGING_LENGTH_M,
     }
-    averages = {f"{w:g} s": partial(rss.local_mean_db, series.time, window_s=w) for w in AVERAGING_WINDOWS_S}
+    averages = {f"{w:g} s": partial(rss.local_mean_db, series.time, window_s=w) for w in _AVERAGING_WINDOWS_S}
     averages |= {name: partial(rss.stretch_means_db, rss.stretches(position_m, m)) for name, m in lengths.items()}
     fits = rss.averaged_fits(levels.measured_db, simulations, averages, **settings.offsets)
     return {
@@ -526,7 +526,7 @@ def _worst(
         if ours in geometry:
             context[theirs] = geometry[ours]
     spans = rss.error_spans(time, residual_db, position_m=position_m, context=context, largest=len(residual_db))
-    return [span for span in spans if span.end_s - span.start_s >= SHORTEST_S][:6]
+    return [span for span in spans if span.end_s - span.start_s >= _SHORTEST_S][:6]
 
 
 # --- rank ----------------------------------------------------------------------------------------------------------
@@ -608,4 +608,4 @@ def _repeated_rank(
 ) -> dict[str, ranks.RankRepeat]:
     """Agreement of the modem with itself where the second half of the flight passes places of the first."""
     passes = _halves(time, position_m, rank, heading_deg)
-    return {name: ranks.repeat_rank(*pair, PASSES_WITHIN_M) for name, pair in passes.items()}
+    return {name: ranks.repeat_rank(*pair, _PASSES_WITHIN_M) for name, pair in passes.items()}

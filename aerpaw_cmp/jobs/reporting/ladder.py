@@ -39,13 +39,13 @@ from ...site.sphere_pattern import SpherePattern
 from .levels import Levels, levels_of
 
 # Loss of the weakened ground reflection: a smooth half-space reflects more than any field.
-WEAK_GROUND_DB = 10.0
+_WEAK_GROUND_DB = 10.0
 
 # Per series; of longer ones every second, third, ... sample is taken.
-MOST_SAMPLES = 4000
+_MOST_SAMPLES = 4000
 
 AS_SET = "as set in flight.yaml"
-FREE_SPACE = BASELINE_TITLE["free_space"]
+_FREE_SPACE = BASELINE_TITLE["free_space"]
 # Lines that replay nothing: what a model must beat to be worth its name.
 LINES = BASELINE_TITLE["constant"], BASELINE_TITLE["log_distance"]
 
@@ -57,7 +57,7 @@ Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
 Trees = Literal["none", "p833", "weissberger", "opaque"]
 
 # What the ladder calls the sums and losses of the ground reflection.
-GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "rough": "rough", "power sum": "incoherent"}
+_GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "rough": "rough", "power sum": "incoherent"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,12 +82,12 @@ class Model:
         }[self.antennas]  # fmt: skip
         parts += {"ignored": [], "level": ["heading"], "logged": ["attitude"]}[self.attitude]
         if self.ground != "none":
-            parts.append(f"{GROUND_WORDS[self.ground]} ground reflection")
+            parts.append(f"{_GROUND_WORDS[self.ground]} ground reflection")
         parts += ["buildings"] if self.buildings else []
         parts += ["diffraction"] if self.diffraction else []
         if self.trees != "none":
             parts.append("opaque trees" if self.trees == "opaque" else f"trees ({self.trees})")
-        return FREE_SPACE if not parts else " + ".join(parts)
+        return _FREE_SPACE if not parts else " + ".join(parts)
 
     def settings(self, max_depth: int) -> dict[str, dict[str, Any]]:
         """The keys of flight.yaml that make it, ``max_depth`` that of the flight file."""
@@ -95,7 +95,7 @@ class Model:
         rt: dict[str, Any] = {
             "max_depth": depth,
             "attitude": self.attitude,
-            "reflection_loss_db": WEAK_GROUND_DB if self.ground == "weakened" else 0.0,
+            "reflection_loss_db": _WEAK_GROUND_DB if self.ground == "weakened" else 0.0,
             **({"ground_roughness_m": self.roughness_m} if self.ground == "rough" else {}),
             "foliage": "none" if self.trees == "none" else "opaque" if self.trees == "opaque" else "attenuating",
         }
@@ -149,7 +149,7 @@ def flight_ladder(data: FlightData, replays: FlightReplay) -> FlightLadder | Non
 def _sampled(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: RssSettings) -> _Series:
     levels = levels_of(rss[index], replayed, rules)
     comparable = np.flatnonzero(levels.posed & np.isfinite(levels.measured_db))
-    step = max(1, -(-len(comparable) // MOST_SAMPLES))
+    step = max(1, -(-len(comparable) // _MOST_SAMPLES))
     rows = comparable[::step]
     pose_of = np.cumsum(replayed.valid) - 1
     seconds = (rss[index].time - rss[0].time[:1]) / np.timedelta64(1, "s")

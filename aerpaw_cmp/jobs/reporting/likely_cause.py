@@ -17,7 +17,7 @@ from ...site.antennas import Isotropic
 from ...site.site import Site
 from .levels import Levels
 
-ANGLES_DEG = tuple(float(angle) for angle in range(10, 360, 10))
+_ANGLES_DEG = tuple(float(angle) for angle in range(10, 360, 10))
 
 
 def cause_of(site: Site, series: RssSeries, replayed: Replayed, levels: Levels, free_space: FloatArray) -> Cause | None:
@@ -87,7 +87,7 @@ def _turned(site: Site, replayed: Replayed, directions: Mapping[str, FloatArray]
     if all(isinstance(pattern, Isotropic) for pattern in array.patterns):
         return {}
     changes = {}
-    for angle in ANGLES_DEG:
+    for angle in _ANGLES_DEG:
         turn = math.radians(-angle)  # a heading grows clockwise
         rotation = np.array(
             [[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]]

@@ -35,10 +35,10 @@ from .outcomes import code_digest
 Task = Callable[[Any], Any]
 
 # Gets the number of an item and the result of its task, or :class:`Lost`.
-OnResult = Callable[[int, Any], None]
+_OnResult = Callable[[int, Any], None]
 
 # A task in work when a worker is lost is tried again; after so many tries once more, alone.
-TRIES = 2
+_TRIES = 2
 
 # Time for a scheduler to answer, after which one without a worker is spoken of, and between counts of workers.
 CONNECT_S, NO_WORKER_S, COUNT_EVERY_S = 10.0, 30.0, 2.0
@@ -51,7 +51,7 @@ class Lost:
     message: str
 
 
-ENDED = Lost("its worker process ended, time after time: out of memory, or killed")
+_ENDED = Lost("its worker process ended, time after time: out of memory, or killed")
 
 
 class Workers(Protocol):
@@ -61,7 +61,7 @@ class Workers(Protocol):
     def count(self) -> int:
         """Tasks at a time."""
 
-    def run(self, function: Task, items: Sequence[Any], on_result: OnResult) -> None:
+    def run(self, function: Task, items: Sequence[Any], on_result: _OnResult) -> None:
         """``function`` of every item, in any order; ``on_result`` gets number and result as they come."""
 
 
@@ -70,7 +70,7 @@ class InProcess:
 
     count = 1
 
-    def run(self, function: Task, items: Sequence[Any], on_result: OnResult) -> None:  # noqa: D102
+    def run(self, function: Task, items: Sequence[Any], on_result: _OnResult) -> None:  # noqa: D102
         for number, item in enumerate(items):
             on_result(number, function(item))
 
@@ -84,18 +84,18 @@ class Processes:
     def __init__(self, count: int) -> None:
         self.count = count
 
-    def run(self, function: Task, items: Sequence[Any], on_result: OnResult) -> None:  # noqa: D102
+    def run(self, function: Task, items: Sequence[Any], on_result: _OnResult) -> None:  # noqa: D102
         with contextlib.ExitStack() as stack:
             crew = [stack.enter_context(_Worker(function)) for _ in range(min(self.count, len(items)))]
             tries: Counter[int] = Counter()
             killed = _through(crew, items, deque(range(len(items))), tries, on_result)
             for number in killed:  # a last time, so that none pays for its neighbour
                 if _through(crew[:1], items, deque([number]), tries, on_result):
-                    on_result(number, ENDED)
+                    on_result(number, _ENDED)
 
 
 def _through(
-    crew: Sequence[_Worker], items: Sequence[Any], waiting: deque[int], tries: Counter[int], on_result: OnResult
+    crew: Sequence[_Worker], items: Sequence[Any], waiting: deque[int], tries: Counter[int], on_result: _OnResult
 ) -> list[int]:
     """Run some tasks; gives those that lost their worker too often."""
     killed: list[int] = []
@@ -113,7 +113,7 @@ def _through(
             except (EOFError, OSError):
                 worker.start_anew()
                 tries[number] += 1
-                (waiting if tries[number] < TRIES else killed).append(number)
+                (waiting if tries[number] < _TRIES else killed).append(number)
             else:
                 on_result(number, content if succeeded else Lost(f"its worker process ended: {content}"))
     return killed
@@ -202,13 +202,13 @@ class Cluster:
         """Threads of all workers that are there now."""
         return max(1, int(sum(self._client.nthreads().values())))
 
-    def run(self, function: Task, items: Sequence[Any], on_result: OnResult) -> None:  # noqa: D102
+    def run(self, function: Task, items: Sequence[Any], on_result: _OnResult) -> None:  # noqa: D102
         killed = self._through(function, items, range(len(items)), on_result)
         for number in killed:  # a last time, so that none pays for its neighbour
             if self._through(function, items, [number], on_result):
-                on_result(number, ENDED)
+                on_result(number, _ENDED)
 
-    def _through(self, function: Task, items: Sequence[Any], numbers: Iterable[int], on_result: OnResult) -> list[int]:
+    def _through(self, function: Task, items: Sequence[Any], numbers: Iterable[int], on_result: _OnResult) -> list[int]:
         """Run some; gives those that lost their worker too often, as Dask counts."""
         killed: list[int] = []
         active = {self._client.submit(function, items[number], pure=False): number for number in numbers}
@@ -353,7 +353,7 @@ class WorkerFacts:
     missing: tuple[str, ...]
 
 
-def worker_facts(paths: Sequence[str]) -> WorkerFacts:
+def _worker_facts(paths: Sequence[str]) -> WorkerFacts:
     """Of the process that this runs in."""
     from ... import __version__
 
@@ -374,8 +374,8 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
     UsageError
         Naming worker, host and what is wrong.
     """
-    answers = client.run(worker_facts, [str(path.absolute()) for path in paths], on_error="return")
-    ours = worker_facts([])
+    answers = client.run(_worker_facts, [str(path.absolute()) for path in paths], on_error="return")
+    ours = _worker_facts([])
     wrong = [f"{worker}: {text}" for worker, facts in answers.items() if (text := _trouble(facts, ours))]
     if wrong:
         more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""

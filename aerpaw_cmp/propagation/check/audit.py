@@ -28,7 +28,7 @@ from .field_audit import (
 )
 
 # Rays of the solve that gives Sionna's own coefficients: which paths there are is asked before, with all of them.
-FIELD_SAMPLES = 100_000
+_FIELD_SAMPLES = 100_000
 
 # Singular-value ratios of the paper.
 RANK_K = (10.0, 100.0, 1000.0)
@@ -145,7 +145,7 @@ def audit(
     search = replace(search, engine=engine)
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
     checked = run_replay(site, link, few, search, Field(field.loss), run)
-    rays = checked.samples or (FIELD_SAMPLES if search.samples == "auto" else search.samples)
+    rays = checked.samples or (_FIELD_SAMPLES if search.samples == "auto" else search.samples)
     fields, ks, expected = None, second.ks, second.expected
     if expected is not None:
         fields = FieldAudit(not_covered=("the second implementation: it knows prisms, no scene of triangles",))
@@ -157,7 +157,7 @@ def audit(
         fields += per_pair(site, link, poses, replay, chosen, replace(search, engine="image"), Field(field.loss), ks=ks)
         if site.scene is None:
             fields += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
-        rayed = replace(search, samples=min(rays, FIELD_SAMPLES))
+        rayed = replace(search, samples=min(rays, _FIELD_SAMPLES))
         fields += against_sionna(site, link, poses, replay, chosen, expected, rayed, complete=complete)
     return Audit(
         field=fields,

@@ -20,7 +20,7 @@ from ...common.units import ComplexArray, FloatArray
 from .reference import C_MPS, MARGIN_M, Matrix, Reference, Vector, element_wave, fresnel, permittivity, product
 
 # Share of an edge's length beside its ends where nothing is judged.
-NEAR_EDGE = 1e-6
+_NEAR_EDGE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Corner:
     solid: int
 
 
-def corners_of(reference: Reference) -> Iterator[Corner]:
+def _corners_of(reference: Reference) -> Iterator[Corner]:
     """Rims and convex upright corners of the site's buildings without holes."""
     ground = reference.site.towers[reference.tower].ground_m
     for number, building in enumerate(reference.site.buildings):
@@ -82,7 +82,7 @@ def bent_matrix(reference: Reference, target: Vector, turn: Matrix) -> tuple[int
     tower = reference.link.towers[reference.tower]
     h = np.zeros((len(reference.link.uav.positions_m), len(tower.positions_m)), dtype=np.complex128)
     count, power = 0, 0.0
-    for corner in corners_of(reference):
+    for corner in _corners_of(reference):
         for below in ((False, False), (False, True), (True, False), (True, True)):
             bend = _Bend(reference, corner, below, np.array(target), turn)
             verdict = bend.verdict()
@@ -122,12 +122,12 @@ class _Bend:
             return sum(float(np.linalg.norm(c.start + x * (c.end - c.start) - p)) for p in self.ends)
 
         best = minimize_scalar(length, bounds=(-0.01, 1.01), method="bounded", options={"xatol": 1e-13}).x
-        if not -NEAR_EDGE < best < 1 + NEAR_EDGE:
+        if not -_NEAR_EDGE < best < 1 + _NEAR_EDGE:
             return False
         self.point = c.start + best * (c.end - c.start)
         if any(self.below) and self.point[2] - self.ground < 0.01:
             return False
-        if min(abs(best), abs(1 - best)) <= NEAR_EDGE or min(sides) < MARGIN_M:
+        if min(abs(best), abs(1 - best)) <= _NEAR_EDGE or min(sides) < MARGIN_M:
             return None
         loose = strict = False
         for a, b, spared in self._legs():

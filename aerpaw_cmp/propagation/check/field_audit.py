@@ -2,7 +2,7 @@
 
 1. *Sionna* traces the audited links once more and gives, for each path, its own complex coefficient with one element at
    each array centre, in both slants, from its own materials, patterns and rotations. Float32: power within
-   ``POWER_TOLERANCE_DB``, phase within ``PHASE_TOLERANCE_RAD`` on paths shorter than ``PHASE_RANGE_M``.
+   ``_POWER_TOLERANCE_DB``, phase within ``_PHASE_TOLERANCE_RAD`` on paths shorter than ``_PHASE_RANGE_M``.
 2. :mod:`aerpaw_cmp.propagation.check.reference` computes a few links of each replay from the settings: its paths, H of
    every element pair with foliage, RSS and rank. Both are float64: the difference is rounding.
 """
@@ -34,30 +34,30 @@ from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Refere
 
 # Of one path in one pair of slants. Float32 coordinates move an angle of incidence by 1e-5; near Brewster's angle and
 # at the edge of a pattern's cut-off the coefficient turns that into some hundredths of a decibel.
-POWER_TOLERANCE_DB = 0.05
+_POWER_TOLERANCE_DB = 0.05
 
-# Float32 moves a reflection point off its plane by 1e-4 m at most within ``PHASE_RANGE_M``: 7e-3 rad at 3.4 GHz.
-PHASE_TOLERANCE_RAD = 0.01
+# Float32 moves a reflection point off its plane by 1e-4 m at most within ``_PHASE_RANGE_M``: 7e-3 rad at 3.4 GHz.
+_PHASE_TOLERANCE_RAD = 0.01
 
-PHASE_RANGE_M = 300.0
+_PHASE_RANGE_M = 300.0
 
 # Entries this far below the largest of a path's four are compared with the largest: float32 has no digits for them.
-WEAK_DB = 20.0
+_WEAK_DB = 20.0
 
 # Of H against the second implementation, relative to the root of the links' mean path power; both are float64.
-EXACT_TOLERANCE = 1e-6
+_EXACT_TOLERANCE = 1e-6
 
 # As that, where paths over edges are in H: their second transition function is a series cut off at 1e-5.
-EDGE_TOLERANCE = 3e-5
+_EDGE_TOLERANCE = 3e-5
 
 # A path that a move of an edge by this much makes or breaks may differ in float32.
-SIONNA_MARGIN_M = 2e-3
+_SIONNA_MARGIN_M = 2e-3
 
 # Links per replay for the second implementation.
 REFERENCE_LINKS = 8
 
 # Patterns of this package that Sionna has too.
-SIONNA_PATTERNS = {"iso": "iso", "hw_dipole": "hw_dipole", "tr38901": "tr38901"}
+_SIONNA_PATTERNS = {"iso": "iso", "hw_dipole": "hw_dipole", "tr38901": "tr38901"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,7 @@ def against_reference(
         for row in chosen:
             mine = np.flatnonzero((replay.paths.pose == row) & (replay.paths.tower == number))
             if beyond[mine].any() or stands:
-                total += FieldAudit(not_covered=(STANDS if stands else ON_TERRAIN,))
+                total += FieldAudit(not_covered=(_STANDS if stands else _ON_TERRAIN,))
                 continue
             link = _OneLink(reference=reference, replay=replay, poses=poses, row=int(row), tower=number, mine=mine)
             total += link.paths_checked(max_depth, complete and site.dem is None)
@@ -185,8 +185,8 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
     return FieldAudit(phantom_paths=count, failures=failures)
 
 
-STANDS = "paths at forests that are a medium"
-ON_TERRAIN = "reflections off shaped ground, and paths over ridges of the terrain"
+_STANDS = "paths at forests that are a medium"
+_ON_TERRAIN = "reflections off shaped ground, and paths over ridges of the terrain"
 
 
 def _over_terrain(replay: Replay) -> BoolArray:
@@ -282,7 +282,7 @@ class _OneLink:
             count = int(((bent.pose == self.row) & (bent.tower == self.tower)).sum())
             if count != again[0]:
                 failures.append(f"{self.name}: {count} paths over edges, expected {again[0]}")
-        h, tolerance = h.T if link.uav_transmits else h, EXACT_TOLERANCE if bent is None else EDGE_TOLERANCE
+        h, tolerance = h.T if link.uav_transmits else h, _EXACT_TOLERANCE if bent is None else _EDGE_TOLERANCE
         return FieldAudit(failures=tuple(failures)) + self._against(h, power, ks, tolerance, len(paths))
 
     def _against(self, h: ComplexArray, power: float, ks: Sequence[float], tolerance: float, paths: int) -> FieldAudit:
@@ -346,7 +346,7 @@ def _level_error(level_dbm: float, power: float, transmit_dbm: float, size: floa
     if not math.isfinite(level_dbm):
         return math.inf
     off = abs(level_dbm - transmit_dbm - 10 * math.log10(power))
-    rounding = 20 / math.log(10) * EXACT_TOLERANCE * size / math.sqrt(power)
+    rounding = 20 / math.log(10) * _EXACT_TOLERANCE * size / math.sqrt(power)
     return max(0.0, off - rounding)
 
 
@@ -502,9 +502,9 @@ def per_pair(
 EXPLICIT_POSES, EXPLICIT_RANGE_M = 10, 150.0
 
 # Of the largest entry of H, on the better half of the links; found: 4e-4.
-EXPLICIT_TOLERANCE = 0.01
+_EXPLICIT_TOLERANCE = 0.01
 
-EXPLICIT_SAMPLES = 50_000
+_EXPLICIT_SAMPLES = 50_000
 
 
 def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
@@ -523,7 +523,7 @@ def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
         return FieldAudit()
     some = Poses(few.position_m[near], few.rotation[near])
     scene = Scene.of(site, link, some)
-    rays = Rays(max_depth=max_depth, samples=EXPLICIT_SAMPLES, batch=EXPLICIT_POSES)
+    rays = Rays(max_depth=max_depth, samples=_EXPLICIT_SAMPLES, batch=EXPLICIT_POSES)
     theirs = own_channels(
         scene.faces, scene.links_to(some), some.rotation, link, rays, explicit=True, surfaces=scene.surfaces
     )
@@ -531,7 +531,7 @@ def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
     size = np.abs(ours).max(axis=(2, 3))
     error = np.sort(np.abs(theirs - ours).max(axis=(2, 3))[size > 0] / size[size > 0])
     worst = float(error[: (len(error) + 1) // 2].max(initial=0.0))
-    bad = worst > EXPLICIT_TOLERANCE
+    bad = worst > _EXPLICIT_TOLERANCE
     failures = (f"H differs from Sionna's explicit arrays by {worst:.2g} of its size at short range",) if bad else ()
     return FieldAudit(explicit_links=len(error), explicit_max_error=worst, failures=failures)
 
@@ -542,7 +542,7 @@ def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
 
     def centre(array: Array) -> Array:
         first = array.patterns[0]
-        if first.name not in SIONNA_PATTERNS:
+        if first.name not in _SIONNA_PATTERNS:
             unasked.append(f"the antenna pattern '{first.name}' (Sionna is asked with isotropic elements)")
             first = Isotropic()
         slants = array.slant_rad[0] + np.array([0.0, np.pi / 2])
@@ -577,23 +577,23 @@ def _paths_against_sionna(
     h = channel_matrices(alone, replay.faces, scene.sources_m, spots, probe).h[np.arange(count), ours.tower]
     reference = theirs.gain[matches]
     size = np.abs(reference).max(axis=(1, 2))
-    strong = np.abs(reference) > size[:, None, None] * 10 ** (-WEAK_DB / 20)
+    strong = np.abs(reference) > size[:, None, None] * 10 ** (-_WEAK_DB / 20)
     with np.errstate(divide="ignore", invalid="ignore"):
         power = np.where(strong, np.abs(20 * np.log10(np.abs(h) / np.abs(reference))), 0.0)
         # a weak entry counts by its difference as a share of the largest
         weak = 20 * np.log10(1 + np.abs(h - reference * np.exp(1j * np.angle(h / reference))) / size[:, None, None])
         power = np.where(strong, power, np.nan_to_num(weak)).max(axis=(1, 2))
         phase = np.where(strong, np.abs(np.angle(h / reference)), 0.0).max(axis=(1, 2))
-    near = theirs.length_m[matches] < PHASE_RANGE_M
+    near = theirs.length_m[matches] < _PHASE_RANGE_M
     failures = []
-    bad = int((~(power <= POWER_TOLERANCE_DB)).sum())
+    bad = int((~(power <= _POWER_TOLERANCE_DB)).sum())
     if bad:
         failures.append(f"{bad} paths differ from Sionna's own by up to {np.nanmax(power):.3g} dB")
-    wrong = int((~(phase[near] <= PHASE_TOLERANCE_RAD)).sum())
+    wrong = int((~(phase[near] <= _PHASE_TOLERANCE_RAD)).sum())
     if wrong:
         failures.append(f"{wrong} paths differ from Sionna's own by up to {np.nanmax(phase[near]):.3g} rad")
     rss = _link_error(ours, h, reference, near, len(few), len(replay.towers))
-    if rss > 2 * POWER_TOLERANCE_DB:
+    if rss > 2 * _POWER_TOLERANCE_DB:
         failures.append(f"the RSS of a link differs from Sionna's own paths by {rss:.3g} dB")
     return FieldAudit(
         paths=count,
@@ -639,7 +639,7 @@ def _lacking(
             doubtful += 1
             continue
         east, north, up = few.position_m[theirs.pose[row]].tolist()
-        exists = reference.verdict(sequence, (east, north, up), SIONNA_MARGIN_M)  # type: ignore[arg-type]
+        exists = reference.verdict(sequence, (east, north, up), _SIONNA_MARGIN_M)  # type: ignore[arg-type]
         missing += exists is True
         doubtful += exists is not True
     failures = (f"{missing} paths that Sionna has are missing",) if missing else ()

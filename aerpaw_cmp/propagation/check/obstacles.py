@@ -11,7 +11,7 @@ from ...common.units import FloatArray, IntArray
 from ..surfaces import Surfaces
 
 # A surface closer to an antenna than this hides nothing.
-NEAR_END_M = 1e-3
+_NEAR_END_M = 1e-3
 
 
 def why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray) -> str:
@@ -43,11 +43,11 @@ def why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArray
         if not good[0]:
             return f"a reflection point lies outside {surfaces.faces.label[int(sequence[0])]} or a later face"
         points = vertices[0]
-    obstacle = first_obstacle(surfaces, np.concatenate([source_m[None], points, target_m[None]]), sequence)
+    obstacle = _first_obstacle(surfaces, np.concatenate([source_m[None], points, target_m[None]]), sequence)
     return "" if obstacle is None else f"occluded by {surfaces.faces.label[obstacle]}"
 
 
-def first_obstacle(surfaces: Surfaces, corners_m: FloatArray, sequence: IntArray) -> int | None:
+def _first_obstacle(surfaces: Surfaces, corners_m: FloatArray, sequence: IntArray) -> int | None:
     """Face that cuts a path (corners, 3) over the faces ``sequence`` first, from the source; None where none does."""
     normal, offset = surfaces.faces.normal, surfaces.faces.offset_m
     for step in range(len(corners_m) - 1):
@@ -60,7 +60,7 @@ def first_obstacle(surfaces: Surfaces, corners_m: FloatArray, sequence: IntArray
             if 0 <= mirror < len(sequence):
                 keep &= np.abs(at @ normal[sequence[mirror]] - offset[sequence[mirror]]) > 2.0 * surfaces.merge_m
             else:
-                keep &= np.linalg.norm(at - end, axis=1) > NEAR_END_M
+                keep &= np.linalg.norm(at - end, axis=1) > _NEAR_END_M
         if length > 0.0 and keep.any():
             return int(face[keep][np.argmin(share[keep])])
     return None

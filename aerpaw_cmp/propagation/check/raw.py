@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+_Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 Grid = NDArray[np.float64]
 
-EQUATOR_M, FLATTENING = 6_378_137.0, 1 / 298.257_223_563
+_EQUATOR_M, _FLATTENING = 6_378_137.0, 1 / 298.257_223_563
 # Poses below this height above the take-off ground are raised to it (arXiv 2502.10324).
 LOWEST_M = 0.5
 
@@ -213,8 +213,8 @@ def east_north_m(latitude_deg: float, longitude_deg: float, origin_deg: tuple[fl
 
 def _earth_centred(latitude_deg: float, longitude_deg: float) -> Vector:
     latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
-    squeezed = FLATTENING * (2 - FLATTENING)
-    normal = EQUATOR_M / math.sqrt(1 - squeezed * math.sin(latitude) ** 2)
+    squeezed = _FLATTENING * (2 - _FLATTENING)
+    normal = _EQUATOR_M / math.sqrt(1 - squeezed * math.sin(latitude) ** 2)
     flat = normal * math.cos(latitude)
     return flat * math.cos(longitude), flat * math.sin(longitude), normal * (1 - squeezed) * math.sin(latitude)
 
@@ -222,7 +222,7 @@ def _earth_centred(latitude_deg: float, longitude_deg: float) -> Vector:
 # ---------------------------------------------------------------- attitude
 
 
-def _times(p: Quaternion, q: Quaternion) -> Quaternion:
+def _times(p: _Quaternion, q: _Quaternion) -> _Quaternion:
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -231,10 +231,10 @@ def _times(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
-def body_quaternion(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Quaternion:
+def body_quaternion(roll_deg: float, pitch_deg: float, yaw_deg: float) -> _Quaternion:
     """Nose-left-up of the aircraft to east-north-up: yaw clockwise from north, nose up +, right wing down +."""
 
-    def about(axis: int, angle_deg: float) -> Quaternion:
+    def about(axis: int, angle_deg: float) -> _Quaternion:
         half = math.radians(angle_deg) / 2
         parts = [math.cos(half), 0.0, 0.0, 0.0]
         parts[axis + 1] = math.sin(half)
@@ -243,7 +243,7 @@ def body_quaternion(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Quater
     return _times(about(2, 90.0 - yaw_deg), _times(about(1, -pitch_deg), about(0, roll_deg)))
 
 
-def between(first: Quaternion, second: Quaternion, share: float) -> Quaternion:
+def between(first: _Quaternion, second: _Quaternion, share: float) -> _Quaternion:
     """The turn after a share of the way from one to another, at constant rate by the shorter way."""
     dot = sum(a * b for a, b in zip(first, second, strict=True))
     nearer = tuple(-b for b in second) if dot < 0 else second
@@ -254,7 +254,7 @@ def between(first: Quaternion, second: Quaternion, share: float) -> Quaternion:
     return tuple(weights[0] * a + weights[1] * b for a, b in zip(first, nearer, strict=True))  # type: ignore[return-value]
 
 
-def matrix(q: Quaternion) -> Matrix:
+def matrix(q: _Quaternion) -> Matrix:
     """The rotation matrix of a unit quaternion."""
     w, x, y, z = q
     return (

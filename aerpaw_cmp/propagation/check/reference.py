@@ -24,18 +24,18 @@ from ...site.site import Site, Tower, Trees
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
-Wave = tuple[complex, complex, complex]
+_Wave = tuple[complex, complex, complex]
 # ``(theta_rad, phi_rad) -> (E_theta, E_phi)`` in the device frame.
 Pattern = Callable[[float, float], tuple[complex, complex]]
 
 C_MPS = 299_792_458.0
-EPS0 = 8.8541878128e-12
+_EPS0 = 8.8541878128e-12
 
 # Paths that a change of the geometry by this much makes or breaks are not judged.
 MARGIN_M = 1e-6
 
 # ITU-R P.2040-4 table 3: lowest and highest GHz, a, b, c, d; and the thickness of a wall of it [m], None a half-space
-P2040: dict[str, tuple[float, float, float, float, float, float, float | None]] = {
+_P2040: dict[str, tuple[float, float, float, float, float, float, float | None]] = {
     "vacuum": (0.001, 100, 1.0, 0.0, 0.0, 0.0, None),
     "concrete": (1, 100, 5.24, 0.0, 0.0462, 0.7822, 0.3),
     "brick": (1, 40, 3.91, 0.0, 0.0238, 0.16, 0.2),
@@ -173,13 +173,13 @@ def permittivity(name: str, carrier_hz: float) -> tuple[complex, float | None] |
     key = name.lower().replace("-", "_").replace(" ", "_")
     key = key[4:] if key.startswith("itu_") else key
     if key == "vegetation":  # 1.1, and 0.5 dB/m for weak loss
-        sigma = 2 * math.sqrt(1.1) * (0.5 * math.log(10) / 20) * EPS0 * C_MPS
-        return 1.1 - 1j * sigma / (2 * math.pi * carrier_hz * EPS0), None
+        sigma = 2 * math.sqrt(1.1) * (0.5 * math.log(10) / 20) * _EPS0 * C_MPS
+        return 1.1 - 1j * sigma / (2 * math.pi * carrier_hz * _EPS0), None
     ghz = carrier_hz / 1e9
-    if key not in P2040 or not P2040[key][0] <= ghz <= P2040[key][1]:
+    if key not in _P2040 or not _P2040[key][0] <= ghz <= _P2040[key][1]:
         return None
-    _, _, a, b, c, d, thickness = P2040[key]
-    return a * ghz**b - 1j * c * ghz**d / (2 * math.pi * carrier_hz * EPS0), thickness
+    _, _, a, b, c, d, thickness = _P2040[key]
+    return a * ghz**b - 1j * c * ghz**d / (2 * math.pi * carrier_hz * _EPS0), thickness
 
 
 # ---------------------------------------------------------------- vectors
@@ -298,7 +298,7 @@ def _edges(part: shapely.Polygon) -> Iterator[tuple[tuple[float, ...], tuple[flo
                 yield a, b
 
 
-def mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
+def _mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
     """Ground of the tower, then walls and roof of each building."""
     mirrors = [Mirror((0.0, 0.0, 1.0), tower.ground_m, site.ground_material)]
     for number, building in enumerate(site.buildings):
@@ -404,7 +404,7 @@ class Reference:
     _chains: dict[tuple[int, int], list[tuple[Mirror, ...]] | None] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mirrors", mirrors_of(self.site, self.site.towers[self.tower]))
+        object.__setattr__(self, "mirrors", _mirrors_of(self.site, self.site.towers[self.tower]))
         object.__setattr__(self, "blocks", Blocks(self.site))
 
     @property
@@ -503,7 +503,7 @@ class Reference:
         spreading = min(1.0, wavelength / (4 * math.pi * length))
         return coupling * spreading * cmath.exp(-2j * math.pi * math.fmod(length / wavelength, 1.0))
 
-    def _reflected(self, mirror: Mirror, wave: Wave, ray: Vector, onward: Vector) -> Wave:
+    def _reflected(self, mirror: Mirror, wave: _Wave, ray: Vector, onward: Vector) -> _Wave:
         cosine = min(1.0, abs(_dot(mirror.normal, ray)))
         across = _cross(ray, mirror.normal)
         size = math.sqrt(_dot(across, across))
@@ -606,7 +606,7 @@ def fresnel(cosine: float, eta: complex, thickness_m: float | None, wavelength: 
     return te * (1 - echo) / (1 - te * te * echo), tm * (1 - echo) / (1 - tm * tm * echo)
 
 
-def element_wave(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -> Wave:
+def element_wave(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -> _Wave:
     """Field of an element along ``ray`` in site axes; TR 38.901 7.3.2, model 2.
 
     Parameters

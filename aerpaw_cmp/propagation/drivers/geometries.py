@@ -29,7 +29,7 @@ from ..paths import Faces, PathSet
 # How the ground ray is added to the direct one.
 Ground = Literal["coherent", "power_sum"]
 
-GROUND_MATERIAL = "itu_medium_dry_ground"
+_GROUND_MATERIAL = "itu_medium_dry_ground"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,7 +175,7 @@ def basis_fields(
     direct, bounced : (n, 2 uav ports, 2 tower ports) complex
     """
     link = Link(carrier_hz, {"tower": _both_slants(tower)}, _both_slants(uav), uav_transmits=False)
-    faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (GROUND_MATERIAL,), ("ground",))
+    faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (_GROUND_MATERIAL,), ("ground",))
     n = len(poses)
     index, zero = np.arange(n), np.zeros(n, dtype=np.int64)
     fields = []

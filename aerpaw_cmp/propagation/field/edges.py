@@ -175,7 +175,7 @@ def _alike(paths: EdgePaths, t: Tables, fields: list[FloatArray | None], double:
     else:
         before, after, cosines, distance, spread, angles = over_one(source[0], target[0], edge_1, t.wave_number)
         bb, bp, pp = wedge(angles[0], angles[1], cosines[0], edge_1[5], distance, edge_1[6], edge_1[7])
-        joined, turn = (bb * spread, bp * spread, -bp * spread, pp * spread), STRAIGHT
+        joined, turn = (bb * spread, bp * spread, -bp * spread, pp * spread), _STRAIGHT
     parts = []
     for side, (end, edge, way) in enumerate(((source, edge_1, before), (target, edge_2, after))):
         mirrors = coefficients(dyads.incidence(way, end[2]), parts_of(t.mirror[paths.ground[:, side], 4:]))
@@ -408,7 +408,7 @@ def over_one(source: Vector, target: Vector, edge: Any, wave_number: float) -> A
 
 
 # ``turn`` of :func:`over_two` for a path over one edge, whose legs lie in one plane as they are.
-STRAIGHT = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_STRAIGHT = (0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def over_two(

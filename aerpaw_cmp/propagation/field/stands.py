@@ -23,7 +23,7 @@ from .ridges import Profile, deygout_db
 # Loss per metre between trunks over that in crowns: assumed.
 TRUNKS = 0.3
 # First Fresnel radii by which a ray clears a knife edge without loss.
-CLEAR = 0.55
+_CLEAR = 0.55
 
 _UPRIGHT_M = 1e-6
 _SEGMENTS_AT_ONCE = 20_000
@@ -116,7 +116,7 @@ def _loss(
     ways = [] if isinstance(model, Opaque) else list(_detours(stand, source, target, enter, leave, top))
     if ways:
         top_way = ways[0]
-        zone = CLEAR * np.sqrt(wavelength_m * top_way.length_m * top_way.share * (1.0 - top_way.share))
+        zone = _CLEAR * np.sqrt(wavelength_m * top_way.length_m * top_way.share * (1.0 - top_way.share))
         lower = np.where(outside, np.maximum((zone - top_way.intrusion_m).min(axis=0), 0.0), 0.0)
     up, rise = start[row, 2] - ground - lower[place], (end - start)[row, 2]
     base, way = stand.height_m * stand.crown_base_fraction, np.linalg.norm((end - start)[row], axis=1)

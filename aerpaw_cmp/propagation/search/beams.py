@@ -32,7 +32,7 @@ from .mirror import merge, searched_links
 SIDE_M = 1e-6
 
 # A surface closer to an antenna than this [m] does not hide it: it is mounted there.
-END_M = 1e-3
+_END_M = 1e-3
 
 # Outlines are this much larger in the cuts than they are [m], so that no cut loses a path to rounding.
 SLACK_M = 1e-5
@@ -41,10 +41,10 @@ SLACK_M = 1e-5
 EDGE_M = 1e-6
 
 # Share of a triangle's height by which a segment must meet it to cut it beyond doubt.
-SOLID_MARGIN = 1e-6
+_SOLID_MARGIN = 1e-6
 
 # First faces that an estimate draws from, the fewest that it tries, and the standard error at which it stops.
-POOL, FEWEST_TRIED, CERTAIN = 1024, 24, 0.12
+_POOL, _FEWEST_TRIED, _CERTAIN = 1024, 24, 0.12
 
 
 class _Mirrors(NamedTuple):
@@ -76,7 +76,7 @@ class Rules(NamedTuple):
 
     depth: int
     clearance: float
-    end: float = END_M
+    end: float = _END_M
     margin: float = 0.0
     side: float = SIDE_M
     beams: bool = True
@@ -163,7 +163,7 @@ def estimate(
 
 
 def _rules(surfaces: Surfaces, max_depth: int, *, solids: bool, beams: bool = True, shadows: bool = True) -> Rules:
-    margin = SOLID_MARGIN if solids else 0.0
+    margin = _SOLID_MARGIN if solids else 0.0
     return Rules(max_depth, 2.0 * surfaces.merge_m, margin=margin, beams=beams, shadows=shadows)
 
 
@@ -242,7 +242,7 @@ class _Search:
         their sequences of two, and weigh less in that measure (M. H. Hansen, W. N. Hurwitz, Ann. Math. Stat. 14
         (1943) 333, doi:10.1214/aoms/1177731356): 24 of them tell munich to 13 %, where plain draws take 500.
         """
-        pool = first[:POOL]
+        pool = first[:_POOL]
         size = np.ones(len(pool))
         if self.rules.depth > 2:
             size = np.array([max(1, self._tried(face, self.rules.depth - 1)[0]) for face in pool], dtype=np.float64)
@@ -251,7 +251,7 @@ class _Search:
             sequences, seconds = self._tried(pool[at], self.rules.depth)
             tried.append((sequences / size[at], seconds / size[at]))
             known = np.array(tried)[:, 0]
-            if len(known) >= FEWEST_TRIED and known.std() < CERTAIN * known.mean() * np.sqrt(len(known)):
+            if len(known) >= _FEWEST_TRIED and known.std() < _CERTAIN * known.mean() * np.sqrt(len(known)):
                 break
         share = size.sum() * len(first) / max(1, len(pool))
         sequences, seconds = share * np.mean(tried or [(0.0, 0.0)], axis=0)
@@ -296,7 +296,7 @@ def _chunks(first: IntArray, threads: int) -> Iterator[tuple[list[IntArray], int
 
 
 # Paths over parallel planes whose reflection points are all closer than this [m] are one path.
-COINCIDENT_M = 5e-3
+_COINCIDENT_M = 5e-3
 
 
 def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
@@ -320,7 +320,7 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
         apart = np.abs(points[:, None] - points[None]).max(axis=(2, 3))
         normal = surfaces.faces.normal[paths.faces[rows, :depth]]
         alike = (np.abs(np.einsum("akc,bkc->abk", normal, normal)) > 0.999).all(axis=2)
-        first, second = np.nonzero(np.triu((apart < COINCIDENT_M) & alike, 1))
+        first, second = np.nonzero(np.triu((apart < _COINCIDENT_M) & alike, 1))
         for i, j in zip(first, second, strict=True):
             if not repeated[rows[i]]:
                 repeated[rows[j]] = True

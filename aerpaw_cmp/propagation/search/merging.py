@@ -17,7 +17,7 @@ from ..surfaces import Surfaces
 from .boxtree import box_tree, overlapping
 
 # Triangles whose corners lie within this of one plane [m] are one face. The files hold float32: 0.1 mm at 1 km.
-MERGE_M = 1e-3
+_MERGE_M = 1e-3
 
 # Corners of one shape closer than this are one corner [m].
 WELD_M = 1e-4
@@ -26,10 +26,10 @@ WELD_M = 1e-4
 WINDOW = 8
 
 # Triangles of less area have no plane; they are dropped.
-SMALLEST_M2 = 1e-10
+_SMALLEST_M2 = 1e-10
 
 
-def merged(scene: TriangleScene, merge_m: float = MERGE_M) -> Surfaces:
+def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
     """Faces of a scene.
 
     Parameters
@@ -45,7 +45,7 @@ def merged(scene: TriangleScene, merge_m: float = MERGE_M) -> Surfaces:
     """
     corners = scene.vertices_m[scene.triangles]
     normal, offset, area = _planes(corners)
-    good = area > SMALLEST_M2
+    good = area > _SMALLEST_M2
     notes = list(scene.notes)
     if not good.all():
         notes.append(f"{int((~good).sum())} triangles without an area were dropped")

@@ -33,7 +33,7 @@ RELATIVE_TOLERANCE = 1e-12
 MINIMUM_LENGTH_M = 0.01
 
 # Face sequences per tower beyond which the ``image`` engine gives up.
-SEQUENCE_BUDGET = 200_000
+_SEQUENCE_BUDGET = 200_000
 
 # Bounds the memory of every dense step (8 MB per array).
 CELLS_PER_CHUNK = 1_000_000
@@ -50,7 +50,7 @@ def find_paths(
     links: Links,
     *,
     max_depth: int = 2,
-    budget: int = SEQUENCE_BUDGET,
+    budget: int = _SEQUENCE_BUDGET,
     extent_m: FloatArray | None = None,
     progress: Progress | None = None,
     hidden: bool = True,
@@ -336,7 +336,7 @@ def _paths_of_level(
         for start in range(0, len(level.faces), sequence_step):
             part = slice(start, start + sequence_step)
             if depth:
-                row, column = meets_last_face(
+                row, column = _meets_last_face(
                     faces, level.faces[part, -1], level.images_m[part, -1], targets[some], hiding.tolerance_m
                 )
             else:
@@ -349,7 +349,7 @@ def _paths_of_level(
     return merge(pieces, max_depth, None)
 
 
-def meets_last_face(
+def _meets_last_face(
     faces: Faces, last: IntArray, image: FloatArray, targets: FloatArray, tolerance_m: float
 ) -> tuple[IntArray, IntArray]:
     """(sequence, target) pairs whose line from the last image meets the bounds of the last face.

@@ -22,10 +22,10 @@ from ..paths import Faces, legs
 CELLS_PER_CHUNK = 1_000_000
 
 # Radius, in tolerances, within which a point of a seam must be surrounded by buildings; shorter seams hide nothing.
-NEIGHBOURHOOD = 1e4
+_NEIGHBOURHOOD = 1e4
 
 # Share of its area by which a convex footprint may fall short of its hull.
-ROUNDING = 1e-13
+_ROUNDING = 1e-13
 
 _ROUND = np.pi / 8 * (np.arange(16) + 0.37)  # no direction of a map is favoured
 _AROUND = np.column_stack([np.cos(_ROUND), np.sin(_ROUND), np.zeros(16)])
@@ -158,7 +158,7 @@ class Occlusion:
         self, start: FloatArray, end: FloatArray, runs: list[tuple[float, float, tuple[FloatArray, FloatArray]]]
     ) -> bool:
         """Check whether the pieces along which one segment runs fill the whole neighbourhood of one of its points."""
-        radius_m = NEIGHBOURHOOD * self.tolerance_m
+        radius_m = _NEIGHBOURHOOD * self.tolerance_m
         length_m = float(np.linalg.norm(end - start))
         breaks = np.unique([share for enter, leave, _ in runs for share in (enter, leave)])
         long = np.flatnonzero(np.diff(breaks) * length_m > 10.0 * radius_m)
@@ -268,7 +268,7 @@ def convex_pieces(footprint: Polygon) -> list[Polygon]:
 def _is_convex(polygons: Polygon | AnyArray) -> BoolArray:
     """Check whether a polygon, or each of an array, fills its hull."""
     hull = shapely.area(shapely.convex_hull(polygons))
-    full = hull - shapely.area(polygons) <= ROUNDING * hull
+    full = hull - shapely.area(polygons) <= _ROUNDING * hull
     return np.asarray(full & (shapely.get_num_interior_rings(polygons) == 0))
 
 

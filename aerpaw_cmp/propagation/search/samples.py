@@ -23,7 +23,7 @@ Samples = int | Literal["auto"]
 # Rays per tower of the first pilot.
 FIRST = 10_000
 
-FACTOR = 4
+_FACTOR = 4
 
 # Rays per tower at which pilots end in any case.
 MOST = 2_560_000
@@ -64,13 +64,13 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
     samples = FIRST
     before = pilot(samples)
     while samples < MOST:
-        samples *= FACTOR
+        samples *= _FACTOR
         paths = pilot(samples)
         if set(plane_keys(paths, plane)) == set(plane_keys(before, plane)):
-            words = f"{samples // FACTOR:,} and {samples:,} rays a tower found the same {len(paths)} paths"
+            words = f"{samples // _FACTOR:,} and {samples:,} rays a tower found the same {len(paths)} paths"
             return Choice(samples, f"{words} at {poses} poses".replace(",", " "), paths)
         before = paths
-    words = f"{samples:,} rays a tower still found other paths than {samples // FACTOR:,} at {poses} poses"
+    words = f"{samples:,} rays a tower still found other paths than {samples // _FACTOR:,} at {poses} poses"
     return Choice(samples, words.replace(",", " "), before)
 
 

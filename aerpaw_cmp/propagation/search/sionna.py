@@ -51,24 +51,24 @@ from .mirror import (
 )
 
 SPECULAR_TABLE_SLOTS = 2**24
-FEWEST_SLOTS = 2**20
+_FEWEST_SLOTS = 2**20
 # Candidates per tower and batch that there is room for at first: their number is known afterwards.
 MAXIMUM_PATHS = 2**16
 
 # Room beyond which a batch is refused (some 100 bytes each).
-MOST_CANDIDATES = 2**25
+_MOST_CANDIDATES = 2**25
 
 # Share of the table that candidates may fill: two hashes are asked, so about twice this share is lost.
-FULLEST_TABLE = 1 / 32
+_FULLEST_TABLE = 1 / 32
 
 # Slots of the table, over all towers of a call (two tables of 4 bytes each).
-MOST_SLOTS = 2**28
+_MOST_SLOTS = 2**28
 
-LARGEST_BATCH = 100
+_LARGEST_BATCH = 100
 # Sionna knows slabs only; in this one no second echo returns. Its coefficients are not used for H.
 HALF_SPACE_THICKNESS_M = 10.0
 # A float32 reflection point may lie this far outside its face.
-EDGE_TOLERANCE_M = 1e-3
+_EDGE_TOLERANCE_M = 1e-3
 
 # Scenes in use. Dr.Jit compiles virtual calls for every material that is alive, those of dead scenes included, and may
 # then define a function twice and abort the process: no scene may stay when the next is made.
@@ -259,7 +259,7 @@ def _slots(built: _Scene, targets: int) -> int:
     """
     mirrors = sum(len(np.unique(faces)) for faces in built.face_of.values())
     slots = 400.0 * (targets * max(mirrors, 1) ** 2) ** 2
-    return int(np.clip(2 ** np.ceil(np.log2(slots)), FEWEST_SLOTS, SPECULAR_TABLE_SLOTS))
+    return int(np.clip(2 ** np.ceil(np.log2(slots)), _FEWEST_SLOTS, SPECULAR_TABLE_SLOTS))
 
 
 def _points(values: FloatArray) -> Any:
@@ -444,16 +444,16 @@ class _Finder:
 
         most = 0 if self.candidates is None else int(np.asarray(self.candidates.numpy()).max(initial=0))
         slots = self.slots
-        while most > FULLEST_TABLE * slots:
+        while most > _FULLEST_TABLE * slots:
             slots *= 2
-        slots = max(self.slots, min(slots, MOST_SLOTS // max(1, len(self.built.scene.transmitters))))
+        slots = max(self.slots, min(slots, _MOST_SLOTS // max(1, len(self.built.scene.transmitters))))
         limit = self.limit
         while most > limit:
             limit *= 2
-        if limit > MOST_CANDIDATES:
+        if limit > _MOST_CANDIDATES:
             raise CheckError(
                 f"a batch has {most} candidates of a path for one tower, more than PathSolver can hold",
-                expected=f"at most {MOST_CANDIDATES}",
+                expected=f"at most {_MOST_CANDIDATES}",
                 cause="take fewer samples or a smaller batch, or engine 'image'",
             )
         if (limit, slots) == (self.limit, self.slots):
@@ -565,8 +565,8 @@ def _refined(
 ) -> Iterator[PathSet]:
     """Paths of each batch, refined in float64."""
     sources_m, targets_m, batch = links.sources_m, links.targets_m, rays.batch
-    if not 1 <= batch <= LARGEST_BATCH:
-        raise UsageError(f"batch {batch}", expected=f"1 to {LARGEST_BATCH} poses per call")
+    if not 1 <= batch <= _LARGEST_BATCH:
+        raise UsageError(f"batch {batch}", expected=f"1 to {_LARGEST_BATCH} poses per call")
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
     load_variant(rays.variant)
     builder = _Builder(faces=faces, links=links, carrier_hz=carrier_hz, surfaces=surfaces)
@@ -815,7 +815,7 @@ def _refine(
 
             ends = (sources_m[tower[some]], targets_m[pose[some]])
             sequence[some, :number], vertices[some, :number], fits = reflection_points(
-                surfaces, sequence[some, :number], *ends, edge_m=EDGE_TOLERANCE_M
+                surfaces, sequence[some, :number], *ends, edge_m=_EDGE_TOLERANCE_M
             )
             good[some] &= fits
             continue
@@ -823,7 +823,7 @@ def _refine(
         sequence[some, :number] = part
         images = images_of(faces, part, sources_m[tower[some]])
         vertices[some, :number], fits = trace_back(
-            faces, part, images, targets_m[pose[some]], tolerance_m, EDGE_TOLERANCE_M
+            faces, part, images, targets_m[pose[some]], tolerance_m, _EDGE_TOLERANCE_M
         )
         good[some] &= fits
     return PathSet(pose[good], tower[good], depth[good], sequence[good], vertices[good])
@@ -839,11 +839,11 @@ def _relocate(
     everywhere = trace_back(faces, sequence, images_of(faces, sequence, sources_m), targets_m, tolerance_m, np.inf)[0]
     result = sequence.copy()
     for step in range(sequence.shape[1]):
-        outside = np.flatnonzero(~inside(faces, sequence[:, step], everywhere[:, step], EDGE_TOLERANCE_M))
+        outside = np.flatnonzero(~inside(faces, sequence[:, step], everywhere[:, step], _EDGE_TOLERANCE_M))
         for row in outside:  # few: only scenes with disjoint coplanar faces
             twins = np.flatnonzero(plane == plane[sequence[row, step]])
             point = np.tile(everywhere[row, step], (len(twins), 1))
-            holding = twins[inside(faces, twins, point, EDGE_TOLERANCE_M)]
+            holding = twins[inside(faces, twins, point, _EDGE_TOLERANCE_M)]
             if len(holding):
                 result[row, step] = holding[-1]
     return np.asarray(result)

@@ -25,7 +25,7 @@ from .occlusion import Occlusion
 TERRAIN = -2
 
 # A mirror over less of its Fresnel zone is left out.
-SMALLEST_PART = 0.1
+_SMALLEST_PART = 0.1
 
 _STEPS = 8
 _STILL_M = 1e-6
@@ -283,7 +283,7 @@ def _stationary(
     ]
     part = np.minimum(widths[0] / np.maximum(widths[1], 1e-12), 1.0)
     part = np.where(part > 1.0 - 1e-9, 1.0, part)
-    good = part >= SMALLEST_PART
+    good = part >= _SMALLEST_PART
     return column[good], d[good], crease[good], part[good]
 
 

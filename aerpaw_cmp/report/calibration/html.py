@@ -36,14 +36,14 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
         **named(data, "flights trained_on scores controls mounts strengths ground words warnings"),
         learning_curve={"points": data.curve, "one_more_rmse_db": data.one_more_rmse_db},
         antennas=[
-            {"name": a.name, "share_of_sphere_seen": share_seen(a), "n_bins": len(a.flown)} for a in data.antennas
+            {"name": a.name, "share_of_sphere_seen": _share_seen(a), "n_bins": len(a.flown)} for a in data.antennas
         ],
         rank=data.rank or {},
         **about(data),
     )
 
 
-def share_seen(antenna: AntennaMap, within_deg: float = 10.0) -> float:
+def _share_seen(antenna: AntennaMap, within_deg: float = 10.0) -> float:
     """Share of the sphere within some degrees of a direction that a flight looked in."""
     t, p = np.radians(antenna.theta_deg)[:, None], np.radians(antenna.azimuth_deg)[None, :]
     grid = np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
@@ -154,7 +154,7 @@ def figure_specs(data: CalibrationData) -> Iterator[FigureSpec]:
     for a in data.antennas:
         yield FigureSpec(
             f"antenna_{safe_name(a.name)}", "antennas", a.name,
-            f"Flights saw directions within 10 degrees of {100 * share_seen(a):.0f} % of the sphere (dots). "
+            f"Flights saw directions within 10 degrees of {100 * _share_seen(a):.0f} % of the sphere (dots). "
             "Elsewhere the gain is a guess, and its standard deviation says so. The level is normalised to a mean of "
             "0 dBi over the sphere: it is not identified beside the offsets.",
             partial(draw_antenna, a),

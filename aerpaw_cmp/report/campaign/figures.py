@@ -35,30 +35,30 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-DISTANCE_BINS = 30
+_DISTANCE_BINS = 30
 
 # Samples that a bin needs: no line is drawn over what was not flown.
-FEWEST_PER_BIN = 8
+_FEWEST_PER_BIN = 8
 
-MAPS_PER_ROW = 3
+_MAPS_PER_ROW = 3
 
 # Flights, links and settings together that a figure with a line for each still shows; the season's figures stand for
 # more.
 MOST_BARS = 200
 
-MOST_SETTINGS = 40
+_MOST_SETTINGS = 40
 
 # Flights that are told apart by colour, or have a map each.
 MOST_FLIGHTS = 12
 
 # No figure is higher than this [inch], however many flights there are.
-TALLEST = 40.0
+_TALLEST = 40.0
 
 
 def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
     """RSS after the offset against distance, and its difference to the simulation below, all flights on one axis."""
     fig, (top, low) = subplots((9.2, 6.4), 2, 1, sharex=True, height_ratios=(1.5, 1.0))
-    edges = np.linspace(0.0, max(float(np.nanmax(row.distance_m)) for row in rows), DISTANCE_BINS + 1)
+    edges = np.linspace(0.0, max(float(np.nanmax(row.distance_m)) for row in rows), _DISTANCE_BINS + 1)
     for row in rows:
         name, style = row.flight, curve_style(numbers[row.flight])
         for ax, values in ((top, row.measured_db + row.offset_db), (low, row.residual_db)):
@@ -85,7 +85,7 @@ def _binned(at: FloatArray, values: FloatArray, edges: FloatArray) -> list[Any]:
     known = pd.DataFrame({"at": at, "values": values}).dropna()
     bins = known.groupby(np.digitize(known["at"], edges[1:-1]))
     levels = [bins["at"].mean(), *(bins["values"].quantile(q) for q in (0.1, 0.5, 0.9))]
-    return [level[bins.size() >= FEWEST_PER_BIN] for level in levels]
+    return [level[bins.size() >= _FEWEST_PER_BIN] for level in levels]
 
 
 def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
@@ -117,7 +117,7 @@ def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
 
 def season_errors(data: CampaignData) -> Figure:
     """Errors of the flights under every setting: 10 to 90 %, 25 to 75 %, median and mean, best setting on top."""
-    ranking = data.season.over_all()[:MOST_SETTINGS]
+    ranking = data.season.over_all()[:_MOST_SETTINGS]
     fig, ax = subplots((9.2, 1.2 + 0.27 * len(ranking)))
     for y, entry in enumerate(ranking):
         q = entry.quantiles_db
@@ -227,7 +227,7 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
     cells = np.array([cell for cell_mean in means for cell in cell_mean]).reshape(-1, 2)
     values = np.array([mean for cell_mean in means for mean, _ in cell_mean.values()])
     reach = float(np.percentile(np.abs(values), 98)) if len(values) else 1.0
-    columns = min(len(rows), MAPS_PER_ROW)
+    columns = min(len(rows), _MAPS_PER_ROW)
     lines = -(-len(rows) // columns)
     shape = plan_shape(*(cells.T + 0.5) * data.cell_m)
     width = (7.2 - 0.2 * columns) / columns  # what labels and the colour bar leave
@@ -256,7 +256,7 @@ Scored: TypeAlias = "tuple[str, float, Interval | None]"
 def _by_setting(names: Sequence[str], groups: Mapping[str, Sequence[Scored]]) -> tuple[Figure, Axes, list[FloatArray]]:
     """Errors with intervals, a group of rows one below the other and a row per setting; also the rows of each group."""
     step = len(names) + 1.0
-    fig, ax = subplots((9.2, min(1.6 + 0.24 * step * len(groups), TALLEST)))
+    fig, ax = subplots((9.2, min(1.6 + 0.24 * step * len(groups), _TALLEST)))
     places = [np.arange(len(names), dtype=np.float64) + index * step for index in range(len(groups))]
     shown: set[str] = set()
     for index, (at, rows) in enumerate(zip(places, groups.values(), strict=True)):
@@ -323,7 +323,7 @@ def _season_specs(data: CampaignData) -> Iterator[FigureSpec]:
     """Figures of the season."""
     if not data.season.over_all():
         return
-    some = f", {MOST_SETTINGS} of {len(data.settings)}" if len(data.settings) > MOST_SETTINGS else ""
+    some = f", {_MOST_SETTINGS} of {len(data.settings)}" if len(data.settings) > _MOST_SETTINGS else ""
     yield FigureSpec(
         "season_errors", "season", "Error of the flights under every setting", f"Best setting on top{some}.",
         partial(season_errors, data),
@@ -369,7 +369,7 @@ def _flight_specs(data: CampaignData) -> Iterator[FigureSpec]:
         if scored and len(scored) <= MOST_FLIGHTS:
             yield FigureSpec(
                 f"distance_{safe_name(link)}", "overlay", f"{link}: RSS against distance, all flights",
-                f"Setting: {data.reference}. Lines: medians of {DISTANCE_BINS} bins of distance; bands: 10 % to 90 %. "
+                f"Setting: {data.reference}. Lines: medians of {_DISTANCE_BINS} bins of distance; bands: 10 % to 90 %. "
                 "Open markers: medians of the simulation at the same samples. Each flight has its own offset.",
                 partial(against_distance, scored, numbers),
             )  # fmt: skip

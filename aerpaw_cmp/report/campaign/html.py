@@ -30,13 +30,13 @@ from . import words
 MANY = 200
 
 # Flights of a table that has a column or a heading for each.
-FEW_FLIGHTS = 20
+_FEW_FLIGHTS = 20
 
 # Rows of a table on the page; the files beside it hold all.
 ROWS_SHOWN = 300
 
 # From so many rows on campaign.json is written without indentation.
-COMPACT_ROWS = 2000
+_COMPACT_ROWS = 2000
 
 # Fields of a row that are samples, not numbers of a table.
 ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
@@ -67,7 +67,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "pairs": telling(data.repeats),
             "rank_pairs_total": len(data.rank_repeats),
             "rank_pairs": telling(data.rank_repeats),
-            "table": f"{PAIR_TABLE}.csv" if data.repeats or data.rank_repeats else None,
+            "table": f"{_PAIR_TABLE}.csv" if data.repeats or data.rank_repeats else None,
         },
         "season": {
             **named(data.season, "held_out started ranking drift"),
@@ -79,7 +79,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
     return safe
 
 
-def campaign_frame(data: CampaignData) -> pd.DataFrame:
+def _campaign_frame(data: CampaignData) -> pd.DataFrame:
     """One row per flight, setting, tower and channel (``kind`` rss) or K (``kind`` rank), and per failure."""
     rows = [
         {"kind": "rss", **cells(row), **{f"{name}_rmse_db": error for name, error in row.baselines.items()},
@@ -88,11 +88,11 @@ def campaign_frame(data: CampaignData) -> pd.DataFrame:
     ]  # fmt: skip
     rows += [{"kind": "rank", **cells(row)} for row in data.rank]
     rows += [{"kind": "failed", **cells(failure)} for failure in data.failures]
-    frame: pd.DataFrame = pd.DataFrame(rows, columns=CSV_COLUMNS)
+    frame: pd.DataFrame = pd.DataFrame(rows, columns=_CSV_COLUMNS)
     return frame
 
 
-CSV_COLUMNS = [
+_CSV_COLUMNS = [
     "kind", "flight", "setting", "tower", "channel", "k", "offset_db", "offset_low_db", "offset_high_db", "rmse_db",
     "rmse_low_db", "rmse_high_db", "free_space_rmse_db", "two_ray_rmse_db", "pooled_offset_db", "pooled_rmse_db", "n",
     "n_out_of_coverage", "held_out_offset_db", "held_out_rmse_db", "correlation", "correlation_low", "correlation_high",
@@ -102,7 +102,7 @@ CSV_COLUMNS = [
 ]  # fmt: skip
 
 
-def errors_of_pairs(data: CampaignData) -> list[tuple[Any, float, float]]:
+def _errors_of_pairs(data: CampaignData) -> list[tuple[Any, float, float]]:
     """Each pair of flights with the RMSE of both under the reference setting."""
     rmse = {row.key: row.rmse_db for row in data.reference_rows}
     return [
@@ -132,7 +132,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         data=data,
         sections=by_section(pictures),
         mean_rmse=words.mean_rmse(data),
-        pair_errors=errors_of_pairs(data),
+        pair_errors=_errors_of_pairs(data),
         halves=halves(data),
         headline=words.headline(data),
         verdict=words.verdict(data),
@@ -149,7 +149,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         else data.rss,
         few=words.FEW,
         many=MANY,
-        few_flights=FEW_FLIGHTS,
+        few_flights=_FEW_FLIGHTS,
         rows_shown=ROWS_SHOWN,
     )
 
@@ -178,8 +178,8 @@ def write_campaign(
     list of Path
     """
     folder = Path(folder)
-    indent = 2 if len(data.rss) + len(data.rank) < COMPACT_ROWS else None
-    table = campaign_frame(data)
+    indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None
+    table = _campaign_frame(data)
     written = [
         write_file(folder / "campaign.json", json_text(campaign_metrics(data), indent)),
         write_file(folder / "campaign.csv", guarded(table).to_csv(index=False, lineterminator="\n")),
@@ -187,7 +187,7 @@ def write_campaign(
     if data.repeats or data.rank_repeats:
         pairs = pair_frame(data)
         written.append(
-            write_file(folder / f"{PAIR_TABLE}.csv", guarded(pairs).to_csv(index=False, lineterminator="\n"))
+            write_file(folder / f"{_PAIR_TABLE}.csv", guarded(pairs).to_csv(index=False, lineterminator="\n"))
         )
     tables = [path.name for path in written]
     drawn, pictures = canvas.write_figures(campaign_figures.figure_specs(data), folder / "figures")
@@ -206,7 +206,7 @@ def write_campaign(
 LISTED_PAIRS = 1000
 
 # The file with all of them, less its ending.
-PAIR_TABLE = "pairs"
+_PAIR_TABLE = "pairs"
 
 
 Pair = TypeVar("Pair", Repeat, RankPairing)

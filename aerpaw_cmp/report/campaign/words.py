@@ -38,10 +38,10 @@ CAUSES: dict[str, tuple[str, str]] = {
 }
 
 # Settings that a sentence names.
-FEW_SETTINGS = 4
+_FEW_SETTINGS = 4
 
 # Below this share of samples with a pair, a repeatability floor is that of a few places.
-FEW_PAIRS = 0.25
+_FEW_PAIRS = 0.25
 
 
 def rss_flights(data: CampaignData) -> list[str]:
@@ -98,7 +98,7 @@ def _ranked_words(data: CampaignData) -> list[str]:
         f"With the offset of the other flights, {ranking[0].setting} has the smallest error "
         f"({ranking[0].mean_db:.2f} dB over {ranking[0].n_flights} flights). "
     )
-    return [first + ranking_sentence({entry.setting: entry.verdict for entry in ranking[1:]}, FEW_SETTINGS)]
+    return [first + ranking_sentence({entry.setting: entry.verdict for entry in ranking[1:]}, _FEW_SETTINGS)]
 
 
 def warnings(data: CampaignData) -> list[str]:
@@ -120,7 +120,7 @@ def warnings(data: CampaignData) -> list[str]:
         f"{pair.tower} {pair.channel}: only {100 * pair.share:.0f} % of the samples of {pair.first} have a pair on "
         f"{pair.second}; their repeatability speaks for those places, not for the flights."
         for pair in data.repeats
-        if 0 < pair.share < FEW_PAIRS
+        if 0 < pair.share < _FEW_PAIRS
     ]
     out += [
         f"Pooled offset {group.group}: its members are in different units ({', '.join(group.units)})."

@@ -35,7 +35,7 @@ def write_diff(diff: ReportDiff, folder: Path) -> list[Path]:
 
 
 # Differences of agreement and kappa below this are rounding.
-LEAST_RANK = 1e-6
+_LEAST_RANK = 1e-6
 
 # Sentence on two reports, by the verdict of the paired interval. No other sentence of a diff says better or worse.
 DIFFERENCE = {
@@ -54,7 +54,7 @@ KEEP = {
 }
 
 # Settings, inputs or versions that a sentence names.
-NAMED = 3
+_NAMED = 3
 
 # Cause and next step, by :func:`~aerpaw_cmp.compare.verdicts.changed_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
@@ -99,7 +99,7 @@ def _cause(diff: ReportDiff) -> str:
     names = [
         str(getattr(entry, "key", None) or getattr(entry, "path", "")) for items in kinds.values() for entry in items
     ]
-    shown = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
+    shown = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
     keep = KEEP.get(cause.where, KEEP["no interval"])
     return " " + said_of(cause, CAUSES, listed=listed, verb=verb, moved=moved, names=shown, keep=keep)
 
@@ -131,7 +131,7 @@ def _bounds(value: tuple[float, float], decimals: int) -> str:
 
 
 def _rank_verdict(diff: ReportDiff) -> str:
-    moved = [rank for rank in diff.ranks if rank.n_changed or abs(rank.kappa.difference) > LEAST_RANK]
+    moved = [rank for rank in diff.ranks if rank.n_changed or abs(rank.kappa.difference) > _LEAST_RANK]
     if not diff.ranks:
         return ""
     if not moved:

@@ -40,7 +40,7 @@ def chosen_formats(*lists: str | Iterable[str]) -> tuple[str, ...]:
     if unknown:
         raise UsageError(f"export {unknown[0]!r}", expected=", ".join((*FORMATS, ALL)))
     for name in chosen:
-        if name != ALL and (missing := missing_module(name)):
+        if name != ALL and (missing := _missing_module(name)):
             raise UsageError(
                 f"export {name} needs {missing}, which is not installed",
                 expected="pip install 'aerpaw-cmp[geo]', or another format",
@@ -48,7 +48,7 @@ def chosen_formats(*lists: str | Iterable[str]) -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in chosen or ALL in chosen)
 
 
-def missing_module(name: str) -> str:
+def _missing_module(name: str) -> str:
     """The module that a format needs and that is not there."""
     return next((module for module in _NEEDS.get(name, ()) if not _installed(module)), "")
 
@@ -90,7 +90,7 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
     place = folder / FOLDER
     written: list[Path] = []
     for name in formats:
-        if missing := missing_module(name):
+        if missing := _missing_module(name):
             progress(f"export {name} left out: {missing} is not installed (pip install 'aerpaw-cmp[geo]')")
             continue
         place.mkdir(exist_ok=True)

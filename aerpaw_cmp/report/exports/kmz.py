@@ -61,7 +61,7 @@ def write_kmz(export: Export, folder: Path) -> list[Path]:
 
 
 def _shown(export: Export) -> Iterator[_Shown]:
-    for kind, scales in scales_of(export).items():
+    for kind, scales in _scales_of(export).items():
         points = next(item for item in export.sets if item.kind == kind)
         columns = {c.name: c for c in points.columns}
         for (flight, tower, channel, rows), (name, scale) in itertools.product(points.links(), scales.items()):
@@ -187,7 +187,7 @@ RANKS = Scale(
 )
 
 
-def scales_of(export: Export) -> dict[str, dict[str, Scale]]:
+def _scales_of(export: Export) -> dict[str, dict[str, Scale]]:
     """By kind and column: levels share one scale, residuals another, ranks their classes."""
     scales: dict[str, dict[str, Scale]] = {}
     for points in export.sets:

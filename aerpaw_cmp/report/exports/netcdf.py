@@ -11,7 +11,7 @@ from ...common.cf import WGS84, dataset, file_attributes, netcdf_bytes
 from .points import LABELS, PLACES, Column, Export, Points
 
 # Stands for a missing code in NetCDF; attribute ``_FillValue``.
-NO_CODE = -1
+_NO_CODE = -1
 
 
 _TITLES = {"rss": "Received level, measured and replayed", "rank": "Channel rank, reported and replayed"}
@@ -22,12 +22,12 @@ def write_netcdf(export: Export, folder: Path) -> list[Path]:
     paths = []
     for points in export.sets:
         path = folder / f"{points.kind}.nc"
-        path.write_bytes(netcdf_bytes(points_dataset(export, points)))
+        path.write_bytes(netcdf_bytes(_points_dataset(export, points)))
         paths.append(path)
     return paths
 
 
-def points_dataset(export: Export, points: Points) -> Any:
+def _points_dataset(export: Export, points: Points) -> Any:
     """The samples of one kind as an ``xarray.Dataset`` with dimensions trajectory (links) and obs."""
     links = list(points.links())
     texts = {
@@ -88,8 +88,8 @@ def _values(column: Column, values: Any) -> tuple[Any, ...]:
     """Values, attributes and encoding of a quantity or of codes."""
     shared = {"long_name": column.meaning, "coordinates": "time latitude longitude up", "grid_mapping": "crs"}
     if column.flags:
-        codes = np.where(np.isfinite(values), values, NO_CODE).astype(np.int8)
+        codes = np.where(np.isfinite(values), values, _NO_CODE).astype(np.int8)
         flags = {"flag_values": np.arange(len(column.flags), dtype=np.int8), "flag_meanings": " ".join(column.flags)}
-        return codes, shared | flags, {"_FillValue": np.int8(NO_CODE)}
+        return codes, shared | flags, {"_FillValue": np.int8(_NO_CODE)}
     comment = {} if column.shown_unit in ("", column.unit) else {"comment": f"unit: {column.shown_unit}"}
     return values, {**shared, "units": column.unit, **comment}, {"_FillValue": np.nan}

@@ -25,11 +25,11 @@ from ..export import DECIMALS, rank_tables, rss_tables
 from ..names import RANK_COLUMNS, RSS_COLUMNS, k_key
 
 # 1 mm.
-DEGREE_DECIMALS = 8
+_DEGREE_DECIMALS = 8
 
 # Meanings of 0 to 4 in a simulated rank.
-RANK_FLAGS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
-YES_NO = ("no", "yes")
+_RANK_FLAGS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
+_YES_NO = ("no", "yes")
 
 _UNITS = (
     (r"_dbm$|^calibrated_db$", DBM, "dBm"),
@@ -174,10 +174,10 @@ def column(name: str, unit: str | None = None) -> Column:
     """The column of a name: its unit from the name's end, its meaning as rss.csv and rank.csv have it."""
     meaning = (RANK_COLUMNS | RSS_COLUMNS).get(name, name.replace("_", " "))
     if name.endswith("out_of_coverage"):
-        return Column(name=name, meaning=meaning, flags=YES_NO)
+        return Column(name=name, meaning=meaning, flags=_YES_NO)
     if name == "measured_rank" or name.startswith("simulated_rank_k"):
         k = name.removeprefix("simulated_rank_k")
-        return Column(name=name, meaning=meaning if k == name else f"rank by ray tracing, K = {k}", flags=RANK_FLAGS)
+        return Column(name=name, meaning=meaning if k == name else f"rank by ray tracing, K = {k}", flags=_RANK_FLAGS)
     if name == "measured_db":
         return Column(name=name, unit=DBM if unit == "dBm" else DB, shown_unit=unit or "dB", meaning=meaning)
     _, udunits, shown = next((known for known in _UNITS if re.search(known[0], name)), ("", "1", ""))
@@ -228,8 +228,8 @@ def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[Flo
     known = np.isfinite(east_m) & np.isfinite(north_m)
     latitude, longitude = frame.to_geographic(np.where(known, east_m, 0.0), np.where(known, north_m, 0.0))
     return (
-        np.where(known, np.round(latitude, DEGREE_DECIMALS), np.nan),
-        np.where(known, np.round(longitude, DEGREE_DECIMALS), np.nan),
+        np.where(known, np.round(latitude, _DEGREE_DECIMALS), np.nan),
+        np.where(known, np.round(longitude, _DEGREE_DECIMALS), np.nan),
     )
 
 

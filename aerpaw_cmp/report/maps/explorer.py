@@ -25,12 +25,12 @@ from .figures import grouped, half_width
 # Base64 that the layers may take; beyond it layers of single towers are left out, then cells.
 MOST_BYTES = 4_000_000
 
-LATTICE = 9
-DEGREE = 4
-FINEST_DB = 0.01
+_LATTICE = 9
+_DEGREE = 4
+_FINEST_DB = 0.01
 
-LEVEL, CLASSES, DIFFERENCE = "level", "classes", "difference"
-RANK_CLASSES = ("Z", *map(str, RANKS))
+LEVEL, _CLASSES, DIFFERENCE = "level", "classes", "difference"
+_RANK_CLASSES = ("Z", *map(str, RANKS))
 
 
 # --- layers ---------------------------------------------------------------------------------------------------------
@@ -62,7 +62,7 @@ def page_layers(data: MapsData) -> list[MapLayer]:
 
 def _rank_layer(m: RankMap, quantity: str, axes: dict[str, str]) -> MapLayer:
     values = np.where(m.rank > 0, m.rank, np.nan)
-    return MapLayer(quantity=quantity, unit="", axes=axes, values=values, classes=RANK_CLASSES)
+    return MapLayer(quantity=quantity, unit="", axes=axes, values=values, classes=_RANK_CLASSES)
 
 
 def _foliage_height(m: RssMap | RankMap) -> dict[str, str]:
@@ -80,7 +80,7 @@ def layer_numbers(layer: MapLayer) -> dict[str, Any]:
     }
     if layer.classes:
         counts = np.bincount(finite.astype(np.int64), minlength=len(layer.classes)).astype(np.float64)
-        if layer.classes[0] == RANK_CLASSES[0]:  # no path is a class of its own
+        if layer.classes[0] == _RANK_CLASSES[0]:  # no path is a class of its own
             counts[0] = layer.values.size - len(finite)
         return result | {"share": dict(zip(layer.classes, counts / layer.values.size, strict=True))}
     names = ("min", "p10", "median", "p90", "max")
@@ -152,14 +152,14 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
                 axes[axis].append(value)
     for axis, values in axes.items():
         values.sort(key=lambda value: _place(axis, value))
-    kind = CLASSES if layers[0].classes else DIFFERENCE if layers[0].difference else LEVEL
+    kind = _CLASSES if layers[0].classes else DIFFERENCE if layers[0].difference else LEVEL
     every = np.concatenate([layer.values[np.isfinite(layer.values)] for layer in layers])
-    step = 1.0 if kind == CLASSES else step_for(every, FINEST_DB)
+    step = 1.0 if kind == _CLASSES else step_for(every, _FINEST_DB)
     stored = {}
     for layer in layers:
         cells = layer.values[::stride, ::stride].ravel()
         key = ",".join(str(axes[axis].index(layer.axes[axis])) if axis in layer.axes else "0" for axis in axes)
-        stored[key] = arrays.add_steps(cells, step) if kind != CLASSES else arrays.add(_codes(cells), "u1")
+        stored[key] = arrays.add_steps(cells, step) if kind != _CLASSES else arrays.add(_codes(cells), "u1")
     return {
         "name": name,
         "unit": layers[0].unit,
@@ -167,7 +167,7 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
         "step": step,
         "range": _range(every, kind),
         "classes": list(layers[0].classes),
-        "colours": class_colours(layers[0].classes),
+        "colours": _class_colours(layers[0].classes),
         "axes": [{"name": axis, "values": values} for axis, values in axes.items()],
         "layers": stored,
     }
@@ -195,11 +195,11 @@ def _range(values: FloatArray, kind: str) -> list[float]:
     return [low, high] if high > low else [low - 0.5, low + 0.5]
 
 
-def class_colours(classes: Sequence[str]) -> list[str]:
+def _class_colours(classes: Sequence[str]) -> list[str]:
     """A colour per class: those of ranks, else well apart in hue and lightness."""
     from matplotlib.colors import to_hex
 
-    if tuple(classes) == RANK_CLASSES:
+    if tuple(classes) == _RANK_CLASSES:
         return ["", *(to_hex(rank_colour(rank)) for rank in RANKS)]
     if not classes:
         return []
@@ -233,10 +233,10 @@ def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dic
     ends = np.array([[east_m[0], east_m[-1]], [north_m[0], north_m[-1]]], dtype=np.float64)
     middle = ends.mean(axis=1)
     reach = np.maximum(np.ptp(ends, axis=1) / 2, 100.0)
-    u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, LATTICE), np.linspace(-1, 1, LATTICE)))
+    u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, _LATTICE), np.linspace(-1, 1, _LATTICE)))
     east, north = middle[0] + u * reach[0], middle[1] + v * reach[1]
     lat, lon = frame.to_geographic(east, north)
-    powers = [(p, q) for p in range(DEGREE + 1) for q in range(DEGREE + 1 - p)]
+    powers = [(p, q) for p in range(_DEGREE + 1) for q in range(_DEGREE + 1 - p)]
     matrix = np.column_stack([u**p * v**q for p, q in powers])
     (by_lat, by_lon), *_ = (np.linalg.lstsq(matrix, np.column_stack([lat, lon]), rcond=None)[0].T,)
     back = frame.to_local(matrix @ by_lat, matrix @ by_lon)

@@ -81,7 +81,7 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
     """
     ax.patch.set(**MISSING)  # cells without a value are transparent, so the hatched ground shows
     image = ax.imshow(values, origin="lower", extent=extent_m(data), interpolation="none", zorder=1, **options)
-    draw_overlay(ax, data.site, highlight)
+    _draw_overlay(ax, data.site, highlight)
     for line in data.borders_m if highlight is None else ():
         ax.plot(line[:, 0], line[:, 1], color="white", linewidth=1.8, zorder=3)
         ax.plot(line[:, 0], line[:, 1], color="black", linewidth=0.9, linestyle=(0, (4, 2)), zorder=3.1)
@@ -94,7 +94,7 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
     return image
 
 
-def draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
+def _draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
     """Outlines of buildings and forests, and the towers; only the named tower when one is named."""
     from matplotlib.collections import PolyCollection
 
@@ -310,7 +310,7 @@ def learning_curves(curves: Sequence[LearningCurve]) -> Figure:
 # --- all figures ---------------------------------------------------------------------------------
 
 
-def level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
+def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
     """One colour scale for all maps [dBm]: the 1 to 99.5 % range, to whole 5 dB."""
     parts = [entry.rss_dbm[np.isfinite(entry.rss_dbm)] for entry in maps]
     finite = np.concatenate(parts) if parts else np.zeros(0)
@@ -331,7 +331,7 @@ def _under(foliage: str) -> str:
 
 def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
     levels = (*data.rss, *data.corrected)
-    limits = level_limits(levels)
+    limits = _level_limits(levels)
     by_height = grouped(levels, lambda m: (f"{m.antennas}{_under(m.foliage)}", m.altitude_m))
     for (antennas, height), maps in by_height.items():
         words = f"{antennas}, {height:g} m"

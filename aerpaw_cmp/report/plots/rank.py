@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 # --- rank ---------------------------------------------------------------------------------------
 
 
-def rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: FloatArray, title: str) -> None:
+def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: FloatArray, title: str) -> None:
     """Ranks at their positions: colour and marker differ; 0 is Z, NaN is left out.
 
     Parameters
@@ -89,7 +89,7 @@ def rank_maps(data: ReportData, panel: RankResult) -> Figure:
     shape = plan_shape(east, north)
     fig, axes = subplots((9.2, rows * (3.9 / shape + 1.1)), rows, columns, squeeze=False)
     for ax, (title, rank) in zip(axes.ravel(), maps, strict=False):
-        rank_map(ax, data.site, east, north, rank, title)
+        _rank_map(ax, data.site, east, north, rank, title)
         frame_around(ax, east, north, shape=shape)
     for ax in axes.ravel()[len(maps) :]:
         ax.set_visible(False)
@@ -102,7 +102,7 @@ def rank_histograms(panel: RankResult) -> Figure:
     reported = int(np.isfinite(panel.measured).sum())
     score = panel.score
     series = [(f"measured ({count(reported)} samples)", score.histogram, score.histogram_ci95)]
-    series += [(at_label(k, fit), fit.histogram, fit.histogram_ci95) for k, fit in score.simulated.items()]
+    series += [(_at_label(k, fit), fit.histogram, fit.histogram_ci95) for k, fit in score.simulated.items()]
     width = 0.8 / len(series)
     from matplotlib import colormaps
 
@@ -125,7 +125,7 @@ def rank_histograms(panel: RankResult) -> Figure:
     return fig
 
 
-def at_label(k: float, fit: RankFit) -> str:
+def _at_label(k: float, fit: RankFit) -> str:
     """Legend entry of one K."""
     distance = "" if not np.isfinite(fit.total_variation) else f" (total variation {fit.total_variation:.2f})"
     return f"K = {k_key(k)}{distance}"

@@ -54,7 +54,7 @@ def overview(data: ReportData, panel: RssResult) -> Figure:
         *panel.position_m[few, :2].T, c=residual[few], cmap="RdBu_r", vmin=-12, vmax=12, s=6, linewidths=0,
         rasterized=True, zorder=5,
     )  # fmt: skip
-    draw_node(plan, panel)
+    _draw_node(plan, panel)
     tower = data.site.towers.get(panel.tower)
     ends = [] if tower is None else [tower.position_m[None]]
     ends += [] if panel.tower_m is None else [panel.tower_m]
@@ -72,7 +72,7 @@ def overview(data: ReportData, panel: RssResult) -> Figure:
     return fig
 
 
-def draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
+def _draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
     """The way of a tower that moves; its mark stands in the middle of it."""
     if panel.tower_m is not None:
         ax.plot(*thinned_plan(*panel.tower_m[:, :2].T), color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5,
@@ -86,8 +86,8 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     draw_site(close, data.site)
     nodes = {item.tower: item for item in data.series}.values()
     for panel in nodes:
-        draw_node(site_plan, panel)
-        draw_node(close, panel)
+        _draw_node(site_plan, panel)
+        _draw_node(close, panel)
     site_plan.plot(*thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.0, label="flight", zorder=4)
     points = close.scatter(
         track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,

@@ -44,6 +44,7 @@ class PredictionPage(Made):
     flown: Mapping[str, Any]
     flights: Sequence[str]
     trained_on: Sequence[str]
+    marks: Sequence[str]
     threshold_db: float | None
     warnings: Sequence[str]
 
@@ -78,7 +79,7 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
     ranks = data.table[data.table["channel"] == "rank"]
     return json_object(
         prediction=data.name,
-        **named(data, "kind flights trained_on threshold_db chosen candidates warnings"),
+        **named(data, "kind flights trained_on marks threshold_db chosen candidates warnings"),
         sentence=data.verdict,
         field=data.model,
         series=series,

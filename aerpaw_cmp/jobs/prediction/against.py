@@ -15,7 +15,7 @@ from ...common.units import FloatArray, IntArray
 from ...compare.forecast import ForecastScore, score_forecast
 from ...compare.learning.calibration import Observed
 from ...flight.data import FlightData
-from ...flight.training import common, flight_logs
+from ...flight.training import common, flight_logs, marks_text, shared
 from ...report.against import Against, AgainstSeries
 from ..learning.calibrate import observe
 from ..learning.calibrate_rank import RankSamples, rank_samples
@@ -49,9 +49,10 @@ def score_against(data: FlightData, folder: Path) -> Against:
             expected="the output folder of 'aerpaw-cmp predict'",
             path=folder,
         ) from None
-    if shared := common(flight_logs(data), [learned]):
+    own = common(flight_logs(data), [learned])
+    if own or any(shared(about.get("marks", ()), marks_text(series)) for _, series in data.series):
         raise UsageError(
-            f"the prediction learned from this flight's own log (SHA-256 {shared[0][:12]}...)",
+            f"the prediction learned from this flight's own {f'log (SHA-256 {own[0][:12]}...)' if own else 'readings'}",
             expected="a prediction made before the flight, or from other flights",
             path=folder,
         )

@@ -24,7 +24,7 @@ from ...compare.spread import BAND
 from ...flight.data import FlightData, choose_site, site_place
 from ...flight.remembered import remembered
 from ...flight.settings import LinkSettings, LinksSettings
-from ...flight.training import common, counted_once, flight_logs, learned_of, learned_patterns
+from ...flight.training import MARKS, common, counted_once, flight_logs, learned_of, learned_patterns, marks_text
 from ...maps import export
 from ...maps.grid import Grid, Layer
 from ...propagation.arrays import Poses, rotation_from_aircraft
@@ -170,6 +170,7 @@ def _model_fields(
             "verdict": memory_words([(m.entry, m.series, m.level.sd_db) for m in model.known.values()], guess),
             "flights": [name for entry in entries for name in entry.flights],
             "trained_on": union(*(entry.trained_on for entry in entries), *used),
+            "marks": (),
             "candidates": [],
             "model": {},
             "chosen": {"title": TITLES["memory"], "base": "memory", "corrected": False, "field": OFF},
@@ -180,6 +181,7 @@ def _model_fields(
         "verdict": first_words(correction, guess, float(np.sqrt((table["slow_sd_db"] ** 2).mean()))),
         "flights": [data.settings.flight.name for data in known],
         "trained_on": union(*map(flight_logs, known), *used, *model.logs),
+        "marks": union(*(marks_text(series, MARKS) for data in known for _, series in data.series)),
         "candidates": [
             {"base": TITLES[base], "field": name, "rmse_db": correction.rmse_db[base, name], "crps_db": crps}
             for (base, name), crps in sorted(correction.crps_db.items(), key=lambda item: item[1])

@@ -36,7 +36,7 @@ def _printable(text: str) -> str:
 
     Examples
     --------
-    >>> print(printable("red: \x1b[31m"))
+    >>> print(_printable("red: \x1b[31m"))
     red: \x1b[31m
     """
     return "\n".join(one_line(line) for line in text.split("\n"))

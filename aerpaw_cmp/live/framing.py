@@ -93,9 +93,9 @@ def _final_result(text: str) -> tuple[Status, str | None] | None:
 
     Examples
     --------
-    >>> final_result("+CME ERROR: 516")
+    >>> _final_result("+CME ERROR: 516")
     ('cme', '516')
-    >>> final_result('+QNWINFO: "TDD NR5G","TOKYO OK"') is None
+    >>> _final_result('+QNWINFO: "TDD NR5G","TOKYO OK"') is None
     True
     """
     if text == "OK":

@@ -66,7 +66,7 @@ def _split_fields(payload: str) -> list[str | None]:
 
     Examples
     --------
-    >>> split_fields('"NR5G-SA","TDD", 515,66,-,"-"')
+    >>> _split_fields('"NR5G-SA","TDD", 515,66,-,"-"')
     ['NR5G-SA', 'TDD', '515', '66', None, None]
     """
     fields: list[str | None] = []

@@ -267,7 +267,7 @@ def _clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 
 
     Examples
     --------
-    >>> clock_ticks(0.0, 200.0, np.datetime64("2025-06-01T14:00:13.5"))[1]
+    >>> _clock_ticks(0.0, 200.0, np.datetime64("2025-06-01T14:00:13.5"))[1]
     ['14:00:30', '14:01:00', '14:01:30', '14:02:00', '14:02:30', '14:03:00', '14:03:30']
     """
     step = next((s for s in _CLOCK_STEPS_S if (high_s - low_s) / s <= most), _CLOCK_STEPS_S[-1])

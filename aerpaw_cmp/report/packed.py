@@ -61,7 +61,7 @@ def _steps_of(values: FloatArray, step: float) -> AnyArray:
 
     Examples
     --------
-    >>> steps_of(np.array([0.014, -1.0, np.nan]), 0.01).tolist()
+    >>> _steps_of(np.array([0.014, -1.0, np.nan]), 0.01).tolist()
     [1, -100, -32768]
     """
     array = np.asarray(values, dtype=np.float64)

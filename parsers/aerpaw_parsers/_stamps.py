@@ -42,7 +42,7 @@ def _date_in_name(name: str) -> str | None:
 
     Examples
     --------
-    >>> date_in_name("24Feb09_172055.1.gpx"), date_in_name("2022-06-10_19:52:44_log.txt"), date_in_name("60m.csv")
+    >>> _date_in_name("24Feb09_172055.1.gpx"), _date_in_name("2022-06-10_19:52:44_log.txt"), _date_in_name("60m.csv")
     ('2024-02-09', '2022-06-10', None)
     """
     for pattern in _IN_NAME:

@@ -515,7 +515,7 @@ def test_the_shift_test_counts_every_shift_that_is_apart(n, given):
     assert np.isnan(ranks.shift_test(np.ones(20), walk(20, 1)))
 
 
-@pytest.mark.parametrize("n", [23, 240])
+@pytest.mark.parametrize("n", [16, 31, 240])
 def test_the_histogram_test_swaps_whole_blocks(n):
     a, b = walk(n, 5), walk(n, 6, 1, 3)
     length = max(autocorrelation(a).block_length, autocorrelation(b).block_length, 1)

@@ -270,11 +270,17 @@ def test_a_link_turned_round_is_the_same() -> None:
     assert there.h[0, 0, 0, 0] == pytest.approx(back.h[0, 0, 0, 0], rel=1e-7)
 
 
+_TILTED = SimpleNamespace(
+    name="tilted", field=lambda theta, phi: (np.sin(theta) * np.cos(8 * theta), 0.5 * np.cos(theta + phi))
+)
+
+
+@pytest.mark.parametrize("patterns", [(Isotropic(),), (_TILTED,)])
 @pytest.mark.parametrize("uav", [(70.0, 4.0, 2.0), (66.0, 41.0, 3.0)])
-def test_a_link_over_two_edges_turned_round_is_the_same(uav: tuple[float, float, float]) -> None:
-    """Vertical and slanted elements, edges that are parallel and edges that are not."""
+def test_a_link_over_two_edges_turned_round_is_the_same(uav: tuple[float, float, float], patterns: tuple) -> None:
+    """Vertical and slanted elements, with a pattern each meets the edge of its own end; edges parallel and not."""
     tower = (0.0, 0.0, 5.0)
-    array = Array(np.zeros((2, 3)), np.array([0.0, np.pi / 3]))
+    array = Array(np.zeros((2, 3)), np.array([0.0, np.pi / 3]), patterns=patterns)
     link = Link(HZ, {"T": array}, array)
     both = "edges", "all"
     there = [trace(place(BARN, tower=tower), link, poses(uav), diffraction=d).h[0, 0] for d in both]

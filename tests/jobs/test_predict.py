@@ -250,9 +250,11 @@ def test_a_prediction_of_another_place_is_no_score(said):
     table.to_csv(folder / "prediction.csv", index=False)
     with pytest.raises(UsageError, match="within 30 m"):
         score_against(data, folder)
-    (folder / "metrics.json").write_text("{}")
-    with pytest.raises(InputError, match="no prediction"):
-        score_against(data, folder)
+    about = json.loads((folder / "metrics.json").read_text())
+    for damaged in ({}, {**about, "marks": None}):
+        (folder / "metrics.json").write_text(json.dumps(damaged))
+        with pytest.raises(InputError, match="no prediction"):
+            score_against(data, folder)
 
 
 def test_a_grid_has_its_heights_one_after_the_other():

@@ -40,7 +40,7 @@ def score_against(data: FlightData, folder: Path) -> Against:
     try:
         about = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         table = pd.read_csv(folder / "prediction.csv", low_memory=False)
-        learned, sentence = list(about[KEY]), str(about["sentence"])
+        learned, marked, sentence = list(about[KEY]), list(about.get("marks", ())), str(about["sentence"])
         groups = dict(iter(table[table["level_db"].notna()].groupby(["tower", "channel"])))
         forecasts = dict(iter(table[table["channel"] == "rank"].groupby("tower")))
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -50,7 +50,7 @@ def score_against(data: FlightData, folder: Path) -> Against:
             path=folder,
         ) from None
     own = common(flight_logs(data), [learned])
-    if own or any(shared(about.get("marks", ()), marks_text(series)) for _, series in data.series):
+    if own or any(shared(marked, marks_text(series)) for _, series in data.series):
         raise UsageError(
             f"the prediction learned from this flight's own {f'log (SHA-256 {own[0][:12]}...)' if own else 'readings'}",
             expected="a prediction made before the flight, or from other flights",

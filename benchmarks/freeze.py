@@ -71,7 +71,7 @@ def street() -> tuple[Any, Any, Any] | None:
 def columns(name: str, replayed: Any) -> dict[str, Any]:
     """The arrays of one replay."""
     paths = replayed.paths
-    held = {f"{name}|{key}": getattr(paths, key) for key in ("pose", "tower", "depth", "faces", "vertices_m", "tree")}
+    held = {f"{name}|{key}": getattr(paths, key) for key in ("pose", "tower", "depth", "faces", "vertices_m")}
     held |= {f"{name}|{key}": getattr(replayed, key) for key in ("h", "rss_dbm", "rss_power_dbm")}
     ranks = np.stack([channel_rank(replayed.h, k) for k in RANK_K])
     return {**held, f"{name}|ranks": ranks}
@@ -113,7 +113,7 @@ def differences(before: Any, after: Any) -> dict[str, float]:
             print(f"{name}: shape {old.shape} before, {new.shape} after")
             worst["paths"] = np.inf
             continue
-        if key in ("pose", "tower", "depth", "faces", "tree", "ranks"):
+        if key in ("pose", "tower", "depth", "faces", "ranks"):
             count = float((old != new).sum())
             worst["ranks" if key == "ranks" else "paths"] += count
         elif key == "h":

@@ -158,9 +158,6 @@ def map_(
     foliage: Annotated[
         list[str] | None, Option(help="none, attenuating, opaque or all; repeatable  [default: all]")
     ] = None,
-    crown_reflections: Annotated[
-        bool, Option("--crown-reflections/--no-crown-reflections", help="Opaque crowns also reflect.")
-    ] = True,
     spacing: Annotated[float | None, Option(help="Distance between positions [m]  [default: 30]")] = None,
     rss_altitude: Annotated[
         list[float] | None, Option(help="Height of RSS maps [m]; repeatable  [default: 30, 70, 110]")
@@ -205,7 +202,6 @@ def map_(
     modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
     fields: dict[str, Any] = {
         "foliage": modes,
-        "crown_reflections": crown_reflections,
         "spacing_m": spacing,
         "rss_altitudes_m": tuple(sorted(set(rss_altitude))) if rss_altitude else None,
         "rank_altitudes_m": tuple(sorted(set(rank_altitude))) if rank_altitude else None,

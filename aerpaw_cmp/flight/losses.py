@@ -1,4 +1,4 @@
-"""Losses of a path of a flight besides its own field: foliage, reflections, rough ground; and crowns that reflect."""
+"""Losses of a path of a flight besides its own field: foliage, reflections, rough ground."""
 
 from __future__ import annotations
 
@@ -10,19 +10,8 @@ from ..propagation.field.foliage import crown_index, foliage_depth_m, foliage_lo
 from ..propagation.field.stands import stand_loss_db
 from ..propagation.options import Loss
 from ..propagation.paths import PathSet
-from ..propagation.search.crowns import Crowns
 from ..site.site import Site, Trees
 from .settings import RtSettings
-
-
-def _crowns_reflect(trees: Trees, rt: RtSettings) -> bool:
-    """Check whether crowns reflect: those of ``foliage: opaque``, unless ``rt.advanced.crown_reflections`` is off."""
-    return rt.foliage == "opaque" and rt.advanced.crown_reflections and len(trees) > 0
-
-
-def reflecting_crowns(trees: Trees, rt: RtSettings) -> Crowns | None:
-    """Crowns that reflect, or None."""
-    return Crowns(trees) if _crowns_reflect(trees, rt) else None
 
 
 def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
@@ -114,7 +103,6 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
             on = np.abs(corner[:, 2:] - heights).min(axis=1) < _ON_GROUND_M  # NaN where the path has no such corner
             if site.dem is not None:
                 on |= np.abs(corner[:, 2] - site.dem.ground_m(corner[:, 0], corner[:, 1])) < _NEAR_TERRAIN_M
-            on &= paths.tree[:, step] < 0
             ray = corner[on] - ray_start[on]
             sine = np.abs(ray[:, 2]) / np.maximum(np.linalg.norm(ray, axis=1), _ON_GROUND_M)
             total[on] += 40.0 * np.log10(np.e) * (2.0 * np.pi / wavelength * sigma * sine) ** 2
@@ -138,7 +126,7 @@ def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
         source, target = sources_m[paths.tower], targets_m[paths.pose]
-        trees_db = foliage_loss_db(source, paths.vertices_m, target, index, model, paths.tree)
+        trees_db = foliage_loss_db(source, paths.vertices_m, target, index, model)
         return trees_db + stand_loss_db(site, source, paths.vertices_m, target, model, wavelength)
 
     return loss

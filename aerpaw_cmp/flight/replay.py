@@ -27,7 +27,7 @@ from .clock import Along, ClockChannel, ClockEstimate, judge_clock
 from .data import FlightData, RssSeries, Times, rank_positions
 from .learned_gain import LearnedGain, learned_gain
 from .lock import LOCK_FLOOR_DB
-from .losses import path_loss, reflecting_crowns
+from .losses import path_loss
 from .settings import RtSettings
 from .track import TrackPoses, nanoseconds
 from .training import learned_here
@@ -389,7 +389,7 @@ def replay_poses(
     engine: Engine | None = None,
     progress: Progress = silent,
 ) -> Replay:
-    """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``.
+    """Replay poses as the flight's ``rt`` asks, foliage included; ``engine`` in place of ``rt.engine``.
 
     Parameters
     ----------
@@ -422,10 +422,9 @@ def replay_poses(
         engine,
         **named(rt, "max_depth diffraction refraction"),
         **named(rt.advanced, "samples ridges device"),
-        crowns=reflecting_crowns(site.trees, rt),
     )
-    # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
-    alone = engine == "image" and search.crowns is None and site.dem is None
+    # the image engine finds the paths of a pose whatever the others are; planes of terrain are numbered as they are met
+    alone = engine == "image" and site.dem is None
     long = alone and len(poses) > BLOCK
     run = Run(
         cache_dir=None if rt.advanced.cache else "",

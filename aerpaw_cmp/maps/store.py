@@ -122,7 +122,7 @@ class TileStore:
                 self._make(part, maps_dataset(empty, frame, about))
                 part.rename(self.path)
             self._group = self._zarr.open_group(self.path, mode="r+")
-            return [int(number) for number in np.flatnonzero(self.paths()[..., 0] == _NOT_COMPUTED)]
+            return [int(number) for number in np.flatnonzero(self.paths() == _NOT_COMPUTED)]
 
     def _make(self, part: Path, like: Any) -> None:
         grid = self.tiling.grid
@@ -145,17 +145,17 @@ class TileStore:
                 dimension_names=variable.dims, attributes=plain,
             )  # fmt: skip
         group.create_array(
-            LEDGER, shape=(*self.tiling.shape, 2), chunks=(1, 1, 2), dtype=np.int64, fill_value=_NOT_COMPUTED,
-            dimension_names=("tile_y", "tile_x", "kind"),
-            attributes={"long_name": "paths of each tile, and those off crowns", "comment": "-1: not computed yet"},
+            LEDGER, shape=self.tiling.shape, chunks=(1, 1), dtype=np.int64, fill_value=_NOT_COMPUTED,
+            dimension_names=("tile_y", "tile_x"),
+            attributes={"long_name": "paths of each tile", "comment": "-1: not computed yet"},
         )  # fmt: skip
         group.attrs[_JOB] = json.dumps(self._job)
 
     def paths(self) -> Any:
-        """Paths of each tile and those off crowns (tile rows, tile columns, 2); -1 of one that is not there."""
+        """Paths of each tile (tile rows, tile columns); -1 of one that is not there."""
         return np.asarray(self._group[LEDGER][:])
 
-    def write(self, number: int, maps: Mapping[str, MapResult], paths: tuple[int, int]) -> None:
+    def write(self, number: int, maps: Mapping[str, MapResult], paths: int) -> None:
         """Write one tile; :class:`~aerpaw_cmp.common.errors.OutputError` where the disk does not take it.
 
         Parameters
@@ -163,15 +163,15 @@ class TileStore:
         number : int
         maps : mapping of str to MapResult
             By foliage mode.
-        paths : (int, int)
-            How many there are, and how many of them bounce off crowns.
+        paths : int
+            How many there are.
         """
         rows, columns = self.tiling.part(number)
         with explained_os_errors(self.path):
             for name, variable in maps_dataset(maps, self._frame, self._about).variables.items():
                 if {"y", "x"} <= {*variable.dims}:
                     self._group[name][..., rows, columns] = variable.values
-            self._group[LEDGER][divmod(number, self.tiling.shape[1])] = np.array(paths)
+            self._group[LEDGER][divmod(number, self.tiling.shape[1])] = paths
 
     def read(self, empty: Mapping[str, MapResult], step: int) -> dict[str, MapResult]:
         """Maps of every ``step``-th position each way, by foliage mode; ``empty`` as for :meth:`begin`."""

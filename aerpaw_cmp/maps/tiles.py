@@ -125,13 +125,9 @@ class Reach:
         Reflections that are followed.
     every : bool
         Keep all buildings, as with cast rays.
-    crowns : bool
-        Crowns reflect.
     """
 
-    def __init__(
-        self, site: Site, budget: Budget, *, max_depth: int, every: bool = False, crowns: bool = False
-    ) -> None:
+    def __init__(self, site: Site, budget: Budget, *, max_depth: int, every: bool = False) -> None:
         self.site, self._range_m, self._depth = site, budget.range_m, max_depth
         self._every = every or max_depth > 1 or site.dem is not None or site.scene is not None or not site.buildings
         footprints = shapely.envelope([building.footprint for building in site.buildings])
@@ -140,10 +136,6 @@ class Reach:
         farthest = np.nanmax(np.abs(np.concatenate(spans)))
         # corners (2, 3) of a box round everything, however the site is turned: it sets the tolerances of all tiles
         self.extent_m = np.sqrt(2.0) * farthest * np.array([[-1.0] * 3, [1.0] * 3])
-        self._mirrors_at = np.zeros((0, 2))  # beside the walls: any crown
-        if crowns:
-            trees = np.column_stack([site.trees.east_m, site.trees.north_m])
-            self._mirrors_at = _box(trees, float(site.trees.crown_diameter_m.max()))
         if self._every:
             return
         faces = self._faces = site_faces(site)
@@ -172,7 +164,7 @@ class Reach:
     def _buildings_in_reach(self, tower: Tower, box_m: FloatArray) -> BoolArray:
         """Buildings (buildings,) that can mirror or shade what one tower sends into a box."""
         at, tile = tower.position_m[:2], _box(box_m[:, :2])
-        lines = [shapely.linestrings(np.vstack([at, tile, self._mirrors_at])[None])]
+        lines = [shapely.linestrings(np.vstack([at, tile])[None])]
         if self._depth:
             lit = self._mirrors.toward(tower.position_m, box_m)
             lit = lit[self._is_wall[lit]]

@@ -13,7 +13,6 @@ from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
 from .field.ridges import Ridges
 from .paths import PathSet
-from .search.crowns import Crowns
 from .search.effort import SearchRun
 from .search.samples import Samples
 
@@ -39,9 +38,6 @@ class Search:
         (:mod:`aerpaw_cmp.propagation.search.samples`).
     batch : int
         ``sionna`` only: poses per call.
-    crowns : Crowns, optional
-        Crowns that reflect: their paths are added to those of the engine, whichever it is. What crowns stop is the
-        business of :class:`Field`.
     diffraction : {"none", "edges", "all"}
         Paths over one edge of a building: with the ground on either side ("edges"), and also with one wall or roof on
         one side ("all"). In H, levels and ranks, whichever engine finds the reflections.
@@ -60,7 +56,6 @@ class Search:
     max_depth: int = 2
     samples: Samples = "auto"
     batch: int = 50
-    crowns: Crowns | None = None
     diffraction: Diffraction = "none"
     ridges: Ridges = "deygout"
     refraction: bool = False

@@ -67,8 +67,7 @@ class Faces:
     polygon : tuple of Polygon or None, length faces
         The face in its plane, where it does not fill its bounds.
     solid : (faces,) int
-        Index of the building, -1 for the ground, which never hides anything. Faces of crowns, which only the paths
-        of :mod:`aerpaw_cmp.propagation.search.crowns` bring along, count on from the last building by tree.
+        Index of the building, -1 for the ground, which never hides anything.
     """
 
     normal: FloatArray
@@ -156,8 +155,6 @@ class PathSet(Rows):
         Face indices from tower to UAV, -1 where unused.
     vertices_m : (paths, max_depth, 3)
         Reflection points for array centres, NaN where unused.
-    tree : (paths, max_depth) int
-        Tree whose crown reflects, -1 where something else does; left out, no crown does.
     terrain_db : (paths,)
         Loss by the terrain: at ground that is curved within the Fresnel zone, or over ridges; left out, none.
     """
@@ -167,22 +164,14 @@ class PathSet(Rows):
     depth: IntArray
     faces: IntArray
     vertices_m: FloatArray
-    tree: IntArray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int64))
     terrain_db: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         if len(self.terrain_db) != len(self.pose):
             object.__setattr__(self, "terrain_db", np.zeros(len(self.pose)))
-        if self.tree.shape != self.faces.shape:
-            object.__setattr__(self, "tree", np.full(self.faces.shape, -1, dtype=np.int64))
 
     def __len__(self) -> int:
         return len(self.pose)
-
-    @property
-    def off_crown(self) -> BoolArray:
-        """Paths (paths,) that bounce off a crown."""
-        return np.asarray((self.tree >= 0).any(axis=1))
 
     @classmethod
     def from_tower(cls, tower: int, pose: IntArray, faces: IntArray, vertices_m: FloatArray, max_depth: int) -> PathSet:

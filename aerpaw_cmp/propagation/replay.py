@@ -202,7 +202,7 @@ def replay(
 def passed(
     site: Site, scene: Scene, link: Link, poses: Poses, paths: PathSet, search: Search
 ) -> tuple[Scene, PathSet, list[Omission]]:
-    """Paths over terrain that it lets through, with those that bounce off crowns.
+    """Paths over terrain that it lets through.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def passed(
     Returns
     -------
     scene : Scene
-        With the facets of crowns that a path meets.
+        With the planes of terrain that a path meets.
     paths : PathSet
     notes : list of Omission
         What was stopped or left out.
@@ -231,14 +231,7 @@ def passed(
     paths = level.select(clear) if lost else level
     if len(shaped):
         paths = mirror.merge([paths, shaped], search.max_depth, None)
-    if search.crowns is None:
-        return scene, paths, notes
-    if scene.surfaces is not None:
-        return scene, paths, [*notes, Omission("reflections off crowns: they are not searched in a scene of triangles")]
-    scene, bounces = scene.with_bounces(site, poses, search.crowns, search.max_depth)
-    if search.max_depth > 1:
-        notes.append(Omission("paths over a crown and a building, or over two crowns"))
-    return scene, mirror.merge([paths, bounces], search.max_depth, None), notes
+    return scene, paths, notes
 
 
 def further_fields(

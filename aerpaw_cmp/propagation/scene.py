@@ -17,8 +17,7 @@ from ..site.site import Site
 from . import compiled
 from .arrays import Link, Poses
 from .faces import inside_solids, site_faces
-from .paths import Faces, Links, PathSet
-from .search.crowns import Crowns
+from .paths import Faces, Links
 from .surfaces import Surfaces
 
 
@@ -79,29 +78,6 @@ class Scene:
     def links_to(self, poses: Poses) -> Links:
         """Ends of the links from the towers to the poses."""
         return Links(self.sources_m, poses.position_m, self.usable, self.excluded)
-
-    def with_bounces(self, site: Site, poses: Poses, crowns: Crowns, max_depth: int) -> tuple[Scene, PathSet]:
-        """Scene with the facets of crowns that reflect, as hidden by nothing else than before, and their paths.
-
-        Parameters
-        ----------
-        site : Site
-        poses : Poses
-        crowns : Crowns
-            Those that reflect.
-        max_depth : int
-            Most reflections of a path, the bounce among them.
-
-        Returns
-        -------
-        scene : Scene
-            Its further faces are the facets that a path meets.
-        paths : PathSet
-            Those that bounce off a crown.
-        """
-        paths, faces = crowns.bounces(self.faces, self.links_to(poses), max_depth=max_depth, dem=site.dem)
-        more = np.zeros((len(self.usable), len(faces) - len(self.faces)), dtype=np.bool_)
-        return replace(self, faces=faces, usable=np.concatenate([self.usable, more], axis=1)), paths
 
 
 def surfaces_of(site: Site) -> Surfaces | None:

@@ -110,12 +110,6 @@ def _crowns(trees: Trees) -> tuple[FloatArray, IntArray]:
     return _bodies(centre, base, top, trees.crown_diameter_m / 2, CROWN_SIDES, pointed=True)
 
 
-def crown_corners_m(trees: Trees) -> tuple[FloatArray, FloatArray]:
-    """Corners of the crowns of :func:`site_meshes`: rim (trees, CROWN_SIDES, 3), counter-clockwise from above; tip."""
-    corners = _crowns(trees)[0].reshape(len(trees), CROWN_SIDES + 2, 3)
-    return corners[:, :CROWN_SIDES], corners[:, CROWN_SIDES]
-
-
 def _ground_mesh(site: Site) -> tuple[FloatArray, IntArray]:
     """The flat ground, up = 0: two triangles that face upwards."""
     west, east, south, north = site.area_m

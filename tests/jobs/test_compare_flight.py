@@ -16,7 +16,6 @@ from aerpaw_cmp.compare.result import RssResult
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.replay import replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.reporting.audit_flight import audit_replays
 from aerpaw_cmp.jobs.reporting.compare_flight import compare_rank_series, compare_rss_series, pairs_of
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.foliage_notes import foliage_notes
@@ -213,41 +212,6 @@ def test_channels_without_common_instants_make_no_pair(tmp_path: Path) -> None:
     early, late = np.arange(0, 20, 0.25), np.arange(30, 60, 0.25)
     path = flight(tmp_path, rss={"USRP1": (early, free_space_db(early)), "USRP2": (late, free_space_db(late))})
     assert pairs_of(compared_rss(path)) == []
-
-
-def test_opaque_crowns_reflect_in_the_flight(tmp_path: Path) -> None:
-    at = np.arange(0, 120, 0.5)
-
-    def replayed(**rt: Any) -> tuple[Any, Any]:
-        folder = tmp_path / f"case{len(list(tmp_path.iterdir()))}"
-        folder.mkdir()
-        path = flight(folder, 120, rss={"USRP1": (at, free_space_db(at))}, rt=rt)
-        data = gathered(path)
-        trees = data.site.trees  # a wood beside the track, which runs east of LW1 at 40 m
-        rng = np.random.default_rng(3)
-        wood = dataclasses.replace(
-            trees, east_m=rng.uniform(20, 480, len(trees)), north_m=rng.uniform(-250, 250, len(trees)),
-        )  # fmt: skip
-        data = dataclasses.replace(data, site=dataclasses.replace(data.site, trees=wood))
-        return data, replay_rss(data)[0]
-
-    bare_data, bare = replayed()
-    data, bouncing = replayed(foliage="opaque")
-    off_data, off = replayed(foliage="opaque", advanced={"crown_reflections": False})
-    bounced = int(bouncing.replay.paths.off_crown.sum())
-    assert bounced > 20
-    assert (bouncing.replay.rss_dbm != off.replay.rss_dbm).any()
-    assert not off.replay.paths.off_crown.any()
-    np.testing.assert_array_equal(off.replay.paths.faces, bare.replay.paths.faces)
-    for some, series, expected in (
-        (data, bouncing, {"crown_reflections": True, "paths_off_crowns": bounced}),
-        (off_data, off, {"crown_reflections": False, "paths_off_crowns": 0}),
-        (bare_data, bare, {}),
-    ):
-        rt = some.settings.rt.model_copy(update={"audit_links": 0})
-        quiet = dataclasses.replace(some, settings=some.settings.model_copy(update={"rt": rt}))
-        settings = audit_replays(quiet, [series]).settings
-        assert {k: v for k, v in settings.items() if "crown" in k} == expected
 
 
 def test_the_report_says_where_foliage_models_are_stretched_or_assumed(tmp_path: Path) -> None:

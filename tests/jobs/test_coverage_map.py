@@ -22,9 +22,8 @@ from aerpaw_cmp.maps.job import RATIO_LIMIT_DB, rank_of_singular_values
 from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL
 from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.field.foliage import CrownIndex, Opaque, foliage_loss_db
-from aerpaw_cmp.propagation.options import Field, Search
+from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.propagation.search.crowns import Crowns
 from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
 from tests.jobs.sent_by_pickle import SentByPickle
@@ -89,36 +88,6 @@ def test_every_mode_is_what_a_replay_with_its_loss_says(site):
     assert 0.1 < shaded.mean() < 0.6
     assert np.array_equal(np.isnan(maps["attenuating"].rss_siso_dbm), np.isnan(maps["none"].rss_siso_dbm))
     assert (maps["attenuating"].singular_values[shaded] > 0).any()
-
-
-def test_opaque_crowns_reflect_as_a_replay_with_them_says(site):
-    crowns = Crowns(site.trees)
-    position = Grid.over_area(site.area_m, 25.0).positions_m(60.0)
-    poses = Poses(position, np.broadcast_to(np.eye(3), (len(position), 3, 3)))
-
-    def loss(paths, source, target):
-        ends = source[paths.tower], paths.vertices_m, target[paths.pose]
-        return foliage_loss_db(*ends, crowns.index, Opaque(), paths.tree)
-
-    line = linear_array(4, wavelength_m(CARRIER_HZ) / 2, 0.0)
-    maps = {}
-    for on in (True, False):
-        channels = mapping.SiteChannels(site, settings(crown_reflections=on))
-        maps[on] = {mode: channels.of(mode)(position, ("A", "B")) for mode in mapping.FOLIAGE}
-        link = Link(CARRIER_HZ, dict.fromkeys(site.towers, line), line, 40.0, uav_transmits=False)
-        single = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
-        many, siso = (
-            replay(site, w, poses, Search(crowns=crowns if on else None), Field(loss=loss)) for w in (link, single)
-        )
-        np.testing.assert_allclose(maps[on]["opaque"].rss_siso_dbm, siso.rss_dbm, atol=1e-9)
-        rank = rank_of_singular_values(maps[on]["opaque"].singular_values, [100.0])[..., 0]
-        np.testing.assert_array_equal(rank, channel_rank(many.h, 100.0))
-        assert channels.paths_off_crowns == siso.paths.off_crown.sum()
-        assert (channels.paths_off_crowns > 20) == on
-    for mode in ("none", "attenuating"):  # bit by bit
-        np.testing.assert_array_equal(maps[True][mode].rss_siso_dbm, maps[False][mode].rss_siso_dbm)
-        np.testing.assert_array_equal(maps[True][mode].singular_values, maps[False][mode].singular_values)
-    assert (maps[True]["opaque"].rss_siso_dbm != maps[False]["opaque"].rss_siso_dbm).any()
 
 
 def test_a_broadside_beam_gains_the_number_of_elements():
@@ -361,7 +330,7 @@ def test_workers_evaluate_the_tiles_to_the_same_digit() -> None:
     shared = mapping.make_maps(load_site("lake_wheeler"), some, Stages(), workers=crew, name="lake_wheeler")
     assert len(crew.sizes) > 1
     assert max(crew.sizes) < 3000
-    assert (shared.paths, shared.paths_off_crowns) == (alone.paths, alone.paths_off_crowns)
+    assert shared.paths == alone.paths
     for mode in some.foliage:
         assert np.array_equal(shared.maps[mode].rss_siso_dbm, alone.maps[mode].rss_siso_dbm, equal_nan=True)
         assert np.array_equal(shared.maps[mode].rank, alone.maps[mode].rank)

@@ -12,6 +12,7 @@ from aerpaw_cmp.jobs.mapping import coverage_map as mapping
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.tiles import PLANES, Budget, Reach, Tiling
 from aerpaw_cmp.propagation.arrays import Link, single_element
+from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search.occlusion import Occlusion
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
@@ -175,7 +176,7 @@ def test_a_tile_without_towers_is_out_of_coverage_at_once(monkeypatch):
 
 def test_solids_beside_segments_are_all_that_may_cut_them():
     site = town(40)
-    hiding = Occlusion(mapping.Scene.of(site, mapping.SiteChannels(site, settings()).siso, _few()).faces, 1e-9)
+    hiding = Occlusion(Scene.of(site, mapping.SiteChannels(site, settings()).siso, _few()).faces, 1e-9)
     rng = np.random.default_rng(5)
     start = np.array([-350.0, -300.0, 9.0]) + rng.uniform(0, 40, (300, 3))
     end = np.array([200.0, 330.0, 2.0]) + rng.uniform(0, 60, (300, 3))

@@ -275,50 +275,6 @@ def test_crowns_at_the_edges_of_the_grid_are_found_from_all_sides(monkeypatch):
     assert (expected[18:27] > 0.3).all()
 
 
-def test_a_crown_that_reflects_does_not_shade_its_own_path():
-    """Two trees on the way; each vertex may stand on the crown of one of them."""
-    stand = forest((0.0, 0.0, 0.0, 10.0, 6.0, 0.0, 0.4), (40.0, 0.0, 0.0, 10.0, 6.0, 0.0, 0.4))
-    source, target = np.array([[-50.0, 0.0, 3.0]] * 3), np.array([[90.0, 0.0, 3.0]] * 3)
-    vertices = np.tile([[[0.0, 0.0, 3.0], [40.0, 0.0, 3.0]]], (3, 1, 1))
-    bounced = np.array([[-1, -1], [0, -1], [-1, 1]])  # a path has one reflection off a crown at most
-    through_both = float(CrownIndex(stand).chords_m(source[:1], target[:1])[0])
-    each = through_both / 2
-    free = foliage_depth_m(source, vertices, target, stand, bounced)
-    np.testing.assert_allclose(free, [through_both, each, each], atol=1e-9)
-    none = foliage_depth_m(source, vertices, target, stand)
-    np.testing.assert_allclose(none, through_both, atol=1e-9)
-    # an unused vertex is the next one; one bounce, its segments alone
-    lone = vertices.copy()
-    lone[:, 1] = np.nan
-    np.testing.assert_allclose(
-        foliage_depth_m(source, lone, target, stand, np.array([[0, -1], [1, -1], [-1, -1]])),
-        [each, each, through_both], atol=1e-9,
-    )  # fmt: skip
-    # a model that is not opaque knows no reflection off crowns
-    for model in (foliage.P833(), foliage.NoFoliage()):
-        assert np.isinf(foliage_loss_db(source, vertices, target, stand, model, bounced)).tolist() == [
-            False,
-            True,
-            True,
-        ]
-    assert np.isfinite(foliage_loss_db(source, vertices, target, stand, foliage.P833())).all()
-
-
-def test_only_the_segments_at_a_vertex_leave_out_its_crown():
-    """The third segment passes the crown of the first vertex again: there it shades."""
-    stand = forest((0.0, 0.0, 0.0, 10.0, 6.0, 0.0, 0.4))
-    source, target = np.array([[-50.0, 0.0, 3.0]]), np.array([[-50.0, 0.5, 3.0]])
-    vertices = np.array([[[-3.0 + 0.9, 0.0, 3.0], [-40.0, 30.0, 3.0], [50.0, 0.5, 3.0]]])
-    bounced = np.array([[0, -1, -1]])
-    far = float(CrownIndex(stand).chords_m(vertices[:, 1], vertices[:, 2])[0])
-    back = float(CrownIndex(stand).chords_m(vertices[:, 2], target)[0])
-    assert back > 3.0
-    depth_m = float(foliage_depth_m(source, vertices, target, stand, bounced)[0])
-    assert depth_m == pytest.approx(far + back, abs=1e-9)
-    last = float(foliage_depth_m(target, vertices[:, ::-1], source, stand, bounced[:, ::-1])[0])
-    assert last == pytest.approx(far + back, abs=1e-9)  # and the way back
-
-
 @pytest.mark.parametrize("low", [2.0, 5.0])
 def test_a_level_line_lies_within_a_slab_up_to_its_faces(low):
     at, step = np.array([low - 1e-12, low, low + 1.0, low + 3.0, low + 3.0 + 1e-12]), np.zeros(5)

@@ -14,7 +14,6 @@ from aerpaw_cmp.propagation.field.baselines import free_space_dbm, two_ray_dbm
 from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.propagation.search.crowns import Crowns
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = load_site("lake_wheeler")
@@ -102,22 +101,6 @@ def test_free_space_and_two_rays_along_a_moving_node_are_the_closed_forms():
     # and not those of the node's middle
     middle = free_space_dbm(rover().mean(axis=0)[None], poses().position_m, 3.4e9, 40.0)[:, 0]
     assert np.abs(middle - expected).max() > 3.0
-
-
-def test_crowns_that_reflect_are_numbered_as_one():
-    near = np.hypot(SITE.trees.east_m - 150, SITE.trees.north_m - 200).argsort()[:6]
-    trees = dataclasses.replace(SITE.trees, **{
-        f.name: getattr(SITE.trees, f.name)[near]
-        for f in dataclasses.fields(SITE.trees) if isinstance(getattr(SITE.trees, f.name), np.ndarray)
-    })  # fmt: skip
-    few, site = poses(40), dataclasses.replace(BARE, trees=trees)
-    replayed = replay_moving(site, LINK, few, rover(40), Search(max_depth=1, crowns=Crowns(trees)))
-    for i in range(0, 40, 5):
-        pose = Poses(few.position_m[i : i + 1], np.eye(3)[None])
-        still = site_with_tower_at(site, "LW1", rover(40)[i])
-        alone = replay(still, LINK, pose, Search(max_depth=1, crowns=Crowns(trees)))
-        assert replayed.rss_dbm[i, 0] == pytest.approx(alone.rss_dbm[0, 0], abs=1e-9, nan_ok=True)
-        assert (replayed.paths.pose == i).sum() == len(alone.paths)
 
 
 def test_what_cannot_move_is_refused_in_one_message():

@@ -18,12 +18,11 @@ from aerpaw_cmp.propagation.arrays import (
 from aerpaw_cmp.propagation.check import field_audit, reference
 from aerpaw_cmp.propagation.field import dyads, sum
 from aerpaw_cmp.propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
-from aerpaw_cmp.propagation.options import Field, Search
+from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search import occlusion as solids
-from aerpaw_cmp.propagation.search.crowns import Crowns
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
-from aerpaw_cmp.site.materials import MATERIALS, VEGETATION, material
+from aerpaw_cmp.site.materials import MATERIALS, material
 from aerpaw_cmp.site.site import Building, Trees
 
 KS = (10.0, 100.0)
@@ -37,7 +36,7 @@ def stand(count=60, seed=6):
 
 def loss_of(trees, model):
     index = CrownIndex(trees)
-    return lambda p, s, t: foliage_loss_db(s[p.tower], p.vertices_m, t[p.pose], index, model, p.tree)
+    return lambda p, s, t: foliage_loss_db(s[p.tower], p.vertices_m, t[p.pose], index, model)
 
 
 @pytest.fixture
@@ -78,8 +77,7 @@ def test_foliage_equals_the_second_implementation(scenes, case, name, in_leaf):
     site, link, poses = case
     site = replace(site, trees=stand())
     model = foliage_model(name, scenes.carrier_hz, in_leaf=in_leaf)
-    crowns = Crowns(site.trees) if name == "opaque" else None
-    result = replay(site, link, poses, Search(crowns=crowns), Field(loss=loss_of(site.trees, model)))
+    result = replay(site, link, poses, field=Field(loss=loss_of(site.trees, model)))
     audit = audited(site, link, poses, result, reference.ExpectedLoss(name, in_leaf=in_leaf))
     assert audit.failures == ()
     bare = replay(site, link, poses)
@@ -112,7 +110,6 @@ def test_materials_a_second_time():
             eta = reference.permittivity(name, 1e9 * ghz)[0]
             assert eta == pytest.approx(what.relative_permittivity(1e9 * ghz), rel=1e-12)
             assert reference.permittivity(name, 1e9 * ghz * beyond) is None
-    assert reference.permittivity("vegetation", 3e9)[0] == pytest.approx(VEGETATION.relative_permittivity(3e9))
 
 
 def test_rotations_a_second_time():
@@ -282,11 +279,10 @@ def test_free_space_and_a_perfect_ground_in_closed_form(scenes):
 def test_chord_through_a_crown_in_closed_form():
     tree = Trees(*(np.array([x]) for x in (10.0, 0.0, 0.0, 20.0, 8.0, 4.0, 0.4)))
     # level, through the axis: the cone is 4 m in radius at 4 m and 0 at 20 m
-    assert reference.crown_depth_m(tree, (0, 0, 8), (20, 0, 8), set()) == pytest.approx(6.0, abs=1e-9)
-    assert reference.crown_depth_m(tree, (10, 0, 30), (10, 0, 0), set()) == pytest.approx(16.0, abs=1e-9)
-    assert reference.crown_depth_m(tree, (0, 0, 2), (20, 0, 2), set(), trunks=True) == pytest.approx(0.4, abs=1e-9)
-    assert reference.crown_depth_m(tree, (0, 0, 8), (20, 0, 8), {0}) == 0.0
-    assert reference.crown_depth_m(tree, (0, 3.9, 8), (20, 3.9, 8), set()) == 0.0  # below its rim, beside the cone
+    assert reference.crown_depth_m(tree, (0, 0, 8), (20, 0, 8)) == pytest.approx(6.0, abs=1e-9)
+    assert reference.crown_depth_m(tree, (10, 0, 30), (10, 0, 0)) == pytest.approx(16.0, abs=1e-9)
+    assert reference.crown_depth_m(tree, (0, 0, 2), (20, 0, 2), trunks=True) == pytest.approx(0.4, abs=1e-9)
+    assert reference.crown_depth_m(tree, (0, 3.9, 8), (20, 3.9, 8)) == 0.0  # below its rim, beside the cone
 
 
 def _wrap(monkeypatch, where, name, change):

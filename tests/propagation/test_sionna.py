@@ -16,8 +16,7 @@ from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.search.crowns import Crowns
-from aerpaw_cmp.site.site import Building, Trees
+from aerpaw_cmp.site.site import Building
 
 pytestmark = pytest.mark.sionna
 
@@ -114,21 +113,6 @@ def test_rays_chosen_by_pilots_find_every_path(sionna, scenes, lone):
     assert scenes.keys(traced.paths) == scenes.keys(replay(site, scenes.link(site), poses).paths)
     assert traced.samples in (40_000, 160_000, 640_000)
     assert "rays a tower found the same" in traced.samples_reason
-
-
-def test_paths_over_crowns_join_those_that_sionna_finds(sionna, scenes, lone):
-    site, poses = lone
-    rng = np.random.default_rng(6)
-    near = rng.uniform(-100, 100, (2, 60))
-    like = np.ones(60)
-    stand = Trees(*near, 0 * like, 18 * like, 9 * like, 5 * like, 0.4 * like)
-    link, crowns = scenes.link(site), Crowns(stand)
-    exact = replay(site, link, poses, Search(crowns=crowns))
-    traced = replay(
-        site, link, poses, Search("sionna", samples=SAMPLES, batch=BATCH, crowns=crowns), run=Run(cache_dir="")
-    )
-    assert scenes.keys(traced.paths) == scenes.keys(exact.paths)
-    assert exact.paths.off_crown.sum() == traced.paths.off_crown.sum() > 3
 
 
 def test_second_replay_traces_nothing(sionna, scenes, lone, tmp_path, monkeypatch):

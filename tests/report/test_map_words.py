@@ -71,10 +71,9 @@ def test_several_heights_name_the_best_and_the_worst(maps_data: MapsData) -> Non
 
 
 def test_warnings_and_notes_stand_only_under_their_condition(maps_data: MapsData) -> None:
-    fine = {"foliage": ("opaque",), "crown_reflections": False, "threshold_dbm": -np.inf, "spacing_m": 30.0}
+    fine = {"foliage": ("opaque",), "threshold_dbm": -np.inf, "spacing_m": 30.0}
     data = dataclasses.replace(maps_data, settings=fine, metrics={})
     assert not any("coarser than" in text or "Corrected by" in text for text in warnings(data))
-    assert any("Opaque crowns do not reflect" in text for text in notes(data))
     assert not any("in maps of RSS above" in text for text in notes(data))
     fit = {"degenerate": True, "message": "one length alone"}
     coarse = dataclasses.replace(

@@ -1,6 +1,6 @@
 """The map job: the replay engine plugged into :mod:`aerpaw_cmp.maps.job`, foliage modes, study, record of the page.
 
-Paths depend neither on arrays nor, but for bounces off opaque crowns, on foliage. Each chunk of positions is searched
+Paths depend neither on arrays nor on foliage. Each chunk of positions is searched
 once; one element and the arrays, and every foliage mode, are evaluated on the same paths, and a mode re-evaluates only
 the links that foliage touches.
 """
@@ -48,8 +48,6 @@ from ...propagation.field.sum import channel_matrices, rss_dbm
 from ...propagation.options import Engine, Job, Run, Search
 from ...propagation.paths import PathSet
 from ...propagation.replay import Replay, replay
-from ...propagation.scene import Scene
-from ...propagation.search.crowns import Crowns
 from ...report.maps import data as page
 from ...report.prediction_html import outside_share
 from ...site.site import Site
@@ -81,8 +79,6 @@ class MapSettings:
     ----------
     foliage : tuple of str
         Modes to map, of :data:`FOLIAGE`.
-    crown_reflections : bool
-        Opaque crowns reflect besides blocking.
     spacing_m : float
         Between neighbouring positions.
     rss_altitudes_m, rank_altitudes_m : tuple of float
@@ -111,7 +107,6 @@ class MapSettings:
     """
 
     foliage: tuple[str, ...] = FOLIAGE
-    crown_reflections: bool = True
     spacing_m: float = cells.PAPER_SPACING_M
     rss_altitudes_m: tuple[float, ...] = job.PAPER_RSS_ALTITUDES_M
     rank_altitudes_m: tuple[float, ...] = job.PAPER_RANK_ALTITUDES_M
@@ -184,9 +179,7 @@ class SiteChannels:
 
     def __init__(self, site: Site, settings: MapSettings) -> None:
         self.settings, self.names = settings, tuple(site.towers)
-        reflect = settings.crown_reflections and "opaque" in settings.foliage and len(site.trees) > 0
-        self.mirrors = Crowns(site.trees) if reflect else None
-        self.crowns = self.mirrors.index if self.mirrors else CrownIndex(site.trees)
+        self.crowns = CrownIndex(site.trees)
         budget = Budget(
             carrier_hz=settings.carrier_hz,
             transmit_power_dbm=settings.transmit_power_dbm,
@@ -194,8 +187,8 @@ class SiteChannels:
             floor_dbm=max(settings.threshold_dbm, THERMAL_NOISE_DBM_HZ),
         )
         cast = settings.engine != "image"
-        self.reach = Reach(site, budget, max_depth=settings.max_depth, every=cast, crowns=reflect)
-        self.paths = self.paths_off_crowns = 0
+        self.reach = Reach(site, budget, max_depth=settings.max_depth, every=cast)
+        self.paths = 0
         self._ready: dict[tuple[str, bytes], job.Evaluation] = {}
         self._take_site(site)
 
@@ -231,9 +224,9 @@ class SiteChannels:
         west, east, south, north = grid.area_m
         heights = (*s.rss_altitudes_m, *s.rank_altitudes_m)
         self._take_site(self.reach.of(np.array([[west, south, min(heights)], [east, north, max(heights)]])))
-        self.paths = self.paths_off_crowns = 0
+        self.paths = 0
         maps = self._maps(grid, progress)
-        return TileDone(maps=maps, paths=self.paths, paths_off_crowns=self.paths_off_crowns)
+        return TileDone(maps=maps, paths=self.paths)
 
     def _maps(self, grid: Grid, progress: Callable[[float], None] | None = None) -> dict[str, job.MapResult]:
         s = self.settings
@@ -269,8 +262,6 @@ class SiteChannels:
             loss = self._loss_db(mode, replayed.paths, poses)
             shaded_siso = self._shaded(siso, replayed, poses, self.siso, loss)
             shaded_mimo = self._shaded(mimo, replayed, poses, self.mimo, loss)
-            if mode == "opaque" and self.mirrors:
-                shaded_siso, shaded_mimo = self._with_bounces(self.mirrors, poses, shaded_siso, shaded_mimo)
             level = self._rss_dbm(shaded_mimo)
             covered = np.isfinite(level)
             spread = np.where(covered, level_sd_db(shaded_mimo), np.nan)
@@ -291,16 +282,6 @@ class SiteChannels:
 
         siso, mimo, spread = (placed(level) for level in some.levels)
         return job.Evaluation(siso, mimo, spread, placed(some.singular_values))
-
-    def _with_bounces(
-        self, mirrors: Crowns, poses: Poses, siso: ComplexArray, mimo: ComplexArray
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Channel matrices with what bounces off opaque crowns, which nothing stops on its way."""
-        scene = Scene.of(self.site, self.siso, poses)
-        scene, paths = scene.with_bounces(self.site, poses, mirrors, self.settings.max_depth)
-        self.paths_off_crowns += len(paths)
-        more = (channel_matrices(paths, scene.faces, self.sources_m, poses, x).h for x in (self.siso, self.mimo))
-        return siso + next(more), mimo + next(more)
 
     def _rss_dbm(self, h: ComplexArray) -> FloatArray:
         level = rss_dbm(_beam_power(h), self.settings.transmit_power_dbm)
@@ -354,7 +335,6 @@ class TileDone:
 
     maps: Mapping[str, job.MapResult]
     paths: int
-    paths_off_crowns: int
 
 
 def map_tile(order: TileOrder) -> TileDone:
@@ -401,7 +381,6 @@ class MapOutcome:
     learning: dict[str, FloatArray] = field(default_factory=dict)
     correlations: dict[str, BinnedCorrelation] = field(default_factory=dict)
     paths: int = 0
-    paths_off_crowns: int = 0
     trajectory_m: FloatArray | None = None
     trajectory_name: str = ""
     tiles: dict[str, Any] = field(default_factory=dict)
@@ -475,7 +454,6 @@ def make_maps(
                 raise InputError(f"a tile of the map: {result.message}")
             parts[number] = result.maps
             outcome.paths += result.paths
-            outcome.paths_off_crowns += result.paths_off_crowns
             share(len(parts) / len(tiling))
 
         crew.run(evaluate, [order(number=number) for number in range(len(tiling))], done)
@@ -504,7 +482,7 @@ def _write_tiles(
         if isinstance(result, Lost):
             lost.append(result.message)
             return
-        store.write(missing[number], result.maps, (result.paths, result.paths_off_crowns))
+        store.write(missing[number], result.maps, result.paths)
         progress("maps", next(written) / len(tiling))
 
     with noting_interrupts(f"{store.path} keeps the finished tiles: the same command goes on"):
@@ -514,7 +492,7 @@ def _write_tiles(
             f"{len(lost)} of {len(tiling)} tiles were lost: {lost[0]}",
             cause="too little memory; the finished tiles are kept, and the same command computes the others",
         )
-    outcome.paths, outcome.paths_off_crowns = (int(count) for count in store.paths().sum(axis=(0, 1)))
+    outcome.paths = int(store.paths().sum())
     step = math.ceil(math.sqrt(len(tiling.grid) / SHOWN_POSITIONS))
     outcome.maps |= store.read(empty, step)
     outcome.settings = replace(outcome.settings, study=False)
@@ -824,7 +802,7 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
 def _metrics(outcome: MapOutcome) -> dict[str, Any]:
     """Content of metrics.json beyond the tables of the page."""
     result: dict[str, Any] = {
-        **named(outcome, "paths paths_off_crowns tiles"),
+        **named(outcome, "paths tiles"),
         "settings": asdict(outcome.settings),
     }
     for key in ("zero", "missing"):

@@ -20,7 +20,7 @@ from ...common.units import AnyArray, FloatArray, spread_out
 from ...compare.field_difference import FieldAudit
 from ...compare.result import AuditResult, EngineResult, RssResult
 from ...flight.data import FlightData
-from ...flight.losses import path_loss, reflecting_crowns
+from ...flight.losses import path_loss
 from ...flight.replay import Replayed, attitude_rotation, part_of
 from ...flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ...logs.ingest import IngestedFile
@@ -50,7 +50,7 @@ _TIMES = "The time of the engine is its share for the audited links; that of the
 _NOT_COVERED = (
     "whether reflection off smooth half-spaces and flat walls is what the place does",
     "positions of footprints and trees; intervals",
-    "geometry of paths off crowns; terrain that blocks",
+    "terrain that blocks",
 )
 
 
@@ -81,19 +81,10 @@ def audit_replays(
         settings={
             **named(rt, "max_depth attitude foliage"),
             "samples": max((r.replay.samples for r in replays), default=0) or rt.advanced.samples,
-            **_crown_settings(rt, replays),
         },
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
         audit=_audit(data, replays, results, progress) if rt.audit_links else None,
     )
-
-
-def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, object]:
-    """Check whether opaque crowns reflect, and how many paths bounce off one."""
-    if rt.foliage != "opaque":
-        return {}
-    bounced = sum(int(r.replay.paths.off_crown.sum()) for r in replays)
-    return {"crown_reflections": rt.advanced.crown_reflections, "paths_off_crowns": bounced}
 
 
 def _audit(
@@ -140,11 +131,7 @@ def _of_series(rt: RtSettings, site: Site, replayed: Replayed, second: Second) -
         replayed.link,
         replayed.poses,
         replayed.replay,
-        Search(
-            max_depth=rt.max_depth,
-            samples=rt.advanced.samples,
-            crowns=reflecting_crowns(site.trees, rt),
-        ),
+        Search(max_depth=rt.max_depth, samples=rt.advanced.samples),
         Field(loss=path_loss(site, rt, replayed.link.carrier_hz)),
         Run(cache_dir=None if rt.advanced.cache else ""),
         second,

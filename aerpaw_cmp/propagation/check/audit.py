@@ -231,7 +231,7 @@ _Keys = dict[tuple[int, ...], int]
 
 def _keys_of_both(replay: Replay, reference: Replay, chosen: IntArray) -> tuple[_Keys, _Keys]:
     """Paths of a replay and of a reference that has only the poses ``chosen``."""
-    # numbered together: the facets of crowns that a replay lists depend on its poses
+    # numbered together: the planes of terrain that a replay lists depend on its poses
     plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])
     return _keys(replay, plane[0], chosen), _keys(reference, plane[1], np.arange(len(chosen)))
 

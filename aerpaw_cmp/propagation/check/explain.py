@@ -296,7 +296,7 @@ def why_not(
             return f"its reflection point lies {_metres(far)} outside {faces.label[face]}"
     corners = np.concatenate([source_m[None], points[0], target_m[None]])
     if not _prisms_only(faces):
-        return "hidden, or not found: crowns and scenes of triangles are not tested here"
+        return "hidden, or not found: scenes of triangles are not tested here"
     for solid in np.unique(faces.solid[faces.solid >= 0]):
         members = np.flatnonzero(faces.solid == solid)
         if Occlusion(faces.select(members), tolerance).segments(corners[:-1], corners[1:]).any():

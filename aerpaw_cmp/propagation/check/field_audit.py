@@ -179,7 +179,7 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
             mine=np.array([row]),
         )
         sequence = link.sequence(int(row))
-        if not replay.paths.off_crown[row] and (sequence is None or reference.verdict(sequence, link.target) is False):
+        if sequence is None or reference.verdict(sequence, link.target) is False:
             count += 1
     failures = (f"{count} paths that cannot exist",) if count else ()
     return FieldAudit(phantom_paths=count, failures=failures)
@@ -237,8 +237,6 @@ class _OneLink:
         for path in self.mine:
             sequence = self.sequence(path)
             keys.add(None if sequence is None else _key(sequence))
-            if self.replay.paths.off_crown[path]:
-                continue
             verdict = False if sequence is None or nowhere else self.reference.verdict(sequence, self.target)
             phantom += verdict is False
             doubtful += verdict is None
@@ -262,8 +260,7 @@ class _OneLink:
             sequence = self.sequence(path)
             if sequence is None:
                 return FieldAudit(doubtful=1)  # a failure already
-            tree = replay.paths.tree[path][: len(sequence)].tolist()
-            loss = self.reference.loss_db(sequence, self.target, tree)
+            loss = self.reference.loss_db(sequence, self.target)
             if loss is None:
                 return FieldAudit(doubtful=1)
             paths.append((sequence, loss))
@@ -353,8 +350,6 @@ def _level_error(level_dbm: float, power: float, transmit_dbm: float, size: floa
 def _mirror_of(reference: Reference, faces: Faces, face: int, vertex: FloatArray) -> Mirror | None:
     normal, offset = faces.normal[face], float(faces.offset_m[face])
     solid = int(faces.solid[face])
-    if solid >= len(reference.site.buildings):
-        return Mirror(tuple(normal.tolist()), offset, "vegetation", solid=-1)
     point = tuple(vertex.tolist())
     same = [
         m
@@ -372,7 +367,7 @@ def _key(sequence: Sequence[Mirror]) -> tuple[tuple[float, ...], ...]:
 
 
 def spread_over_paths(replay: Replay, chosen: IntArray, count: int) -> IntArray:
-    """Poses of ``chosen`` that together meet as many kinds of paths as possible: faces, and crowns."""
+    """Poses of ``chosen`` that together meet as many faces as possible."""
     if len(chosen) <= count:
         return chosen
     kinds: dict[int, set[tuple[int, ...]]] = {int(row): set() for row in chosen}
@@ -442,7 +437,7 @@ def against_sionna(
     )
     place = np.full(int(max(len(poses), 1)), -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
-    rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~replay.paths.off_crown & ~_over_terrain(replay))
+    rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~_over_terrain(replay))
     ours = replace(replay.paths.select(rows), pose=place[replay.paths.pose[rows]])
     mine, matches = _matched(ours, replay.faces, theirs.paths, scene.faces)
     total = _paths_against_sionna(ours.select(mine), replay, scene, few, probe, theirs, matches)

@@ -172,9 +172,6 @@ def permittivity(name: str, carrier_hz: float) -> tuple[complex, float | None] |
     """Complex relative permittivity and thickness of a material; None where the table above has none."""
     key = name.lower().replace("-", "_").replace(" ", "_")
     key = key[4:] if key.startswith("itu_") else key
-    if key == "vegetation":  # 1.1, and 0.5 dB/m for weak loss
-        sigma = 2 * math.sqrt(1.1) * (0.5 * math.log(10) / 20) * _EPS0 * C_MPS
-        return 1.1 - 1j * sigma / (2 * math.pi * carrier_hz * _EPS0), None
     ghz = carrier_hz / 1e9
     if key not in _P2040 or not _P2040[key][0] <= ghz <= _P2040[key][1]:
         return None
@@ -524,7 +521,7 @@ class Reference:
         e = [te * e_s * s[k] + tm * e_p * p_out[k] for k in range(3)]
         return e[0], e[1], e[2]
 
-    def loss_db(self, sequence: Sequence[Mirror], target: Vector, bounced: Sequence[int] = ()) -> float | None:
+    def loss_db(self, sequence: Sequence[Mirror], target: Vector) -> float | None:
         """Foliage and reflection loss of a path; None where an opaque tree is only just touched."""
         total = self.loss.reflection_db * len(sequence) + self._rough_db(sequence, target)
         if self.loss.model == "none" or not len(self.site.trees):
@@ -533,11 +530,10 @@ class Reference:
         if points is None:
             return None
         depth = trunks = 0.0
-        for step, (a, b) in enumerate(itertools.pairwise(points)):
-            reflecting = {bounced[k] for k in (step - 1, step) if 0 <= k < len(bounced)}
-            depth += crown_depth_m(self.site.trees, a, b, reflecting)
+        for a, b in itertools.pairwise(points):
+            depth += crown_depth_m(self.site.trees, a, b)
             if self.loss.model == "opaque":
-                trunks += crown_depth_m(self.site.trees, a, b, set(), trunks=True)
+                trunks += crown_depth_m(self.site.trees, a, b, trunks=True)
         if self.loss.model == "opaque":
             touched = depth + trunks
             return None if 0 < touched < 1e-6 else (math.inf if touched else total)
@@ -680,7 +676,7 @@ def _p833(mhz: float) -> tuple[float, float]:
     raise AssertionError(mhz)
 
 
-def crown_depth_m(trees: Trees, a: Vector, b: Vector, without: set[int], *, trunks: bool = False) -> float:
+def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -> float:
     """Length of a segment inside crowns (cones) or trunks (cylinders).
 
     The largest of the distances outside base, top and side is a convex function along the segment: its minimum by
@@ -691,8 +687,6 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, without: set[int], *, trun
     trees : Trees
     a, b : (3,)
         Ends of the segment [m].
-    without : set of int
-        Trees that do not count.
     trunks : bool
         The cylinders below in place of the cones.
 
@@ -711,7 +705,6 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, without: set[int], *, trun
     near = np.clip((east * step[0] + north * step[1]) / flat, 0, 1) if flat > 0 else np.zeros(len(trees))
     close = np.hypot(east - near * step[0], north - near * step[1]) < radius
     close &= (min(a[2], b[2]) < top) & (max(a[2], b[2]) > base) & (radius > 0) & (top > base)
-    close[list(without)] = False
     rows = np.flatnonzero(close)
     if not len(rows) or length == 0:
         return 0.0

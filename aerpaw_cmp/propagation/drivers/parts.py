@@ -63,7 +63,7 @@ def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | 
 def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
     """One replay of parts, poses in their order; the parts are taken apart, so that memory holds them once."""
     first, count = parts[0], sum(map(len, rows))
-    # faces of crowns and terrain are numbered as they are met: other blocks have others
+    # planes of terrain are numbered as they are met: other blocks have others
     faces, shifted = _joined_faces(parts)
     bent = [part.edge_paths for part in parts if part.edge_paths is not None]
     through = [part.through for part in parts if part.through is not None]
@@ -112,7 +112,7 @@ def _shared(first: Faces, second: Faces) -> int:
     count = min(len(first), len(second))
     same = (first.normal[:count] == second.normal[:count]).all(axis=1)
     same &= first.offset_m[:count] == second.offset_m[:count]
-    # the bottoms of two crowns lie in one plane, and are two faces
+    # faces of two buildings may lie in one plane, and are two
     same &= np.array([a == b for a, b in zip(first.label, second.label, strict=False)], dtype=np.bool_)
     return count if same.all() else int(np.argmin(same))
 

@@ -1,4 +1,4 @@
-"""Loss in trees along traced paths, in closed form (crowns that reflect: :mod:`aerpaw_cmp.propagation.search.crowns`).
+"""Loss in trees along traced paths, in closed form.
 
 Crowns are not in the traced scene. The polyline of each path (source, reflection points, target) is cut with every
 crown near it; the chords add up to the path's depth in foliage, and a model turns depth into loss. Nothing is traced
@@ -207,7 +207,6 @@ def foliage_loss_db(
     target_m: FloatArray,
     trees: Trees | CrownIndex,
     model: FoliageModel,
-    bounced: IntArray | None = None,
 ) -> FloatArray:
     """Loss of each path in foliage [dB].
 
@@ -221,39 +220,25 @@ def foliage_loss_db(
         Keep an index when many batches of paths meet the same trees.
     model : FoliageModel
         Depth to loss.
-    bounced : (paths, depth) int, optional
-        Tree whose crown reflects at each vertex, -1 for none (:attr:`~aerpaw_cmp.propagation.paths.PathSet.tree`); at
-        most one per path. Only for :class:`Opaque` do crowns reflect: to any other model such a path does not exist.
 
     Returns
     -------
     ndarray, (paths,)
         The model's loss of the path's total depth; NaN where an end is not finite.
     """
-    opaque = isinstance(model, Opaque)
     if isinstance(model, NoFoliage):
-        loss = np.zeros(len(source_m))
-    else:
-        index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
-        depth = foliage_depth_m(source_m, vertices_m, target_m, index, bounced if opaque else None)
-        if opaque:
-            depth = depth + foliage_depth_m(source_m, vertices_m, target_m, index.trunks())
-        loss = model.loss_db(depth)
-    if bounced is not None and not opaque:
-        loss[(bounced >= 0).any(axis=1)] = np.inf
-    return loss
+        return np.zeros(len(source_m))
+    index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
+    depth = foliage_depth_m(source_m, vertices_m, target_m, index)
+    if isinstance(model, Opaque):
+        depth = depth + foliage_depth_m(source_m, vertices_m, target_m, index.trunks())
+    return model.loss_db(depth)
 
 
 def foliage_depth_m(
-    source_m: FloatArray,
-    vertices_m: FloatArray,
-    target_m: FloatArray,
-    trees: Trees | CrownIndex,
-    bounced: IntArray | None = None,
+    source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray, trees: Trees | CrownIndex
 ) -> FloatArray:
     """Length of each path inside crowns (paths,) [m]; arguments as for :func:`foliage_loss_db`.
-
-    The crown off which a path bounces does not count on the two segments that meet there: a bounce is on its outside.
 
     Parameters
     ----------
@@ -262,8 +247,6 @@ def foliage_depth_m(
     vertices_m : (paths, depth, 3)
         Points of reflection [m]; NaN where a path has fewer.
     trees : Trees or CrownIndex
-    bounced : (paths, depth) int, optional
-        Tree whose crown reflects at each vertex, -1 for none.
 
     Returns
     -------
@@ -274,13 +257,10 @@ def foliage_depth_m(
     vertices = np.asarray(vertices_m, dtype=np.float64)
     index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
     depth = np.zeros(len(source))
-    last = vertices.shape[1] - 1
     # from the target back, as lengths were always added: another order moves their last digit
-    for k, (start, end) in reversed([*enumerate(legs(source, vertices, target), start=-1)]):
+    for start, end in reversed([*legs(source, vertices, target)]):
         moved = (start != end).any(axis=1)
-        adjacent = slice(max(k, 0), min(k, last - 1) + 2)
-        bouncing = None if bounced is None else bounced[moved][:, adjacent].max(axis=1, initial=-1)
-        depth[moved] += index.chords_m(start[moved], end[moved], bouncing)
+        depth[moved] += index.chords_m(start[moved], end[moved])
     depth[~(np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1))] = np.nan
     return depth
 
@@ -333,7 +313,6 @@ class CrownIndex:
 
     def _set(self, base_m: FloatArray, top_m: FloatArray, radius_m: FloatArray) -> None:
         solid = (radius_m > 0) & (top_m > base_m)
-        self._tree = np.flatnonzero(solid)
         #: columns: east, north, base, top, radius
         self._bodies = np.stack(
             [self.trees.east_m[solid], self.trees.north_m[solid], base_m[solid], top_m[solid], radius_m[solid]], axis=-1
@@ -373,8 +352,8 @@ class CrownIndex:
         self._row = np.zeros(int(self._shape2.prod()) + 1, dtype=np.int64)
         np.cumsum(np.bincount(cells, minlength=len(self._row) - 1), out=self._row[1:])
 
-    def chords_m(self, start_m: FloatArray, end_m: FloatArray, without: IntArray | None = None) -> FloatArray:
-        """Length inside bodies of each segment (n,) [m]; ends (n, 3); ``without`` (n,) a tree that does not count."""
+    def chords_m(self, start_m: FloatArray, end_m: FloatArray) -> FloatArray:
+        """Length inside bodies of each segment (n,) [m]; ends (n, 3)."""
         total = np.zeros(len(start_m))
         if not len(self._bodies) or not len(start_m):
             return total
@@ -389,8 +368,7 @@ class CrownIndex:
             used = ends[begin - 1] if begin else 0
             stop = max(begin + 1, int(np.searchsorted(ends, used + at_once, side="right")))
             some = live[begin:stop]
-            excepted = None if without is None else without[some]
-            total[some] = self._sum(start_m[some], end_m[some], first[some], last[some], pieces[begin:stop], excepted)
+            total[some] = self._sum(start_m[some], end_m[some], first[some], last[some], pieces[begin:stop])
             begin = stop
         return total
 
@@ -400,13 +378,7 @@ class CrownIndex:
         return _slab(start_m[:, 2], end_m[:, 2] - start_m[:, 2], low, high)
 
     def _sum(
-        self,
-        start: FloatArray,
-        end: FloatArray,
-        first: FloatArray,
-        last: FloatArray,
-        pieces: IntArray,
-        without: IntArray | None,
+        self, start: FloatArray, end: FloatArray, first: FloatArray, last: FloatArray, pieces: IntArray
     ) -> FloatArray:
         """Chords of a batch, looked up piece by piece; each body counts in the piece nearest to it."""
         move = end - start
@@ -428,8 +400,6 @@ class CrownIndex:
         east -= nearest * step_east
         north -= nearest * step_north
         close = east * east + north * north < self._bodies[body, 4] ** 2
-        if without is not None:
-            close &= self._tree[body] != without[owner]
         hit = np.flatnonzero(close & (np.minimum(turn, pieces[owner] - 1) == number[piece]))
         owner, body = owner[hit], body[hit]
         share = _chord_share(start[owner], move[owner], self._bodies[body], self.shape)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...common.units import ComplexArray, FloatArray
-from ...site.materials import face_material
+from ...site.materials import material
 from ..paths import Faces
 from .dyads import larger, select, sine_cosine
 
@@ -209,7 +209,7 @@ class FaceMaterials:
     @classmethod
     def of(cls, faces: Faces, carrier_hz: float) -> FaceMaterials:
         """Those of all faces at a carrier."""
-        known = {name: face_material(name.removeprefix(THROUGH)) for name in set(faces.material)}
+        known = {name: material(name.removeprefix(THROUGH)) for name in set(faces.material)}
         eta = {name: material.relative_permittivity(carrier_hz) for name, material in known.items()}
         thick = {
             name: (-1.0 if name.startswith(THROUGH) else 1.0)

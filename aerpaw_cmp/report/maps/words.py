@@ -9,7 +9,6 @@ import numpy as np
 from ...compare.verdicts import Coverage, coverage_verdict
 from ...maps.grid import PAPER_SPACING_M
 from ..phrases import said_of
-from ..words import count
 from .data import JOINT, MapsData, RssMap
 
 LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
@@ -116,13 +115,6 @@ def _made(data: MapsData) -> Iterator[str]:
         f"Foliage {', '.join(s['foliage'])}: opaque stops whatever touches a crown or a trunk (the paper); attenuating "
         "takes ITU-R P.833 over the path's length in crowns; none leaves the trees out."
     )
-    if "opaque" in s["foliage"] and len(data.site.trees):
-        yield (
-            f"Opaque crowns reflect: {count(data.metrics['paths_off_crowns'])} paths bounce off one, beside "
-            f"{count(data.metrics['paths'])}."
-            if s["crown_reflections"]
-            else "Opaque crowns do not reflect: crown_reflections is off."
-        )
     yield "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element."
     threshold = f", in maps of RSS above {s['threshold_dbm']:g} dBm" if np.isfinite(s["threshold_dbm"]) else ""
     yield (

@@ -21,7 +21,7 @@ from ..logs.records import Stream
 from ..propagation.arrays import Link
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
-from .heights import at_height, lacks_height
+from .heights import at_height, lacks_height, raised
 from .hour_shift import clock_trap
 from .lock import lock_of
 from .scored import scored_rows, unscored
@@ -244,6 +244,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
         site.frame,
         maximum_gap_s=settings.rt.advanced.maximum_gap_s,
         ground_m=site.datum.takeoff_ground_m,
+        ground=site.ground_under_m,
     )
     if not len(track):
         raise InputError(
@@ -441,7 +442,8 @@ def _channel_of(log: LogSettings, stream: Stream) -> str:
 
 def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximum_gap_s: float) -> Track:
     frame, _ = scored_rows(stream, path)
-    track = Track(frame, site.frame, maximum_gap_s=maximum_gap_s, ground_m=site.datum.takeoff_ground_m)
+    takeoff_m, ground = site.datum.takeoff_ground_m, site.ground_under_m
+    track = Track(frame, site.frame, maximum_gap_s=maximum_gap_s, ground_m=takeoff_m, ground=ground)
     if not len(track) and lacks_height(stream):
         raise InputError(
             f"none of the {len(stream.frame)} telemetry rows has an altitude",
@@ -587,9 +589,10 @@ def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | N
     position = None
     if {"latitude_deg", "longitude_deg", "altitude_m"} <= set(frame.columns) and frame["latitude_deg"].notna().any():
         east, north = site.frame.to_local(frame["latitude_deg"], frame["longitude_deg"])
-        above = np.maximum(frame["altitude_m"].to_numpy(np.float64), MINIMUM_HEIGHT_M)  # NaN stays NaN
-        up = above + site.datum.takeoff_ground_m  # as of the track: altitude_m counts from take-off
-        position = np.stack([east, north, up], axis=-1)
+        takeoff_m = site.datum.takeoff_ground_m  # as of the track: altitude_m counts from there
+        up = frame["altitude_m"].to_numpy(np.float64) + takeoff_m
+        up, buried = raised(up, site.ground_under_m(east, north), takeoff_m)
+        position = np.stack([east, north, np.where(buried | np.isnan(frame["altitude_m"]), np.nan, up)], axis=-1)
     sinr = frame["sinr_db"].to_numpy(np.float64) if "sinr_db" in frame else np.full(len(frame), np.nan)
     return RankSeries(
         tower=home,

@@ -1,15 +1,57 @@
-"""Heights of tracks whose log has none: phones and drive-test programs write latitude and longitude alone."""
+"""Heights of tracks: over the ground under them, and those of logs that write latitude and longitude alone."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..common.errors import UsageError
+from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream
 from .settings import LogSettings
+
+Ground = Callable[[FloatArray, FloatArray], FloatArray]
+"""Up of the ground [m] at easts and norths (n,)."""
+
+# Heights above take-off drift by this much in a flight [m]: real ones end at -3.9 m after landing.
+_DRIFT_M = 5.0
+
+
+def raised(
+    up_m: FloatArray, ground_m: FloatArray, takeoff_m: float, least_m: float = MINIMUM_HEIGHT_M
+) -> tuple[FloatArray, BoolArray]:
+    """Heights of poses over the ground under them, and which poses lie below it.
+
+    A little below ground that is about as high as the take-off point is the drift of the height; all else below
+    ground cannot have been flown: the ground or the heights are wrong.
+
+    Parameters
+    ----------
+    up_m, ground_m : (n,)
+        Of the poses and of the ground under them [m].
+    takeoff_m : float
+        Up of the take-off point [m].
+    least_m : float
+        Lower poses are raised to this height above the ground [m].
+
+    Returns
+    -------
+    (n,), (n,) bool
+
+    Examples
+    --------
+    >>> raised(np.array([-2.0, -20.0, 8.0]), np.zeros(3), 0.0)
+    (array([  0.5, -20. ,   8. ]), array([False,  True, False]))
+    """
+    drift = np.where(ground_m <= takeoff_m + _DRIFT_M, _DRIFT_M, 0.0)
+    buried = up_m < ground_m - drift
+    return np.where(buried, up_m, np.fmax(up_m, ground_m + least_m)), buried
+
 
 _IN_NAME = re.compile(r"(?<![A-Za-z0-9.])(\d{1,3}) ?(?:m|meters|metres)(?![A-Za-z0-9])")
 

@@ -99,7 +99,8 @@ class Placer:
 
     def __post_init__(self) -> None:
         frame = self.telemetry.frame[~unscored(self.telemetry.frame)]
-        self.track = Track(frame, self.site.frame, ground_m=self.site.datum.takeoff_ground_m)
+        takeoff_m, ground = self.site.datum.takeoff_ground_m, self.site.ground_under_m
+        self.track = Track(frame, self.site.frame, ground_m=takeoff_m, ground=ground)
 
     @property
     def at_site(self) -> bool:

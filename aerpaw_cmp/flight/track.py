@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from ..common.geodesy import SiteFrame
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..propagation.arrays import rotation_from_aircraft
+from .heights import Ground, raised
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,7 +36,8 @@ _COURSE_SPAN_S = 2.0
 
 # Why a pose is not valid; index 0 is a valid pose.
 REASONS = (
-    "", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time", "no position of the tower"
+    "", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time", "no position of the tower",
+    "below the site's ground plane",
 )  # fmt: skip
 
 
@@ -54,6 +56,10 @@ class TrackAccount:
         Steps back in time of a shuffled file, whose rows were sorted: the path is shorter in order of time.
     unknown_attitude : int
         Used rows without attitude (NaN, or exactly 0, 0, 0: written by converters for "unknown").
+    heading_alone : int
+        Used rows with a heading and neither roll nor pitch.
+    below_ground : int
+        Used rows below the site's ground plane.
     gaps : int
         Intervals between used rows that are longer than the limit.
     longest_gap_s : float
@@ -72,6 +78,8 @@ class TrackAccount:
     longest_gap_s: float
     hour_steps: int = 0
     steps_sorted: int = 0
+    heading_alone: int = 0
+    below_ground: int = 0
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -85,6 +93,12 @@ class TrackAccount:
             (self.bad_position, "telemetry row(s) without a position (NaN, -999) were left out"),
             (self.gaps, f"telemetry gap(s), the longest {self.longest_gap_s:.1f} s, were not bridged"),
             (self.unknown_attitude, "telemetry row(s) without attitude: level flight along the course stands in"),
+            (self.heading_alone, "telemetry row(s) hold a heading alone: level flight along it stands in"),
+            (
+                self.below_ground,
+                "telemetry row(s) lie below the site's ground plane and are not compared: origin.takeoff_ground_m, or "
+                "an elevation model, says how high the ground is",
+            ),
         )
         return tuple(f"{count} {text}" for count, text in reasons if count)
 
@@ -233,9 +247,11 @@ class Track:
     maximum_gap_s : float
         Longer gaps are not bridged [s].
     minimum_height_m : float
-        Lower poses are raised to this height above the take-off ground [m].
+        Lower poses are raised to this height above the ground under them [m].
     ground_m : float
         Height of the take-off point above the site origin [m], added to ``altitude_m``.
+    ground : callable, optional
+        Up [m] of the site's ground at easts and norths; by default that of the take-off point.
 
     Attributes
     ----------
@@ -253,6 +269,7 @@ class Track:
         maximum_gap_s: float = _MAXIMUM_GAP_S,
         minimum_height_m: float = MINIMUM_HEIGHT_M,
         ground_m: float = 0.0,
+        ground: Ground | None = None,
     ) -> None:
         if not maximum_gap_s > 0:
             raise ValueError(f"maximum_gap_s must be positive, found {maximum_gap_s}")
@@ -260,6 +277,7 @@ class Track:
         self.maximum_gap_s = maximum_gap_s
         self.minimum_height_m = minimum_height_m
         self.ground_m = ground_m
+        self._ground = ground or (lambda east, _: np.full(len(east), ground_m))
         self._load(telemetry)
 
     def _load(self, telemetry: pd.DataFrame) -> None:
@@ -287,7 +305,10 @@ class Track:
         self._velocity = _velocities(self._time_s, self._position, np.column_stack(velocity)[rows])
         self._course_deg = _courses(self._velocity)
         self._attitude = np.column_stack([column("roll_deg"), column("pitch_deg"), column("yaw_deg")])[rows]
-        known = np.isfinite(self._attitude).all(axis=1) & np.any(self._attitude != 0.0, axis=1)
+        turn, yaw = self._attitude[:, :2], self._attitude[:, 2]
+        heading_alone = np.isfinite(yaw) & ~np.isfinite(turn).any(axis=1) & bool(np.nan_to_num(yaw).any())
+        turn[heading_alone] = 0.0
+        known = np.isfinite(self._attitude).all(axis=1) & (np.any(self._attitude != 0.0, axis=1) | heading_alone)
         self._known = known
         self._asked = np.zeros(0, np.int64), self._pose_at(np.zeros(0, np.int64))
         interval = np.diff(self._time_s)
@@ -302,6 +323,8 @@ class Track:
             longest_gap_s=float(interval.max()) if len(interval) else 0.0,
             hour_steps=hour_steps,
             steps_sorted=steps_sorted,
+            heading_alone=int(heading_alone.sum()),
+            below_ground=int(self._raised(position)[1].sum()),
         )
 
     def __len__(self) -> int:
@@ -357,7 +380,10 @@ class Track:
         if valid.any():
             position[valid] = interpolated(t[valid], self._time_s, self._position)
             rotation[valid], known[valid] = self._rotations(t[valid])
-            position[valid, 2] = np.maximum(position[valid, 2], self.ground_m + self.minimum_height_m)
+            position[valid, 2], buried = self._raised(position[valid])
+            code[np.flatnonzero(valid)[buried]] = REASONS.index("below the site's ground plane")
+            valid = code == 0
+            position[~valid], rotation[~valid], known[~valid] = np.nan, np.nan, False
         return TrackPoses(
             position_m=position,
             rotation=rotation,
@@ -365,6 +391,11 @@ class Track:
             reason_code=code.astype(np.int8),
             attitude_known=known,
         )
+
+    def _raised(self, position: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Up of positions (n, 3), the lowest raised to just above the ground, and those that lie below it."""
+        ground = self._ground(position[:, 0], position[:, 1])
+        return raised(position[:, 2], ground, self.ground_m, self.minimum_height_m)
 
     def _codes(self, t: FloatArray) -> AnyArray:
         """Index into :data:`REASONS` for every instant."""

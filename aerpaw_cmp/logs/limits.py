@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from ..common.units import AnyArray, BoolArray, IntArray
+from .jumps import FLAG, PLACE, jumps_of
 from .records import ReadResult, Stream
 
 
@@ -69,6 +70,11 @@ _LEVEL_OTHER_DB = (-200.0, 100.0)
 _APART_S = 86_400.0
 
 _FEW_SHARE = 0.01
+
+# A computer without a battery of its clock begins in 1970 and is set by GNSS or network.
+# Some begin in 1980 or 2000; AERPAW is younger than all of these.
+_CLOCK_SET_NS = int(np.datetime64("2010-01-01", "ns").astype(np.int64))
+
 # At most this share, or this many, are "a few".
 _FEW_ROWS = 3
 
@@ -102,6 +108,10 @@ def _checked(stream: Stream, warnings: list[str]) -> Stream:
     if stream.kind == "rank":
         frame = _within_ports(stream, frame, warnings)
     frame = _near_in_time(stream, frame, warnings)
+    bad, sentence = jumps_of(stream if frame is stream.frame else replace(stream, frame=frame))
+    if bad.any():
+        frame = _marked(frame, bad, FLAG, [name for name in PLACE if name in frame.columns])
+    warnings += [sentence] if sentence else []
     return stream if frame is stream.frame else replace(stream, frame=frame)
 
 
@@ -176,17 +186,20 @@ def _near_in_time(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> p
     order = np.argsort(np.where(timed, stamp, np.iinfo(np.int64).max), kind="stable")[: int(timed.sum())]
     group = np.concatenate(([0], np.cumsum(np.diff(stamp[order].astype(np.float64)) > _APART_S * 1e9)))
     size = np.bincount(group)
-    if 2 * size.max() <= len(order):
-        return frame  # no main part: two flights in one file, not a few bad stamps
     few = size <= max(_FEW_ROWS, _FEW_SHARE * len(order))
     few[int(np.argmax(size))] = False
+    few &= 2 * size.max() > len(order)  # without a main part: two flights in one file, not a few bad stamps
+    last = stamp[order][np.append(np.flatnonzero(np.diff(group)), len(order) - 1)]
+    unset = last < _CLOCK_SET_NS  # rows before the clock was set, however many
+    few |= unset & ~unset.all()
     bad = np.zeros(len(frame), dtype=np.bool_)
     bad[order[few[group]]] = True
     if not bad.any():
         return frame
     row = int(np.argmax(bad))
     shown = f"the first: {np.datetime_as_string(frame['time'].to_numpy('datetime64[ns]')[row], unit='s')}"
-    text = f"{shown} in line {int(frame['line'].iloc[row])}, days from all others; not scored"
+    why = "written before the clock was set" if stamp[row] < _CLOCK_SET_NS else "days from all others"
+    text = f"{shown} in line {int(frame['line'].iloc[row])}, {why}; not scored"
     warnings.append(_sentence(stream, int(bad.sum()), "time_out_of_range", text))
     return _marked(frame, bad, "time_out_of_range", [])
 

@@ -181,6 +181,15 @@ class Site:
         """True if trees or stands can shade a path."""
         return len(self.trees) > 0 or any(forest.height_m is not None for forest in self.forests)
 
+    def ground_under_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
+        """Up of the ground (n,) [m]: the terrain's, else of the lowest plane; in a scene that of the take-off point."""
+        level = min((0.0, *(tower.ground_m for tower in self.towers.values())))
+        ground = np.full(len(east_m), self.datum.takeoff_ground_m if self.scene is not None else level)
+        if self.dem is None:
+            return ground
+        terrain = self.dem.ground_m(east_m, north_m)
+        return np.where(np.isnan(terrain), ground, terrain)
+
     def _repr_html_(self) -> str:
         """Towers and their places, for notebooks."""
         rows = [(name, *(f"{metres:.1f}" for metres in tower.position_m)) for name, tower in self.towers.items()]

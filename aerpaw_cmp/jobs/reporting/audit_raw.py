@@ -186,12 +186,22 @@ def _path(data: FlightData, logs: Sequence[Log | None], account: _Account) -> Ra
         if "origin" not in content:
             account.leave("the track, since the site's file is not beside the logs")
             return None
-        path = RawPath(log.rows, origin, float(content["origin"].get("takeoff_ground_m", 0.0)))
+        jumped = _flagged_us(file, "position_jump")
+        rows = [row for row in log.rows if row.time_us not in jumped]
+        takeoff_m = float(content["origin"].get("takeoff_ground_m", 0.0))
+        path = RawPath(rows, origin, takeoff_m, lambda *at: float(data.site.ground_under_m(*np.array(at)[:, None])[0]))
         if path.out_of_order or not path.rows:
             account.leave("the track, whose rows are out of time order")
             return None
         return path
     return None
+
+
+def _flagged_us(file: IngestedFile, flag: str) -> set[int]:
+    """Times [us] of rows that carry a flag."""
+    frames = [stream.frame for stream in file.result.streams]
+    marked = [frame["time"][frame["flag"].str.contains(flag)] for frame in frames]
+    return {int(at) for times in marked for at in times.to_numpy("datetime64[us]").astype(np.int64)}
 
 
 # ---------------------------------------------------------------- site
@@ -510,7 +520,7 @@ def _rank_checked(
             if series.position_m is not None and path is not None and "latitude" in reading.values:
                 place = (reading.values["latitude"], reading.values["longitude"])
                 east, north = east_north_m(*place, path.origin_deg)
-                up = path.ground_m + max(reading.values["altitude"], LOWEST_M)
+                up = max(path.ground_m + reading.values["altitude"], path.floor(east, north) + LOWEST_M)
                 distance_m = math.dist((east, north, up), series.position_m[row].tolist())
                 account.add("position", distance_m, where, spare=1e-6 * math.hypot(east, north))
 

@@ -291,9 +291,17 @@ class RawPath:
         Latitude and longitude of the site's origin.
     ground_m : float
         Height of the take-off point above the origin's ground.
+    floor : callable, optional
+        Height of the ground under an east and a north; by default that of the take-off point.
     """
 
-    def __init__(self, rows: Sequence[Row], origin_deg: tuple[float, float], ground_m: float) -> None:
+    def __init__(
+        self,
+        rows: Sequence[Row],
+        origin_deg: tuple[float, float],
+        ground_m: float,
+        floor: Callable[[float, float], float] | None = None,
+    ) -> None:
         self.rows: list[Row] = []
         self.times_us: list[int] = []
         self.out_of_order = 0
@@ -307,6 +315,7 @@ class RawPath:
                 self.rows.append(row)
                 self.times_us.append(row.time_us)
         self.origin_deg, self.ground_m = origin_deg, ground_m
+        self.floor = floor or (lambda _east, _north: ground_m)
 
     def pose(self, time_us: float) -> Pose | None:
         """At an instant [us]; None before the first and after the last row."""
@@ -324,7 +333,7 @@ class RawPath:
         known = [row.angles_deg for row in (earlier, later) if row.angles_deg is not None and any(row.angles_deg)]
         if len(known) == 2 and all(math.isfinite(angle) for angles in known for angle in angles):
             turn = matrix(between(body_quaternion(*known[0]), body_quaternion(*known[1]), share))
-        return Pose((east, north, max(up, self.ground_m + LOWEST_M)), turn)
+        return Pose((east, north, max(up, self.floor(east, north) + LOWEST_M)), turn)
 
 
 # ---------------------------------------------------------------- tables of gain

@@ -9,12 +9,65 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
-from .errors import InputError, OutputError
+from .errors import AerpawCmpError, InputError, OutputError, one_line
 
 # Of small files that are read whole: antenna patterns, receivers, the numbers of a report [bytes].
 LARGEST_TABLE = 64 << 20
+
+
+def inside(
+    folder: Path, name: str, source: Path, *, plain: bool = False, error: type[AerpawCmpError] = InputError
+) -> Path:
+    """Place below a folder of a file that another file names: the only way from such a name to a path.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str
+        As the other file, which somebody may have handed on, writes it.
+    source : Path
+        That file, for the message.
+    plain : bool
+        Refuse names of files in folders below, too.
+    error : type
+        Of what is raised.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    AerpawCmpError
+        The name is absolute, holds ``..`` or NUL, or a link on its way leaves the folder.
+    """
+    parts = PureWindowsPath(name)  # both separators, drives, and all that POSIX knows
+    depth, place = len(parts.parts), folder.joinpath(*parts.parts)
+    wrong = not depth or parts.anchor or ".." in parts.parts or "\0" in name or (plain and depth > 1)
+    if wrong or not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(folder)):
+        raise error(
+            f"it names '{one_line(name)}', {'no file of its folder' if wrong else 'a link that leaves its folder'}",
+            expected=f"the name of a file {'in' if plain else 'in or below'} {one_line(str(folder))}",
+            cause="it was changed by hand, or somebody wants to reach your other files",
+            path=source,
+        )
+    return place
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """A folder for one process at a time: others wait. Without effect on systems and disks that have no locks."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 @contextlib.contextmanager

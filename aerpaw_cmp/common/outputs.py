@@ -32,8 +32,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
-from .errors import OutputError, UsageError, add_note, one_line
-from .files import plain_mode, sync
+from .errors import InputError, OutputError, UsageError, add_note, one_line
+from .files import inside, plain_mode, sync
 from .interrupts import AT_END, held, interrupted, raise_interrupt
 
 # The list of a result folder; ``sha256sum -c SHA256SUMS`` checks it.
@@ -68,15 +68,19 @@ def is_sealed(path: Path) -> bool:
 
 
 def read_sums(folder: Path) -> dict[str, str] | None:
-    """SHA-256 of each file of a result folder by its relative name; None where there is no list of this tool."""
+    """SHA-256 of each file of a result folder by its relative name; None where there is no list of this tool.
+
+    A list that names a file outside the folder is none: what it lists may be removed.
+    """
     try:
         text = (folder / SUMS).read_text(encoding="utf-8")
-    except (OSError, ValueError):
+        rows = [line.split("  ", 1) for line in text.splitlines() if not line.startswith("#")]
+        sums = {row[1]: row[0] for row in rows if len(row) == 2}
+        for name in sums:
+            inside(folder, name, folder / SUMS)
+    except (OSError, ValueError, InputError):
         return None
-    if not text.startswith(_SUMS_HEAD):
-        return None
-    rows = [line.split("  ", 1) for line in text.splitlines() if not line.startswith("#")]
-    return {row[1]: row[0] for row in rows if len(row) == 2}
+    return sums if text.startswith(_SUMS_HEAD) else None
 
 
 def changed_files(folder: Path) -> list[str]:
@@ -344,8 +348,10 @@ class OutputFolder:
         """UsageError where the folder holds what this tool did not write, or what was changed since."""
         if not self.target.is_dir():
             return
-        own = read_sums(self.target) or {}
-        if foreign := next(foreign_entries(self.target, own), None):
+        own = read_sums(self.target)
+        list_of_others = SUMS if own is None and _taken(self.target / SUMS) else None
+        own = own or {}
+        if foreign := next(foreign_entries(self.target, own), list_of_others):
             raise UsageError(
                 f"the folder holds what this tool did not write: {one_line(foreign)}",
                 expected="a new or empty folder after -o: a folder of results is replaced as a whole",

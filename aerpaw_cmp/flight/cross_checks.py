@@ -45,7 +45,9 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     start = _start(streams)
     if start is not None:
         zone = ZoneInfo(timezone) if timezone else None
-        starts = [*_name_starts(file.path), *_summary_starts(Path(file.path))]
+        starts = _name_starts(file.path)
+        if not file.holder:  # else a path that the flight file names, of another machine
+            starts += _summary_starts(Path(file.path))
         texts += [
             f"{where} says {time:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is right?"
             for where, time, form, slack in starts

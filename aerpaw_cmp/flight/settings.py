@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from ..common.errors import InputError, UsageError
+from ..common.files import inside
 from ..common.jsonable import named
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, noise_floor_dbm, wavelength_m
 from ..common.yamlfile import StrictModel, load_yaml
@@ -601,12 +602,15 @@ def load_flight(path: str | Path, learned: Path | None = None) -> FlightFile:
         settings = settings.model_copy(update={"flight": flight})
     if learned is not None:
         knowledge = load_yaml(learned, LearnedSettings).model_dump(exclude_unset=True)
-        settings = _joined(settings, files_of(knowledge, learned.parent), learned)
+        settings = _joined(settings, files_of(knowledge, learned.parent, learned), learned)
     return with_learned(settings, Path(path).parent)
 
 
-def files_of(content: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Settings of a file in a folder, with the files that they name as absolute paths."""
+def files_of(content: Mapping[str, Any], folder: Path, learned: Path | None = None) -> dict[str, Any]:
+    """Settings of a file in a folder, with the files that they name as absolute paths.
+
+    Those of a learned file must lie below its folder.
+    """
 
     def place(value: Any, key: str = "") -> Any:
         if isinstance(value, dict):
@@ -614,7 +618,7 @@ def files_of(content: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         if isinstance(value, list):
             return [place(item) for item in value]
         if key in ("file", "receiver") and isinstance(value, str):
-            return str((folder / value).absolute())
+            return str((folder / value if learned is None else inside(folder, value, learned)).absolute())
         return value
 
     return dict(place(dict(content)))

@@ -8,7 +8,6 @@ flight.yaml for ``aerpaw-cmp report``, which must recover what was planted.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
@@ -19,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from ..common.errors import UsageError
+from ..common.files import inside
 from ..common.geodesy import SiteFrame
 from ..common.outputs import SUMS, OutputFolder
 from ..common.stages import Progress, silent
@@ -318,9 +318,7 @@ class FlightSimulator:
         """UsageError for logs of the flight file that would lie outside ``out``, or twice."""
         names = [log.path for log in self.settings.logs]
         for name in names:
-            place = Path(os.path.normpath(out / name))
-            if Path(name).is_absolute() or Path(os.path.normpath(out)) not in place.parents:
-                raise UsageError(f"log {name!r} lies outside the folder of the logs", expected="a path below it")
+            inside(out, name, out / FLIGHT, error=UsageError)
             if names.count(name) > 1 or name in (_TRUTH, FLIGHT, SUMS):
                 raise UsageError(f"two files of this flight are named {name!r}", expected="a name of its own for each")
 

@@ -8,6 +8,7 @@ command that made it.
 from __future__ import annotations
 
 import gzip
+import hashlib
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -16,7 +17,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ..common.errors import InputError, UsageError
-from ..common.files import LARGEST_TABLE, read_bounded, write_whole
+from ..common.files import LARGEST_TABLE, inside, locked, read_bounded, write_whole
+from ..common.outputs import explained_os_errors, file_digest
 from ..common.yamlfile import StrictModel, dump_yaml, load_yaml
 
 _INDEX = "learned.yaml"
@@ -117,6 +119,8 @@ class Entry(StrictModel):
     series: list[LearnedSeries] = []
     receivers: list[LearnedReceiver] = []
     ground_roughness_m: float | None = None
+    tables: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = {}
+    """SHA-256 of the tables as they were written: nothing else is ever replaced or removed."""
 
     def about(self) -> str:
         """One sentence: learned from what, and what error to expect."""
@@ -159,9 +163,14 @@ def read_learned(site: str | Path) -> Learned:
     ------
     UsageError
         An index that is damaged, or of another version.
+    InputError
+        It names a file outside its folder.
     """
     index = folder_of(site) / _INDEX
-    return load_yaml(index, Learned) if index.is_file() else Learned()
+    memory = load_yaml(index, Learned) if index.is_file() else Learned()
+    for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
+        inside(index.parent, name, index, plain=True)
+    return memory
 
 
 def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, bytes]) -> list[Path]:
@@ -179,17 +188,39 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
     Returns
     -------
     list of Path
+
+    Raises
+    ------
+    UsageError
+        A file of the name of a table that no calibration wrote, or that was changed since.
+    InputError, OutputError
+        As :func:`read_learned`; the folder cannot be written.
     """
-    folder, memory = folder_of(site), read_learned(site)
-    folder.mkdir(exist_ok=True)
-    old = memory.entries.get(name)
-    for file, content in files.items():
-        write_whole(folder / file, gzip.compress(content, 9, mtime=0))
-    entries = {**memory.entries, name: entry}
-    text = dump_yaml(Learned(entries=dict(sorted(entries.items()))).model_dump(mode="json", exclude_none=True))
-    write_whole(folder / _INDEX, text)
-    for file in sorted(files_of(old) - set(files)) if old is not None else ():
-        (folder / file).unlink(missing_ok=True)
+    folder = folder_of(site)
+    packed = {file: gzip.compress(content, 9, mtime=0) for file, content in files.items()}
+    tables = {file: hashlib.sha256(content).hexdigest() for file, content in packed.items()}
+    with explained_os_errors(folder):
+        folder.mkdir(exist_ok=True)
+        with locked(folder):
+            memory = read_learned(site)
+            written = {item for known in memory.entries.values() for item in known.tables.items()}
+            for file in packed:
+                place = inside(folder, file, folder / _INDEX, plain=True)
+                if place.exists() and (file, file_digest(place)) not in {*written, *tables.items()}:
+                    raise UsageError(
+                        "no calibration wrote this file, or it was changed since",
+                        expected="another 'calibration:' name, or that file moved away",
+                        path=place,
+                    )
+            for file, content in packed.items():
+                write_whole(folder / file, content)
+            entries = {**memory.entries, name: entry.model_copy(update={"tables": tables})}
+            text = dump_yaml(Learned(entries=dict(sorted(entries.items()))).model_dump(mode="json", exclude_none=True))
+            write_whole(folder / _INDEX, text)
+            used = {file for known in entries.values() for file in files_of(known)}
+            for file, digest in sorted(written):
+                if file not in used and (folder / file).is_file() and file_digest(folder / file) == digest:
+                    (folder / file).unlink()
     return [folder / _INDEX, *(folder / file for file in files)]
 
 
@@ -263,9 +294,10 @@ def find_named(name: str, folder: Path) -> Named:
         No such site, entry or part; a memory that cannot be read.
     """
     site, _, entry_part = name.rpartition("/")
-    place = folder / f"{site}.yaml"
-    if not place.with_suffix(".learned").is_dir():
-        place = Path(site) if folder_of(site).is_dir() else place
+    place: str | Path = folder.absolute() / f"{site}.yaml"  # the paths in it hold in any working folder
+    packaged = folder_of(site)
+    if not folder_of(place).is_dir() and packaged.is_absolute() and packaged.is_dir():
+        place = site
     memory = read_learned(place)
     for entry_name, entry in memory.entries.items():
         parts = {"": entry_name, "uav": f"{entry_name}_uav"}

@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..common.errors import InputError, UsageError
-from ..common.files import read_input
+from ..common.files import inside, read_input
 from ..common.units import FloatArray, IntArray
 from .materials import material, stated_name
 from .meshfiles import RawMesh, read_mesh
@@ -314,13 +314,7 @@ def _mesh(reading: _Reading, shape: ElementTree.Element, kind: str, name: str) -
         raise InputError(
             f"the shape '{name}' names no file", expected='<string name="filename" .../>', path=reading.path
         )
-    place = (reading.folder / wanted.replace("\\", "/")).resolve()
-    if Path(wanted).is_absolute() or ":" in wanted[:3] or not place.is_relative_to(reading.folder):
-        raise InputError(
-            f"the shape '{name}' names '{wanted}', outside the scene's folder",
-            expected="a path that stays below the folder of the XML file",
-            path=reading.path,
-        )
+    place = inside(reading.folder, wanted, reading.path)
     if not place.is_file():
         raise InputError(
             f"the shape '{name}' names '{wanted}', which is not there",

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.files import atomic_path, read_bounded
+from aerpaw_cmp.common.files import atomic_path, inside, read_bounded
 
 
 @pytest.mark.parametrize("durable", [False, True])
@@ -154,3 +154,29 @@ def test_a_bounded_file_is_read_to_the_last_byte(size, tmp_path):
             InputError, match=f"the file has {size} bytes; expected a table of at most {size - 1} bytes"
         ):
             read_bounded(tmp_path / "a", size - 1, "a table")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["", ".", "/etc/passwd", "../a", "b/../../a", "b/../a", "..\\a", "C:/a", "C:a", "\\a", "a\0b", "link", "up/a"],
+)
+def test_a_name_from_a_file_leads_to_no_place_outside_its_folder(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (tmp_path / "a").write_text("of others")
+    (folder / "link").symlink_to(tmp_path / "a")
+    (folder / "up").symlink_to(tmp_path)
+    for plain in (False, True):
+        with pytest.raises(InputError, match=r"leaves its folder|no file of its folder") as refused:
+            inside(folder, name, tmp_path / "index.yaml", plain=plain)
+        assert "\0" not in str(refused.value)
+
+
+def test_names_inside_a_folder_are_places_below_it(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "reached").symlink_to(tmp_path / "real")  # a folder that is itself a link may be used
+    source = tmp_path / "index"
+    assert inside(tmp_path / "reached", "a.csv", source, plain=True) == tmp_path / "reached" / "a.csv"
+    assert inside(tmp_path, "meshes\\x.ply", source) == inside(tmp_path, "meshes/x.ply", source)
+    with pytest.raises(UsageError, match="no file of its folder"):
+        inside(tmp_path, "meshes/x.ply", source, plain=True, error=UsageError)

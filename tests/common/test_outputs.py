@@ -1,6 +1,7 @@
 """Outputs replace no input and nothing of others, and are whole."""
 
 import errno
+import hashlib
 import os
 import shutil
 import stat
@@ -144,6 +145,22 @@ def test_a_folder_with_something_of_others_is_refused_and_left_alone(tmp_path: P
     with pytest.raises(UsageError, match="did not write"):
         write_folder(target, {"a.html": "2", "b.html": "2"}, force=force)
     assert sorted((path, path.lstat().st_mtime_ns) for path in tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["../thesis.tex", "{folder}/thesis.tex", "link/thesis.tex", "a/../../thesis.tex"])
+@pytest.mark.parametrize("force", [False, True])
+def test_a_list_that_names_a_file_outside_its_folder_removes_nothing(tmp_path: Path, name: str, force: bool) -> None:
+    """A folder of results that somebody handed on, with a list that its own tool could have written."""
+    thesis, out = tmp_path / "thesis.tex", tmp_path / "out"
+    thesis.write_text("years of work")
+    out.mkdir()
+    if name.startswith("link"):
+        (out / "link").symlink_to(tmp_path)
+    digest = hashlib.sha256(thesis.read_bytes()).hexdigest()
+    (out / "SHA256SUMS").write_text(f"# aerpaw-cmp: of 'x'\n{digest}  {name.format(folder=tmp_path)}\n")
+    with pytest.raises(UsageError, match="did not write"):
+        write_folder(out, {"a": "1"}, force=force)
+    assert thesis.read_text() == "years of work"
 
 
 def test_a_folder_without_a_list_is_refused(tmp_path: Path) -> None:

@@ -129,7 +129,7 @@ def test_a_start_is_one_instant_of_a_wall_clock(start: str, right: int) -> None:
 def test_logs_of_a_plan_have_names_of_their_own_below_its_folder(names: list[str], tmp_path: Path) -> None:
     made = simulator()
     made.settings = SimpleNamespace(logs=[SimpleNamespace(path=name) for name in names])  # type: ignore[assignment]
-    with pytest.raises(UsageError, match=r"named|outside"):
+    with pytest.raises(UsageError, match=r"named|no file of its folder"):
         made._check_names(tmp_path)
     made.settings = SimpleNamespace(logs=[SimpleNamespace(path=n) for n in ("a.txt", "b/a.txt")])  # type: ignore[assignment]
     made._check_names(tmp_path)

@@ -1,13 +1,17 @@
 """What a site remembers: written, found by name, refused where it does not fit."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.flight.remembered import Nodes, propose, searching_airframe
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.site.learned import (
@@ -175,7 +179,7 @@ def test_a_memory_of_the_first_format_reads_and_is_written_in_the_second(folder:
     assert text.startswith("format: aerpaw-cmp learned 2\n")
     index.write_text(text.replace("learned 2", "learned 1"))
     known = read_learned(folder / "mine.yaml")
-    assert known.entries["d12"] == entry("A")
+    assert known.entries["d12"].model_copy(update={"tables": {}}) == entry("A")
     table = sphere_csv(np.zeros((7, 8)), np.ones((7, 8))).encode()
     remember(folder / "mine.yaml", "other", entry("B"), {"B.t.csv.gz": table, "B.u.csv.gz": table})
     assert index.read_text().startswith("format: aerpaw-cmp learned 2\n")
@@ -191,6 +195,85 @@ def test_a_second_entry_joins_the_first_and_one_of_the_same_name_replaces_it(fol
         "learned.yaml", "B.t.csv.gz", "B.u.csv.gz", "C.t.csv.gz", "C.u.csv.gz"
     }  # fmt: skip
     assert find_named("mine/d12_LW1.C", folder).part == "LW1.C"
+
+
+@pytest.mark.parametrize("name", ["../thesis.tex", "{folder}/thesis.tex", "link.gz"])
+@pytest.mark.parametrize("key", ["tower_file: A.t.csv.gz", "A.t.csv.gz: "])
+def test_a_memory_that_names_a_file_of_others_touches_and_shows_none(
+    folder: Path, name: str, key: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site, thesis = folder / "mine.yaml", folder / "thesis.tex"
+    site.write_bytes(folder_of("lake_wheeler").with_suffix(".yaml").read_bytes())
+    thesis.write_text("years of work")
+    (folder_of(site) / "link.gz").symlink_to(thesis)
+    index = folder_of(site) / "learned.yaml"
+    index.write_text(index.read_text().replace(key, key.replace("A.t.csv.gz", name.format(folder=folder))))
+    table = sphere_csv(np.zeros((7, 8)), np.ones((7, 8))).encode()
+    with pytest.raises(InputError, match=r"leaves its folder|no file of its folder"):
+        remember(site, "d12", entry("A"), {"A.t.csv.gz": table, "A.u.csv.gz": table})
+    assert main(["predict", str(site), "-o", str(folder / "out")]) == 3
+    said = capsys.readouterr()
+    assert "years of work" not in said.out + said.err
+    assert thesis.read_text() == "years of work"
+    assert load_flight(flight(folder, {"uav": "mine/d12_uav"})).flight.notes
+
+
+@pytest.mark.parametrize("name", ["A.t.csv.gz", "B.t.csv.gz"])
+def test_a_table_that_no_calibration_wrote_is_neither_replaced_nor_removed(folder: Path, name: str) -> None:
+    """One of another channel that lies there already, and one of the entry that somebody changed."""
+    site = folder / "mine.yaml"
+    (folder_of(site) / name).write_bytes(b"mine")
+    table = sphere_csv(np.zeros((7, 8)), np.ones((7, 8))).encode()
+    before = (folder_of(site) / "learned.yaml").read_text()
+    with pytest.raises(UsageError, match="no calibration wrote this file"):
+        remember(site, "d12", entry(name[0]), {f"{name[0]}.t.csv.gz": table, f"{name[0]}.u.csv.gz": table})
+    assert (folder_of(site) / "learned.yaml").read_text() == before
+    remember(site, "d12", entry("C"), {"C.t.csv.gz": table, "C.u.csv.gz": table})
+    assert (folder_of(site) / name).read_bytes() == b"mine"
+    assert not (folder_of(site) / "A.u.csv.gz").exists()
+
+
+def test_two_processes_store_all_of_their_entries(tmp_path: Path) -> None:
+    script = (
+        "import sys; from pathlib import Path; from aerpaw_cmp.site.learned import Entry, remember;"
+        "site, who, entry = sys.argv[1:]; input();"
+        "[remember(Path(site), name, Entry.model_validate_json(entry.replace('A.', f'{name}.')),"
+        " {f'{name}.{end}.csv.gz': b'table' for end in 'tu'}) for name in (f'{who}{i}' for i in range(20))]"
+    )
+    site, text = tmp_path / "mine.yaml", entry("A").model_dump_json()
+    each = [
+        subprocess.Popen([sys.executable, "-c", script, str(site), who, text], stdin=subprocess.PIPE, text=True)
+        for who in "ab"
+    ]
+    for process in each:
+        assert process.stdin is not None
+        process.stdin.write("\n")  # both are loaded and wait
+        process.stdin.close()
+    assert [process.wait(120) for process in each] == [0, 0]
+    assert set(read_learned(site).entries) == {f"{who}{i}" for who in "ab" for i in range(20)}
+    assert len(list(folder_of(site).iterdir())) == 1 + 40 * 2
+
+
+@pytest.mark.parametrize("where", [".", "rl", "rl/deep"])
+def test_learned_antennas_are_found_from_any_working_folder(
+    folder: Path, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The flight file is named relative to the working folder, and its site's memory lies beside it."""
+    (folder / "rl" / "deep").mkdir(parents=True)
+    folder_of(folder / "mine.yaml").rename(folder / "rl" / "mine.learned")
+    receiver = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=CARRIER_HZ, file="r.json.gz")
+    ranked = entry("A").model_copy(update={"series": [], "receivers": [receiver]})
+    remember(folder / "rl" / "mine.yaml", "nr", ranked, {"r.json.gz": b"{}"})
+    path = flight(folder / "rl", {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"})
+    path.write_text(path.read_text() + "rank: {receiver: mine/nr}\n", encoding="utf-8")
+    monkeypatch.chdir(folder / where)
+    relative = Path(os.path.relpath(path))
+    settings = load_flight(relative)
+    assert settings.flight.notes == []
+    link = settings.link.channels["A"].build(["LW1"], relative.parent)
+    assert isinstance(link.uav_array.patterns[0], SpherePattern)
+    assert isinstance(link.tower_arrays["LW1"].patterns[0], SpherePattern)
+    assert (relative.parent / settings.rank.receiver).samefile(folder / "rl" / "mine.learned" / "r.json.gz")
 
 
 def test_a_draft_takes_only_what_fits(folder: Path) -> None:

@@ -64,7 +64,7 @@ class FitSettings(StrictModel):
 class CalibrationFile(StrictModel):
     """The whole calibration.yaml."""
 
-    calibration: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\\-]*$")]
+    calibration: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
     flights: Annotated[list[str], Field(min_length=1)]
     patterns: PatternsSettings = PatternsSettings()
     fit: FitSettings = FitSettings()

@@ -66,19 +66,13 @@ class Against:
     series: tuple[AgainstSeries, ...]
     ranks: Mapping[str, ForecastScore] = field(default_factory=dict)
     """By tower."""
+    words: str
+    """Sentences on what the flight says of the prediction."""
 
     @property
     def scores(self) -> dict[str, dict[str, float]]:
         """Scores by ``tower channel``."""
         return {series.name: series.scores for series in self.series}
-
-    @property
-    def words(self) -> str:
-        """Sentences on what the flight says of the prediction."""
-        from .prediction_words import after_flight, rank_after_flight  # few reports score a prediction
-
-        sentences = [after_flight(self.scores, [item.stated for item in self.series])] if self.series else []
-        return " ".join([*sentences, *(rank_after_flight(tower, score) for tower, score in self.ranks.items())])
 
     def metrics(self) -> dict[str, Any]:
         """``against`` of metrics.json."""

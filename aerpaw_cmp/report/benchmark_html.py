@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .html import rendered
+from .page import rendered
 
 _LEVEL_COLUMNS = {
     "rmse_db": ("RMSE", "dB"),

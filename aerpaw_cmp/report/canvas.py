@@ -8,7 +8,7 @@ are rasterised and long lines thinned (extremes kept), so that an SVG stays smal
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +21,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, spread_out
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site, Trees
-from .data import ReportData
-from .export import write_file
+from .files import write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -234,15 +233,6 @@ def write_figures(
 def seconds_since(time: AnyArray, start: np.datetime64) -> FloatArray:
     """Instants as seconds after ``start``."""
     return np.asarray((np.asarray(time) - start) / np.timedelta64(1, "s"), dtype=np.float64)
-
-
-def start_of(data: ReportData) -> np.datetime64:
-    """The instant that is zero on every time axis: the first of the track, or of any panel."""
-    times = [] if data.track is None or not len(data.track.time) else [data.track.time[0]]
-    times += [item.time[0] for item in data.series if len(item.time)]
-    if not times:
-        return np.datetime64(0, "ns")
-    return times[0] if data.track is not None and len(data.track.time) else min(times)
 
 
 _CLOCK_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 86400)
@@ -468,25 +458,28 @@ def _apart(spans: list[tuple[int, int]], seconds: FloatArray) -> list[tuple[int,
     return joined
 
 
-def draw_waypoints(ax: Axes, data: ReportData, start: np.datetime64, *, names: bool = True) -> None:
+def draw_waypoints(
+    ax: Axes, waypoints: Iterable[tuple[str, np.datetime64]], start: np.datetime64, *, names: bool = True
+) -> None:
     """Vertical lines at the named moments of the flight.
 
     Parameters
     ----------
     ax : Axes
         Its x axis is seconds.
-    data : ReportData
+    waypoints : iterable of (str, datetime64)
+        Label and instant of each.
     start : datetime64
         Where its seconds begin.
     names : bool
         Write the labels, too.
     """
-    for number, waypoint in enumerate(data.waypoints):
-        at = float((waypoint.time - start) / np.timedelta64(1, "s"))
+    for number, (label, time) in enumerate(waypoints):
+        at = float((time - start) / np.timedelta64(1, "s"))
         ax.axvline(at, color=WAYPOINT, linewidth=0.8, linestyle=(0, (2, 2)), label="waypoint" if number == 0 else None)
         if names:
             ax.annotate(
-                waypoint.label, (at, 1.0), xycoords=ax.get_xaxis_transform(), xytext=(0, 2),
+                label, (at, 1.0), xycoords=ax.get_xaxis_transform(), xytext=(0, 2),
                 textcoords="offset points", ha="center", va="bottom", fontsize=8, color=WAYPOINT,
             )  # fmt: skip
 
@@ -651,12 +644,6 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
         bar.solids.set_rasterized(True)
         bar.solids.set_edgecolor("face")
     return bar
-
-
-def used_towers(data: ReportData) -> list[str]:
-    """Towers that a panel of the report names, or all."""
-    used = dict.fromkeys(item.tower for item in data.series)
-    return [name for name in used if name in data.site.towers] or list(data.site.towers)
 
 
 def thinned_plan(east: FloatArray, north: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:

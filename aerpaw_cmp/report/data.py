@@ -158,3 +158,23 @@ class ReportData(FlightResult):
     paths: tuple[PosePaths, ...] = ()
     against: Against | None = None
     """What was predicted before the flight, where a prediction is named."""
+
+    @property
+    def moments(self) -> list[tuple[str, np.datetime64]]:
+        """Label and instant of each waypoint."""
+        return [(waypoint.label, waypoint.time) for waypoint in self.waypoints]
+
+
+def start_of(data: ReportData) -> np.datetime64:
+    """The instant that is zero on every time axis: the first of the track, or of any panel."""
+    times = [] if data.track is None or not len(data.track.time) else [data.track.time[0]]
+    times += [item.time[0] for item in data.series if len(item.time)]
+    if not times:
+        return np.datetime64(0, "ns")
+    return times[0] if data.track is not None and len(data.track.time) else min(times)
+
+
+def used_towers(data: ReportData) -> list[str]:
+    """Towers that a panel of the report names, or all."""
+    used = dict.fromkeys(item.tower for item in data.series)
+    return [name for name in used if name in data.site.towers] or list(data.site.towers)

@@ -6,8 +6,6 @@ correlation and histograms of the chosen samples), by the same formulas as :mod:
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,8 +17,8 @@ from ..compare.rss import RssComparison
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site
-from .canvas import keep_extremes, seconds_since, start_of
-from .data import GEOMETRY, PosePaths, ReportData, Source
+from .canvas import keep_extremes, seconds_since
+from .data import GEOMETRY, PosePaths, ReportData, Source, start_of
 from .names import k_key
 from .packed import PackedArrays
 from .shapes import listed, outline, walls
@@ -60,11 +58,6 @@ def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
         "paths": [_paths(p, start) for p in data.paths],
         "packed": arrays.content(),
     }
-
-
-def as_json(content: Mapping[str, Any]) -> str:
-    """Text for a script element: no name can close it."""
-    return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _place(panel: RssResult | RankResult, pick: IntArray, arrays: PackedArrays) -> dict[str, int]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +15,7 @@ from ..compare.result import APPLIED, GIVEN, ClockResult, EngineResult, RankResu
 from ..compare.statistics import Interval
 from ..logs.records import has_wall_clock
 from .data import RANKS, ReportData
+from .files import merge
 from .made import about
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 from .words import audit_summary
@@ -155,15 +154,6 @@ def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
     }
 
 
-def merge(into: dict[str, Any], numbers: Mapping[str, Any]) -> None:
-    """Put ``other`` into ``into``, key by key; what is only in ``into`` stays."""
-    for key, value in numbers.items():
-        if isinstance(value, Mapping) and isinstance(into.get(key), dict):
-            merge(into[key], value)
-        else:
-            into[key] = value
-
-
 def rss_csv(series: Sequence[RssResult]) -> Iterator[str]:
     """The text of :func:`rss_frame` in pieces of bounded size."""
     return _text(rss_tables(series), RSS_COLUMNS)
@@ -287,23 +277,3 @@ def _times(time: Any, part: slice) -> dict[str, Any]:
     first = known.min()
     seconds = (instants[part] - first) / np.timedelta64(1, "s")
     return {"time_utc": iso_time(instants[part]) if has_wall_clock(first) else "", "time_s": seconds}
-
-
-def json_text(numbers: Mapping[str, Any], indent: int | None = 2) -> str:
-    """Numbers as the text of a file."""
-    return json.dumps(numbers, indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def write_file(path: Path, content: str | bytes | Iterator[str]) -> Path:
-    """Write one file of a folder of results; its own folder is made when missing, but not that one's parent.
-
-    Text may come in pieces.
-
-    The set becomes whole, and errors become messages, in :class:`~aerpaw_cmp.common.outputs.OutputFolder`.
-    """
-    path.parent.mkdir(exist_ok=True)
-    pieces = iter([content]) if isinstance(content, (str, bytes)) else content
-    with path.open("wb") as file:
-        for piece in pieces:
-            file.write(piece.encode("utf-8") if isinstance(piece, str) else piece)
-    return path

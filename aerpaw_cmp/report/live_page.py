@@ -11,10 +11,10 @@ from markupsafe import Markup
 
 from ..common.units import AnyArray, FloatArray
 from ..site.site import Site
-from .explorer import as_json, plan_of
-from .html import digest, environment, script
+from .explorer import plan_of
 from .names import k_key
 from .packed import PackedArrays
+from .page import as_json, digest, environment, script
 
 _POLICY = (
     "default-src 'none'; script-src {script}; style-src {style}; connect-src 'self'; img-src data:; base-uri 'none'; "

@@ -17,9 +17,9 @@ from ..common.jsonable import json_object, named
 from ..common.units import FloatArray
 from . import canvas
 from .canvas import FigureSpec
-from .export import write_file
-from .html import write_page
+from .files import write_file
 from .made import Made, about
+from .page import write_page
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

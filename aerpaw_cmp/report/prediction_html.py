@@ -19,10 +19,10 @@ from ..common.jsonable import json_object, named
 from ..site.site import Site
 from . import canvas
 from .canvas import FigureSpec
-from .export import write_file
-from .html import write_page
+from .files import write_file
 from .made import Made, about
 from .names import safe_name
+from .page import write_page
 from .prediction_words import FLAGS
 
 

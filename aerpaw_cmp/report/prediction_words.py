@@ -12,6 +12,7 @@ from ..compare.learning.correction import OFF, Correction, crps_difference
 from ..compare.statistics import mean_interval, paired_difference
 from ..compare.verdicts import Verdict, stated_errors
 from ..site.learned import Entry, LearnedSeries
+from .against import AgainstSeries
 from .phrases import filled, said_of
 
 TITLES = {
@@ -193,6 +194,12 @@ def field(correction: Correction) -> Verdict:
     ends = mean_interval(difference)
     cause = "better" if correction.on else "worse" if ends[0] > 0.0 else "off"
     return Verdict(cause=cause, effect=float(difference.mean()), interval=ends, where=title)
+
+
+def against_words(series: Sequence[AgainstSeries], ranks: Mapping[str, ForecastScore]) -> str:
+    """Sentences on what a flight says of the prediction made before it: levels, then ranks by tower."""
+    levels = [after_flight({s.name: s.scores for s in series}, [s.stated for s in series])] if series else []
+    return " ".join([*levels, *(rank_after_flight(tower, score) for tower, score in ranks.items())])
 
 
 def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Verdict]) -> str:

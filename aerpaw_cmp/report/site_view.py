@@ -16,9 +16,9 @@ from ..site.site import Site
 from . import canvas
 from .data import Track
 from .explorer import scene
-from .export import write_file
-from .html import embedded, rendered
+from .files import write_file
 from .names import safe_name
+from .page import embedded, rendered
 from .shapes import at_height, listed
 
 if TYPE_CHECKING:

@@ -11,8 +11,9 @@ from ..common.stages import Stages
 from . import html
 from .canvas import FORMATS, STYLES, write_figures
 from .data import ReportData
-from .export import json_text, metrics, rank_csv, rss_csv, write_file
+from .export import metrics, rank_csv, rss_csv
 from .exports.formats import FOLDER
+from .files import json_text, write_file
 from .plots import flight as figures
 
 PAGE = "page"

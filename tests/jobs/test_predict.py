@@ -26,7 +26,7 @@ from aerpaw_cmp.jobs.prediction.sources import named_flights
 from aerpaw_cmp.jobs.prediction.where import TargetOptions, Targets, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
-from aerpaw_cmp.report.html import coded
+from aerpaw_cmp.report.page import coded
 from aerpaw_cmp.report.plots.against import against_specs
 from aerpaw_cmp.report.prediction_html import prediction_metrics, write_prediction
 from aerpaw_cmp.site.siteyaml import load_site

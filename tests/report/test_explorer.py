@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.report import canvas, explorer
+from aerpaw_cmp.report import canvas, explorer, page
 from aerpaw_cmp.report.data import Source
 
 
@@ -21,7 +21,7 @@ def array(content, number):
 
 
 def test_arrays_come_back_as_they_were(report_data):
-    content = json.loads(explorer.as_json(explorer.payload(report_data)))
+    content = json.loads(page.as_json(explorer.payload(report_data)))
     for series, panel in zip(content["rss"], report_data.rss, strict=True):
         assert array(content, series["measured"]) == pytest.approx(panel.measured_db, nan_ok=True, rel=1e-6)
         assert array(content, series["models"][0]["level"]) == pytest.approx(panel.simulated_dbm, nan_ok=True, rel=1e-6)
@@ -69,7 +69,7 @@ def test_long_series_are_thinned_with_their_extremes(report_data):
     assert 10_000 < len(shown) <= explorer.POINTS + 2
     assert shown.max() == np.float32(-10.0)
     assert shown.min() == np.float32(level.min())
-    assert len(explorer.as_json(content)) < 8e6
+    assert len(page.as_json(content)) < 8e6
 
 
 @settings(max_examples=50, deadline=None)

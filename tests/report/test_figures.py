@@ -13,7 +13,7 @@ from PIL import Image
 from aerpaw_cmp.compare.detection import DetectionScore
 from aerpaw_cmp.compare.result import RankResult, RssResult
 from aerpaw_cmp.report import canvas, html
-from aerpaw_cmp.report.data import ReportData, Track
+from aerpaw_cmp.report.data import ReportData, Track, start_of, used_towers
 from aerpaw_cmp.report.plots import flight as figures
 from aerpaw_cmp.report.plots import rss as rss_figures
 from benchmarks.fabricated import rank_result, rss_result, with_numbers
@@ -154,7 +154,7 @@ def test_odd_flights_are_drawn_without_a_warning(report_data, drawn_before, chan
     left_alone = data.track is report_data.track and data.site is report_data.site
     for spec in figures.figure_specs(data):
         if left_alone and spec.section.startswith("flight"):  # these have of the panels only what is named:
-            what = (spec.name, canvas.start_of(data), *canvas.used_towers(data))
+            what = (spec.name, start_of(data), *used_towers(data))
             if what in drawn_before:
                 continue
             drawn_before.add(what)

@@ -28,7 +28,7 @@ from ...flight.training import flight_logs, marks_note
 from ...logs.records import has_wall_clock
 from ...report.calibration.data import AntennaMap, CalibrationData
 from ...report.calibration.html import calibration_metrics, write_calibration
-from ...report.export import write_file
+from ...report.files import write_file
 from ...report.names import safe_name
 from ...site.learned import Entry, Errors, LearnedLevel, LearnedLock, LearnedReceiver, LearnedSeries
 from ...site.pair_gain import PairGain

@@ -17,6 +17,7 @@ from ...compare.learning.calibration import Observed
 from ...flight.data import FlightData
 from ...flight.training import common, flight_logs, marks_text, shared
 from ...report.against import Against, AgainstSeries
+from ...report.prediction_words import against_words
 from ..learning.calibrate import observe
 from ..learning.calibrate_rank import RankSamples, rank_samples
 from .predict import RANKS
@@ -80,6 +81,7 @@ def score_against(data: FlightData, folder: Path) -> Against:
         flights=tuple(map(str, about.get("flights", ()))),
         series=tuple(series),
         ranks=ranks,
+        words=against_words(series, ranks),
     )
 
 

@@ -14,9 +14,9 @@ from ...common.jsonable import json_object, named
 from ...compare.learning.calibration import BASELINES
 from .. import canvas
 from ..canvas import FigureSpec
-from ..html import write_page
 from ..made import about
 from ..names import safe_name
+from ..page import write_page
 from .data import AntennaMap, CalibrationData
 
 SPLIT_TITLE = {

@@ -17,11 +17,11 @@ from ...compare.passes import Repeated
 from .. import canvas
 from ..campaign_data import CampaignData, RankPairing, Repeat, RssRow
 from ..canvas import Picture
-from ..export import json_text, write_file
 from ..exports.formats import write_exports
 from ..exports.points import of_campaign
-from ..html import by_section, rendered
+from ..files import json_text, write_file
 from ..made import about
+from ..page import by_section, rendered
 from ..words import pretty
 from . import figures as campaign_figures
 from . import words

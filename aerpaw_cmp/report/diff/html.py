@@ -9,8 +9,8 @@ from typing import Any
 from ...common.jsonable import fields_of, json_object
 from ...compare.report_difference import Changed
 from ...compare.verdicts import changed_verdict
-from ..export import json_text, write_file
-from ..html import rendered
+from ..files import json_text, write_file
+from ..page import rendered
 from ..phrases import said_of
 from ..words import count
 from .data import ReportDiff

@@ -10,10 +10,10 @@ from ...common.jsonable import json_object, json_safe, named
 from .. import canvas
 from ..canvas import Picture
 from ..data import RANKS
-from ..export import json_text, merge, write_file
-from ..html import by_section, embedded, rendered
+from ..files import json_text, merge, write_file
 from ..made import about
 from ..names import k_key
+from ..page import by_section, embedded, rendered
 from . import figures as maps_figures
 from .data import MapError, MapsData
 from .explorer import layer_numbers, page_layers, payload

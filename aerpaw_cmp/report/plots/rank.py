@@ -27,11 +27,10 @@ from ..canvas import (
     plan_shape,
     rank_colour,
     seconds_since,
-    start_of,
     subplots,
     time_axis,
 )
-from ..data import RANKS, ReportData
+from ..data import RANKS, ReportData, start_of
 from ..names import k_key
 from ..words import count
 
@@ -147,7 +146,7 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
         )  # fmt: skip
         draw_out_of_coverage(ax, seconds, rank == 0, "Z: no path")
     for number, ax in enumerate(axes[:rows]):
-        draw_waypoints(ax, data, start, names=number == 0)
+        draw_waypoints(ax, data.moments, start, names=number == 0)
         ax.set_yticks(RANKS)
         ax.set(ylim=(0.5, 4.5), ylabel="Rank")
         ax.legend(*legend_of(ax, lambda label: label != "waypoint"), loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -183,7 +182,7 @@ def rank_forecast(data: ReportData, panel: RankResult) -> Figure:
     upper.set(ylim=(0, 100), ylabel="Probability [%]")
     upper.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
     draw_measured_rank(lower, seconds, panel)
-    draw_waypoints(upper, data, start, names=True)
+    draw_waypoints(upper, data.moments, start, names=True)
     lower.set_yticks(RANKS)
     lower.set(ylim=(0.5, 4.5), ylabel="Rank")
     lower.legend(*legend_of(lower, lambda label: label != "waypoint"), loc="center left", bbox_to_anchor=(1.0, 0.5))

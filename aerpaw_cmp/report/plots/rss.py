@@ -29,14 +29,12 @@ from ..canvas import (
     lonely,
     robust_limits,
     seconds_since,
-    start_of,
     subplots,
     thinned,
     thinned_plan,
     time_axis,
-    used_towers,
 )
-from ..data import ReportData, Track
+from ..data import ReportData, Track, start_of, used_towers
 from ..words import count, pretty, signed
 
 if TYPE_CHECKING:
@@ -128,7 +126,7 @@ def altitude(data: ReportData, track: Track) -> Figure:
     seconds = seconds_since(track.time, start)
     fig, ax = subplots((9.2, 2.9))
     ax.plot(*thinned(seconds, track.up_m), color=SIMULATED, linewidth=1.2, label="height of the UAV")
-    draw_waypoints(ax, data, start)
+    draw_waypoints(ax, data.moments, start)
     time_axis(ax, start)
     ax.set_ylabel("Height above ground [m]")
     ax.set_ylim(bottom=min(0.0, float(np.nanmin(track.up_m, initial=0.0))))
@@ -168,7 +166,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
         ax.fill_between(seconds[some], low, high, color=SIMULATED, alpha=0.15, linewidth=0, label="90 % band", zorder=1)
     alone = lonely(panel.simulated_dbm)  # a line shows no single point between two gaps
     ax.plot(seconds[alone], panel.simulated_dbm[alone], linestyle="none", marker=".", markersize=4, color=SIMULATED)
-    draw_waypoints(ax, data, start)
+    draw_waypoints(ax, data.moments, start)
     robust_limits(ax, [calibrated, panel.simulated_dbm])
     ax.set_ylabel("RSS [dBm]")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), ncols=3, markerscale=3)
@@ -180,7 +178,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
                 sign * score.rmse_db, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 3)),
                 label=f"RMSE {score.rmse_db:.1f} dB" if sign == 1 else None,
             )  # fmt: skip
-    draw_waypoints(below, data, start, names=False)
+    draw_waypoints(below, data.moments, start, names=False)
     robust_limits(below, [residual], around=0.0)
     below.set_ylabel("Residual [dB]")
     time_axis(below, start)

@@ -29,9 +29,6 @@ from ..logs.matfile import read_arrays
 # Peak directivity of a half-wave dipole (2.15 dBi): 4 / Cin(2 pi).
 _HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 
-# Mean gain over the sphere that a file may have: no antenna radiates more than it gets, 0.5 dB is calibration.
-_MAXIMUM_EFFICIENCY = 1.12
-
 # A mean gain below -20 dB is a field in other units, or normalised; measured antennas lie near 0.5.
 _MINIMUM_EFFICIENCY = 0.01
 
@@ -107,8 +104,8 @@ class MeasuredPattern:
 
     Attributes
     ----------
-    peak_gain_dbi : float
-        Largest sample.
+    peak_gain_dbi, least_gain_dbi : float
+        Largest and smallest sample.
     efficiency : float
         Mean gain over the sphere (radiation efficiency times mismatch).
     """
@@ -123,6 +120,7 @@ class MeasuredPattern:
             raise UsageError(f"pattern '{name}' has {thetas} x {phis} samples", expected="3 or more x an even number")
         samples = np.abs(e_theta) ** 2 + (0.0 if e_phi is None else np.abs(e_phi) ** 2)
         self.peak_gain_dbi = float(db_from_power(samples.max()))
+        self.least_gain_dbi = float(db_from_power(max(samples.min(), 1e-30)))
         self.efficiency = _sphere_mean(samples)
         if e_phi is None:
             amplitude = np.abs(e_theta)
@@ -260,7 +258,7 @@ def read_pattern_text(path: str | Path, *, polarised: bool = True) -> MeasuredPa
     else:
         total = np.hypot(np.abs(e_theta), np.abs(e_phi)).astype(np.complex128)
         pattern = MeasuredPattern(path.stem, total.T, None, rows.frequency_hz)
-    _check_power(pattern, path)
+    check_power(pattern, path)
     return pattern
 
 
@@ -455,13 +453,25 @@ def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
     return scores[0] > 1.05 * scores[1] + 1e-6
 
 
-def _check_power(pattern: MeasuredPattern, path: Path) -> None:
-    if not _MINIMUM_EFFICIENCY <= pattern.efficiency <= _MAXIMUM_EFFICIENCY:
+def check_power(pattern: MeasuredPattern, path: Path, *, most_db: float = 0.5) -> None:
+    """Refuse a pattern of any format that radiates more than it is fed, almost nothing, or linear numbers.
+
+    Parameters
+    ----------
+    pattern : MeasuredPattern
+    path : Path
+        For the message.
+    most_db : float
+        Greatest mean gain over the sphere; an antenna without loss has 0 dB, the rest is error of the measurement.
+    """
+    # without a gain below that of an isotropic antenna none can lie above it
+    linear = pattern.least_gain_dbi >= 0.0 and pattern.peak_gain_dbi - pattern.least_gain_dbi > most_db
+    if linear or not _MINIMUM_EFFICIENCY <= pattern.efficiency <= power_from_db(most_db):
         raise InputError(
             f"the mean gain over the sphere is {float(db_from_power(pattern.efficiency)):.1f} dB "
             f"(peak {pattern.peak_gain_dbi:.1f} dBi)",
             expected=f"a mean of {float(db_from_power(_MINIMUM_EFFICIENCY)):g} to 0 dB",
-            cause="the values are not gain over isotropic",
+            cause="linear values in place of dBi" if linear else "the values are not gain over isotropic",
             path=path,
         )
 
@@ -512,7 +522,7 @@ def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
     by_azimuth = np.argsort(np.round(azimuth % 360.0, 6) % 360.0)
     gain = gain[np.argsort(-elevation)][:, by_azimuth]
     pattern = MeasuredPattern(variable, np.sqrt(power_from_db(gain)).astype(np.complex128), None)
-    _check_power(pattern, path)
+    check_power(pattern, path)
     return pattern
 
 

@@ -1,6 +1,7 @@
 """Buildings, forests and geofences from map files: classified, projected, repaired, with a list of what was done.
 
-Heights: the ``height`` tag, else ``building:levels`` times 3 m, else a default. Parts of a building keep the ground
+Heights: the ``height`` tag, else ``building:levels`` times 3 m, else that of the outline around a part, else a default,
+which is counted. Parts of a building keep the ground
 before its outline. Overlapping buildings of one height become one; of different heights the higher keeps the ground.
 Holes stay. Slivers and duplicates go. Single trees keep their tagged sizes; tree rows become trees along their line.
 """
@@ -30,7 +31,18 @@ from .mapfiles import read_map_file
 from .outlines import MAX_CROSSINGS, MapFile, Outline, Position, TreeLine, is_tangled
 from .site import Building, Forest, Geofence
 from .siteyaml import SiteModel, extent_m, site_model
-from .tags import Kind, is_part, kind_of, levels_of, main_tag, material_of, metres, positive_metres
+from .tags import (
+    Kind,
+    below_ground,
+    height_of,
+    is_part,
+    kind_of,
+    levels_of,
+    main_tag,
+    material_of,
+    metres,
+    positive_metres,
+)
 
 _LEVEL_M = 3.0
 _DEFAULT_HEIGHT_M = 6.0
@@ -76,7 +88,7 @@ class Footprints:
     """Elements found in map files, in the site frame, and the actions taken on them.
 
     ``actions`` are sentences for the user; those that ask for a look begin with ``warning:``. ``credits`` name those
-    whose data they are.
+    whose data they are; ``assumed`` counts the buildings without a height.
     """
 
     buildings: list[Building] = field(default_factory=list)
@@ -84,6 +96,7 @@ class Footprints:
     geofences: list[Geofence] = field(default_factory=list)
     trees: list[SingleTree] = field(default_factory=list)
     credits: list[str] = field(default_factory=list)
+    assumed: list[str] = field(default_factory=list)
     actions: list[str] = field(default_factory=list)
 
 
@@ -96,6 +109,8 @@ class _Shape:
     area: BaseGeometry
     height_m: float = 0.0
     stated: bool = False
+    assumed: bool = False
+    """Neither height nor levels are in the map."""
     material: str = "concrete"
     part: bool = False
 
@@ -159,6 +174,7 @@ def import_footprints(
         )
         for tree in content.trees:
             result.trees += _single_trees(tree, frame, result.actions)
+    _inherit(shapes["building"], result.actions)
     _warn_of_feet(shapes["building"], result.actions)
     near = None if area_m is None else box(area_m[0], area_m[2], area_m[1], area_m[3]).buffer(_FOREST_MARGIN_M)
     shapes["forest"] = _cut_off(shapes["forest"], near, result.actions)
@@ -184,8 +200,8 @@ def _sort(
     skipped: Counter[str] = Counter()
     for outline in content.outlines:
         kind = kind_of(outline.tags) or untagged or ("geofence" if content.kind == "KML" else None)
-        if kind is None:
-            skipped[main_tag(outline.tags)] += 1
+        if kind is None or (kind == "building" and below_ground(outline.tags)):
+            skipped[main_tag(outline.tags) if kind is None else "building below the ground"] += 1
             continue
         actions += [f"{outline.source}: {problem}" for problem in dict.fromkeys(outline.broken)]
         shape = _project(outline, frame, actions)
@@ -197,7 +213,7 @@ def _sort(
         listed = ", ".join(f"{count} {tag}" for tag, count in skipped.most_common(5))
         more = "" if len(skipped) <= 5 else f" and {len(skipped) - 5} other tags"
         hint = "; '--untagged building' takes areas without tags for buildings" if skipped["untagged"] else ""
-        actions.append(f"{path.name}: left out, neither building nor forest: {listed}{more}{hint}")
+        actions.append(f"{path.name}: left out, no building or forest above the ground: {listed}{more}{hint}")
 
 
 def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[SingleTree]:
@@ -249,9 +265,10 @@ def _fill(
     result: Footprints, shapes: dict[Kind, list[_Shape]], trees_per_hectare: float, minimum_spacing_m: float
 ) -> None:
     actions = result.actions
-    for name, shape, area in _parts(
-        _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions), actions
-    ):
+    buildings = _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions)
+    result.assumed = _assumed_heights(buildings)
+    actions += result.assumed
+    for name, shape, area in _parts(buildings, actions):
         result.buildings.append(
             Building(name, area, round(shape.height_m, 2), material=shape.material, source=shape.source)
         )
@@ -381,9 +398,9 @@ def _areas_only(shape: BaseGeometry) -> BaseGeometry:
 def _describe(shape: _Shape, outline: Outline, default_m: float, path: Path, actions: list[str]) -> None:
     tags = {key.lower(): value for key, value in outline.tags.items()}
     notes: list[str] = []
-    height = positive_metres(tags, ("height", "building:height", "height_m", "est_height"), notes)
+    height = height_of(tags, notes)
     levels = levels_of(tags, notes)
-    shape.stated = height is not None
+    shape.stated, shape.assumed = height is not None, height is None and not levels
     if height is None:
         height = levels * _LEVEL_M if levels else default_m
         notes = [f"{note}; it is drawn {height:g} m high" for note in notes]
@@ -405,6 +422,27 @@ def _describe(shape: _Shape, outline: Outline, default_m: float, path: Path, act
         actions.append(f"warning: {shape.source}: {height:g} m for {levels:g} levels; are these feet?")
 
 
+def _inherit(shapes: list[_Shape], actions: list[str]) -> None:
+    """Parts without a height are as high as the building whose outline holds them."""
+    known = [shape for shape in shapes if not (shape.part or shape.assumed)]
+    tree = shapely.STRtree([shape.area for shape in known])
+    for part in (shape for shape in shapes if shape.part and shape.assumed):
+        around = [known[int(i)] for i in tree.query(part.area.representative_point(), predicate="within")]
+        if around:
+            part.height_m, part.assumed = around[0].height_m, False
+            actions.append(f"{part.source}: no height; as high as {around[0].source}, {part.height_m:g} m")
+
+
+def _assumed_heights(shapes: list[_Shape]) -> list[str]:
+    """One line on the buildings whose height no map says."""
+    assumed = [shape for shape in shapes if shape.assumed]
+    if not assumed:
+        return []
+    heights = " and ".join(f"{height:g} m" for height in sorted({shape.height_m for shape in assumed}))
+    named = ", ".join(shape.name for shape in assumed[:5]) + ("" if len(assumed) <= 5 else ", ...")
+    return [f"height assumed: {len(assumed)} of {len(shapes)} buildings have none in the map, {heights} each: {named}"]
+
+
 def _warn_of_feet(shapes: list[_Shape], actions: list[str]) -> None:
     """A country site where most stated heights are tower blocks was probably drawn in feet."""
     stated = [shape.height_m for shape in shapes if shape.stated]
@@ -419,7 +457,7 @@ def _warn_of_feet(shapes: list[_Shape], actions: list[str]) -> None:
 
 
 def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
-    """Drops outlines that cover the same ground as an earlier one; a stated height is kept."""
+    """Drops outlines that cover the same ground as an earlier one, parts those of parts; a stated height is kept."""
     tree = shapely.STRtree([shape.area for shape in shapes])
     duplicates: set[int] = set()
     for i, shape in enumerate(shapes):
@@ -428,12 +466,13 @@ def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape
         for j in sorted(int(k) for k in tree.query(shape.area) if k > i and int(k) not in duplicates):
             other = shapes[j]
             ratio = shape.area.area / max(other.area.area, 1e-9)
-            if not (0.98 < ratio < 1.02 and shape.area.intersection(other.area).area > 0.98 * shape.area.area):
+            alike = shape.part == other.part and 0.98 < ratio < 1.02
+            if not (alike and shape.area.intersection(other.area).area > 0.98 * shape.area.area):
                 continue
             duplicates.add(j)
             actions.append(f"{other.source}: left out, it repeats {shape.source}")
             if other.stated and not shape.stated:
-                shape.height_m, shape.stated = other.height_m, True
+                shape.height_m, shape.stated, shape.assumed = other.height_m, True, False
     return [shape for i, shape in enumerate(shapes) if i not in duplicates]
 
 
@@ -594,7 +633,11 @@ def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
         ],
         "geofences": [outline_dict(g.name, g.area) for g in imports.geofences],
         "illustrative": False,
-        "notes": [*(note for note in content["notes"] if "illustrative" not in note.lower()), *imports.credits],
+        "notes": [
+            *(note for note in content["notes"] if "illustrative" not in note.lower()),
+            *imports.credits,
+            *imports.assumed,
+        ],
     }
     content["trees"] |= only_trees(imports.trees)
     return imports.actions

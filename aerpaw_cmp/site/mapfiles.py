@@ -307,7 +307,9 @@ def _kml(root: ElementTree.Element, path: Path, data: bytes) -> MapFile:
         parts = list(_outermost(placemark, _PLACEMARK_PARTS)) if len(placemark) else []
         outline = Outline(identity, f"{path.name}: {identity}", _kml_tags(parts))
         try:
-            for polygon in (part for part in parts if _plain(part.tag) == "Polygon"):
+            polygons = [part for part in parts if _plain(part.tag) == "Polygon"]
+            _kml_height(polygons, outline)
+            for polygon in polygons:
                 bounds = list(_outermost(polygon, {"outerBoundaryIs", "innerBoundaryIs"}))
                 outer = [_kml_ring(b, outline, path) for b in bounds if _plain(b.tag) == "outerBoundaryIs"]
                 holes = [_kml_ring(b, outline, path) for b in bounds if _plain(b.tag) == "innerBoundaryIs"]
@@ -352,7 +354,23 @@ def _kml_tags(parts: list[ElementTree.Element]) -> dict[str, str]:
     return tags
 
 
+def _kml_height(polygons: list[ElementTree.Element], outline: Outline) -> None:
+    """Height tag of polygons drawn above the ground, extruded or not, where the placemark's data name none."""
+    modes = {str(m.text or "").strip() for polygon in polygons for m in _named(polygon, "altitudeMode")}
+    text = " ".join(_kml_coordinates(polygon) for polygon in polygons)
+    highest = max((float(height) for height in _KML_HEIGHT.findall(text)), default=0.0)
+    if modes == {"relativeToGround"} and highest > 0.0:
+        outline.tags = {"height": f"{highest:g}", **outline.tags}
+
+
+# The third number of a point.
+_KML_HEIGHT = re.compile(r"(?<!\S)[^,\s]+,[^,\s]+,(-?\d+(?:\.\d*)?)(?!\S)")
+
+
+def _kml_coordinates(element: ElementTree.Element) -> str:
+    text = " ".join(str(c.text or "") for c in _named(element, "coordinates"))
+    return re.sub(r"\s*,\s*", ",", text)  # 'longitude, latitude' with a blank is common and can mean nothing else
+
+
 def _kml_ring(boundary: ElementTree.Element, outline: Outline, path: Path) -> list[Position]:
-    text = " ".join(str(c.text or "") for c in _named(boundary, "coordinates"))
-    text = re.sub(r"\s*,\s*", ",", text)  # 'longitude, latitude' with a blank is common and can mean nothing else
-    return [lonlat(point.split(","), outline.source, path) for point in text.split()]
+    return [lonlat(point.split(","), outline.source, path) for point in _kml_coordinates(boundary).split()]

@@ -14,10 +14,16 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.files import LARGEST_TABLE, read_input
 from ..common.units import FloatArray, power_from_db
-from .antennas import HIGHEST_DBI, MeasuredPattern, read_pattern_text
+from .antennas import HIGHEST_DBI, MeasuredPattern, check_power, read_pattern_text
 
 _DBI_OF_DBD = 2.15
 STEP_DEG = 3.0
+
+# Values of a cut may lie this far beyond the peak, and the peak this far from both cuts [dB].
+_RIPPLE_DB = 1.0
+
+# Mean gain over the sphere that the way between two cuts may add to that of an antenna without loss [dB].
+_MOST_OF_CUTS_DB = 1.5
 _PLANET = re.compile(r"(?im)^\s*(HORIZONTAL|VERTICAL)\s+(\d{1,4})\s*$")
 _GAIN = re.compile(r"(?im)^\s*GAIN\s+([-+]?\d{1,3}(?:\.\d{1,6})?)\s*(dBd|dBi)?\s*$")
 _FREQUENCY = re.compile(r"(?im)^\s*FREQUENCY\s+(\d{1,6}(?:\.\d{1,6})?)\s*(?:MHz)?\s*$")
@@ -74,8 +80,28 @@ def _planet(text: str, path: Path) -> dict[str, FloatArray]:
     cuts: dict[str, FloatArray] = {}
     for cut in _PLANET.finditer(text):
         rows = _pairs(text[cut.end() :].split("\n"), int(cut[2]), path)
-        cuts[cut[1].upper()] = peak - _each_degree(rows, cut[1], path)
-    return cuts
+        cuts[cut[1].upper()] = _each_degree(rows, cut[1], path)
+    return _about_peak(cuts, peak, path)
+
+
+def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float, path: Path) -> dict[str, FloatArray]:
+    """Gain [dBi] of cuts that hold attenuations below the peak, of whichever sign the program wrote."""
+    values = np.concatenate(list(cuts.values()))
+    if min(-values.min(), values.max()) > _RIPPLE_DB:
+        raise InputError(
+            f"values from {values.min():g} to {values.max():g} dB below the peak",
+            expected="attenuations of one sign",
+            cause="gains in place of attenuations",
+            path=path,
+        )
+    if (least := np.abs(values).min()) > _RIPPLE_DB:
+        raise InputError(
+            f"no direction of the cuts is less than {least:.1f} dB below the gain of {peak_dbi:g} dBi",
+            expected="cuts through the peak",
+            cause="another gain, or gains in place of attenuations",
+            path=path,
+        )
+    return {name: peak_dbi - np.abs(cut) for name, cut in cuts.items()}
 
 
 def _nsma(text: str, path: Path) -> dict[str, FloatArray]:
@@ -98,8 +124,8 @@ def _nsma(text: str, path: Path) -> dict[str, FloatArray]:
         rows = _pairs(lines, len(lines), path)
         if kind == "VERTICAL":
             rows = rows * [-1.0, 1.0]  # elevation is positive upwards there
-        cuts[kind] = _each_degree(rows, cut[1], path) + (peak if relative else 0.0)
-    return cuts
+        cuts[kind] = _each_degree(rows, cut[1], path)
+    return _about_peak(cuts, peak, path) if relative and cuts else cuts
 
 
 def _pairs(lines: list[str], count: int, path: Path) -> FloatArray:
@@ -155,7 +181,9 @@ def _grid() -> tuple[FloatArray, FloatArray]:
 def _pattern(level_dbi: FloatArray, name: str, path: Path, frequency_hz: float | None) -> MeasuredPattern:
     if level_dbi.max() > HIGHEST_DBI:
         raise InputError(f"a gain of {level_dbi.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
-    return MeasuredPattern(name, np.sqrt(power_from_db(level_dbi)).astype(np.complex128), None, frequency_hz)
+    pattern = MeasuredPattern(name, np.sqrt(power_from_db(level_dbi)).astype(np.complex128), None, frequency_hz)
+    check_power(pattern, path, most_db=_MOST_OF_CUTS_DB)
+    return pattern
 
 
 def _great_circle(text: str, name: str, path: Path, carrier_hz: float | None) -> MeasuredPattern:

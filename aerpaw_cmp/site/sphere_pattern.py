@@ -14,7 +14,7 @@ from ..common.cf import CONVENTIONS, DB, dataset, netcdf_bytes
 from ..common.errors import InputError, UsageError
 from ..common.provenance import trained_on
 from ..common.units import BoolArray, FloatArray, db_from_power, power_from_db
-from .antennas import HIGHEST_DBI, MeasuredPattern
+from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
 from .learned import read_table
 from .pair_gain import PairGain
 
@@ -194,9 +194,11 @@ def read_sphere_csv(path: str | Path) -> SpherePattern:
     if len(header) > 3:
         sd[row, column] = values[:, 3]
     notes = "\n".join(line for line in text.splitlines() if line.startswith("#"))
-    return SpherePattern(
+    pattern = SpherePattern(
         path.stem, gain, sd, learned_from=_flights_in(notes), trained_on=trained_on(notes), notes=notes
     )
+    check_power(pattern, path)
+    return pattern
 
 
 # Begins the comment that names a calibration and, after ``, from``, its flights.

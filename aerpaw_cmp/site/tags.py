@@ -51,6 +51,22 @@ def is_part(tags: Mapping[str, str]) -> bool:
     return tags.get("building:part", "no").lower() not in _NOT
 
 
+def below_ground(tags: Mapping[str, str]) -> bool:
+    """Check whether nothing of a building stands above the ground.
+
+    Examples
+    --------
+    >>> below_ground({"building": "yes", "location": "underground"})
+    True
+    >>> below_ground({"building": "yes", "building:levels": "0", "building:levels:underground": "3"})
+    True
+    """
+    if "underground" in (tags.get("location", "").lower(), tags.get("parking", "").lower()):
+        return True
+    levels, cellars = (_number(tags.get(f"building:levels{what}", "")) for what in ("", ":underground"))
+    return levels is not None and levels <= 0 and bool(cellars) and not tags.get("height")
+
+
 def main_tag(tags: Mapping[str, str]) -> str:
     """The tag that tells most about an area of no known kind."""
     for key in ("highway", "landuse", "natural", "waterway", "leisure", "amenity", "barrier", "boundary"):
@@ -112,9 +128,42 @@ def positive_metres(tags: Mapping[str, str], keys: tuple[str, ...], notes: list[
     return None
 
 
+_OTHER_HEIGHTS = re.compile(
+    "min|base|ground|eave|ceil|level|floor|stor|sourc|method|accura|confid|varian|std|tree|canopy|veg|antenna|unit|elev"
+)
+_UNIT_AT_END = re.compile(
+    r"(?:[^a-z]|(?<=height)|(?<=hgt)|(?<=hght)|(?<=ht))(ft|feet|foot|cm|m|met(?:er|re)s?)[^a-z]*$"
+)
+_FEET = re.compile(r"feet|foot|[^a-z]ft([^a-z]|$)")
+_STOREYS = ("building:levels", "levels", "num_floors", "floors", "stories", "storeys", "num_stories", "no_floors")
+
+
+def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
+    """Height of a building [m] by any of the names that programs give it, in the unit of the name or of the value.
+
+    Examples
+    --------
+    >>> [height_of({name: "40"}, []) for name in ("height", "HEIGHT_FT", "Bldg Hgt (m)", "ground_height")]
+    [40.0, 12.192, 40.0, None]
+    """
+    names = [name for name in tags if re.search("height|hgt|hght", name.lower())]
+    names = [name for name in names if not _OTHER_HEIGHTS.search(name.lower())]
+    first = ("height", "building:height", "height_m", "est_height")
+    for name in sorted(names, key=lambda n: first.index(n) if n in first else len(first)):
+        named = _UNIT_AT_END.search(name.lower())
+        unit = named[1] if named else "ft" if _FEET.search(name.lower()) else tags.get(f"{name}_unit", "")
+        value = tags[name].strip()
+        if unit and re.fullmatch(r"-?\d+(?:[.,]\d+)?", value):
+            value = f"{value} {unit.lower()}"
+        if (height := positive_metres({name: value}, (name,), notes)) is not None:
+            return height
+    return None
+
+
 def levels_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
     """Number of levels; of several (``2;3``) the largest."""
-    written = tags.get("building:levels", tags.get("levels", "")).strip()
+    plain = {name.lower(): value for name, value in tags.items()}
+    written = next((plain[name].strip() for name in _STOREYS if plain.get(name, "").strip()), "")
     if not written:
         return None
     parts = [_number(part) for part in written.split(";")]

@@ -23,7 +23,7 @@ from aerpaw_cmp.jobs.reporting.audit_flight import expectations
 from aerpaw_cmp.jobs.reporting.audit_raw import raw_checked
 from aerpaw_cmp.jobs.reporting.compare_flight import compare_flight
 from aerpaw_cmp.site import antennas, site
-from aerpaw_cmp.site.sphere_pattern import sphere_csv, sphere_grid
+from aerpaw_cmp.site.sphere_pattern import sphere_csv, sphere_grid, unit_mean_gain
 
 ORIGIN = (35.7275, -78.696)
 # Height of the take-off point above the ground of the origin.
@@ -89,7 +89,8 @@ def write_flight(folder: Path) -> Path:
     for name, seed in (("tower", 1), ("uav", 2)):
         _, _, vectors = sphere_grid(10.0)
         gain = sum(4.0 * np.tanh(vectors @ axis) for axis in np.random.default_rng(seed).normal(size=(3, 3)))
-        (folder / f"{name}.csv").write_text(sphere_csv(np.asarray(gain), np.ones_like(gain)), encoding="utf-8")
+        gain = unit_mean_gain(np.asarray(gain))
+        (folder / f"{name}.csv").write_text(sphere_csv(gain, np.ones_like(gain)), encoding="utf-8")
     (folder / "site.yaml").write_text(SITE, encoding="utf-8")
     flight = folder / "flight.yaml"
     flight.write_text(FLIGHT, encoding="utf-8")

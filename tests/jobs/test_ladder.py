@@ -15,7 +15,7 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_settings
 from aerpaw_cmp.site.learned import Entry, Errors, LearnedSeries, folder_of, remember
-from aerpaw_cmp.site.sphere_pattern import sphere_csv
+from aerpaw_cmp.site.sphere_pattern import sphere_csv, unit_mean_gain
 from tests.simulated import write_yaml
 from tests.tables import eastwards, rss_log
 
@@ -102,6 +102,7 @@ def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64) -> 
     site.write_bytes(Path(str(folder_of("lake_wheeler"))).with_suffix(".yaml").read_bytes())
     rows, columns = np.mgrid[0:19, 0:24]
     table = 2.0 * np.cos(np.radians(15.0 * columns)) + 0.1 * rows
+    table = unit_mean_gain(table)
     sphere = sphere_csv(table, np.ones(table.shape), (f"aerpaw-cmp calibrate: some, trained_on: {trained_on}",))
     files = dict.fromkeys(("t.csv.gz", "u.csv.gz"), sphere.encode())
     series = LearnedSeries(

@@ -30,7 +30,7 @@ def table(gain_db: float, sd_db: tuple[float, float], note: str = "") -> bytes:
     azimuth = np.radians(np.arange(0.0, 360.0, 5.0))
     ahead = np.cos(azimuth) >= 0
     sd = np.broadcast_to(np.where(ahead, *sd_db), (37, 72))
-    return sphere_csv(np.broadcast_to(gain_db * np.cos(azimuth), (37, 72)), sd, (note,) if note else ()).encode()
+    return sphere_csv(np.broadcast_to(gain_db * np.cos(azimuth) - 1.0, (37, 72)), sd, (note,) if note else ()).encode()
 
 
 def copied(folder: Path) -> Path:
@@ -70,7 +70,7 @@ def test_levels_are_free_space_and_the_remembered_gains(site: Path) -> None:
     assert list(said.table["flag"]) == ["", "", "outside_flown", "outside_flown"]  # behind the tower, and off the site
     free = 30.0 - 20 * np.log10(4 * np.pi * 300.0 * 3.3e9 / 299_792_458.0)
     # the tower sees the UAV in the east, east and west; the nose points away from the tower, at it, and at it
-    expected = free - 7.0 + np.array([4.0 - 2.0, 4.0 + 2.0, -4.0 + 2.0])
+    expected = free - 7.0 - 2 * 1.0 + np.array([4.0 - 2.0, 4.0 + 2.0, -4.0 + 2.0])
     np.testing.assert_allclose(levels["level_db"], expected, atol=0.02)
     near, far = (1.0**2 + 0.5**2), (5.0**2 + 0.5**2)
     slow = np.sqrt(np.array([near, near, far]) + 1.0**2 + 2.0**2 + 1.5**2)

@@ -42,9 +42,9 @@ def entry(channel: str, reader: str = "flight_mat", tower: str = "LW1") -> Entry
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A site that remembers one channel, its tower antenna 3 dB above its UAV antenna."""
+    """A site that remembers one channel, its tower antenna 3 dB below its UAV antenna."""
     text = {
-        end: sphere_csv(np.full((7, 8), level), np.ones((7, 8))).encode() for end, level in (("t", 3.0), ("u", 0.0))
+        end: sphere_csv(np.full((7, 8), level), np.ones((7, 8))).encode() for end, level in (("t", -3.0), ("u", 0.0))
     }
     remember(tmp_path / "mine.yaml", "d12", entry("A"), {f"A.{end}.csv.gz": content for end, content in text.items()})
     return tmp_path
@@ -81,7 +81,7 @@ def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:
     ends = [link.tower_arrays["LW1"].patterns[0], link.uav_array.patterns[0]]
     assert all(isinstance(pattern, SpherePattern) for pattern in ends)
     assert [float(pattern.gain_dbi(np.array(1.0), np.array(1.0))) for pattern in ends] == pytest.approx(
-        [3.0, 0.0], abs=1e-3
+        [-3.0, 0.0], abs=1e-3
     )  # type: ignore[attr-defined]
     assert not isinstance(link.tower_arrays["LW2"].patterns[0], SpherePattern)
     assert settings.flight.notes == []

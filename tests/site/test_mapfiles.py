@@ -279,7 +279,7 @@ def test_parts_of_a_building_have_their_own_heights(tmp_path: Path) -> None:
     [
         ({"height": "-1"}, 6, "not above 0"),
         ({"height": 0, "building:levels": 3}, 9, "not above 0"),
-        ({"height": None}, 6, ""),
+        ({"height": None}, 6, "height assumed"),
         ({"height": "2;3"}, 3, "taken as 3 m"),
         ({"height": "~12"}, 12, "taken as 12 m"),
         ({"height": "1,200"}, 6, "is not a length"),

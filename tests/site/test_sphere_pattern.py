@@ -103,10 +103,11 @@ def nsma(pattern):
     level = pattern.gain_dbi(np.full(len(azimuth), np.pi / 2), -np.radians(azimuth))
     zenith = np.radians(90.0 - azimuth) % (2 * np.pi)
     over = pattern.gain_dbi(np.where(zenith > np.pi, 2 * np.pi - zenith, zenith), np.where(zenith > np.pi, np.pi, 0.0))
-    lines = ["REVNUM:,TIA/EIA-804-B", "GUNITS:,DBI/DBR", "MDGAIN:,10.0", "PATFRE:,3500", "NUMCUT:,2"]
+    peak = max(level.max(), over.max())
+    lines = ["REVNUM:,TIA/EIA-804-B", "GUNITS:,DBI/DBR", f"MDGAIN:,{peak:.3f}", "PATFRE:,3500", "NUMCUT:,2"]
     for kind, values in (("AZ", level), ("EL", over)):
         lines += [f"PATCUT:,{kind}", "POLARI:,V/V", f"NUPOIN:,{len(azimuth)}"]
-        lines += [f"{a:g},{v - 10.0:.3f}," for a, v in zip(azimuth, values, strict=True)]
+        lines += [f"{a:g},{v - peak:.3f}," for a, v in zip(azimuth, values, strict=True)]
     return "\n".join([*lines, "ENDFIL:,EOF"]) + "\n"
 
 
@@ -146,12 +147,69 @@ def test_broken_cuts_are_told(tmp_path, spoil, message):
         read_pattern_file(file)
 
 
+def msi(gain_dbi, horizontal, vertical):
+    lines = ["NAME a", "FREQUENCY 3300", f"GAIN {gain_dbi:.2f} dBi"]
+    for name, cut in (("HORIZONTAL", horizontal), ("VERTICAL", vertical)):
+        lines += [f"{name} 360", *(f"{angle} {value:.2f}" for angle, value in enumerate(cut))]
+    return "\n".join(lines) + "\n"
+
+
+def sector(width_deg, floor_db=30.0):
+    """Attenuation of a sector antenna's cut at each degree [dB]."""
+    off = np.minimum(np.arange(360.0), 360.0 - np.arange(360.0))
+    return np.minimum(12.0 * (off / width_deg) ** 2, floor_db)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_attenuations_with_minus_signs_are_attenuations(tmp_path, sign):
+    file = tmp_path / "a.msi"
+    file.write_text(msi(14.0, sign * sector(65), sign * sector(15)))
+    pattern = read_pattern_file(file)
+    level = np.full(2, np.pi / 2)
+    assert np.allclose(pattern.gain_dbi(level, np.array([0.0, np.pi])), [14.0, -16.0], atol=0.1)
+    assert pattern.efficiency < 1.0
+
+
+@pytest.mark.parametrize(
+    ("gain_dbi", "cut", "message"),
+    [
+        (22.0, sector, "mean gain over the sphere is 6.6 dB"),  # a wrong peak
+        (15.0, lambda w: 10 ** (-sector(w) / 10), "mean gain over the sphere"),  # linear power
+        (15.0, lambda w: 10 ** (-sector(w) / 20), "mean gain over the sphere"),  # linear field
+        (15.0, lambda w: 15.0 - sector(w), "attenuations of one sign"),  # gains
+        (15.0, lambda w: sector(w) + 6.0, "less than 6.0 dB below the gain of 15 dBi"),
+    ],
+)
+def test_a_pattern_that_no_antenna_can_have_is_refused(tmp_path, gain_dbi, cut, message):
+    file = tmp_path / "a.msi"
+    file.write_text(msi(gain_dbi, cut(65), cut(15)))
+    with pytest.raises(InputError, match=message):
+        read_pattern_file(file)
+
+
+@pytest.mark.parametrize("values", ["power", "normalised", "dBd", "peak 10 dB too high"])
+def test_a_table_of_impossible_gains_is_refused(tmp_path, values):
+    _, _, v = sphere_grid()
+    gain_dbi = unit_mean_gain(6.0 * v[..., 0] + 3.0 * v[..., 2])
+    power = 10 ** (gain_dbi / 10)
+    table = {
+        "power": power,
+        "normalised": power / power.max(),
+        "dBd": gain_dbi + 2.15,
+        "peak 10 dB too high": gain_dbi + 10.0,
+    }[values]
+    file = tmp_path / "a.csv"
+    file.write_text(sphere_csv(table, 0.0 * table))
+    with pytest.raises(InputError, match="mean gain over the sphere"):
+        read_sphere_csv(file)
+
+
 def test_a_great_circle_at_several_frequencies(tmp_path):
     """The carrier chooses; both halves of the circle come back, blended around."""
     theta = np.linspace(-np.pi, np.pi, 121)
     rows = [
         f"{f}\t{t:.10f}\t{g}\t0\t0\t0\t0" for f, shift in ((902000000, 0), (3300000000, 2))
-        for t, g in zip(theta, 3 * np.cos(theta) + shift + 2 * (theta > 0), strict=True)
+        for t, g in zip(theta, 3 * np.cos(theta) + shift + 2 * (theta > 0) - 4, strict=True)
     ]  # fmt: skip
     head = "2\r\nPhi=0(deg)\r\n\r\nFrequency\tTheta\tE Total. dB\tE(Phi) . Amp dB\tE(Theta) . Amp dB\tp\tq"
     file = tmp_path / "phi_0.txt"
@@ -159,7 +217,7 @@ def test_a_great_circle_at_several_frequencies(tmp_path):
     pattern = read_pattern_file(file, carrier_hz=3.4e9)
     assert pattern.frequency_hz == 3.3e9
     down = np.radians([30.0, 60.0, 120.0])
-    assert np.allclose(pattern.gain_dbi(down, np.zeros(3)), 3 * np.cos(down) + 4, atol=0.05)
-    assert np.allclose(pattern.gain_dbi(down, np.full(3, np.pi)), 3 * np.cos(down) + 2, atol=0.05)
+    assert np.allclose(pattern.gain_dbi(down, np.zeros(3)), 3 * np.cos(down), atol=0.05)
+    assert np.allclose(pattern.gain_dbi(down, np.full(3, np.pi)), 3 * np.cos(down) - 2, atol=0.05)
     with pytest.raises(InputError, match="2 frequencies"):
         read_pattern_file(file)

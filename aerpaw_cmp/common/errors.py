@@ -129,6 +129,36 @@ def about_file(path: str | Path) -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def parsing(path: str | Path, expected: str | None = None, cause: str = "a damaged file") -> Iterator[None]:
+    """Whatever a file's content makes its parser raise is an :class:`InputError` about the file.
+
+    The one place for it, since libraries raise two dozen kinds on damage (RecursionError of a nested JSON, csv.Error of
+    a long cell, struct.error, MemoryError of a forged length, ...). Only reading stands inside, no computation.
+
+    Parameters
+    ----------
+    path : str or Path
+    expected, cause : str, optional
+        Of the message, for what the parser does not foresee itself.
+    """
+    try:
+        with about_file(path):
+            yield
+    except AerpawCmpError:
+        raise
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", expected=expected, path=path) from error
+    except Exception as error:
+        reason = one_line(str(error)[:200])
+        raise InputError(
+            f"cannot be read ({type(error).__name__}{reason and ': ' + reason})",
+            expected=expected,
+            cause=cause,
+            path=path,
+        ) from error
+
+
 class CheckError(AerpawCmpError):
     """The job ran, but a check that the user asked for did not hold."""
 

@@ -524,6 +524,14 @@ class _Place:
                 fault = error
                 continue
             fault = None
+            if not _is_own(os.fstat(descriptor)):
+                os.close(descriptor)
+                raise UsageError(
+                    f"the hidden place {one_line(str(self.part))} belongs to another user",
+                    expected="a hidden place of yours alone: remove that, or name another output",
+                    cause="a shared folder: whoever owns the place could replace the results before they are done",
+                    path=self.named,
+                )
             if not _lock(descriptor):
                 os.close(descriptor)
                 raise self._busy()
@@ -565,6 +573,11 @@ class _Place:
                 _clear(self.part) if self.part.is_dir() else self.part.unlink()
         for descriptor in descriptors:
             os.close(descriptor)
+
+
+def _is_own(status: os.stat_result) -> bool:
+    """Check whether a file or folder belongs to this user; True on systems without users."""
+    return not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
 
 
 def _lock(descriptor: int) -> bool:
@@ -620,7 +633,7 @@ def _exchange(part: Path, target: Path) -> None:
 def _restore(target: Path) -> None:
     """Mend what a run killed between the two steps left: the old set has its name again."""
     old = hidden_name(target, "old")
-    if not old.is_dir():
+    if not old.is_dir() or not _is_own(old.lstat()):
         return
     if os.path.lexists(target):
         _clear(old)

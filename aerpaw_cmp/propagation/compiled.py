@@ -103,18 +103,25 @@ def _source_hash() -> str:
 
 @lru_cache(maxsize=1)
 def cache_folder() -> Path | None:
-    """Folder of compiled code: ``NUMBA_CACHE_DIR``, beside this file or the user's cache; None if none is kept."""
+    """Folder of compiled code, this user's alone: in ``NUMBA_CACHE_DIR``, the package or the user's cache; or None."""
     named = os.environ.get("NUMBA_CACHE_DIR")
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     for base in (Path(named),) if named else (ROOM / "__pycache__", home / "aerpaw-cmp" / "compiled"):
         folder = base / f"kernels-{_source_hash()}"
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if not _is_private(folder.stat()):
+                continue
             with tempfile.TemporaryFile(dir=folder):
                 return folder
         except OSError:
             continue
     return None
+
+
+def _is_private(status: os.stat_result) -> bool:
+    """Check whether nobody but this user can write in a folder: what is in it will be run."""
+    return not hasattr(os, "geteuid") or (status.st_uid == os.geteuid() and not status.st_mode & 0o022)
 
 
 def kernels_for(pairs: int) -> ModuleType | None:

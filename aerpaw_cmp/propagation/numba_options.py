@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numba
 from numba.core import config
+from numba.core.serialize import dumps
 from numba.extending import register_jitable
 
+from ..common.files import read_sealed, write_sealed
 from .compiled import cache_folder
 
 FOLDER = cache_folder()
+_MARK = b"aerpaw-cmp kernel 1\n"
 _MATHS: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 _PART: dict[str, Any] = {"forceinline": True, "_nrt": False}
 
@@ -19,12 +25,43 @@ _PART: dict[str, Any] = {"forceinline": True, "_nrt": False}
 def kernel(function: Callable[..., Any], **options: Any) -> Any:
     """Decorator of a kernel: compiled at its first call, kept in :data:`FOLDER` where something can be written."""
     options = options or {"_nrt": True}  # said, or it would be that of the first caller
-    before = config.CACHE_DIR
-    config.CACHE_DIR = "" if FOLDER is None else str(FOLDER)  # numba asks for it when a function is decorated
-    try:
-        return numba.njit(cache=FOLDER is not None, nogil=True, **_MATHS, **options)(function)
-    finally:
-        config.CACHE_DIR = before
+    compiled = numba.njit(nogil=True, **_MATHS, **options)(function)
+    if FOLDER is not None:
+        before = config.CACHE_DIR
+        config.CACHE_DIR = str(FOLDER)  # numba wants a folder of its own, in which it then keeps nothing
+        try:
+            compiled.enable_caching()
+        finally:
+            config.CACHE_DIR = before
+        compiled._cache._cache_file = _Sealed(function)
+    return compiled
+
+
+class _Sealed:
+    """Compiled code of one kernel on disk, in place of numba's files, whose damage ends in any exception or a crash.
+
+    An entry has its SHA-256 behind it: a damaged one is none, and is compiled anew. The folder is this user's alone
+    (:func:`aerpaw_cmp.propagation.compiled.cache_folder`), since an entry holds machine code.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._name = f"{function.__module__}.{function.__qualname__}"
+
+    def _place(self, key: Any) -> Path:
+        assert FOLDER is not None
+        return FOLDER / f"{self._name}-{sha256(repr(key).encode()).hexdigest()[:32]}.kernel"
+
+    def load(self, key: Any) -> Any:
+        """Compiled code of a signature; None where none is kept."""
+        try:
+            content = read_sealed(self._place(key), _MARK)
+        except ValueError:
+            return None
+        return None if content is None else pickle.loads(content)
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep the compiled code of a signature."""
+        write_sealed(self._place(key), dumps(data), _MARK)
 
 
 def part(function: Callable[..., Any]) -> Any:

@@ -230,6 +230,28 @@ def test_a_file_system_mounted_in_a_result_folder_keeps_its_files(tmp_path: Path
     assert content(target).keys() == {"a.html", "figures/a.svg", SUMS}
 
 
+@pytest.mark.parametrize("kind", ["file", "folder", "old"])
+def test_what_waits_in_the_hidden_place_of_another_user_is_not_adopted(kind: str, tmp_path: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root gives files to another user")
+    target = tmp_path / "out"
+    place = outputs.hidden_name(target, "old" if kind == "old" else "part")
+    place.touch() if kind == "file" else place.mkdir()
+    if kind != "file":
+        (place / ".unfinished").touch()
+        (place / "theirs").write_text("theirs")
+    before = content(tmp_path)
+    os.chown(place, 12345, 12345)
+    if kind == "old":
+        write_folder(target, {"a": "new"})
+        assert (target / "a").read_text() == "new"
+        assert not (target / "theirs").exists()
+        return
+    with pytest.raises(UsageError, match=r"aerpaw-part belongs to another user"):
+        write_file(target) if kind == "file" else write_folder(target, {"a": "new"})
+    assert content(tmp_path) == before
+
+
 def test_a_changed_result_needs_force(tmp_path: Path) -> None:
     target = tmp_path / "report"
     write_folder(target, {"rss.csv": "1"})

@@ -2,7 +2,10 @@
 
 import json
 import os
+import pickle
+import re
 import resource
+import shutil
 import signal
 import sys
 from dataclasses import replace
@@ -117,21 +120,142 @@ def test_a_half_written_store_is_gone_on_with(ending, tmp_path, in_one_piece):
     assert not done.numbers, "nothing is computed twice"
 
 
-def test_a_store_killed_as_it_was_made_is_made_anew(tmp_path, in_one_piece):
-    half = tmp_path / ".map.zarr.aerpaw-part"
-    half.mkdir()
-    (half / "zarr.json").write_text('{"zarr_for')
+def test_a_store_killed_as_it_was_made_is_gone_on_with(tmp_path, in_one_piece):
+    store = tmp_path / "map.zarr"
+    store.mkdir()
+    assert_like(make(store), in_one_piece)
+    for name in ("rss_siso", "x"):  # as if they had not been written yet
+        shutil.rmtree(store / name)
+    assert_like(make(store), in_one_piece)
+
+
+def test_no_folder_of_others_is_adopted_or_removed(tmp_path, in_one_piece):
+    waiting = tmp_path / ".map.zarr.aerpaw-part"
+    waiting.mkdir()
+    (waiting / "zarr.json").write_text("theirs")
     assert_like(make(tmp_path / "map.zarr"), in_one_piece)
-    assert not half.exists()
+    assert (waiting / "zarr.json").read_text() == "theirs"
 
 
-def test_a_tile_cut_short_before_its_entry_is_computed_again(tmp_path, in_one_piece):
-    make(tmp_path / "map.zarr")
-    (tmp_path / "map.zarr" / LEDGER / "c" / "1" / "0").unlink()
-    (tmp_path / "map.zarr" / "rss_siso" / "c" / "0" / "0" / "0" / "1" / "0").write_bytes(b"cut")
-    crew = Watched()
-    assert_like(make(tmp_path / "map.zarr", workers=crew), in_one_piece)
-    assert crew.numbers == [2]
+def change_metadata(name, **more):
+    def change(store):
+        place = store / name
+        content = json.loads(place.read_text())
+        for key, value in more.items():
+            content[key] = value
+        place.write_text(json.dumps(content))
+
+    return change
+
+
+def rewrite(name, content):
+    return lambda store: (store / name).write_bytes(content)
+
+
+def cut(name):
+    return lambda store: (store / name).write_bytes((store / name).read_bytes()[:-3])
+
+
+LEVEL, JOINT, SECOND = "rss_siso/c/0/0/0/1/0", "rss_siso_joint/c/0/0/1/0", f"{LEDGER}/c/1/0/0"
+# Damage to a finished store, and the tile that is computed again.
+REPAIRED = {
+    "a chunk is gone": (lambda store: (store / LEVEL).unlink(), [2]),
+    "a chunk of the joint map is gone": (lambda store: (store / JOINT).unlink(), [2]),
+    "a chunk is cut": (cut(LEVEL), [2]),
+    "a chunk of another tile": (lambda store: shutil.copy(store / "rss_siso/c/0/0/0/2/0", store / LEVEL), [2]),
+    "paths of a tile are cut": (cut("tile_paths/c/1/0"), [2]),
+    "an entry is gone": (lambda store: (store / SECOND).unlink(), [2]),
+    "an entry is cut": (cut(SECOND), [2]),
+    "the entry of another tile": (lambda store: shutil.copy(store / LEDGER / "c/2/0/0", store / SECOND), [2]),
+    "a chunk of an axis": (rewrite("x/c/0", b"cut"), []),
+    "metadata are gone": (lambda store: (store / "rank/zarr.json").unlink(), []),
+    "attributes": (change_metadata("rank/zarr.json", attributes={"units": "furlong"}), []),
+}  # fmt: skip
+PICKLE = [{"name": "numcodecs.pickle", "configuration": {"protocol": 5}}]
+# Metadata that this job does not write.
+REFUSED = {
+    "no JSON": (rewrite("zarr.json", b'{"attributes": {'), "cannot be read (JSONDecodeError"),
+    "nested without end": (rewrite("rank/zarr.json", b"[" * 100_000), "cannot be read (RecursionError"),
+    "a list": (rewrite("rank/zarr.json", b"[]"), "no metadata of Zarr 3"),
+    "no job": (change_metadata("zarr.json", attributes=7), "names no job"),
+    "a job that is a list": (change_metadata("zarr.json", attributes={"aerpaw_cmp_job": "[]"}), "names no job"),
+    "another format": (change_metadata("zarr.json", zarr_format=2), "zarr_format in zarr.json is 2"),
+    "another codec": (change_metadata("rank/zarr.json", codecs=PICKLE), "codecs in rank/zarr.json is"),
+    "another type": (change_metadata("rank/zarr.json", data_type="float64"), "data_type in rank/zarr.json"),
+    "another shape": (change_metadata("rank/zarr.json", shape=[1 << 40] * 6), "shape in rank/zarr.json"),
+    "other chunks": (change_metadata(f"{LEDGER}/zarr.json", chunk_grid={}), f"chunk_grid in {LEDGER}/zarr.json"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    store = tmp_path_factory.mktemp("finished") / "map.zarr"
+    make(store)
+    return store
+
+
+@pytest.mark.parametrize("kind", REPAIRED)
+def test_a_damaged_tile_is_computed_again_and_said(kind, finished, tmp_path, in_one_piece):
+    damage, again = REPAIRED[kind]
+    store = tmp_path / "map.zarr"
+    shutil.copytree(finished, store)
+    damage(store)
+    crew, said = Watched(), []
+    outcome = mapping.make_maps(
+        load_site(SITE), SETTINGS, Stages(lambda text, *_: said.append(text)), name=SITE, store=store, workers=crew
+    )
+    assert_like(outcome, in_one_piece)
+    assert crew.numbers == again
+    entered = "an entry is gone" not in kind and bool(again)
+    assert any("1 finished tiles have chunks that are missing" in text for text in said) == entered
+    with xarray.open_zarr(store, consolidated=False) as data, xarray.open_zarr(finished, consolidated=False) as before:
+        assert data.identical(before), "attributes and axes too"
+
+
+@pytest.mark.parametrize("force", [False, True], ids=["", "force"])
+@pytest.mark.parametrize("kind", REFUSED)
+def test_a_store_with_other_metadata_is_refused_before_it_is_opened(kind, force, finished, tmp_path, monkeypatch):
+    damage, message = REFUSED[kind]
+    store = tmp_path / "map.zarr"
+    shutil.copytree(finished, store)
+    damage(store)
+    before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
+    monkeypatch.setattr(zarr, "open_group", lambda place, **how: OPEN(place, **only_in_memory(place, how)))
+    with pytest.raises(InputError, match=re.escape(message)):
+        make(store, force=force)
+    assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
+
+
+OPEN = zarr.open_group
+
+
+def only_in_memory(place, how):
+    assert isinstance(place, zarr.storage.MemoryStore), "a stranger's store was opened"
+    return how
+
+
+def test_a_store_of_zarr_2_runs_no_codec_of_its_own(finished, tmp_path):
+    store, ran = tmp_path / "map.zarr", tmp_path / "ran"
+    shutil.copytree(finished, store)
+    shutil.rmtree(store / "rank")
+    (store / "rank").mkdir()
+    (store / "rank" / ".zarray").write_text(json.dumps({
+        "zarr_format": 2, "shape": [1], "chunks": [1], "dtype": "|O", "compressor": None, "fill_value": 0,
+        "order": "C", "filters": [{"id": "pickle", "protocol": 4}],
+    }))  # fmt: skip
+    (store / "rank" / "0").write_bytes(pickle.dumps(_Runs(ran)))
+    for force in (False, True):
+        with pytest.raises(UsageError, match=r"what this tool did not write: rank/(\.zarray|0)"):
+            make(store, force=force)
+    assert not ran.exists()
+
+
+class _Runs:
+    def __init__(self, place):
+        self.place = place
+
+    def __reduce__(self):
+        return Path.touch, (self.place,)
 
 
 def test_the_store_of_another_job_is_refused(tmp_path, in_one_piece):
@@ -145,9 +269,10 @@ def test_the_store_of_another_job_is_refused(tmp_path, in_one_piece):
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "rss_siso/c/notes.txt", "rss_siso/c/link"])
-def test_a_store_with_files_of_others_is_not_replaced(name, tmp_path):
+@pytest.mark.parametrize("same", [False, True], ids=["other job", "same job"])
+def test_a_store_with_files_of_others_is_not_replaced(same, name, finished, tmp_path):
     store = tmp_path / "map.zarr"
-    make(store, replace(SETTINGS, carrier_hz=2e9, max_depth=0))
+    shutil.copytree(finished, store)
     place = store / name
     if name.endswith("link"):
         place.symlink_to(tmp_path)
@@ -155,7 +280,7 @@ def test_a_store_with_files_of_others_is_not_replaced(name, tmp_path):
         place.write_text("mine")
     before = sorted(path.relative_to(store).as_posix() for path in store.rglob("*"))
     with pytest.raises(UsageError, match=f"the store holds what this tool did not write: {name}"):
-        make(store, force=True)
+        make(store, SETTINGS if same else replace(SETTINGS, carrier_hz=2e9), force=True)
     assert sorted(path.relative_to(store).as_posix() for path in store.rglob("*")) == before
 
 
@@ -169,9 +294,20 @@ def test_what_is_no_store_stays(content, tmp_path):
         (store / {"notes": "notes.txt", "damaged": "zarr.json"}[content]).write_text('{"attributes": {')
     before = sorted(path.name for path in tmp_path.rglob("*"))
     for force in (False, True):
-        with pytest.raises(UsageError, match="no map store of this tool"):
+        with pytest.raises((InputError, UsageError), match=r"no map store|did not write: notes|JSONDecodeError"):
             make(store, force=force)
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
+
+
+def test_a_full_disk_leaves_no_store_that_was_not_begun(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (600, hard))
+    try:
+        with pytest.raises(OutputError, match=r"map.zarr: cannot be written|zarr.json: cannot be written"):
+            make(tmp_path / "map.zarr")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_full_disk_is_one_message_and_the_run_goes_on_later(tmp_path, in_one_piece):

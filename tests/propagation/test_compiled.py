@@ -5,6 +5,7 @@ import dataclasses
 import importlib.util
 import itertools
 import json
+import pickle
 import shutil
 import subprocess
 import sys
@@ -499,6 +500,56 @@ def test_many_jobs_of_one_process_pay_for_a_compiler(monkeypatch, tmp_path):
     before = [compiled.kernels_for(pairs) is not None for _ in range(30)]
     assert before == sorted(before)
     assert before.index(True) * 1.0 == pytest.approx(compiled.COMPILE_S[compiled.FIELD], abs=1.0)
+
+
+DAMAGED = {
+    "cut": lambda place, content: place.write_bytes(content[:-40]),
+    "empty": lambda place, _: place.write_bytes(b""),
+    "another byte": lambda place, content: place.write_bytes(content[:2000] + b"\xff\x00" + content[2002:]),
+    "rubbish": lambda place, _: place.write_bytes(b"\x80\x05rubbish." * 99),
+    "a program": lambda place, _: place.write_bytes(pickle.dumps(_Ends())),
+    "gone": lambda place, _: place.unlink(),
+    "a folder": lambda place, _: (place.unlink(), place.mkdir()),
+}  # fmt: skip
+
+
+class _Ends:
+    def __reduce__(self):
+        return sys.exit, (9,)
+
+
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_a_damaged_entry_of_compiled_code_is_compiled_again(kind, tmp_path, monkeypatch):
+    numba_options = pytest.importorskip("aerpaw_cmp.propagation.numba_options")
+    monkeypatch.setattr(numba_options, "FOLDER", tmp_path)
+
+    def run():
+        def doubled(x):
+            return 2.0 * x
+
+        kernel = numba_options.kernel(doubled)
+        assert kernel(4.0) == 8.0
+        return sum(kernel.stats.cache_hits.values())
+
+    assert run() == 0
+    assert run() == 1
+    (place,) = tmp_path.glob("*.kernel")
+    DAMAGED[kind](place, place.read_bytes())
+    assert run() == 0
+    assert run() == (kind != "a folder")
+
+
+def test_compiled_code_is_kept_where_nobody_else_can_write(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    compiled.cache_folder.cache_clear()
+    try:
+        folder = compiled.cache_folder()
+        assert folder is not None
+        folder.chmod(0o777)
+        compiled.cache_folder.cache_clear()
+        assert compiled.cache_folder() is None
+    finally:
+        compiled.cache_folder.cache_clear()
 
 
 def test_wrong_settings_are_named(monkeypatch):

@@ -473,6 +473,8 @@ def _write_tiles(
     """Compute the tiles that a store lacks, write each as it comes, and read some positions of all for the page."""
     empty, tiling = channels.empty(store.tiling.grid_of(0)), store.tiling
     missing = store.begin(empty, outcome.site.frame, _about_maps(outcome.site.name))
+    if store.damaged:
+        progress(f"{store.damaged} finished tiles have chunks that are missing or were changed: computed again")
     if len(missing) < len(tiling):
         progress(f"{len(tiling) - len(missing)} of {len(tiling)} tiles were computed before")
     lost: list[str] = []

@@ -324,7 +324,6 @@ def part_of(replayed: Replay, start: int, stop: int) -> Replay:
         rows = (paths.pose >= start) & (paths.pose < stop)
         return dataclasses.replace(paths.select(rows), pose=paths.pose[rows] - start)
 
-    through = replayed.through
     share = (stop - start) / max(len(replayed.rss_dbm), 1)
     columns: dict[str, Any] = {name: getattr(replayed, name)[start:stop] for name in PER_LINK}
     return dataclasses.replace(
@@ -332,7 +331,6 @@ def part_of(replayed: Replay, start: int, stop: int) -> Replay:
         **columns,
         paths=cut(replayed.paths),
         edge_paths=None if replayed.edge_paths is None else cut(replayed.edge_paths),
-        through=None if through is None else dataclasses.replace(through, paths=cut(through.paths)),
         seconds=replayed.seconds * share,
         search_seconds=replayed.search_seconds * share,
     )
@@ -420,7 +418,7 @@ def replay_poses(
     name = f"{engine} {towers}" if towers_m is None else f"replay {towers}, which moves"
     search = Search(
         engine,
-        **named(rt, "max_depth diffraction refraction"),
+        **named(rt, "max_depth diffraction"),
         **named(rt.advanced, "samples ridges device"),
     )
     # the image engine finds the paths of a pose whatever the others are; planes of terrain are numbered as they are met

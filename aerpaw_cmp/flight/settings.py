@@ -404,8 +404,6 @@ class RtSettings(GroupedSettings):
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
     diffraction: Literal["none", "edges", "all"] = "none"
     """Paths over one edge of a building, in H, levels and ranks; ``all``: also with a wall or roof on one side."""
-    refraction: bool = False
-    """Paths straight through walls and roofs of buildings, in H, levels and ranks."""
     attitude: Literal["logged", "level", "ignored"] = "ignored"
     """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
@@ -422,9 +420,7 @@ class RtSettings(GroupedSettings):
     def refuse_gone(cls, data: Mapping[str, Any]) -> None:
         """Interactions that Sionna's search added to RSS."""
         if data.get("interactions", ["reflection"]) != ["reflection"]:
-            raise ValueError(
-                "interactions of Sionna are no longer added to RSS; use diffraction: edges and refraction: true"
-            )
+            raise ValueError("interactions of Sionna are no longer added to RSS; use diffraction: edges")
 
 
 # The offset grid of a report may not be longer: 100 dB in steps of 0.0001 dB.

@@ -44,8 +44,6 @@ class Search:
     ridges : {"deygout", "bullington"}
         With diffraction, what the straight path loses over terrain that blocks it: up to three knife edges, or the one
         where the horizons meet.
-    refraction : bool
-        Paths straight through walls and roofs, in H, levels and ranks.
     device : {"auto", "cpu", "cuda"}
         Of Sionna's search; "auto" is a GPU where Dr.Jit finds one.
     links : (towers, poses) bool, optional
@@ -58,7 +56,6 @@ class Search:
     batch: int = 50
     diffraction: Diffraction = "none"
     ridges: Ridges = "deygout"
-    refraction: bool = False
     device: Device = "auto"
     links: BoolArray | None = None
 

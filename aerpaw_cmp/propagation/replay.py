@@ -24,7 +24,6 @@ from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
 from .search.edges import find_edge_paths
 from .search.terrain import on_terrain
-from .search.walls import ThroughWalls, paths_through
 from .surfaces import Surfaces
 
 # Poses of which levels are made at once.
@@ -68,8 +67,6 @@ class Replay:
         What the faces are made of, where the site is a scene of triangles.
     edge_paths : EdgePaths, optional
         Paths over edges, where diffraction was asked for; they are in H and both levels.
-    through : ThroughWalls, optional
-        Paths through walls, where refraction was asked for; they are in H and both levels.
     """
 
     rss_dbm: FloatArray
@@ -88,7 +85,6 @@ class Replay:
     samples_reason: str = ""
     surfaces: Surfaces | None = None
     edge_paths: EdgePaths | None = None
-    through: ThroughWalls | None = None
 
     @property
     def left_out(self) -> list[str]:
@@ -182,11 +178,10 @@ def replay(
     search = search if choice is None else replace(search, samples=choice.samples)
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
     notes += map(Omission, cache.warnings) if cache else []
-    (bent, over, unmodelled), (through, added) = further_fields(site, scene, link, poses, search, field, run)
+    bent, over, unmodelled = further_fields(site, scene, link, poses, search, field, run)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
-    more = [item for item in (over, added) if item is not None]
-    result = _evaluated(scene, link, poses, paths, search, field, run, more)
-    result = replace(result, edge_paths=bent, through=through)
+    result = _evaluated(scene, link, poses, paths, search, field, run, [] if over is None else [over])
+    result = replace(result, edge_paths=bent)
     notes += [*stopped, *unmodelled]
     return replace(
         result,
@@ -234,25 +229,6 @@ def passed(
     return scene, paths, notes
 
 
-def further_fields(
-    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, run: Run
-) -> tuple[tuple[EdgePaths | None, Fields | None, list[Omission]], tuple[ThroughWalls | None, Fields | None]]:
-    """Paths over edges and paths through walls, where they are asked for, with what they add to H and to the powers.
-
-    Parameters
-    ----------
-    site, scene, link, poses, search, field, run
-        As for :func:`replay`.
-
-    Returns
-    -------
-    (paths, fields, notes) over edges; (paths, fields) through walls
-        None where they were not asked for.
-    """
-    options = site, scene, link, poses, search, field, run
-    return _bent(*options), _passing(*options)
-
-
 def _shaped_ground(
     site: Site, scene: Scene, link: Link, poses: Poses, paths: PathSet
 ) -> tuple[Scene, PathSet, PathSet, list[Omission]]:
@@ -286,10 +262,21 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
     return clear
 
 
-def _bent(
+def further_fields(
     site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, run: Run
 ) -> tuple[EdgePaths | None, Fields | None, list[Omission]]:
-    """Paths over edges, what they add, and what of diffraction is not modelled."""
+    """Paths over edges, where they are asked for, what they add, and what of diffraction is not modelled.
+
+    Parameters
+    ----------
+    site, scene, link, poses, search, field, run
+        As for :func:`replay`.
+
+    Returns
+    -------
+    paths, fields, notes
+        None where they were not asked for.
+    """
     if search.diffraction == "none":
         return None, None, []
     edges = edges_of(scene)
@@ -314,30 +301,6 @@ def _bent(
     missing = "three edges" if search.diffraction == "all" else "two edges, after a reflection off a wall,"
     missing = f"diffraction over {missing} and with more than one reflection on a side"
     return paths, Fields(h, power, power), [Omission(missing)]
-
-
-def _passing(
-    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, run: Run
-) -> tuple[ThroughWalls | None, Fields | None]:
-    """Paths through walls, and what they add."""
-    if not search.refraction:
-        return None, None
-    if scene.surfaces is not None:
-        raise UsageError(
-            "refraction in a scene of triangles",
-            expected="buildings with footprints",
-            cause="a triangle does not say where its wall ends",
-        )
-    through = paths_through(scene.faces, scene.links_to(poses), search.max_depth)
-    lines = through.reflections()
-    clear = _clear_of_terrain(site, scene, poses, lines)
-    loss_db = field.loss_db(lines, scene.sources_m, poses.position_m)
-    if loss_db is not None:
-        clear &= np.isfinite(loss_db)
-        loss_db = loss_db[clear]
-    through = through.select(clear)
-    fields = channel_matrices(through.paths, through.faces, scene.sources_m, poses, link, loss_db, threads=run.threads)
-    return through, fields
 
 
 def edges_of(scene: Scene | Replay) -> Edges:

@@ -87,8 +87,8 @@ class Source:
     line: IntArray
 
 
-# Kinds of drawn paths beside a number of reflections: over edges, and through walls.
-DIFFRACTED, PASSING = -1, -2
+# Kind of drawn paths beside a number of reflections: over edges.
+DIFFRACTED = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

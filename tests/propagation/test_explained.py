@@ -116,7 +116,7 @@ def test_terms_and_places_of_paths_by_hand(scenes):
     ]  # fmt: skip
 
 
-def test_a_bounce_straight_down_and_paths_through_walls_in_words(scenes):
+def test_a_bounce_straight_down_in_words(scenes):
     site = scenes.site((Building("hall", box(40, -15, 52, 25), 8.0, material="wood"),))
     link, pose = scenes.link(site), scenes.poses([0.0, 0.0, 30.0])
     replayed = replay(site, link, pose, Search(max_depth=1))
@@ -125,17 +125,7 @@ def test_a_bounce_straight_down_and_paths_through_walls_in_words(scenes):
     free = 40.0 + 20 * math.log10(wavelength_m(scenes.carrier_hz) / (4 * math.pi * 40.0))
     assert ground.level_dbm == pytest.approx(free + ground.bounces[0].te_db)
     assert ground.bounces[0].te_db == pytest.approx(ground.bounces[0].tm_db)
-    behind = scenes.poses([70.0, 3.0, 2.0])
     assert further_path_lines(replayed, np.array([0.0, 0, 10]), pose, link) == []
-    lit = replay(site, link, behind, Search(max_depth=1, refraction=True))
-    lines = further_path_lines(lit, np.array([0.0, 0, 10]), behind, link)
-    levels = [float(line.split()[1]) for line in lines]
-    assert levels == sorted(levels, reverse=True)
-    assert len(lines) == len(lit.through.paths) >= 2
-    assert 10 * math.log10(sum(10 ** (level / 10) for level in levels)) == pytest.approx(
-        lit.rss_power_dbm[0, 0], abs=0.02
-    )
-    assert lines[0].count("through hall") == 2
 
 
 def test_what_comes_after_an_antenna_that_sends_nothing_loses_nothing(scenes):

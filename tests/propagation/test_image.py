@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -52,11 +54,12 @@ def test_mirrors_toward_a_box_are_those_of_all_paths_into_it_and_hardly_more(sce
     site = scenes.site(scenes.buildings(rng, 9, spread_m=120.0))
     faces = site_faces(site)
     mirrors, thinned = Mirrors(faces, np.array([[-200.0, -200, 0], [200, 200, 60]])), 0
+    open_ = replace(faces, solid=np.full(len(faces), -1))  # nothing hides
     for _ in range(12):
         low = rng.uniform([-150, -150, 1], [120, 120, 30])
         box_m = np.array([low, low + rng.uniform(5, 30, 3)])
         near = mirrors.toward(SOURCE[0], box_m).tolist()
-        paths = find_paths(faces, Links(SOURCE, rng.uniform(*box_m, (60, 3))), max_depth=1, hidden=False)
+        paths = find_paths(open_, Links(SOURCE, rng.uniform(*box_m, (60, 3))), max_depth=1)
         met = set(paths.faces[paths.depth == 1, 0].tolist())
         assert met <= set(near)
         assert len(near) == len(set(near))

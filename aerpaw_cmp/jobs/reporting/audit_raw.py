@@ -260,8 +260,8 @@ def _reference(
         account.leave(f"levels of {tower} (a node of the flight, or one that moves)")
         return None
     rt = data.settings.rt
-    if data.site.scene is not None or data.site.dem is not None or rt.diffraction != "none" or rt.refraction:
-        account.leave("levels over terrain, in scenes of triangles, with diffraction or refraction")
+    if data.site.scene is not None or data.site.dem is not None or rt.diffraction != "none":
+        account.leave("levels over terrain, in scenes of triangles, with diffraction")
         return None
     return Reference(replace(data.site, towers={tower: towers[tower]}), tower, expected.link, expected.loss)
 

@@ -10,12 +10,12 @@ from ...common.units import FloatArray
 from ...flight.data import FlightData
 from ...flight.replay import FlightReplay, Replayed
 from ...propagation.paths import PathSet
-from ...report.data import DIFFRACTED, PASSING, PosePaths
+from ...report.data import DIFFRACTED, PosePaths
 
 # Poses per tower whose paths are drawn.
 POSES = 300
 
-# Paths over edges, and through walls, that are drawn of a pose.
+# Paths over edges that are drawn of a pose.
 SHORTEST = 8
 
 
@@ -33,13 +33,11 @@ def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> t
 
 
 def _lines(replayed: Replayed, pose: int, tower_m: FloatArray) -> Iterator[tuple[FloatArray, int]]:
-    """Polylines of a pose with their kind: number of reflections, DIFFRACTED or PASSING."""
+    """Polylines of a pose with their kind: number of reflections, or DIFFRACTED."""
     replay, target_m = replayed.replay, replayed.poses.position_m[pose]
     kinds: list[tuple[PathSet, int | None]] = [(replay.paths, None)]
     if replay.edge_paths is not None:
         kinds.append((replay.edge_paths.as_path_set(), DIFFRACTED))
-    if replay.through is not None:
-        kinds.append((replay.through.paths, PASSING))
     for paths, kind in kinds:
         start, stop = np.searchsorted(paths.pose, [pose, pose + 1])
         lines = [

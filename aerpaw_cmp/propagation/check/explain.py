@@ -28,7 +28,7 @@ from ..field.edges import Tables
 from ..field.edges import amplitudes as edge_amplitudes
 from ..field.fresnel import FaceMaterials, reflection_coefficients
 from ..field.geometry import Elements, geometry
-from ..field.sum import amplitudes, channel_matrices, pattern_ends
+from ..field.sum import amplitudes, pattern_ends
 from ..paths import Faces, PathSet
 from ..replay import Replay, edges_of
 from ..search.mirror import images_of, scene_tolerance_m, trace_back
@@ -129,9 +129,7 @@ def explain_paths(
 
 
 def further_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Link) -> list[str]:
-    """Paths over edges, then those through walls, of a replay of one link in words.
-
-    Strongest first, with their levels before foliage.
+    """Paths over edges of a replay of one link in words, strongest first, with their levels before foliage.
 
     Parameters
     ----------
@@ -146,7 +144,7 @@ def further_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link:
     -------
     list of str
     """
-    bent, through, lines = replay.edge_paths, replay.through, list[str]()
+    bent, lines = replay.edge_paths, list[str]()
     if bent is not None and len(bent):
         edges, label = edges_of(replay), replay.faces.label
         field = edge_amplitudes(bent, Tables.of(edges, replay.faces, source_m[None], poses, link), link)
@@ -161,10 +159,6 @@ def further_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link:
             before, after = ([label[face]] if face >= 0 else [] for face in bent.ground[row])
             words.append([*before, *steps, *after])
         lines += _strongest_first("diffracted path", (np.abs(field) ** 2).mean(axis=(1, 2)), words, link)
-    if through is not None and len(through.paths):
-        power = channel_matrices(through.paths, through.faces, source_m[None], poses, link).path_power
-        words = [[through.faces.label[face] for face in row if face >= 0] for row in through.paths.faces]
-        lines += _strongest_first("path", power, words, link)
     return lines
 
 

@@ -254,8 +254,6 @@ class _OneLink:
     def field_checked(self, ks: Sequence[float]) -> FieldAudit:
         """H, RSS and rank from the replay's own list of paths."""
         paths, replay = [], self.replay
-        if replay.through is not None and replay.through.of_link(self.row, self.tower):
-            return FieldAudit(not_covered=("paths through walls",))
         for path in self.mine:
             sequence = self.sequence(path)
             if sequence is None:

@@ -167,9 +167,7 @@ def _scene_of(
 
 def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     """Replay of a block as of one tower, which had its own place at each pose."""
-    row, bent, through = np.arange(len(block.rows)), replayed.edge_paths, replayed.through
-    if through is not None:
-        through = replace(through, paths=replace(through.paths, tower=np.zeros_like(through.paths.tower)))
+    row, bent = np.arange(len(block.rows)), replayed.edge_paths
 
     def at_place(values: AnyArray) -> AnyArray:
         return np.ascontiguousarray(values[row, block.place][:, None])
@@ -179,7 +177,6 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
         replayed,
         **columns,
         paths=replace(replayed.paths, tower=np.zeros_like(replayed.paths.tower)),
-        through=through,
         edge_paths=None if bent is None else replace(bent, tower=np.zeros_like(bent.tower)),
         towers=(name,),
         omitted=[replace(item, tower=name if item.tower else "") for item in replayed.omitted],

@@ -39,7 +39,7 @@ def replay_pairs(
 ) -> PairChannels:
     """Replay with paths of each element pair; as many searches as the UAV has elements.
 
-    Paths over edges and through walls are those of the array centres, as in a replay.
+    Paths over edges are those of the array centres, as in a replay.
 
     Parameters
     ----------
@@ -88,10 +88,9 @@ def replay_pairs(
         h[:, :, element] = fields.h[..., 0, 0].reshape(len(poses), towers, ports)
         power += fields.power.reshape(len(poses), towers, ports).sum(axis=2) / (ports * len(uav))
     h = np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
-    (_, over_edges, _), (_, through_walls) = further_fields(site, scene, link, poses, search, field, quiet)
-    for added in (over_edges, through_walls):
-        if added is not None:
-            h, power = h + added.h, power + added.power
+    _, added, _ = further_fields(site, scene, link, poses, search, field, quiet)
+    if added is not None:
+        h, power = h + added.h, power + added.power
     level = rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm)
     h = np.where(np.isfinite(level)[:, :, None, None], h, 0.0)
     return PairChannels(h, level, rss_dbm(power, link.transmit_power_dbm, link.noise_floor_dbm))

@@ -66,13 +66,11 @@ def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
     # planes of terrain are numbered as they are met: other blocks have others
     faces, shifted = _joined_faces(parts)
     bent = [part.edge_paths for part in parts if part.edge_paths is not None]
-    through = [part.through for part in parts if part.through is not None]
     further: dict[str, Any] = {
         "faces": faces,
         "seconds": sum(part.seconds for part in parts),
         "search_seconds": sum(part.search_seconds for part in parts),
         "omitted": _added(parts),
-        "through": replace(through[0], paths=_in_flight([t.paths for t in through], rows)) if through else None,
         "edge_paths": _in_flight(bent, rows) if bent else None,
     }
     columns = {name: [getattr(part, name) for part in parts] for name in PER_LINK}

@@ -103,59 +103,9 @@ def reflection(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
     return te_re, te_im, tm_re, tm_im
 
 
-def passing(r_re: Any, r_im: Any, e_re: Any, e_im: Any, c_re: Any, c_im: Any) -> tuple[Any, Any]:
-    """Transmission of a slab in place of the air there: ``(1 - r^2) e c / (1 - r^2 e^2)``.
-
-    Source: ITU-R P.2040-3 eq. 44.
-
-    Parameters
-    ----------
-    r_re, r_im : float or (...)
-        Coefficient r of a half-space of the material.
-    e_re, e_im : float or (...)
-        e: :func:`echo` of half the thickness, once through the slab.
-    c_re, c_im : float or (...)
-        c: what the air would have done, undone.
-
-    Returns
-    -------
-    re, im : float or (...)
-    """
-    s_re, s_im = r_re * r_re - r_im * r_im, 2.0 * r_re * r_im
-    q_re, q_im = e_re * e_re - e_im * e_im, 2.0 * e_re * e_im
-    d_re, d_im = 1.0 - (s_re * q_re - s_im * q_im), -(s_re * q_im + s_im * q_re)
-    a_re, a_im = e_re * c_re - e_im * c_im, e_re * c_im + e_im * c_re
-    n_re = (1.0 - s_re) * a_re + s_im * a_im
-    n_im = (1.0 - s_re) * a_im - s_im * a_re
-    scale = 1.0 / (d_re * d_re + d_im * d_im)
-    return (n_re * d_re + n_im * d_im) * scale, (n_im * d_re - n_re * d_im) * scale
-
-
-def transmission(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
-    """TE and negative TM coefficients of slabs that a ray passes.
-
-    With the sign of a mirror's: a wave that goes on has its TM part where a mirror would turn it.
-    """
-    eta_re, eta_im, thickness = material
-    te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
-    e_re, e_im = echo(0.5 * thickness, root_re, root_im)
-    sine, free = sine_cosine(thickness * cosine)
-    te_re, te_im = passing(te_re, te_im, e_re, e_im, free, sine)
-    tm_re, tm_im = passing(tm_re, tm_im, e_re, e_im, free, sine)
-    return te_re, te_im, -tm_re, -tm_im
-
-
 def coefficients(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
-    """TE and TM coefficients (re, im each) of faces: the Fresnel coefficients that NumPy's field takes.
-
-    A negative thickness is that of a slab which the ray passes: :func:`transmission`.
-    """
+    """TE and TM coefficients (re, im each) of faces: the Fresnel coefficients that NumPy's field takes."""
     eta_re, eta_im, thickness = material
-    passes = thickness < 0.0
-    if np.any(passes):
-        reflecting = coefficients(cosine, (eta_re, eta_im, np.where(passes, np.inf, thickness)))
-        through = transmission(cosine, (eta_re, eta_im, np.where(passes, -thickness, 0.0)))
-        return tuple(np.where(passes, a, b) for a, b in zip(through, reflecting, strict=True))  # type: ignore[return-value]
     if np.any(np.isfinite(thickness)):
         return reflection(cosine, material)
     return half_space(cosine, eta_re, eta_im)[:4]
@@ -195,10 +145,6 @@ def reflection_coefficients(
     return np.asarray(te_re + 1j * te_im), np.asarray(tm_re + 1j * tm_im)
 
 
-# Before the material's name: a path passes the face; its thickness is negative.
-THROUGH = "through "
-
-
 @dataclass(frozen=True, slots=True)
 class FaceMaterials:
     """Permittivity and thickness per face; the entry at -1 is a harmless one for paths without a face."""
@@ -209,13 +155,9 @@ class FaceMaterials:
     @classmethod
     def of(cls, faces: Faces, carrier_hz: float) -> FaceMaterials:
         """Those of all faces at a carrier."""
-        known = {name: material(name.removeprefix(THROUGH)) for name in set(faces.material)}
-        eta = {name: material.relative_permittivity(carrier_hz) for name, material in known.items()}
-        thick = {
-            name: (-1.0 if name.startswith(THROUGH) else 1.0)
-            * (np.inf if material.thickness_m is None else material.thickness_m)
-            for name, material in known.items()
-        }
+        known = {name: material(name) for name in set(faces.material)}
+        eta = {name: face.relative_permittivity(carrier_hz) for name, face in known.items()}
+        thick = {name: np.inf if face.thickness_m is None else face.thickness_m for name, face in known.items()}
         return cls(
             np.array([*(eta[name] for name in faces.material), 2.0 + 0j], dtype=np.complex128),
             np.array([*(thick[name] for name in faces.material), np.inf], dtype=np.float64),

@@ -44,7 +44,7 @@ def _smaller(a, b):  # type: ignore[no-untyped-def]  # noqa: ARG001
 for _short in (
     dyads.sine_cosine, dyads.turned, dyads.turned_back, dyads.direction, dyads.slant_rotation, dyads.field_vector,
     dyads.incidence, dyads.reflected, dyads.spreading, dyads.received, fresnel.half_space, fresnel.echo, fresnel.slab,
-    fresnel.returned, fresnel.reflection, fresnel.passing, fresnel.transmission,
+    fresnel.returned, fresnel.reflection,
 ):  # fmt: skip
     law(_short)
 
@@ -95,18 +95,13 @@ def _radiate(
 
 @kernel
 def _reflect(w: FloatArray, pairs: int, normal: Any, eta_re: float, eta_im: float, thickness: float) -> None:
-    """The wave after one reflection, or with a negative thickness after one slab."""
+    """The wave after one reflection."""
     for p in range(pairs):
         cosine = dyads.incidence(taken(w, _X + p), normal)
         te_re, te_im, tm_re, tm_im, root_re, root_im = fresnel.half_space(cosine, eta_re, eta_im)
         w[_TE + p], w[_TE + LANES + p], w[_TM + p], w[_TM + LANES + p] = te_re, te_im, tm_re, tm_im
         w[_ROOT + p], w[_ROOT + LANES + p] = root_re, root_im
-    if thickness < 0.0:
-        for p in range(pairs):
-            cosine = dyads.incidence(taken(w, _X + p), normal)
-            te_re, te_im, tm_re, tm_im = fresnel.transmission(cosine, (eta_re, eta_im, -thickness))
-            w[_TE + p], w[_TE + LANES + p], w[_TM + p], w[_TM + LANES + p] = te_re, te_im, tm_re, tm_im
-    elif math.isfinite(thickness):
+    if math.isfinite(thickness):
         for p in range(pairs):
             e_re, e_im = fresnel.echo(thickness, w[_ROOT + p], w[_ROOT + LANES + p])
             for at in (_TE, _TM):

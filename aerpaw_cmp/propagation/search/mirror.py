@@ -53,7 +53,6 @@ def find_paths(
     budget: int = _SEQUENCE_BUDGET,
     extent_m: FloatArray | None = None,
     progress: Progress | None = None,
-    hidden: bool = True,
 ) -> PathSet:
     """All paths with at most ``max_depth`` reflections.
 
@@ -70,8 +69,6 @@ def find_paths(
         Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
     progress : callable, optional
         Called with the share done.
-    hidden : bool
-        Solids stop paths.
 
     Returns
     -------
@@ -89,8 +86,6 @@ def find_paths(
     known = targets_m[np.isfinite(targets_m).all(axis=1)] if extent_m is None else extent_m
     tolerance_m = scene_tolerance_m(faces, sources_m, known)
     hiding = Occlusion(faces, tolerance_m)
-    if not hidden:
-        hiding.pieces = []
     box = _Bounds.of(faces, float(max(1.0, *(np.abs(p).max(initial=0.0) for p in (known, sources_m)))))
     growth = _Growth(
         faces=faces,

@@ -361,7 +361,7 @@
       const found = data.paths.find(x => x.tower === tower);
       if (found && found.time.length) {
         const j = nearest(found.time, state.pose);
-        const look = kind => kind === -1 ? ["--measured", [2, 3]] : kind === -2 ? ["--accent", [7, 3, 2, 3]] : kind ? ["--baseline", [5, 3]] : ["--ink", []];
+        const look = kind => kind === -1 ? ["--measured", [2, 3]] : kind ? ["--baseline", [5, 3]] : ["--ink", []];
         for (const [points, kind] of found.lines[j]) polyline(points.map(project), css(look(kind)[0]), 1.4, look(kind)[1]);
       }
       pen.beginPath(); pen.arc(p[0], p[1], 6, 0, 7); pen.fillStyle = "#F0C000"; pen.fill(); pen.strokeStyle = "#000"; pen.lineWidth = 1.2; pen.stroke();

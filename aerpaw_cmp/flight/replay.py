@@ -419,7 +419,7 @@ def replay_poses(
     search = Search(
         engine,
         **named(rt, "max_depth diffraction"),
-        **named(rt.advanced, "samples ridges device"),
+        **named(rt.advanced, "samples device"),
     )
     # the image engine finds the paths of a pose whatever the others are; planes of terrain are numbered as they are met
     alone = engine == "image" and site.dem is None

@@ -378,8 +378,6 @@ class AdvancedRt(StrictModel):
 
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=100_000_000)] = "auto"
     """Rays per tower of Sionna; ``auto`` raises the number until two pilots find the same paths."""
-    ridges: Literal["deygout", "bullington"] = "deygout"
-    """With diffraction: loss of the straight path over terrain that blocks it."""
     gamma_db_per_m: Positive | None = None
     maximum_loss_db: Positive | None = None
     """Replace P.833's specific attenuation and largest loss at the carrier."""

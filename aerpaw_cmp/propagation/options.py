@@ -11,7 +11,6 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
-from .field.ridges import Ridges
 from .paths import PathSet
 from .search.effort import SearchRun
 from .search.samples import Samples
@@ -41,9 +40,6 @@ class Search:
     diffraction : {"none", "edges", "all"}
         Paths over one edge of a building: with the ground on either side ("edges"), and also with one wall or roof on
         one side ("all"). In H, levels and ranks, whichever engine finds the reflections.
-    ridges : {"deygout", "bullington"}
-        With diffraction, what the straight path loses over terrain that blocks it: up to three knife edges, or the one
-        where the horizons meet.
     device : {"auto", "cpu", "cuda"}
         Of Sionna's search; "auto" is a GPU where Dr.Jit finds one.
     links : (towers, poses) bool, optional
@@ -55,7 +51,6 @@ class Search:
     samples: Samples = "auto"
     batch: int = 50
     diffraction: Diffraction = "none"
-    ridges: Ridges = "deygout"
     device: Device = "auto"
     links: BoolArray | None = None
 

@@ -156,7 +156,7 @@ class PathSet(Rows):
     vertices_m : (paths, max_depth, 3)
         Reflection points for array centres, NaN where unused.
     terrain_db : (paths,)
-        Loss by the terrain: at ground that is curved within the Fresnel zone, or over ridges; left out, none.
+        Loss at ground that is curved within the Fresnel zone; left out, none.
     """
 
     pose: IntArray

@@ -16,7 +16,6 @@ from .arrays import Link, Poses
 from .edges import EdgePaths, Edges
 from .engines import chosen_samples, path_cache, search_or_read
 from .field.edges import edge_channels
-from .field.ridges import ridge_loss_db
 from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
 from .options import Field, Run, Search
 from .paths import Faces, PathSet, legs
@@ -216,11 +215,6 @@ def passed(
     """
     scene, level, shaped, notes = _shaped_ground(site, scene, link, poses, paths)
     clear = _clear_of_terrain(site, scene, poses, level)
-    if search.diffraction != "none" and site.dem is not None:
-        direct = np.flatnonzero(level.depth == 0)
-        ends = scene.sources_m[level.tower[direct]], poses.position_m[level.pose[direct]]
-        level.terrain_db[direct] = ridge_loss_db(site.dem, *ends, wavelength_m(link.carrier_hz), search.ridges)
-        clear[direct] = True
     lost = int((~clear).sum())
     notes += [Omission("paths end at the terrain of the elevation model", (lost, len(level)))]
     paths = level.select(clear) if lost else level

@@ -1,7 +1,6 @@
 """Digital elevation model: ground heights, profiles under lines, and which lines the ground blocks.
 
-The ground it shapes reflects (:mod:`aerpaw_cmp.propagation.search.terrain`) and diffracts
-(:mod:`aerpaw_cmp.propagation.field.ridges`).
+The ground it shapes reflects (:mod:`aerpaw_cmp.propagation.search.terrain`).
 """
 
 from __future__ import annotations
@@ -186,7 +185,9 @@ class Dem:
         source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
         tolerance, free = np.broadcast_to(tolerance_m, len(source)), np.ones(len(source), dtype=bool)
         for some, share, ground in self.profiles(source, target):
-            intrusion = above_line(source[some], target[some], share, ground)
+            start, way = source[some], target[some] - source[some]
+            bulge = share * (1 - share) * np.hypot(*way[:, :2].T) ** 2 / (2 * EARTH_RADIUS_M)
+            intrusion = ground + bulge - (start[:, 2] + share * way[:, 2])
             free[some] = ~((intrusion > tolerance[some]) & (share > 0.0) & (share < 1.0)).any(axis=0)
         return free
 
@@ -199,26 +200,6 @@ class Dem:
         longitude, latitude = self._to_grid.transform([x + self.step_x, x], [y, y + self.step_y], direction="INVERSE")
         east, north = self.frame.to_local(latitude, longitude)
         return float(np.hypot(east, north).min())
-
-
-def above_line(source_m: FloatArray, target_m: FloatArray, share: FloatArray, ground_m: FloatArray) -> FloatArray:
-    """Height of the ground, with the Earth's bulge, above straight lines.
-
-    Parameters
-    ----------
-    source_m, target_m : (lines, 3)
-        Ends [m].
-    share, ground_m : (samples, lines)
-        As :meth:`Dem.profiles` gives them.
-
-    Returns
-    -------
-    (samples, lines)
-        [m]; negative under the line.
-    """
-    length = np.hypot(*(target_m - source_m)[:, :2].T)
-    line = source_m[:, 2] + share * (target_m - source_m)[:, 2]
-    return np.asarray(ground_m + share * (1 - share) * length**2 / (2 * EARTH_RADIUS_M) - line)
 
 
 def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None, anchored: bool = True) -> Dem:

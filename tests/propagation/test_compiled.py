@@ -300,7 +300,7 @@ def test_a_replay_on_three_threads_is_that_on_one_bit_by_bit(monkeypatch, case, 
     assert not serial.h[~serial.has_path].any()
     for name in ("rss_dbm", "rss_power_dbm", "h", "has_path"):
         np.testing.assert_array_equal(getattr(serial, name), getattr(threaded, name))
-    for name in ("pose", "tower", "depth", "faces", "vertices_m", "tree"):
+    for name in ("pose", "tower", "depth", "faces", "vertices_m"):
         np.testing.assert_array_equal(getattr(serial.paths, name), getattr(threaded.paths, name))
 
 

@@ -1,4 +1,4 @@
-"""An elevation model shapes the ground: mirrors, shadows and ridges."""
+"""An elevation model shapes the ground: mirrors and shadows."""
 
 import dataclasses
 import itertools
@@ -238,18 +238,6 @@ def test_holes_keep_level_ground_and_cliffs_leave_no_gap() -> None:
         cliff = over(shaped(lambda e, _: np.where(e > 100.0, -50.0, 0.0)), spots, diffraction=diffraction)
         assert np.isfinite(cliff.h).all()
         assert (cliff.h[spots[:, 0] > 300.0] != 0).any(), "poses below the tower's ground are not buried"
-
-
-@pytest.mark.parametrize("ridges", ["deygout", "bullington"])
-def test_behind_a_ridge_the_level_is_that_of_free_space_less_a_knife_edge(site: Site, ridges: str) -> None:
-    dark, lit = over(site, [900.0, 0.0, 20.0]), over(site, [900.0, 0.0, 20.0], diffraction="edges", ridges=ridges)
-    assert not dark.has_path.any()
-    direct = np.hypot(900.0, 10.0)
-    line = 10.0 + 10.0 * RIDGE_EAST_M / 900.0 - RIDGE_EAST_M * 400.0 / (2 * 6.371e6)
-    nu = (RIDGE_TOP_M - line) * np.sqrt(2 * direct / (wavelength_m(3.3e9) * direct * (5 / 9) * direct * (4 / 9)))
-    free = 40.0 - 20 * np.log10(4 * np.pi * direct / wavelength_m(3.3e9))
-    expected = free - 6.9 - 20 * np.log10(np.sqrt((nu - 0.1) ** 2 + 1) + nu - 0.1)
-    assert lit.rss_dbm[0, 0] == pytest.approx(expected - (10.02 if ridges == "bullington" else 0.0), abs=0.3)
 
 
 def test_the_audit_checks_level_ground_and_names_links_over_shaped_ground() -> None:

@@ -186,13 +186,13 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
 
 
 _STANDS = "paths at forests that are a medium"
-_ON_TERRAIN = "reflections off shaped ground, and paths over ridges of the terrain"
+_ON_TERRAIN = "reflections off shaped ground"
 
 
 def _over_terrain(replay: Replay) -> BoolArray:
-    """Paths (paths,) off ground that is no level plane, or over ridges."""
+    """Paths (paths,) off ground that is no level plane."""
     shaped = np.append(replay.faces.solid == TERRAIN, False)
-    return np.asarray(shaped[replay.paths.faces].any(axis=1) | (replay.paths.terrain_db != 0.0))
+    return np.asarray(shaped[replay.paths.faces].any(axis=1))
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from ...common.units import FloatArray, IntArray
 from ...site.site import Forest, Site
 from ..paths import legs
 from .foliage import FoliageModel, NoFoliage, Opaque
-from .ridges import Profile, deygout_db
+from .knife_edges import Profile, deygout_db
 
 # Loss per metre between trunks over that in crowns: assumed.
 TRUNKS = 0.3

@@ -1,26 +1,19 @@
-"""Loss over ridges of the terrain: knife edges across the straight line between the ends."""
+"""Loss of knife edges across a straight line: the detours over and around a wood."""
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ...common.units import FloatArray
-from ...site.dem import Dem, above_line
-
-Ridges = Literal["deygout", "bullington"]
-
-# Ground that rises less over its chord is a plane.
-_PLANE_M = 1e-6
 
 
 class Profile(NamedTuple):
-    """Ground under straight lines, a column of samples each.
+    """Edges under straight lines, a column of samples each.
 
     ``length_m`` (links,) is that of the lines, ``share`` (samples, links) the part of the way to each sample,
-    ``intrusion_m`` the height of the ground above the line there (:func:`aerpaw_cmp.site.dem.above_line`), NaN where it
-    is unknown.
+    ``intrusion_m`` the height of the edge above the line there, NaN where it is unknown.
     """
 
     length_m: FloatArray
@@ -32,42 +25,6 @@ class Profile(NamedTuple):
         return _parameter(
             self.intrusion_m, self.share * self.length_m, (1.0 - self.share) * self.length_m, wavelength_m
         )
-
-
-def ridge_loss_db(
-    dem: Dem, source_m: FloatArray, target_m: FloatArray, wavelength_m: float, method: Ridges = "deygout"
-) -> FloatArray:
-    """Diffraction loss of straight lines over the terrain.
-
-    Parameters
-    ----------
-    dem : Dem
-    source_m, target_m : (links, 3)
-        Ends [m].
-    wavelength_m : float
-    method : {"deygout", "bullington"}
-
-    Returns
-    -------
-    (links,)
-        [dB]
-    """
-    loss, law = np.zeros(len(source_m)), deygout_db if method == "deygout" else bullington_db
-    length = np.linalg.norm(target_m - source_m, axis=1)
-    for some, share, ground in dem.profiles(source_m, target_m):
-        profile = Profile(length[some], share, above_line(source_m[some], target_m[some], share, ground))
-        loss[some] = law(profile, wavelength_m) * _edge_share(profile, ground, wavelength_m)
-    return loss
-
-
-def _edge_share(profile: Profile, ground_m: FloatArray, wavelength_m: float) -> FloatArray:
-    """Share of an edge that the ground nearest to each line (links,) is: 1 where it blocks the line, 0 on a plane."""
-    main = profile.parameter(wavelength_m).argmax(axis=0)
-    columns = profile.share, profile.intrusion_m, ground_m
-    at, over, ground = (np.take_along_axis(column, main[None], axis=0)[0] for column in columns)
-    rise = ground - (1.0 - at) * ground_m[0] - at * ground_m[-1]
-    ridge = (over <= 0.0) & (rise > _PLANE_M)
-    return np.where(over > 0.0, 1.0, np.where(ridge, rise / np.where(ridge, rise - over, 1.0), 0.0))
 
 
 def knife_edge_db(nu: FloatArray) -> FloatArray:
@@ -113,22 +70,3 @@ def deygout_db(profile: Profile, wavelength_m: float) -> FloatArray:
         correction = np.maximum(6.0 - first + knife_edge_db(nu[edge, link]), 0.0) * cosine
         total = total + np.maximum(knife_edge_db(side[edge, link]) - correction, 0.0)
     return np.asarray(total)
-
-
-def bullington_db(profile: Profile, wavelength_m: float) -> FloatArray:
-    """Loss (links,) [dB] of the one edge where the horizons of both ends meet.
-
-    Source: ITU-R P.526-15 section 4.5.1.
-    """
-    (length_m, share, intrusion_m), nu = profile, profile.parameter(wavelength_m).max(axis=0)
-    before, after = share * length_m, (1.0 - share) * length_m
-    inner = (before > 0.0) & (after > 0.0) & np.isfinite(intrusion_m)
-    rise, fall = (
-        np.where(inner, intrusion_m / np.where(inner, way, 1.0), -np.inf).max(axis=0) for way in (before, after)
-    )
-    hidden = (rise > 0.0) & (fall > 0.0)
-    rise, fall = np.where(hidden, rise, 1.0), np.where(hidden, fall, 1.0)
-    place = fall / (rise + fall)
-    horizon = _parameter(rise * place * length_m, place * length_m, (1.0 - place) * length_m, wavelength_m)
-    loss = knife_edge_db(np.where(hidden, horizon, nu))
-    return np.asarray(loss - np.expm1(-loss / 6.0) * (10.0 + 0.02 * length_m / 1000.0))

@@ -92,10 +92,8 @@ def geometry(
     image = sources_m[paths.tower] if sources_m.ndim == 2 else sources_m[paths.pose, paths.tower]
     frame = mounts[paths.tower]
     normals = np.where((sequence >= 0)[..., None], faces.normal[sequence], 0.0)
-    passed = table[sequence, 2] < 0.0
     for step in range(depth):
-        # zero where there is no face, or one that the path passes: nothing is mirrored
-        normal = np.where(passed[:, step, None], 0.0, normals[:, step])
+        normal = normals[:, step]  # zero where there is no face: nothing is mirrored
         offset = np.where(sequence[:, step] >= 0, faces.offset_m[sequence[:, step]], 0.0)
         image = image - 2.0 * ((image * normal).sum(axis=1) - offset)[:, None] * normal
         for vectors in (frame, normals[:, :step]):

@@ -17,11 +17,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 from scipy.special import log_softmax, softmax
@@ -35,10 +37,12 @@ from aerpaw_cmp.compare.learning.field_gp import FieldFit, FieldModel, Rows, fit
 from aerpaw_cmp.compare.spread import fading_of
 from aerpaw_cmp.compare.statistics import mean_interval
 from aerpaw_cmp.flight.settings import AntennaSettings
-from aerpaw_cmp.jobs.benchmarks.benchmark import Bench, Task, load_manifest, questions
-from aerpaw_cmp.jobs.learning.calibrate import gain_of, learned_antennas
-from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankFitSettings, RankSamples, Tried
+from aerpaw_cmp.jobs.learning.calibrate import gain_of, learned_antennas, observe
+from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankFitSettings, RankSamples, Tried, rank_samples
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from benchmarks.published import tasks
 
 DATASET12 = ("40m_fs10MHz", "40m_fs5MHz", "70m_fs20MHz")
 LTE = ("lte_plotdata2", "lte_plotdata4")
@@ -65,6 +69,43 @@ AHEAD_S, FIRST_S = 30.0, 120.0
 HEIGHT_COUNTS = 2.0
 # Errors and stated standard deviations (n,) [dB].
 Part = tuple[FloatArray, FloatArray]
+
+
+class Bench(tasks.Bench):
+    """Published flights as samples to learn from."""
+
+    def observed(self, flight: str) -> list[Observed]:
+        """Level samples of a flight, known ones alone."""
+        parts, _ = observe([self.flight(flight).data])
+        return [o.part(np.isfinite(o.samples.residual_db)) for o in parts]
+
+    def ranks(self, flight: str) -> list[RankSamples]:
+        """Rank reports of a flight, those with CSI alone."""
+        data = self.flight(flight).data
+        return [samples.part(samples.rank >= 1) for samples in (rank_samples(data, series) for series in data.rank)]
+
+
+def rows_of(o: Observed) -> pd.DataFrame:
+    """Columns by which splits are made."""
+    assert o.start is not None
+    time = o.start + (o.samples.time_s * 1e9).round().astype("timedelta64[ns]")
+    rows = {"flight": o.samples.flight, "tower": o.samples.tower, "channel": o.samples.channel, "time": time}
+    return pd.DataFrame({**rows, "east_m": o.samples.position_m[:, 0], "north_m": o.samples.position_m[:, 1]})
+
+
+def questions(
+    bench: Bench, split: tasks.Split, known: Sequence[str], flight: str
+) -> Iterator[tuple[list[LinkSamples], list[LinkSamples]]]:
+    """What may be known and what is asked of each fold of a flight; with a split that asks for it, of itself too."""
+    tests, train = bench.observed(flight), samples_of(bench, known)
+    folds = [tasks.folds_of(split, rows_of(o)) for o in tests]
+    for fold in np.unique(np.concatenate(folds)):
+        targets = [o.part(numbers == fold) for o, numbers in zip(tests, folds, strict=True)]
+        first = rows_of(next(o for o in targets if len(o.samples)))
+        own = [] if split == "flights" else [
+            o.part(tasks.may_know(split, rows_of(o), first, same_flight=True)) for o in tests
+        ]  # fmt: skip
+        yield [o.samples for o in (*train, *own) if len(o.samples)], [o.samples for o in targets]
 
 
 def learned(
@@ -144,10 +185,8 @@ def block_errors(
     bench: Bench, test: str, known: Sequence[str], antennas: Sequence[str], *, every: int = 1
 ) -> list[float]:
     """Numbers of :data:`BLOCK_LINE` for one flight, of every n-th block; ``antennas``: flights that teach no more."""
-    bench.manifest.tasks["block"] = Task(title="", split="blocks", train=list(known), test=[test])
     extra = [o.samples for o in samples_of(bench, antennas)]
-    asked = list(questions(bench, "block", test))[::every]
-    answers = [both([o.samples for o in q.train], [o.samples for o in q.targets], extra) for q in asked]
+    answers = [both(*fold, extra) for fold in list(questions(bench, "blocks", known, test))[::every]]
     row = []
     for k in (1, 2):  # blocks of one series are one series again
         series = zip(*(answer[k] for answer in answers), strict=True)
@@ -169,7 +208,7 @@ def lte_height(bench: Bench, name: str, other: str, *, repeats: int) -> dict[str
     known = {end: gain_of(AntennaSettings(model="file", file=f"{file}_F3500.txt"), bench.folder / "antennas")
              for end, file in (("uav", "SA-1400-5900"), ("tower", "RM-WB1-DN-BLK_right_side_up"))}  # fmt: skip
     asked, (train,) = at_height(bench, name), bench.observed(other)
-    tower = bench.data(name).site.towers[asked.samples.tower]
+    tower = bench.flight(name).site.towers[asked.samples.tower]
     model = learned_antennas([train.samples])
 
     def two_ray(o: Observed) -> FloatArray:
@@ -239,12 +278,9 @@ def whole_flight(asked: Observed, train: Observed, quick: bool) -> FloatArray:
 
 def folds(bench: Bench, names: Sequence[str]) -> Iterator[tuple[list[LinkSamples], list[LinkSamples]]]:
     """Each flight and the others; of a single flight, eighths of its time and the rest but 20 s."""
-    split = "flights" if len(names) > 1 else "stretches"
     for name in names:
         others = [other for other in names if other != name]
-        bench.manifest.tasks["fold"] = Task(title="", split=split, train=others, test=[name])
-        for question in questions(bench, "fold", name):
-            yield [o.samples for o in question.train], [o.samples for o in question.targets]
+        yield from questions(bench, "flights" if others else "stretches", others, name)
 
 
 def crps(bench: Bench, *, quick: bool) -> None:
@@ -354,7 +390,7 @@ def main() -> None:
     folder = os.environ.get("AERPAW_CMP_FIELD_DATA")
     if not folder:
         raise SystemExit("AERPAW_CMP_FIELD_DATA does not name the folder of the real logs")
-    bench = Bench(load_manifest(), Path(folder))
+    bench = Bench(Path(folder))
     for name in asked.only:
         PARTS[name](bench, quick=asked.quick)
 

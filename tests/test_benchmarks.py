@@ -22,7 +22,7 @@ def every() -> dict:
 
 
 def test_the_check_runs_every_benchmark(every: dict) -> None:
-    assert set(every["SMALLEST"]) == {path.stem for path in BENCHMARKS.glob("*.py")}
+    assert set(every["SMALLEST"]) == {path.stem for path in BENCHMARKS.glob("*.py")} | {"published"}
     assert set(every["ON_FIELD_DATA"]) <= set(every["SMALLEST"])
 
 

@@ -40,7 +40,7 @@ def test_the_output_option_says_what_it_takes_and_its_default(name: str) -> None
 WITHOUT_INPUT = {"bench", "doctor", "formats", "sample", "site", "tap", "modem-sim"}
 MISSING = [
     "ingest nope", "report nope.yaml", "report nope.yaml --dry-run", "calibrate nope.yaml", "campaign nope.yaml",
-    "benchmark --data nope", "benchmark score nope.csv", "explain nope.yaml --time 1 --tower LW1", "diff nope other",
+    "explain nope.yaml --time 1 --tower LW1", "diff nope other",
     "tap --play nope", "tap nope --flight nope.yaml", "map nope.yaml", "map lake_wheeler --flight nope.yaml --dry-run",
     "predict nope.kml --with nope.yaml", "plan nope.kml --site lake_wheeler", "plan sphere --with nope.yaml",
     "plan sphere --site lake_wheeler --geofence nope.kml", "simulate nope.yaml", "site show nope.yaml",

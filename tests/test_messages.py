@@ -54,13 +54,13 @@ COMMANDS = {
     "missing file": (
         "ingest gone.txt; report gone.yaml; report no_log.yaml; explain gone.yaml --tower LW1 --time 5; "
         "simulate gone.yaml; calibrate gone.yaml; calibrate calibration.yaml; campaign gone.yaml; "
-        "report flihgt.yaml; benchmark --data gone; benchmark score gone.csv; diff gone other; "
+        "report flihgt.yaml; diff gone other; "
         "predict gone.kml --with flight.yaml; plan gone.kml --site lake_wheeler; map gone.yaml; tap --play gone; "
         "report flight.yaml --with gone.yaml; report flight.yaml --against gone; site import gone.osm -o site.yaml"
     ),
     "wrong type of file": (
         "report .; report damaged.txt; simulate vehicleOut.txt; calibrate flight.yaml; campaign flight.yaml; "
-        "diff . .; predict vehicleOut.txt --with calibration.yaml; benchmark score scores.csv; map damaged.txt; "
+        "diff . .; predict vehicleOut.txt --with calibration.yaml; map damaged.txt; "
         "tap --play .; site import notes.txt -o site.yaml; plan route.kml --site lake_wheeler; "
         "report flight.yaml --against .; report flight.yaml --with flight.yaml"
     ),

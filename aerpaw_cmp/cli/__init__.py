@@ -11,12 +11,12 @@ from typing import Any
 import typer
 
 from ..common.errors import UsageError
-from . import benchmark, campaign, diff, explain, flight, live, logs, machine, plan, predict, site
+from . import campaign, diff, explain, flight, live, logs, machine, plan, predict, site
 from .app import Interrupted, app
 from .shown import say
 
 # The modules whose commands there are: importing them registers these.
-GROUPS = (logs, flight, explain, campaign, benchmark, diff, predict, plan, live, site, machine)
+GROUPS = (logs, flight, explain, campaign, diff, predict, plan, live, site, machine)
 
 
 @cache

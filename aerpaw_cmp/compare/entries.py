@@ -1,8 +1,8 @@
-"""Scores of predictions that somebody hands in, for the public benchmark."""
+"""Scores of levels that were predicted: after a flight, and of entries of benchmarks/published."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +10,6 @@ from scipy.special import ndtr, ndtri  # every report loads this module: scipy.s
 
 from ..common.units import FloatArray
 from .rss import local_mean_db
-from .statistics import bootstrap_means
-
-# Length of the blocks that are resampled [s].
-_BLOCK_S = 20.0
 
 # Averaging window of the second error [s].
 WINDOW_S = 4.0
@@ -56,12 +52,6 @@ class LevelSeries:
         """Measured minus predicted (n,), less the bias where the series has an offset of its own [dB]."""
         error = self.measured_db - self.level_db
         return np.asarray(error - error.mean() if self.own_offset else error)
-
-    @property
-    def block(self) -> int:
-        """Samples in :data:`_BLOCK_S`, at least one."""
-        span = float(np.ptp(self.time_s))
-        return max(1, min(len(self.time_s), round(_BLOCK_S * (len(self.time_s) - 1) / span))) if span > 0.0 else 1
 
 
 def crps_normal(error_db: FloatArray, sd_db: FloatArray) -> FloatArray:
@@ -117,33 +107,3 @@ def _series_scores(s: LevelSeries) -> dict[str, float]:
         scores["log_score"] = float(np.mean(0.5 * (error / s.sd_db) ** 2 + np.log(np.sqrt(2.0 * np.pi) * s.sd_db)))
         scores["coverage_90"] = float(np.mean(np.abs(error) <= ndtri(0.5 + COVERAGE / 2) * s.sd_db))
     return scores
-
-
-REPLICATES, SEED = 2000, 20240715
-
-
-def rmse_replicates(series: Sequence[LevelSeries]) -> FloatArray:
-    """Mean RMSE (replicates,) over series whose blocks of :data:`_BLOCK_S` are drawn anew [dB].
-
-    Blocks of one series are the same for every entrant, so differences of replicates are paired.
-    """
-    total = np.zeros(REPLICATES)
-    for number, levels in enumerate(series):
-        error = levels.error_db
-        columns = np.column_stack([error**2, error])
-        drawn = bootstrap_means(columns, levels.block, replicates=REPLICATES, seed=SEED + number)
-        offset = drawn[:, 1] ** 2 if levels.own_offset else 0.0
-        total += np.sqrt(np.maximum(drawn[:, 0] - offset, 0.0))
-    return total / len(series)
-
-
-def intervals(
-    series: Sequence[LevelSeries], baselines: Mapping[str, Sequence[LevelSeries]]
-) -> dict[str, tuple[float, float]]:
-    """95 % intervals of the mean RMSE, and of its difference from each baseline [dB]."""
-    replicates = rmse_replicates(series)
-    spread = {"rmse_ci95_db": replicates}
-    spread |= {
-        f"difference_to_{name}_ci95_db": replicates - rmse_replicates(baseline) for name, baseline in baselines.items()
-    }
-    return {key: (float(np.quantile(v, 0.025)), float(np.quantile(v, 0.975))) for key, v in spread.items()}

@@ -1,4 +1,4 @@
-"""Scores of an entry of the benchmark: every number by hand, the interval of a pair from the same draws."""
+"""Scores of an entry of the benchmark: every number by hand."""
 
 import dataclasses
 
@@ -7,8 +7,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from aerpaw_cmp.compare.entries import LevelSeries, crps_normal, intervals, level_scores, rmse_replicates
-from aerpaw_cmp.compare.statistics import bootstrap_means
+from aerpaw_cmp.compare.entries import LevelSeries, crps_normal, level_scores
 
 RNG = np.random.default_rng(2)
 LONG = LevelSeries(
@@ -50,25 +49,3 @@ def test_scores_are_those_by_hand(own: bool) -> None:
     assert level_scores([ripple])["rmse_db"] == pytest.approx(3.0)
     step = dataclasses.replace(ripple, measured_db=np.repeat([2.0, 6.0], 400), own_offset=own)
     assert level_scores([step])["rmse_4s_db"] == pytest.approx(2.0 if own else np.sqrt(20.0), abs=0.1)
-
-
-def test_intervals_are_those_of_blocks_of_twenty_seconds() -> None:
-    assert (LONG.block, SHORT.block) == (10, 13)  # 20 s at 2 s and at 1.5 s a sample
-    assert dataclasses.replace(LONG, time_s=np.zeros(60)).block == 1
-    assert dataclasses.replace(LONG, time_s=np.arange(60) * 0.1).block == 60
-    total = np.zeros(2000)
-    for series, block, own in ((LONG, 10, True), (SHORT, 13, True)):
-        error = series.error_db
-        drawn = bootstrap_means(
-            np.column_stack([error, error**2]), block, replicates=2000, seed=20240715 + (series is SHORT)
-        )
-        total += np.sqrt(drawn[:, 1] - own * drawn[:, 0] ** 2) / 2
-    np.testing.assert_allclose(rmse_replicates([LONG, SHORT]), total)
-    free = dataclasses.replace(LONG, own_offset=False)
-    error = free.error_db
-    drawn = bootstrap_means(error[:, None] ** 2, 10, replicates=2000, seed=20240715)[:, 0]
-    np.testing.assert_allclose(rmse_replicates([free]), np.sqrt(drawn))
-    worse = dataclasses.replace(LONG, level_db=LONG.measured_db + 2.0 * (LONG.level_db - LONG.measured_db))
-    ends = intervals([worse], {"base": [LONG]})
-    assert ends["rmse_ci95_db"] == pytest.approx(np.quantile(2.0 * rmse_replicates([LONG]), [0.025, 0.975]))
-    assert ends["difference_to_base_ci95_db"] == pytest.approx(np.quantile(rmse_replicates([LONG]), [0.025, 0.975]))

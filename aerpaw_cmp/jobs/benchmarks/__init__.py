@@ -1,1 +1,0 @@
-"""The public benchmark: tasks, entrants, scores."""

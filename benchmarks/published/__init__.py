@@ -1,0 +1,1 @@
+"""Channel models scored on published AERPAW flights with frozen splits (README.md beside this file)."""

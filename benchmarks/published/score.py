@@ -1,0 +1,231 @@
+"""An entry, its scores and its refusals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.files import read_input
+from aerpaw_cmp.common.jsonable import fields_of
+from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.compare.entries import LevelSeries, level_scores
+from aerpaw_cmp.compare.forecast import constant_forecast, score_forecast
+from aerpaw_cmp.compare.statistics import bootstrap_means
+
+from .tasks import KEY, RANKS, SERIES, Bench
+
+LARGEST_ENTRY = 2**30
+
+# Length of the blocks that are resampled [s].
+BLOCK_S = 20.0
+REPLICATES, SEED = 2000, 20240715
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Predictions of one entrant: ``frame`` by :data:`KEY`, and what its head says (``entrant``, ``who``, ...)."""
+
+    frame: pd.DataFrame
+    head: Mapping[str, str]
+
+
+def read_entry(path: Path) -> Entry:
+    """A predictions.csv, with lines ``# key: value`` before its header.
+
+    Raises
+    ------
+    InputError
+        Unreadable, no table, columns missing, rows twice, values that are no numbers.
+    """
+    try:
+        text = read_input(path, LARGEST_ENTRY, "a CSV of predictions").decode()
+    except UnicodeDecodeError:
+        raise InputError("not a text file", expected="a CSV of predictions in UTF-8", path=path) from None
+    lines = text.splitlines()
+    count = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    head = {k.strip(): v.strip() for k, _, v in (line[1:].partition(":") for line in lines[:count])}
+    try:
+        table = StringIO("\n".join(lines[count:]))
+        frame = pd.read_csv(table, dtype=dict.fromkeys(KEY, str), keep_default_na=False, low_memory=False)
+    except (pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        raise InputError(f"no table: {error}", expected=f"columns {', '.join(KEY)}, level_db", path=path) from None
+    if absent := [name for name in KEY if name not in frame]:
+        raise InputError(f"no column {absent[0]!r}", expected=f"columns {', '.join(KEY)}, level_db", path=path)
+    values = [name for name in ("level_db", "sd_db", *RANKS) if name in frame]
+    if not values or ("level_db" not in frame and not set(RANKS) <= set(frame)):
+        raise InputError("no predictions", expected=f"level_db (and sd_db), or {', '.join(RANKS)}", path=path)
+    for name in values:
+        number = pd.to_numeric(frame[name].replace("", "nan"), errors="coerce")
+        wrong = number.isna() & ~frame[name].astype(str).str.strip().str.lower().isin(["", "nan"])
+        if wrong.any():
+            row = int(np.flatnonzero(wrong)[0])
+            text_of = f"{name} {str(frame[name].iloc[row])!r}"
+            raise InputError(text_of, expected="a number", path=path, line=count + row + 2)
+        frame[name] = number
+    twice = frame.duplicated(KEY)
+    if twice.any():
+        row = int(np.flatnonzero(twice)[0])
+        raise InputError(
+            f"{int(twice.sum())} rows stand twice, {frame['flight'].iloc[row]} {frame['time'].iloc[row]} first",
+            expected="one row per task, flight, tower, channel and time",
+            path=path,
+            line=count + row + 2,
+        )
+    return Entry(frame, head)
+
+
+def check_training(bench: Bench, entry: Entry, tasks: Sequence[str]) -> None:
+    """UsageError where the entrant declares a test file among what it was trained on."""
+    declared = set(entry.head.get("trained_on", "").replace(",", " ").split())
+    test_flights = [(task, flight) for task in tasks for flight in bench.manifest.tasks[task].test]
+    for task, flight in test_flights if declared else ():
+        files = [bench.manifest.files[name] for name in bench.logs_of(flight)]
+        known = declared & {digest for file in files for digest in (file.sha256, *file.also)}
+        if known and bench.manifest.tasks[task].own_offset:
+            raise UsageError(
+                f"trained on {flight}, a test flight of {task}",
+                expected="predictions of a model that never saw the test flights",
+                cause="'# trained_on:' at the top of the file names its SHA-256",
+            )
+
+
+def score_task(
+    bench: Bench, task: str, entry: Entry, baselines: Mapping[str, Entry], *, accept_levels: bool = False
+) -> dict[str, Any]:
+    """Scores, intervals and counts of one task under stable names.
+
+    Parameters
+    ----------
+    bench : Bench
+    task : str
+    entry : Entry
+    baselines : mapping of str to Entry
+        Whose RMSE is compared on the same blocks.
+    accept_levels : bool
+        Skip the test of sign and unit.
+
+    Raises
+    ------
+    UsageError
+        Rows missing, unknown rows, levels of the wrong sign or unit.
+    """
+    table = bench.rows(task)
+    if bench.manifest.tasks[task].kind == "rank":
+        return _score_rank(bench, task, _joined(task, table, entry, RANKS))
+    series = _level_series(bench, task, table, entry)
+    if not accept_levels:
+        _check_levels(task, _joined(task, table, entry, ["level_db"]))
+    answered = {n: b for n, b in baselines.items() if b is not entry and (b.frame["task"] == task).any()}
+    peers = {name: _level_series(bench, task, table, peer) for name, peer in answered.items()}
+    return {**level_scores(series), **intervals(series, peers)}
+
+
+def _joined(task: str, table: pd.DataFrame, entry: Entry, values: Sequence[str]) -> pd.DataFrame:
+    """The rows of the truth with the predictions beside them."""
+    predicted = entry.frame[entry.frame["task"] == task]
+    if absent := [name for name in values if name not in predicted]:
+        raise UsageError(f"{task}: no column {absent[0]!r}", expected=f"{', '.join(values)} beside {', '.join(KEY)}")
+    joined: pd.DataFrame = table.merge(predicted[[*KEY, *values]], on=KEY, how="left", validate="one_to_one")
+    lost = ~np.isfinite(joined[list(values)]).all(axis=1)
+    if lost.any():
+        first = joined[lost].iloc[0]
+        raise UsageError(
+            f"{task}: {int(lost.sum())} of {len(joined)} rows have no prediction, first {first['flight']} "
+            f"{first['tower']} {first['channel']} {first['time']}",
+            expected="a number for every row of the template",
+            cause="other times or channels, rows left out, or a flight that was not predicted",
+        )
+    return joined
+
+
+def _level_series(bench: Bench, task: str, table: pd.DataFrame, entry: Entry) -> list[LevelSeries]:
+    has_sd = "sd_db" in entry.frame and bool(entry.frame.loc[entry.frame["task"] == task, "sd_db"].notna().all())
+    joined = _joined(task, table, entry, ["level_db", "sd_db"] if has_sd else ["level_db"])
+    if has_sd and not (joined["sd_db"] > 0).all():
+        raise UsageError(f"{task}: a standard deviation of {joined['sd_db'].min():g} dB", expected="sd_db above 0")
+    own_offset = bench.manifest.tasks[task].own_offset
+    return [
+        LevelSeries(
+            name=" ".join(map(str, name)),
+            time_s=(pd.to_datetime(rows["time"]) - pd.to_datetime(rows["time"].iloc[0])).dt.total_seconds().to_numpy(),
+            measured_db=rows["measured"].to_numpy(np.float64),
+            level_db=rows["level_db"].to_numpy(np.float64),
+            sd_db=rows["sd_db"].to_numpy(np.float64) if has_sd else None,
+            own_offset=own_offset,
+        )
+        for name, rows in joined.groupby(SERIES, sort=False)
+    ]
+
+
+def _check_levels(task: str, joined: pd.DataFrame) -> None:
+    """UsageError where levels rise with distance, or are spread as no dB are."""
+    places = [joined[f"{axis}_m"] - joined[f"tower_{axis}_m"] for axis in ("east", "north", "up")]
+    distance = np.log10(np.maximum(np.sqrt(sum(p**2 for p in places)), 1.0))
+    spread, level = float(joined["level_db"].std()), joined["level_db"]
+    if spread < 1e-9:
+        return  # a constant is an honest model
+    slope = float(np.polyfit(distance, level, 1)[0]) if float(distance.std()) > 1e-6 else 0.0
+    measured = float(np.polyfit(distance, joined["measured"], 1)[0]) if float(distance.std()) > 1e-6 else 0.0
+    if slope > 5.0 and measured < 0.0:
+        raise UsageError(
+            f"{task}: predicted levels rise by {slope:.0f} dB per decade of distance",
+            expected="received levels, which fall",
+            cause="path loss in place of a level; --accept-levels where it is meant",
+        )
+    if spread < 0.02 * float(joined["measured"].std()) or spread > 50.0 * float(joined["measured"].std()):
+        raise UsageError(
+            f"{task}: predicted levels are spread by {spread:.2g}, measured ones by {joined['measured'].std():.2g} dB",
+            expected="dB",
+            cause="milliwatts or amplitudes; --accept-levels where it is meant",
+        )
+
+
+def _score_rank(bench: Bench, task: str, joined: pd.DataFrame) -> dict[str, Any]:
+    p = joined[RANKS].to_numpy(np.float64)
+    if (p < 0.0).any() or not np.allclose(p.sum(axis=1), 1.0, atol=1e-3):
+        raise UsageError(f"{task}: probabilities that do not add up to 1", expected=", ".join(RANKS))
+    known = bench.rows(task, training=True)["measured"].to_numpy(np.float64)
+    constant = constant_forecast(known) if len(known) else np.full(4, 0.25)
+    decided = p.argmax(axis=1) + 1
+    score = score_forecast(joined["measured"].to_numpy(np.float64), p / p.sum(axis=1)[:, None], decided, constant)
+    return {name: tuple(v) if isinstance(v, np.ndarray) else v for name, v in fields_of(score).items()}
+
+
+def block_of(series: LevelSeries) -> int:
+    """Samples in :data:`BLOCK_S`, at least one."""
+    n, span = len(series.time_s), float(np.ptp(series.time_s))
+    return max(1, min(n, round(BLOCK_S * (n - 1) / span))) if span > 0.0 else 1
+
+
+def rmse_replicates(series: Sequence[LevelSeries]) -> FloatArray:
+    """Mean RMSE (replicates,) over series whose blocks of :data:`BLOCK_S` are drawn anew [dB].
+
+    Blocks of one series are the same for every entrant, so differences of replicates are paired.
+    """
+    total = np.zeros(REPLICATES)
+    for number, levels in enumerate(series):
+        error = levels.error_db
+        columns = np.column_stack([error**2, error])
+        drawn = bootstrap_means(columns, block_of(levels), replicates=REPLICATES, seed=SEED + number)
+        offset = drawn[:, 1] ** 2 if levels.own_offset else 0.0
+        total += np.sqrt(np.maximum(drawn[:, 0] - offset, 0.0))
+    return total / len(series)
+
+
+def intervals(
+    series: Sequence[LevelSeries], baselines: Mapping[str, Sequence[LevelSeries]]
+) -> dict[str, tuple[float, float]]:
+    """95 % intervals of the mean RMSE, and of its difference from each baseline [dB]."""
+    replicates = rmse_replicates(series)
+    spread = {"rmse_ci95_db": replicates}
+    spread |= {
+        f"difference_to_{name}_ci95_db": replicates - rmse_replicates(baseline) for name, baseline in baselines.items()
+    }
+    return {key: (float(np.quantile(v, 0.025)), float(np.quantile(v, 0.975))) for key, v in spread.items()}

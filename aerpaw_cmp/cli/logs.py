@@ -59,7 +59,9 @@ def ingest(
     for note in account_notes(summary):
         say(note)
     if out is not None:
-        print(f"wrote {out}")
+        flights = summary["flights"]
+        several = f": {len(flights)} flights, {', '.join(flights)}" if len(flights) > 1 else ""
+        print(f"wrote {out}{several}")
     if draft is not None:
         for remark in summary["draft"]:
             say(remark)

@@ -1,4 +1,4 @@
-"""Questions about a log: what its name, files beside it or the ground at take-off contradict; what is assumed."""
+"""Questions about logs: what names, files beside them, clocks or the ground contradict; what is assumed."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from ..common.units import AnyArray
 from ..logs import archives
 from ..logs.ingest import IngestedFile, read_bytes
 from ..logs.records import Stream, has_wall_clock
 from .grouping import stream_span
+from .track import Track
 
 _IN_NAME = re.compile(
     r"(?<!\d)(20\d\d)[-_]?([01]\d)[-_]?([0-3]\d)(?:[T_ -]([0-2]\d)[-_:]?([0-5]\d)(?:[-_:]?([0-5]\d))?)?(?!\d)"
@@ -61,6 +63,51 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
         if stream.kind == "telemetry" and (low := _lowest_m(stream)) is not None and abs(low) > _GROUND_M:
             texts.append(f"the lowest height is {low:.0f} m, expected 0 m: does the track begin in the air?")
     return list(dict.fromkeys(texts))
+
+
+# Nothing flown here goes higher; a lowest height above it is one of another datum [m].
+_TOO_HIGH_M = 150.0
+
+# Radios are started within this of the telemetry; a whole number of hours apart, a zone is wrong.
+_TOGETHER_S = 90.0
+
+_MANY_WITHOUT_POSE = 0.1
+
+
+def doubts(track: Track, telemetry: Stream, series: Sequence[tuple[str, AnyArray]]) -> tuple[str, ...]:
+    """Clauses on clocks and heights that the first words of a report repeat.
+
+    Parameters
+    ----------
+    track : Track
+    telemetry : Stream
+        That it was made from.
+    series : sequence of (str, (n,) datetime64)
+        Names and times of what is compared on the track.
+    """
+    apart: dict[int, list[str]] = {}
+    poseless: dict[str, float] = {}
+    for name, time in ((name, time) for name, time in series if len(time)):
+        late_s = float((time.min() - np.datetime64(track.start_ns, "ns")) / np.timedelta64(1, "s"))
+        hours = round(late_s / 3600.0)
+        if hours and abs(late_s - 3600.0 * hours) < _TOGETHER_S:
+            apart.setdefault(hours, []).append(name)
+        if (without := float(np.mean(~track.pose_at(time).valid))) > _MANY_WITHOUT_POSE:
+            poseless[name] = without
+    texts = [
+        f"{_listed(names)} begins {hours:+d} h from the telemetry, as with a wrong time zone"
+        for hours, names in apart.items()
+    ]
+    if poseless:
+        texts.append(f"{max(poseless.values()):.0%} of the samples of {_listed(list(poseless))} have no position")
+    low_m, assumed = _lowest_m(telemetry), telemetry.attributes.get("height_from") == "assumed"
+    if low_m is not None and (low_m > _TOO_HIGH_M or (assumed and abs(low_m) > _GROUND_M)):
+        texts.append(f"the lowest height above take-off is {low_m:.0f} m, as of another datum")
+    return tuple(texts)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} (and {len(names) - 1} more)"
 
 
 def _start(streams: Sequence[Stream]) -> datetime | None:

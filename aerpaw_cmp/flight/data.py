@@ -21,6 +21,7 @@ from ..logs.records import Stream
 from ..propagation.arrays import Link
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
+from .cross_checks import doubts
 from .heights import at_height, lacks_height, raised
 from .hour_shift import clock_trap
 from .lock import lock_of
@@ -91,6 +92,8 @@ class FlightData:
     warnings: tuple[str, ...]
     nodes: Mapping[str, Track] = field(default_factory=dict)
     """Tracks of the towers that move; ``site`` has them in the middle of their positions."""
+    doubts: tuple[str, ...] = ()
+    """Clauses on clocks and heights that the first words of a report repeat."""
     _links: dict[str, Link] = field(init=False, default_factory=dict, repr=False, compare=False)
 
     @property
@@ -400,6 +403,14 @@ def gather(
     )
     _check_place(data, [(path, stream) for path, stream in telemetry[:1]])
     _check_overlap(data)
+    if track is not None:
+        on_track = [
+            (f"{kind} of {s.tower} {s.channel}" if isinstance(s, RssSeries) else f"{kind} of {s.tower}", s.time)
+            for kind, s in data.series
+            if isinstance(s, RssSeries) or s.position_m is None
+        ]
+        asked = doubts(track, telemetry[0][1], on_track)
+        data = dataclasses.replace(data, doubts=asked, warnings=(*data.warnings, *(f"{text}." for text in asked)))
     return dataclasses.replace(data, warnings=(*_idle_attitude(data), *data.warnings))
 
 

@@ -18,6 +18,7 @@ from ..common.yamlfile import parse_yaml
 from ..logs.ingest import IngestedFile, name_inside, read_log
 from ..logs.records import Stream, has_wall_clock
 from ..site.learned import Learned, read_learned
+from ..site.site import Site
 from ..site.siteyaml import load_site
 from .cross_checks import questions
 from .data import is_ratio, site_place
@@ -31,7 +32,6 @@ from .remembered import Nodes, Proposal, propose, searching_airframe
 from .settings import FlightFile, LogSettings, RssSettings, with_learned
 from .time_origin import Origin, origin_of
 
-_TOWER = re.compile(r"(?<![a-z0-9])lw[-_ ]?([1-5])(?![0-9])", re.IGNORECASE)
 _RADIO = re.compile(r"usrp-?([0-9]+)", re.IGNORECASE)
 
 HEAD = """\
@@ -70,7 +70,9 @@ class DraftOptions:
     site: str = SITE
 
 
-def draft(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = DraftOptions()) -> tuple[str, list[str]]:
+def draft(
+    files: Sequence[IngestedFile], folder: Path, options: DraftOptions = DraftOptions(), name: str | None = None
+) -> tuple[str, list[str]]:
     """The text of a flight.yaml that names the logs.
 
     Parameters
@@ -80,6 +82,8 @@ def draft(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = D
     folder : Path
         Of the flight.yaml; the paths in it are relative to it.
     options : DraftOptions
+    name : str, optional
+        Of the flight; by default its first minute.
 
     Returns
     -------
@@ -92,6 +96,7 @@ def draft(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = D
         If no log has what a flight needs.
     """
     flown, site = _flown(files), options.site
+    place = load_site(site_place(site, folder))
     every = [stream for file in files for stream in file.result.streams]
     entries = _Entries(
         folder=folder,
@@ -99,7 +104,8 @@ def draft(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = D
         has_level=_has_level(files, flown),
         options=options,
         positioned=any(_has_positions(stream) for stream in every),
-        placer=_placer(files, flown, site_place(site, folder)),
+        towers_known=tuple(place.towers),
+        placer=_placer(files, flown, place),
         locks=any(may_lose_lock(stream) for stream in every),
     )
     # of copies, the one on the telemetry's clock, then the fullest
@@ -111,7 +117,7 @@ def draft(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = D
             "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in entries.out),
             expected="telemetry and levels or ranks of one flight",
         )
-    parts = [HEAD, f"flight: {_name(entries.flown, files)}\n", f"site: {site}  # or your own site.yaml?\n"]
+    parts = [HEAD, f"flight: {name or _name(entries.flown, files)}\n", f"site: {site}  # or your own site.yaml?\n"]
     if entries.towers:
         parts += [
             "towers:\n",
@@ -187,20 +193,31 @@ def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = 
     list of Draft
         At least one; its remarks say what is left to check.
     """
-    every = [flight for flight in flights(files) if flight.measured]
-    complete = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
-    groups = [flight.files for flight in complete] if len(complete) > 1 else [list(files)]
+    groups = flights_by_name(files)
     written = []
-    for group in groups:
-        text, remarks = draft(group, folder, options)
-        written.append(Draft(_name(_flown(group), group), text, tuple(remarks)))
-    home = {file.path for group in groups for file in group}
+    for name, group in groups.items():
+        text, remarks = draft(group, folder, options, name)
+        written.append(Draft(name, text, tuple(remarks)))
+    home = {file.path for group in groups.values() for file in group}
     homeless = [one_line(os.path.relpath(Path(f.path).resolve(), folder)) for f in files if f.path not in home]
     if homeless:
         first = written[0]
         out = tuple(f"left out: {path}: it goes with no flight here" for path in homeless)
         written[0] = Draft(first.name, first.text, (*first.remarks, *out))
     return written
+
+
+def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, list[IngestedFile]]:
+    """The files of each flight that can be drafted, by the flight's name, in the order of time."""
+    every = [flight for flight in flights(files) if flight.measured]
+    complete = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
+    groups = [flight.files for flight in complete] if len(complete) > 1 else [list(files)]
+    named: dict[str, list[IngestedFile]] = {}
+    for group in groups:
+        name = _name(_flown(group), group)
+        taken = sum(other == name or other.startswith(f"{name}_") for other in named)
+        named[f"{name}_{taken + 1}" if taken else name] = group
+    return named
 
 
 # Samples below it are take-off, landing and waiting: at 2 m an airframe, its pilot and the grass decide the level.
@@ -297,12 +314,12 @@ def _span_of_offsets(offsets_db: Sequence[float]) -> dict[str, Any]:
     return {"span_db": [10 * floor(low / 10.0), 10 * ceil(high / 10.0)]}
 
 
-def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, site: str | Path) -> Placer | None:
+def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, site: Site) -> Placer | None:
     """Proposals for nodes, where there is a track at the site."""
     if flown is None or lacks_height(flown[0]):
         return None
     listed = listed_places(Path(file.path).resolve().parent for file in files)
-    placer = Placer(load_site(site), flown[0], listed)
+    placer = Placer(site, flown[0], listed)
     return placer if placer.at_site else None
 
 
@@ -352,6 +369,8 @@ class _Entries:
     """Path by SHA-256."""
     positioned: bool = False
     """Some log to compare has positions of its own."""
+    towers_known: Sequence[str] = ()
+    """Towers of the site."""
     placer: Placer | None = None
     locks: bool = False
     """The receiver is a sounder that loses its lock."""
@@ -396,7 +415,7 @@ class _Entries:
 
     def _enter(self, file: IngestedFile, path: str, shown: str) -> None:
         streams = [s for s in file.result.streams if s.kind != "kpi"]  # no report compares these
-        entry, comment = _entry(file, path)
+        entry, comment = _entry(file, path, self.towers_known)
         origin = None if self.options.time_origin else self._origin(streams)
         if self.placer is not None:
             levels = [s for s in streams if s.kind == "rss" and not is_ratio(s)]
@@ -704,15 +723,16 @@ def _cells(streams: Sequence[Stream]) -> list[int]:
     return sorted(pci for pci in most_sampled if 20 * counts[pci] >= most)
 
 
-def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
+def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[str, Any], str]:
     """Keys of a log and a question about what had to be guessed."""
     entry: dict[str, Any] = {"path": path, "reader": file.result.reader}
     need = [s for s in file.result.streams if s.kind in ("rss", "rank") and not s.attributes.get("node")]
     if not need:
         return entry, ""
-    near = _TOWER.findall("/".join(Path(file.path).resolve().parts[-2:]))  # of the file or its folder
-    towers = near or _TOWER.findall(path)
-    entry["node"] = f"LW{towers[-1]}" if towers else "LW1"
+    here = Path(file.path).resolve()
+    near = _named_tower("/".join(here.parts[-2:]), towers)  # of the file or its folder
+    alone = towers[0] if len(towers) == 1 else None
+    entry["node"] = near or _named_tower(path, towers) or alone or next(iter(towers), "LW1")
     if cells := _cells(need):
         entry["cells"] = dict.fromkeys(cells, entry["node"])
         if all("pci" in stream.attributes for stream in need):
@@ -720,7 +740,18 @@ def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
         return entry, "  # which tower has which PCI?"
     if (radio := _RADIO.findall(path)) and len(need) == 1 and need[0].kind == "rss":
         entry["channel"] = f"USRP{radio[-1]}"
-    return entry, "" if near else "  # which tower?"
+    return entry, "" if near or alone else "  # which tower?"
+
+
+def _named_tower(path: str, towers: Sequence[str]) -> str | None:
+    """The tower of the site whose name stands in a path, the last where several do; ``lw-1`` is LW1."""
+    places = {}
+    for tower in towers:
+        letters = "[-_ ]?".join(map(re.escape, re.findall(r"\d+|[^\W\d_]+", tower)))
+        ends = r"(?!\d)" if tower[-1:].isdigit() else r"(?![^\W_])"
+        for match in re.finditer(rf"(?<![^\W_]){letters}{ends}" if letters else r"(?!)", path, re.IGNORECASE):
+            places[match.start()] = tower
+    return places[max(places)] if places else None
 
 
 def _also(comment: str, question: str) -> str:

@@ -17,7 +17,7 @@ from ..common.units import ComplexArray, FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.result import FlightResult
 from ..flight.data import FlightData, gather, load_data, rank_positions
-from ..flight.draft import draft
+from ..flight.draft import draft, flights_by_name
 from ..flight.overrides import overridden
 from ..flight.replay import FlightReplay, Replayed, replay_flight
 from ..flight.settings import FlightFile, load_flight, with_learned
@@ -41,6 +41,7 @@ def open_flight(
     *,
     logs_root: str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
+    flight: str | None = None,
 ) -> Flight:
     """Read a flight.yaml and its logs, or a flight.h5 with the settings that a draft of it would have.
 
@@ -52,6 +53,8 @@ def open_flight(
         Folder against which the paths of its logs resolve; default its own folder.
     overrides : mapping, optional
         Keys of the flight file in dotted form, changed: ``{"rt.max_depth": 1, "rss.lag": "off"}``.
+    flight : str, optional
+        Which flight of a flight file that holds several; the message without it names them.
 
     Returns
     -------
@@ -70,15 +73,23 @@ def open_flight(
     file = Path(path).expanduser()
     root = None if logs_root is None else Path(logs_root).expanduser()
     drafted = file.is_file() and is_flight_file(file)
-    settings = _drafted(file) if drafted else load_flight(file)
+    if flight is not None and not drafted:
+        raise UsageError("flight=NAME beside a flight.yaml", expected="a flight file of several flights", path=file)
+    settings = _drafted(file, flight) if drafted else load_flight(file)
     data = load_data(overridden(settings, overrides or {}), file.parent, root)
     changed = ("the draft of its flight file",) if drafted else ()
     return Flight(file, data, root, changed=(*changed, *(overrides or ())))
 
 
-def _drafted(file: Path) -> FlightFile:
-    """Settings that ``ingest --draft`` would write for a flight file."""
-    text, _ = draft(ingest(file), file.parent)
+def _drafted(file: Path, flight: str | None) -> FlightFile:
+    """Settings that ``ingest --draft`` would write for a flight of a flight file."""
+    known = flights_by_name(ingest(file))
+    if flight is None and len(known) > 1:
+        raise UsageError(f"{len(known)} flights", expected=f"flight='NAME', one of {', '.join(known)}", path=file)
+    if flight is not None and flight not in known:
+        raise UsageError(f"no flight {flight!r}", expected=f"one of {', '.join(known)}", path=file)
+    name = flight or next(iter(known))
+    text, _ = draft(known[name], file.parent, name=name)
     return with_learned(parse_yaml(text, FlightFile), file.parent)
 
 

@@ -76,7 +76,8 @@ def run_ingest(
     Returns
     -------
     dict
-        What :func:`aerpaw_cmp.logs.ingest.summary` says; with a draft also ``draft`` and ``drafts``.
+        What :func:`aerpaw_cmp.logs.ingest.summary` says; with a draft also ``draft`` and ``drafts``, with ``out`` the
+        names of its ``flights``.
     """
     from ..logs.flight_file import fill, is_flight_file
     from ..logs.ingest import ingest, summary
@@ -118,6 +119,9 @@ def run_ingest(
             account["drafts"] = [str(place) for place in places]
         if target is not None:
             target.write(partial(fill, files=files))
+            from ..flight.draft import flights_by_name
+
+            account["flights"] = list(flights_by_name(files))
     return account
 
 

@@ -69,6 +69,7 @@ def report_data(
         sources=sources,
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
+        doubts=data.doubts,
         notes=(*settings.flight.notes, *notes),  # the page adds those of the site
         settings=settings.model_dump(mode="json"),
     )

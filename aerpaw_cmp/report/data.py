@@ -130,6 +130,8 @@ class ReportData(FlightResult):
         The logs were made by ``aerpaw-cmp simulate``; said on the first screen.
     warnings : tuple of str
         What the reader must know before believing a number, one sentence each.
+    doubts : tuple of str
+        Clauses on clocks and heights for the first words.
     notes : tuple of str
         Remarks for the end of the report.
     settings : mapping
@@ -151,6 +153,7 @@ class ReportData(FlightResult):
     sources: Mapping[str, Source] = field(default_factory=dict)
     synthetic: bool = False
     warnings: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     stages_s: Mapping[str, float] = field(default_factory=dict)

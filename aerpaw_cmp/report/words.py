@@ -281,6 +281,7 @@ def _missing_paths(data: ReportData) -> int:
 
 # What may be said against the numbers, and when.
 DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
+    (lambda d: bool(d.doubts), "{doubts}"),
     (lambda d: any(p.score.at_edge for p in d.rss), "an offset lies at the edge of its search"),
     (lambda d: any(not p.score.n and not p.training for p in d.rss), "a channel could not be scored"),
     (lambda d: any(_moved_by_outliers(p) for p in d.rss), "{outliers}"),
@@ -302,6 +303,7 @@ def trust(data: ReportData) -> str:
         "missing": count(_missing_paths(data)),
         "failed": count(_field_failures(data)),
         "outliers": _outliers_in_words(data),
+        "doubts": "; ".join(data.doubts),
     }
     doubts = [text.format_map(facts) for holds, text in DOUBTS if holds(data)]
     return f"Caution: {'; '.join(doubts)}." if doubts else "Every check of this report passed."

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aerpaw_cmp import open_flight
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
@@ -429,3 +430,24 @@ def test_an_attitude_is_there_where_most_rows_hold_it(share: float, known: bool)
     frame["yaw_deg"] = np.where(np.arange(100) < 100 * share, 1.0, np.nan)
     assert drafting._has_attitude(frame) is known
     assert not drafting._has_attitude(frame[["roll_deg", "pitch_deg"]])
+
+
+def test_a_flight_file_keeps_and_names_five_flights(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    days = [f"2025-06-0{day}" for day in range(1, 6)]
+    for day in days:
+        for path in (next(logs.glob("UAV/*vehicleOut.txt")), logs / "LW1/USRP1_power_log.txt"):
+            target = logs.parent / "five" / day / path.parent.name / path.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(path.read_text().replace(days[0], day))
+    book = logs.parent / "all.h5"
+    assert main(["ingest", str(logs.parent / "five"), "--timezone", ZONE, "-o", str(book)]) == 0
+    names = [f"flight_{day}_1400" for day in days]
+    assert f"5 flights, {', '.join(names)}" in capsys.readouterr().out
+    assert len(read_flight(book)) == 10
+    with pytest.raises(UsageError, match=", ".join(names)):
+        open_flight(book)
+    with pytest.raises(UsageError, match=f"no flight 'x'.*{names[0]}"):
+        open_flight(book, flight="x")
+    flight = open_flight(book, flight=names[2])
+    assert flight.settings.flight.name == names[2]
+    assert str(flight.track["time"].iloc[0]).startswith(days[2])

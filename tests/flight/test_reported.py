@@ -1,15 +1,21 @@
 """Flights of public bug reports, and their cousins: heights, headings and clocks with values known in closed form."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import aerpaw_cmp
+from aerpaw_cmp.flight.cross_checks import doubts
 from aerpaw_cmp.flight.data import FlightData, load_data
+from aerpaw_cmp.flight.draft import DraftOptions, _entry, draft
 from aerpaw_cmp.flight.replay import estimate_clocks
 from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.site.siteyaml import load_site
 
 REPORTED = Path(__file__).parents[1] / "reported"
 
@@ -114,3 +120,59 @@ def test_samples_before_the_clock_was_set_are_named(case: Path) -> None:
     assert series.flagged == {"time_out_of_range": 60}
     assert series.time.min() > np.datetime64("2025-01-01")
     assert any("60 rows are flagged time_out_of_range" in text and "clock was set" in text for text in data.warnings)
+
+
+@reported("rtc1970")
+def test_clauses_on_clocks_reach_the_first_words(case: Path) -> None:
+    rewrite(case / "T1_power_log.txt", "1970-01-01", "2025-06-01")  # 60 samples hours before the telemetry
+    data = loaded(case)
+    assert any("30% of the samples of RSS of T1 U have no position" in text for text in data.doubts)
+    assert set(data.doubts) <= {text.rstrip(".") for text in data.warnings}
+
+
+@reported("clock_glitch")
+@pytest.mark.parametrize(("late_s", "asked"), [(3600, True), (2 * 3600 - 20, True), (1800, False), (0, False)])
+def test_logs_that_begin_whole_hours_apart_are_doubted(case: Path, late_s: int, asked: bool) -> None:
+    data = loaded(case)
+    assert data.track is not None
+    telemetry = next(s for file in data.files for s in file.result.streams if s.kind == "telemetry")
+    start = np.datetime64(data.track.start_ns, "ns") + np.timedelta64(late_s, "s")
+    time = start + np.arange(100).astype("timedelta64[s]")
+    clauses = doubts(data.track, telemetry, [("RSS of T1 U", time)])
+    assert any("begins" in text and "wrong time zone" in text for text in clauses) == asked
+
+
+@reported("below_takeoff")
+@pytest.mark.parametrize(("up_m", "asked"), [(0.0, False), (24.0, False), (1690.0, True)])
+def test_a_height_of_another_datum_is_doubted(case: Path, up_m: float, asked: bool) -> None:
+    data = loaded(case)
+    assert data.track is not None
+    telemetry = next(s for file in data.files for s in file.result.streams if s.kind == "telemetry")
+    frame = telemetry.frame.assign(altitude_m=telemetry.frame["altitude_m"].abs() + up_m)
+    clauses = doubts(data.track, replace(telemetry, frame=frame), [])
+    assert any("as of another datum" in text for text in clauses) == asked
+
+
+def test_a_draft_takes_the_one_tower_of_the_users_site(tmp_path: Path) -> None:
+    shutil.copytree(REPORTED / "draft_own_site", tmp_path / "c")
+    files = ingest([tmp_path / "c/own"], options=ReadOptions(timezone="America/New_York"))
+    options = DraftOptions(timezone="America/New_York", site="site.yaml")
+    text, remarks = draft(files, tmp_path / "c", options)
+    assert "node: T1}\n" in text
+    assert remarks[0] == "60 samples can be compared"
+    assert not any("which tower" in remark for remark in remarks)
+
+
+@pytest.mark.parametrize(
+    ("folder", "node"),
+    [("north mast", "North_Mast"), ("T-2", "T2"), ("t2rx", "T2"), ("T21", "North_Mast"), ("x", "North_Mast")],
+)
+def test_a_folder_names_a_tower_of_the_users_site(tmp_path: Path, folder: str, node: str) -> None:
+    shutil.copytree(REPORTED / "draft_own_site", tmp_path / "c")
+    (tmp_path / "c/own/T1").rename(tmp_path / "c/own" / folder)
+    site = tmp_path / "c/site.yaml"
+    place = "{latitude_deg: 35.7275, longitude_deg: -78.6970, antenna_height_m: 10}"
+    site.write_text(site.read_text().split("towers:")[0] + f"towers:\n  North_Mast: {place}\n  T2: {place}\n")
+    (log,) = (f for f in ingest([tmp_path / "c/own"], options=ReadOptions(timezone="UTC")) if "power" in f.path)
+    assert _entry(log, log.path, ("North_Mast", "T2"))[0]["node"] == node
+    assert load_site(site).towers.keys() == {"North_Mast", "T2"}

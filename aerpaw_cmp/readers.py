@@ -8,6 +8,7 @@ group ``aerpaw_cmp.readers``.
 from __future__ import annotations
 
 from .common.errors import InputError, UsageError
+from .logs import dictionary
 from .logs.clocks import TIME, ZONE
 from .logs.lines import NUMBER, Lines, add_flag, first_lines, mostly, split
 from .logs.readers import ENTRY_POINT_GROUP, Reader, ReadOptions
@@ -34,6 +35,7 @@ __all__ = [
     "UsageError",
     "add_flag",
     "built",
+    "dictionary",
     "first_lines",
     "matched",
     "mostly",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -22,6 +22,7 @@ from .readers import ReadOptions
 from .records import Attribute, Kind, ReadResult, RejectedLine, Stream
 
 _NO_DATE = "the time stamp is no date of the calendar"
+_UNREAD = "the time is empty or of a form that is not read"
 NO_TIME = "the time is beyond any flight"
 _DECIMAL = re.compile(_lines.NUMBER)
 _SI = {b"k": 1e3, b"M": 1e6, b"G": 1e9, b"m": 1e-3, b"u": 1e-6, b"n": 1e-9}
@@ -112,6 +113,13 @@ class Rows:
         """Add a reason to the flag of some rows."""
         _lines.add_flag(self.flag, where, reason)
 
+    def part(self, where: BoolArray) -> Rows:
+        """The rows that a mask holds; warnings and rejected lines are shared, the account stays that of all."""
+        columns = {name: cells[where] for name, cells in self.columns.items()}
+        return replace(
+            self, row=self.row[where], time=self.time[where], flag=self.flag[where], at=self.at[where], columns=columns
+        )
+
     def stream(
         self,
         kind: Kind,
@@ -179,7 +187,7 @@ class Rows:
             reader=self.reader,
             streams=present,
             lines=self.lines,
-            accepted=len(self),
+            accepted=len(np.unique(self.row)),  # markup may have all its records on a line
             blank=self.blank,
             rejected=tuple(sorted(self.rejected, key=lambda line: line.number)),
             warnings=tuple(dict.fromkeys([*self.warnings, *back])),
@@ -247,6 +255,7 @@ def built(
     clock: str = "wall",
     extra: Iterable[RejectedLine] = (),
     markup: IntArray | None = None,
+    closed: bool = False,
 ) -> Rows:
     """Rows from their lines and columns of text, ``time`` among them; see :func:`matched`.
 
@@ -263,6 +272,8 @@ def built(
         Lines that were rejected before.
     markup : int array, optional
         0-based lines known to be comments.
+    closed : bool
+        Are records known to be whole by their own end, whatever ends the line?
 
     Returns
     -------
@@ -276,11 +287,12 @@ def built(
     blank += int(comment.sum())
     if comment.any():
         rows, column = rows[~comment], {name: cells[~comment] for name, cells in column.items()}
-    relative, instants, valid = times(column.pop("time"), options, clock=clock, reader=reader)
-    rejected += lines.reject_all(rows[~valid], _NO_DATE if clock == "wall" else NO_TIME)
+    column_time = column.pop("time")
+    relative, instants, valid = times(column_time, options, clock=clock, reader=reader)
+    rejected += _untimed(lines, rows, column_time, valid, clock)
     flag = _lines.flags(len(rows))
     instants.flag(flag)
-    if lines.unterminated:
+    if lines.unterminated and not closed:
         _lines.add_flag(flag, rows == len(lines) - 1, _lines.UNTERMINATED)
     warnings = list(instants.warnings)
     if relative and len(rows):
@@ -306,6 +318,16 @@ def built(
         at=at,
         data=lines.data,
     )
+
+
+def _untimed(lines: _lines.Lines, rows: IntArray, cells: AnyArray, valid: BoolArray, clock: str) -> list[RejectedLine]:
+    """Lines rejected for their time: it is of no known form, no date of the calendar, or beyond any flight."""
+    bad = np.flatnonzero(~valid & ~np.isin(rows, rows[valid]))
+    bad = bad[np.unique(rows[bad], return_index=True)[1]] if len(bad) else bad
+    if clock != "wall":
+        return lines.reject_all(rows[bad], NO_TIME)
+    unread = cells[bad] == b"-"
+    return lines.reject_all(rows[bad[unread]], _UNREAD) + lines.reject_all(rows[bad[~unread]], _NO_DATE)
 
 
 RELATIVE = "the times are relative and no time_origin is given: they count from 1970-01-01T00:00"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -10,7 +11,8 @@ import numpy as np
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.records import Attribute, Stream
+from aerpaw_cmp.readers import dictionary
 
 # Radio accesses; the first where a log does not say.
 RATS = ("", "lte", "nr")
@@ -196,3 +198,38 @@ def _stream(rows: _rows.Rows, columns: Table, pick: IntArray, served: FloatArray
     )  # fmt: skip
     assert stream is not None
     return stream
+
+
+def named(
+    rows: _rows.Rows, name: str, values: FloatArray, *, unit: str = "", where: BoolArray | None = None,
+    about: Mapping[str, Attribute | None] | None = None,
+) -> Stream | None:  # fmt: skip
+    """Level or KPI stream of a column by its name; of an unknown one, a KPI under its own name.
+
+    A level of a neighbour that nobody names, and one that the base station measured, is a KPI.
+
+    Parameters
+    ----------
+    rows : Rows
+    name : str
+        As the log calls it.
+    values : (n,)
+    unit : str
+        Where the quantity does not say.
+    where : (n,) bool, optional
+        Rows that count.
+    about : mapping, optional
+        Further attributes.
+    """
+    meaning = dictionary.meaning(name)
+    quantity = dictionary.Quantity(name, "kpi", ()) if meaning is None else meaning.quantity
+    short = re.sub(r"\W+", "_", dictionary.plain(name))
+    if quantity.kind == "rss" and meaning is not None and not meaning.uplink and not meaning.neighbour:
+        level, flag = rows.level(np.where(dictionary.is_none(quantity, values), np.nan, values))
+        return rows.stream(
+            "rss", short, {"rss_db": level}, where=where, flag=flag, channel=rows.options.channel or short,
+            unit=rows.options.unit or unit or quantity.unit, quantity=quantity.name, about=about,
+        )  # fmt: skip
+    return rows.stream(
+        "kpi", short, {"value": values}, where=where, unit=unit or quantity.unit, quantity=quantity.name, about=about
+    )

@@ -2,77 +2,27 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.records import Attribute, Stream
+from aerpaw_cmp.readers import dictionary
 
 from . import _sheet
 
-LATITUDE = (r"(osd |gps )?(lat|latitude)( deg| degrees)?", r".* (lat|latitude)")
-_LONGITUDE = (r"(osd |gps )?(lon|lng|long|longitude)( deg| degrees)?", r".* (lon|lng|longitude)")
-_LENGTH = r"( m| meters| metres| ft| feet)?"
-ABOVE_TAKEOFF = (
-    rf"height above takeoff{_LENGTH}", rf"osd height{_LENGTH}", rf"(rel|relative) (alt|altitude|height){_LENGTH}",
-    rf"(altitude ?relative|relalt){_LENGTH}", rf"height{_LENGTH}", rf"ascent{_LENGTH}", r"alt m",
-)  # fmt: skip
-_ALTITUDE = (
-    rf"(gps )?(alt|altitude|ele|elevation){_LENGTH}",
-    rf"osd altitude{_LENGTH}",
-    r"altitude above ?sea ?level.*",
-    rf"(altitude|alt|height|elevation) ?(amsl|msl|asl){_LENGTH}|(amsl|msl)( altitude| alt)?{_LENGTH}",
-)
-_SEA_LEVEL = re.compile(r"sea ?level|(\b|altitude)(amsl|msl|asl)\b|\b(ele|elevation)\b|^gps |^osd ")
-_OF_AERPAW = {
-    "gpsfix",
-    "numberofsatellites",
-    "number of satellite",
-    "number of satellites",
-    "batteryvolts",
-    "volt",
-    "voltage",
-}
-_OF_RECEIVERS = (
-    {"gcrs", "spd"},
-    {"networktech"},
-    {"networkmode"},
-    {"cellname"},
-    {"psc or pci"},
-    {"timestamp sample", "eph"},
-    {"time utc usec"},
-)
-_OF_PHONES = {"networktech", "networkmode"}
-# PX4's receiver: positions in 1e-7 degrees, altitudes in mm, where they are whole numbers.
-_PX4_GPS = "time utc usec"
-_REST_S, _REST_M, _REST_RISE_M = 5.0, 2.0, 0.3
-_ANGLES = {
-    "roll_deg": (r"(osd |gimbal )?roll( deg| degrees| rad)?",),
-    "pitch_deg": (r"(osd )?pitch( deg| degrees| rad)?",),
-    "yaw_deg": (r"(osd )?yaw( deg| degrees| rad)?", r"compass heading( degrees)?", r"heading( deg)?", r"bearing"),
-}
-_VELOCITIES = {
-    "velocity_north_mps": (r"velocity ?(north|x)( mps)?", r"vn", r"vel n m s", r"(osd )?x ?speed.*", r"speed ?x"),
-    "velocity_east_mps": (r"velocity ?(east|y)( mps)?", r"ve", r"vel e m s", r"(osd )?y ?speed.*", r"speed ?y"),
-    "velocity_down_mps": (r"velocity ?(down|z)( mps)?", r"vd", r"vz", r"vel d m s", r"(osd )?z ?speed.*", r"speed ?z"),
-}
-_COUNTS = {
-    "fix": (r"(gps )?fix( type)?", r"gpsfix", r"gps lock"),
-    "satellites": (
-        r"(number of satellites?|satellites( used)?|num ?sat|osd gpsnum|nsats|numberofsatellites|gps count)",
-    ),
-}
-
-
+_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
+_VELOCITIES = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
+# Attributes of a stream that say how its heights are known.
+Height = dict[str, Attribute | None]
 # No count is so large.
 _MOST = 1e9
 
 
 def has_position(names: list[str]) -> bool:
-    """Check whether plain names hold a latitude and a longitude."""
-    return all(any(_sheet.matches(name, form[:1]) for name in names) for form in (LATITUDE, _LONGITUDE))
+    """Check whether names hold a latitude and a longitude."""
+    known = {meaning.quantity.name for name in names if (meaning := dictionary.meaning(name)) is not None}
+    return {"latitude_deg", "longitude_deg"} <= known
 
 
 def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> Stream | None:
@@ -87,26 +37,29 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     name, source : str
         Of the stream, and where its pose comes from.
     """
-    latitude, longitude = sheet.find(*LATITUDE), sheet.find(*_LONGITUDE)
+    latitude, longitude = sheet.find("latitude_deg"), sheet.find("longitude_deg")
     if latitude is None or longitude is None:
         return None
-    scale = 1e-7 if _is_px4_gps(sheet, latitude) else 1.0
     values: dict[str, AnyArray] = {
-        "latitude_deg": scale * _signed(sheet, latitude, "NS"),
-        "longitude_deg": scale * _signed(sheet, longitude, "EW"),
+        "latitude_deg": _signed(sheet, latitude, "NS"),
+        "longitude_deg": _signed(sheet, longitude, "EW"),
     }
     lost = clean(rows, values)
-    values["altitude_m"] = _altitude(rows, sheet, lost)
-    values |= _angles(rows, sheet)
-    for key, form in _VELOCITIES.items():
-        if (column := sheet.find(*form)) is not None:
+    datum, height = _height(rows, sheet)
+    values["altitude_m"] = height
+    about: Height = {"height_from": rows.height_from}
+    if np.isfinite(height).any():
+        values["altitude_m"], about = above_takeoff(rows, values, datum, lost)
+    values |= _attitude(rows, sheet)
+    for key in _VELOCITIES:
+        if (column := sheet.find(key)) is not None:
             values[key] = sheet.numbers(column)
-    for key, form in _COUNTS.items():
-        if (column := sheet.find(*form)) is not None:
+    for key in ("fix", "satellites"):
+        if (column := sheet.find(key)) is not None:
             count = sheet.numbers(column)
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
     where = None if lost.all() else ~lost
-    return rows.stream("telemetry", name, values, where=where, source=source, height_from=rows.height_from)
+    return rows.stream("telemetry", name, values, where=where, source=source, about=about)
 
 
 def _signed(sheet: _sheet.Sheet, column: int, letters: str) -> FloatArray:
@@ -118,11 +71,6 @@ def _signed(sheet: _sheet.Sheet, column: int, letters: str) -> FloatArray:
     if not np.isin(side, list(letters)).any() or not np.isin(side, [*letters, ""]).all():
         return angle
     return np.where(side == letters[1], -np.abs(angle), angle)
-
-
-def _is_px4_gps(sheet: _sheet.Sheet, latitude: int) -> bool:
-    """Check whether positions are PX4's integers."""
-    return _PX4_GPS in sheet.plain and bool((np.abs(sheet.numbers(latitude)) > 180.0).any())
 
 
 def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
@@ -137,68 +85,120 @@ def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
     return lost
 
 
-def above_takeoff(rows: _rows.Rows, altitude: FloatArray, lost: AnyArray) -> FloatArray:
-    """Altitudes above sea level as heights above the first position, with a warning."""
-    known = altitude[np.isfinite(altitude) & ~lost]
-    if not len(known):
-        return altitude
-    zero = float(known[0])
-    rows.warnings.append(_TAKEN_OFF.format(zero))
-    return np.asarray(altitude - zero)
+# --- heights ----------------------------------------------------------------------------------------------------------
 
 
-_TAKEN_OFF = "altitudes are above sea level: {:.1f} m, that of the first position, was taken off"
-
-
-def _altitude(rows: _rows.Rows, sheet: _sheet.Sheet, lost: BoolArray) -> FloatArray:
-    above, column = sheet.find(*ABOVE_TAKEOFF), sheet.find(*_ALTITUDE)
-    if above is not None and not (column is not None and _OF_PHONES & set(sheet.plain)):  # there a height of the floor
-        rows.height_from = "written"
-        return sheet.numbers(above)
+def _height(rows: _rows.Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
+    """Datum and values of the column of heights whose datum is of most use: the dictionary has them in that order."""
+    column = sheet.find("altitude_m")
     if column is None:
         rows.warnings.append("the log has no altitude: give the track another log, or heights are unknown")
-        return np.full(len(rows), np.nan)
-    altitude = sheet.numbers(column)
-    if _PX4_GPS in sheet.plain and sheet.plain[column] == "alt":
-        altitude = altitude / 1e3
-    first = altitude[np.isfinite(altitude) & ~lost][:1]
-    if not len(first) or abs(first[0]) < 10.0:  # what begins within a few metres of zero is relative to take-off
-        return altitude
-    rows.height_from, names = "program", set(sheet.plain)
-    if len(_OF_AERPAW & names) > 1:
-        return altitude  # converted vehicleOut, whose altitude is above take-off also where the table begins in flight
-    if _SEA_LEVEL.search(sheet.plain[column]):
-        rows.height_from = "written"
-    elif not any(signs <= names for signs in _OF_RECEIVERS):
-        rows.height_from = "assumed"
-        if not _begins_at_rest(rows, sheet, altitude, lost):
-            text = f"altitude begins at {first[0]:.1f} m in flight and nothing says above what: read as above take-off"
-            rows.warnings.append(text)
-            return altitude
-    return above_takeoff(rows, altitude, lost)
+        return "unknown", np.full(len(rows), np.nan)
+    meaning = sheet.meanings[column]
+    assert meaning is not None
+    rows.height_from, datum = "written", meaning.quantity.datum
+    if datum == "unknown":
+        known = sheet.program.datum if sheet.program is not None else ""
+        rows.height_from, datum = ("program", known) if known else ("assumed", datum)
+    return datum, sheet.numbers(column)
 
 
-def _begins_at_rest(rows: _rows.Rows, sheet: _sheet.Sheet, altitude: FloatArray, lost: BoolArray) -> bool:
-    """Check whether the first seconds of a track have one place and one height: that of the ground."""
-    seconds = (rows.time - rows.time[:1]) / np.timedelta64(1, "s")
-    early = np.flatnonzero(~lost & np.isfinite(altitude) & (seconds <= _REST_S))
-    if len(early) < 3:
-        return False
-    columns = [sheet.find(*form) for form in (LATITUDE, _LONGITUDE)]
-    moved = [np.ptp(sheet.numbers(i)[early]) * _DEGREE_M for i in columns if i is not None]
-    return bool(max(moved) < _REST_M and np.ptp(altitude[early]) < _REST_RISE_M)
+def above_takeoff(
+    rows: _rows.Rows, values: dict[str, AnyArray], datum: str, lost: BoolArray
+) -> tuple[FloatArray, Height]:
+    """Heights above take-off, and the attributes that say how they are known.
+
+    Heights above sea level, or above nothing that anybody says, count from the height at rest on the ground before the
+    climb: a hover is no ground. Without such a rest they count from the first position.
+
+    Parameters
+    ----------
+    rows : Rows
+        ``height_from`` says who told the datum.
+    values : dict
+        ``latitude_deg``, ``longitude_deg`` and ``altitude_m`` as the log has it.
+    datum : str
+        As in the dictionary.
+    lost : bool array, shape (n,)
+        Rows without a position.
+    """
+    altitude: FloatArray = values["altitude_m"]
+    about: Height = {"height_from": rows.height_from, "height_datum": datum}
+    known = np.flatnonzero(np.isfinite(altitude) & ~lost)
+    if datum in ("take-off", "ground") or not len(known):
+        return altitude, about
+    rest = _at_rest(rows, values, known)
+    first = float(altitude[known[0]]) if rest is None else rest
+    climbs = rest is not None and float(altitude[known].max()) - rest > _CLIMB_M
+    if datum == "unknown" and abs(first) < _NEAR_ZERO_M:
+        return altitude, about | {"height_datum": "take-off"}
+    if datum == "unknown" and not climbs:
+        rows.warnings.append(
+            f"altitude begins at {first:.1f} m and nothing says above what (sea level, ground or take-off?), nor does "
+            "the track begin on the ground: read as above take-off"
+        )
+        return altitude, about
+    how = "that at rest before the climb" if climbs else "that of the first position"
+    zero = "the ellipsoid" if datum == "ellipsoid" else "sea level"
+    rows.warnings.append(f"altitudes are above {zero}: {first:.1f} m, {how}, was taken off")
+    about |= {"takeoff_from": "rest" if climbs else "first position", "height_taken_off_m": round(first, 3)}
+    return altitude - first, about
 
 
+# What begins within a few metres of zero is relative to take-off.
+_NEAR_ZERO_M = 10.0
+_REST_S, _REST_M, _REST_MPS, _CLIMB_M = 2.0, 3.0, 0.3, 5.0
 _DEGREE_M = 111_000.0
 
 
-def _angles(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
-    """Angles: degrees, unless no column names a unit and no yaw of the log is beyond 2 pi."""
-    columns = {key: column for key, form in _ANGLES.items() if (column := sheet.find(*form)) is not None}
+def _at_rest(rows: _rows.Rows, values: dict[str, AnyArray], known: AnyArray) -> float | None:
+    """Height of the ground: where the track begins at one place and one height, the last of that; else None.
+
+    Zeros before the first fix are none.
+    """
+    altitude = values["altitude_m"][known]
+    begun = int(np.argmax(altitude != 0)) if altitude[0] == 0 and np.abs(altitude).max() > _NEAR_ZERO_M else 0
+    if begun and abs(altitude[begun]) < _NEAR_ZERO_M:
+        begun = 0  # it rises from zero: that is no zero before the fix
+    known, altitude = known[begun:], altitude[begun:]
+    seconds = (rows.time[known] - rows.time[known[0]]) / np.timedelta64(1, "s")
+    east, north = (
+        (values[name][known] - values[name][known[0]]) * _DEGREE_M for name in ("longitude_deg", "latitude_deg")
+    )
+    step_s = np.maximum(np.diff(seconds, prepend=seconds[0] - 1.0), 0.1)
+    rise = np.abs(np.diff(altitude, prepend=altitude[0])) / step_s
+    still = (np.hypot(east, north) < _REST_M) & (rise < _REST_MPS)
+    end = len(still) if still.all() else int(np.argmin(still))
+    if end < 3 or seconds[end - 1] < _REST_S:
+        return None
+    last = seconds[:end] >= seconds[end - 1] - 5.0
+    return float(np.median(altitude[:end][last]))
+
+
+# --- angles -----------------------------------------------------------------------------------------------------------
+
+
+def _attitude(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
+    """Angles in degrees: by the unit of the name, by the program, and only then by the values of all three."""
+    columns = {key: column for key in _ANGLES if (column := sheet.find(key)) is not None}
     values = {key: sheet.numbers(column) for key, column in columns.items()}
-    named = any(sheet.unit(c) or sheet.plain[c].endswith((" deg", " degrees", " rad")) for c in columns.values())
-    yaw = np.abs(values.get("yaw_deg", np.full(1, np.nan)))
-    if named or not np.isfinite(yaw).any() or (yaw > 2 * np.pi).any():
-        return values
-    rows.warnings.append("no yaw is beyond 2 pi: the angles were read as radians")
-    return {key: np.degrees(value) for key, value in values.items()}
+    told = any(sheet.unit(column) for column in columns.values())
+    if not told and _are_radians(values):
+        rows.warnings.append("nothing names the unit of the angles: by their values they were read as radians, a guess")
+        values = {key: np.degrees(value) for key, value in values.items()}
+    yaw = values.get("yaw_deg")
+    if yaw is not None and len(yaw) > 2 and np.isfinite(yaw).any() and not np.nan_to_num(yaw).any():
+        rows.warnings.append("the yaw is 0 throughout: read as not known")
+        values["yaw_deg"] = np.full(len(yaw), np.nan)
+    return values
+
+
+def _are_radians(values: dict[str, FloatArray]) -> bool:
+    """Check whether roll, pitch and yaw all lie where radians of an aircraft do, and no degrees are likelier.
+
+    In degrees a flight with such values never turned away from north by more than six degrees.
+    """
+    if set(values) != set(_ANGLES) or not all(np.isfinite(value).any() for value in values.values()):
+        return False
+    roll, pitch, yaw = (float(np.nanmax(np.abs(values[key]))) for key in _ANGLES)
+    return roll <= np.pi / 2 and pitch <= np.pi / 2 and yaw <= 2 * np.pi and max(roll, pitch, yaw) > 0

@@ -1,48 +1,34 @@
-"""Tables with a header whose columns come in any order and under the names of several programs.
+"""Tables with a header whose columns come in any order; what each holds is said by the dictionary.
 
 The header is looked for behind title lines; the separator is the one that the header uses; a decimal comma is read
-where the separator leaves room for one.
+where the separator leaves room for one. A header in mid-file begins a new table; rows that are shorter by habit miss
+their last cells; rows that do not fit their header by the ranges of the dictionary are refused.
 """
 
 from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
-from functools import cache, cached_property
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
 
 import numpy as np
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+from aerpaw_cmp.readers import ReadOptions, dictionary
 
 from . import _stamps
-from ._quantities import SRSUE, plain
 
 SEPARATORS = (",", ";", "\t", "|")
 # Lines in front of a header, at most.
 TITLES = 60
-_NUMBER = re.compile(r"[-+]?\d{0,20}(?:[.,]\d{0,20})?(?:[eE][-+]?\d{1,3})?")
-_UNIT = re.compile(r"[\[(]([^\[\]()]{1,12})[\])]\s*$")
-_A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5%\u00b0]{1,7}(/[a-z]{1,3})?")
-# Units of values as they are read, and what one of each unit that a header may have is in them.
-_READ_IN = {
-    "m": {"ft": 0.3048, "feet": 0.3048, "m": 1.0, "meters": 1.0, "cm": 0.01, "mm": 1e-3, "km": 1e3},
-    "m/s": {
-        "mph": 0.44704, "m/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kts": 0.514444, "knots": 0.514444, "cm/s": 0.01,
-    },
-    "deg": {"deg": 1.0, "degrees": 1.0, "rad": 180 / np.pi, "radians": 180 / np.pi},
-    "bit/s": {
-        "bps": 1.0, "bit/s": 1.0, "kbps": 1e3, "kbit/s": 1e3, "mbps": 1e6, "mbit/s": 1e6, "gbps": 1e9, "gbit/s": 1e9,
-    },
-    "dB": {"db": 1.0},
-    "dBm": {"dbm": 1.0},
-}  # fmt: skip
-_FACTORS = {written: (unit, factor) for unit, units in _READ_IN.items() for written, factor in units.items()}
+_NUMBER = re.compile(r"([-+]?\d{0,20}(?:[.,]\d{0,20})?(?:[eE][-+]?\d{1,3})?) ?([^\d\s,.][^\d\s]{0,9})?")
 
 _IsHeader = Callable[[list[str]], bool]
 
@@ -64,7 +50,7 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
     Parameters
     ----------
     is_header : callable
-        Of the names in plain form, see :func:`_quantities.plain`.
+        Of the names as written.
     """
     for i, line in enumerate(lines[:TITLES]):
         if len(line) > 65_536 or b"\0" in line:
@@ -73,7 +59,7 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
             if separator.encode() not in line:
                 continue
             names = [name.strip() for name in split_row(line, separator)]
-            if len(names) > 1 and is_header([plain(name) for name in names]):
+            if len(names) > 1 and is_header(names):
                 return i, separator, names
     return None
 
@@ -86,17 +72,23 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
         return False
     at, separator, names = header
     below = [line for line in lines[at + 1 :] if line.strip()][:5]
-    return not below or any(abs(len(split_row(line, separator)) - len(names)) <= 1 for line in below)
+    widths = [len(split_row(line, separator)) for line in below]
+    return 2 * sum(len(names) < 2 * width and width <= len(names) + 1 for width in widths) >= len(widths)
 
 
-def _number(text: str) -> float:
-    plain_text = text.replace("\u2212", "-")  # the minus sign of typesetting, which word processors put in
-    if not text or not _NUMBER.fullmatch(plain_text):
-        return np.nan
+def _number(text: str) -> tuple[float, str]:
+    """Number and unit of a cell; NaN where it is no number."""
+    match = _NUMBER.fullmatch(text.replace("\u2212", "-"))  # the minus sign of typesetting, of word processors
+    if match is None or not match[1] or (match[2] and not (dictionary.is_unit(match[2]) or match[2] in _HARMLESS)):
+        return np.nan, ""
     try:
-        return float(plain_text.replace(",", "."))
+        return float(match[1].replace(",", ".")), (match[2] or "").lower()
     except ValueError:
-        return np.nan
+        return np.nan, ""
+
+
+# Units of cells that change nothing.
+_HARMLESS = ("%", "ms", "s", "Hz", "MHz", "kHz")
 
 
 @dataclass
@@ -114,8 +106,8 @@ class Sheet:
     blank_rows : int array
         0-based lines of titles, headers and words below the table.
     rejected : list of RejectedLine
-    units : dict of int to str
-        Units of columns whose names have none.
+    notes : dict
+        Sentences about columns, by the column: read otherwise than written.
     """
 
     lines: _lines.Lines
@@ -124,35 +116,75 @@ class Sheet:
     cells: list[list[str]]
     blank_rows: IntArray
     rejected: list[RejectedLine] = field(default_factory=list)
-    units: dict[int, str] = field(default_factory=dict)
+    notes: dict[int, str] = field(default_factory=dict)
     _silent: dict[int, BoolArray] = field(default_factory=dict)
     _numbers: dict[int, FloatArray] = field(default_factory=dict)
-    _words: dict[int, tuple[int, str]] = field(default_factory=dict)
+    _cell_units: dict[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the rows."""
         return len(self.row)
 
     @cached_property
-    def plain(self) -> list[str]:
-        """Names in plain form."""
-        return [plain(name) for name in self.names]
+    def _own(self) -> list[str]:
+        return [dictionary.plain(name) for name in self.names]
 
-    def find(self, *patterns: str) -> int | None:
-        """The first column whose plain name is wholly one of the patterns; earlier patterns are preferred."""
-        any_of, *each = _compiled(patterns)
-        names = [(i, name) for i, name in enumerate(self.plain) if any_of.fullmatch(name)]
-        return next((i for pattern in each for i, name in names if pattern.fullmatch(name)), None)
+    @cached_property
+    def plain(self) -> list[str]:
+        """Names in plain form, in common words."""
+        return dictionary.in_common_words(self._own)
+
+    @cached_property
+    def program(self) -> dictionary.Program | None:
+        """The program that is known to write such columns."""
+        return dictionary.program(self._own)
+
+    @cached_property
+    def meanings(self) -> list[dictionary.Meaning | None]:
+        """What each column holds."""
+        return [
+            dictionary.meaning(name) if written == words else dictionary.meaning(name, words)
+            for name, written, words in zip(self.names, self._own, self.plain, strict=True)
+        ]
+
+    def find(self, *quantities: str) -> int | None:
+        """The column that surest holds one of the quantities."""
+        known = [
+            (dictionary.rank_of(meaning.quantity, self.plain[i]), i)
+            for i, meaning in enumerate(self.meanings)
+            if meaning is not None and meaning.quantity.name in quantities
+        ]
+        return min(known)[1] if known else None
+
+    def named(self, *names: str) -> int | None:
+        """The first column of one of some plain names, as the file has them."""
+        return next((self._own.index(name) for name in names if name in self._own), None)
 
     def unit(self, column: int) -> str:
-        """Unit in brackets at the end of a column's name, or the one that is known of it, or an empty text."""
-        written = _UNIT.search(self.names[column])
-        return written[1].strip().lower() if written else self.units.get(column, "")
+        """Unit that the name of a column writes, or that its program is known to write, or an empty text."""
+        meaning = self.meanings[column]
+        written = meaning.unit if meaning is not None else dictionary.in_brackets(self.names[column])[0]
+        if written or self.program is None:
+            return written
+        unit = self.program.units.get(self._own[column], "")
+        if meaning is not None and meaning.quantity.role == "angle":
+            unit = unit or self.program.angles
+        return unit if unit not in _OF_INTEGERS or self._in_integers else ""
 
     def unit_read(self, column: int) -> str:
         """Unit of :meth:`numbers`; empty where the brackets hold something else, such as ``(LTE scell0)``."""
-        unit = self.unit(column)
-        return _FACTORS[unit][0] if unit in _FACTORS else unit if _A_UNIT.fullmatch(unit) else ""
+        self.numbers(column)
+        return dictionary.unit_of(self._cell_units.get(column) or self.unit(column))
+
+    @cached_property
+    def _in_integers(self) -> bool:
+        """Check whether positions are MAVLink's integers, 1e-7 degrees."""
+        column = self.find("latitude_deg")
+        if column is None:
+            return False
+        values = np.array([_number(cells[column].strip())[0] for cells in self.cells[:200]])
+        values = values[np.isfinite(values)]
+        return bool(len(values) and (np.abs(values) > 1e5).mean() > 0.5 and (values == np.round(values)).all())
 
     def silence(self, where: BoolArray, columns: Iterable[int]) -> None:
         """Read the cells of some rows as empty."""
@@ -160,12 +192,20 @@ class Sheet:
             self._silent[column] = where
             self._numbers.pop(column, None)
 
-    def keep(self, where: BoolArray) -> None:
-        """Leave the rows out that a mask does not hold."""
-        self.cells = [cells for cells, inside in zip(self.cells, where.tolist(), strict=True) if inside]
-        self.row = self.row[where]
-        self._silent = {column: mask[where] for column, mask in self._silent.items()}
-        self._numbers = {}
+    def add(self, name: str, texts: list[str]) -> None:
+        """A column more."""
+        self.names.append(name)
+        self.cells = [[*cells, text] for cells, text in zip(self.cells, texts, strict=True)]
+        for cached in ("_own", "plain", "program", "meanings"):
+            self.__dict__.pop(cached, None)
+
+    def part(self, where: BoolArray) -> Sheet:
+        """The rows that a mask holds; notes are shared."""
+        return replace(
+            self, row=self.row[where], _numbers={}, _cell_units={},
+            cells=[cells for cells, inside in zip(self.cells, where.tolist(), strict=True) if inside],
+            _silent={column: mask[where] for column, mask in self._silent.items()},
+        )  # fmt: skip
 
     def texts(self, column: int) -> list[str]:
         """A column as text."""
@@ -177,54 +217,79 @@ class Sheet:
         return column_texts
 
     def numbers(self, column: int) -> FloatArray:
-        """A column as numbers in the unit of its name's brackets made SI or degrees; what is none is NaN. Read only."""
+        """A column as numbers in the unit of the dictionary; what is none is NaN. Read only.
+
+        Levels and positions keep the numbers that stand for none: they are flagged as records.
+        """
         if column not in self._numbers:
-            texts = self.texts(column)
-            if self._has_points and _are_thousands(texts):
-                texts = [text.replace(",", "") for text in texts]
-            parsed = {text: _number(text) for text in set(texts)}  # tables repeat themselves
-            values = np.array([parsed[text] for text in texts], dtype=np.float64)
-            words = [text for text in texts if np.isnan(parsed[text]) and text.lower() not in _NONE]
-            if 2 * len(words) > sum(text.lower() not in _NONE for text in texts):
-                self._words[column] = len(words), words[0]
-            values *= _FACTORS.get(self.unit(column), ("", 1.0))[1]
+            values = self._parsed(column, self.texts(column))
+            meaning = self.meanings[column]
+            if meaning is not None:
+                values = self._angles(column, meaning.quantity, values)
+                if meaning.quantity.role not in ("rss", "rank", "position", "time") or meaning.uplink:
+                    values = np.where(dictionary.is_none(meaning.quantity, values), np.nan, values)
             values.flags.writeable = False  # the next who asks gets the same
             self._numbers[column] = values
         return self._numbers[column]
+
+    def _parsed(self, column: int, texts: list[str]) -> FloatArray:
+        if self._has_points and _are_thousands(texts):
+            texts = [text.replace(",", "") for text in texts]
+        parsed = {text: _number(text) for text in set(texts)}  # tables repeat themselves
+        values = np.array([parsed[text][0] for text in texts], dtype=np.float64)
+        words = [text for text in texts if np.isnan(parsed[text][0]) and text.lower() not in NO_VALUE]
+        if 2 * len(words) > sum(text.lower() not in NO_VALUE for text in texts):
+            self.notes[column] = (
+                f"column {self.names[column]!r}: {len(words)} cells are no number (the first: {words[0][:30]!r}) and "
+                "read as missing"
+            )
+        units = {unit for _, unit in parsed.values() if dictionary.is_unit(unit)}
+        if not units:
+            return dictionary.converted(values, self.unit(column))
+        of_cell = np.array([parsed[text][1] for text in texts], dtype=object)
+        self._cell_units[column] = next(iter(units))
+        for unit in {*units, ""}:
+            mine = of_cell == unit if unit else ~np.isin(of_cell, list(units))
+            values[mine] = dictionary.converted(values[mine], unit or self.unit(column))
+        return values
+
+    def _angles(self, column: int, quantity: dictionary.Quantity, values: FloatArray) -> FloatArray:
+        """Positions that are no degrees, in degrees: MAVLink's integers, and NMEA's degrees and minutes."""
+        if quantity.role != "position" or dictionary.is_unit(self.unit(column)):
+            return values
+        form = dictionary.angle_form(values, quantity)
+        if form:
+            self.notes[column] = f"column {self.names[column]!r}: no angle in degrees can be so large: read as {form}"
+        return dictionary.converted(values, form)
 
     @cached_property
     def _has_points(self) -> bool:
         """Check whether the first row has a decimal point: then no comma of the table is a decimal one."""
         return bool(self.cells) and any(_DECIMAL_POINT.fullmatch(cell.strip()) for cell in self.cells[0])
 
+    @cached_property
+    def has_decimal_commas(self) -> bool:
+        """Check whether the first row has numbers with a decimal comma."""
+        return bool(self.cells) and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in self.cells[0])
+
     def unread(self) -> list[str]:
-        """A sentence for each column that was to be numbers and mostly holds something else."""
-        return [
-            f"column {self.names[column]!r}: {count} cells are no number (the first: {text[:30]!r}) and read as missing"
-            for column, (count, text) in sorted(self._words.items())
-        ]
+        """Sentences about columns that were read otherwise than they are written."""
+        return [self.notes[column] for column in sorted(self.notes)]
 
 
+# Units of numbers that MAVLink writes as integers: of a table in decimals they are another program's.
+_OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7")
 _DECIMAL_POINT = re.compile(r"-?\d{1,9}\.\d{1,15}")
+_DECIMAL_COMMA = re.compile(r"-?\d{1,4},\d{1,9}")
 _THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d{0,12})?")
 # Cells that say that there is no value.
-_NONE = {"", "-", "--", "nan", "na", "n/a", "#n/a", "none", "null", "inf", "-inf", "unavailable", "unknown", "invalid"}
+NO_VALUE = {"", "-", "--", "nan", "na", "n/a", "#n/a", "none", "null", "inf", "-inf", "-infinity", "unavailable",
+            "unknown", "invalid"}  # fmt: skip
 
 
 def _are_thousands(texts: Sequence[str]) -> bool:
     """Check whether the commas of a column part thousands: ``1,300`` and never ``35,72``."""
     return any("," in text for text in texts) and all(_THOUSANDS.fullmatch(text) for text in texts if "," in text)
-
-
-@cache
-def _compiled(patterns: tuple[str, ...]) -> list[re.Pattern[str]]:
-    """Patterns for whole names: all of them as one, and then each."""
-    return [re.compile(text) for text in ("|".join(f"(?:{item})" for item in patterns), *patterns)]
-
-
-def matches(name: str, patterns: tuple[str, ...]) -> bool:
-    """Check whether a plain name is wholly one of the patterns."""
-    return _compiled(patterns)[0].fullmatch(name) is not None
 
 
 def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
@@ -250,38 +315,104 @@ def cut(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> Sheet
     Returns
     -------
     Sheet
+        Of several headers its columns are those of all.
     """
     below = ~lines.blank
     below[: at + 1] = False
-    row: list[int] = []
-    cells: list[list[str]] = []
-    comments: list[int] = [*range(at + 1)]
-    odd: list[tuple[int, int]] = []
-    split = _fitted([(i, split_row(lines.raw(i), separator)) for i in np.flatnonzero(below).tolist()], names)
-    for i, fields in split:
-        if len(fields) != len(names):
-            odd.append((i, len(fields)))
-        elif fields[0].strip() == names[0] and [text.strip() for text in fields] == names:
-            comments.append(i)  # a header again: files joined by hand
+    numbers = np.flatnonzero(below).tolist()
+    table = _Table(list(names), [*range(at + 1)])
+    for i, fields in _fitted([(i, split_row(lines.raw(i), separator)) for i in numbers], names):
+        table.add(i, fields)
+    return table.sheet(lines, numbers[-1] if numbers else at)
+
+
+class _Table:
+    """Rows under one header or several."""
+
+    def __init__(self, names: list[str], comments: list[int]) -> None:
+        self.names, self.comments = names, comments
+        self._place = list(range(len(names)))  # column of each field under the present header
+        self._known = set(names)
+        self._row: list[int] = []
+        self._cells: list[list[str]] = []
+        self._short: list[tuple[int, list[str]]] = []
+        self._odd: list[tuple[int, int, int]] = []
+
+    def add(self, i: int, fields: list[str]) -> None:
+        """The next line that is not blank."""
+        width = len(self._place)
+        if fields[0].strip() in self._known and self._is_header([text.strip() for text in fields]):
+            self.comments.append(i)  # files joined by hand
+        elif len(fields) == width:
+            self._row.append(i)
+            self._cells.append(self._placed(fields))
+        elif 1 < len(fields) < width:
+            self._short.append((i, self._placed([*fields, *[""] * (width - len(fields))])))
+            self._odd.append((i, len(fields), width))
         else:
-            row.append(i)
-            cells.append(fields)
-    last = row[-1] if row else at
-    torn = len(lines) - 1 if lines.unterminated else -1
-    # words below the table, as Nemo writes them, have no separator
-    foot = {i for i, count in odd if i > last and count == 1 and i != torn}
-    return Sheet(
-        lines=lines,
-        names=names,
-        row=np.array(row, dtype=np.int64),
-        cells=cells,
-        blank_rows=np.array([*comments, *foot], dtype=np.int64),
-        rejected=[
-            lines.reject(i, f"{count} fields where the header has {len(names)} (torn line?)")
-            for i, count in odd
-            if i not in foot
-        ],
-    )
+            self._odd.append((i, len(fields), width))
+
+    def _is_header(self, texts: list[str]) -> bool:
+        """Check whether a line is a header, of the same columns or of others; what follows is read under it."""
+        known = sum(text in self._known or dictionary.meaning(text) is not None for text in texts if text)
+        numbers = any(np.isfinite(_number(text)[0]) for text in texts)
+        if numbers or 2 * known <= sum(bool(text) for text in texts):
+            return False
+        spare = {name: [j for j, other in enumerate(self.names) if other == name] for name in texts}
+        self._place = []
+        for name in texts:
+            if not spare[name]:
+                spare[name].append(len(self.names))
+                self.names.append(name)
+                self._known.add(name)
+            self._place.append(spare[name].pop(0))
+        return True
+
+    def _placed(self, fields: list[str]) -> list[str]:
+        cells = [""] * len(self.names)
+        for j, text in zip(self._place, fields, strict=True):
+            cells[j] = text
+        return cells
+
+    def sheet(self, lines: _lines.Lines, last_line: int) -> Sheet:
+        """The table; rows shorter than their header are read where that is a habit of the program."""
+        inner = [i for i, _ in self._short if i != last_line]
+        if len(inner) >= max(2, len(self._row) // 20):
+            meanings = [dictionary.meaning(name) for name in self.names]
+            read = {i for i, cells in self._short if not _torn(cells, meanings)}
+            both = [*zip(self._row, self._cells, strict=True), *(item for item in self._short if item[0] in read)]
+            self._row, self._cells = [list(part) for part in zip(*sorted(both), strict=True)] if both else ([], [])
+            self._odd = [item for item in self._odd if item[0] not in read]
+        last = self._row[-1] if self._row else self.comments[-1]
+        torn = len(lines) - 1 if lines.unterminated else -1
+        # words below the table, as Nemo writes them, have no separator
+        foot = {i for i, count, _ in self._odd if i > last and count == 1 and i != torn}
+        return Sheet(
+            lines=lines,
+            names=self.names,
+            row=np.array(self._row, dtype=np.int64),
+            cells=[[*cells, *[""] * (len(self.names) - len(cells))] for cells in self._cells],
+            blank_rows=np.array([*self.comments, *foot], dtype=np.int64),
+            rejected=[
+                lines.reject(i, f"{count} fields where the header has {width} (torn line?)")
+                for i, count, width in self._odd
+                if i not in foot
+            ],
+        )
+
+
+def _torn(cells: list[str], meanings: list[dictionary.Meaning | None]) -> bool:
+    """Check whether a row without its last cells is torn: half a position, or a value that its column cannot have."""
+    place = {"latitude_deg": False, "longitude_deg": False}
+    for text, meaning in zip(cells, meanings, strict=False):
+        if meaning is None:
+            continue
+        value = _number(text.strip())[0]
+        if meaning.quantity.name in place and meaning.unit == "":
+            place[meaning.quantity.name] |= np.isfinite(value)
+        if dictionary.impossible(meaning.quantity, np.array([value]))[0]:
+            return True
+    return len(set(place.values())) > 1
 
 
 def _fitted(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[int, list[str]]]:
@@ -302,66 +433,110 @@ def _fitted(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[i
     return rows
 
 
-# Names of the column of times, the surest first.
-TIME_NAMES = (
-    r"time utc usec",
-    r"(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| iso| unix)?",
-    r"(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s)?",
-    r"(custom )?(update ?)?time( utc| ms| s| local| epoch)?",
-    r"time ?millisecond",
-    r"(rel|relative|elapsed) ?time( ms| s)?",
-    r"t",
-)
-
-
-# Columns of ulog2csv's tables, whose time counts microseconds since the autopilot was switched on.
-PX4 = {"timestamp", "timestamp sample"}
-
-
-def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str] = ()) -> _rows.Rows | None:
+def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None = None) -> _rows.Rows | None:
     """Rows of a table with their times; None where no column is one of times.
 
     Parameters
     ----------
-    also : sequence of str
-        Patterns of further names of the time column, preferred.
+    column : int, optional
+        Of the times; by default the one that the dictionary finds.
     """
-    column = sheet.find(*also, *TIME_NAMES)
-    if column is None:
+    refuse_shifted(
+        [(sheet.names[i], m.quantity, sheet.numbers(i)) for i, m in enumerate(sheet.meanings)
+         if m is not None and m.quantity.role in ("position", "cell") and m.quantity.can_be[1] < np.inf]
+        + [(sheet.names[i], m.quantity, sheet.numbers(i)) for i, m in enumerate(sheet.meanings)
+           if m is not None and m.quantity.role == "rss" and not m.uplink]
+    )  # fmt: skip
+    mapped = column is not None
+    column = sheet.find("time") if column is None else column
+    weeks = None if mapped else _gps_weeks(sheet, column)
+    if column is None and weeks is None:
         return None
-    texts = sheet.texts(column)
-    day = sheet.find(r"(custom )?date( local| utc)?")
-    if day is not None and day != column:
-        pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
-        texts = [f"{date} {time}".strip() for date, time in pairs]
-    name, unit = sheet.plain[column], sheet.unit(column)
-    in_ms = unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) is not None
-    count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s" if unit or name.endswith(" s") else None
-    # the sign for micro is no letter of a plain name: 'Time [\u00b5s]' is 'time s' there
-    in_us = unit in ("us", "\u00b5s", "\u03bcs") or (set(sheet.plain) >= PX4 and name == "timestamp")
-    count = "us" if in_us else count
-    utc = re.search(r"\b(utc|gps|gmt)\b", name) is not None
-    clock, cells, warnings = _stamps.read(texts, options, unit=count, european=_has_decimal_commas(sheet))
-    if clock == "wall" and utc and not np.char.endswith(cells, b"Z").all():
-        cells = np.array([cell if re.search(rb"(Z|[+-]\d\d:?\d\d)$", cell) else cell + b"Z" for cell in cells.tolist()])
+    if weeks is not None:
+        clock, cells, warnings = "epoch_s", weeks, ["the times are GPS weeks and seconds: leap seconds were taken off"]
+    else:
+        assert column is not None
+        clock, cells, warnings = _times(sheet, column, options, mapped=mapped)
     timed = _rows.built(
         sheet.lines, sheet.row, {"time": cells}, options, reader=reader, reason=lambda _line: None, clock=clock,
         extra=sheet.rejected, markup=sheet.blank_rows,
     )  # fmt: skip
     timed.warnings += warnings
     if len(timed.row) < len(sheet.row):
-        sheet.keep(np.isin(sheet.row, timed.row))
-    if (counter := sheet.find("time millisecond")) not in (None, column):
+        kept = sheet.part(np.isin(sheet.row, timed.row))
+        sheet.row, sheet.cells, sheet._silent, sheet._numbers = kept.row, kept.cells, kept._silent, {}
+    if (counter := sheet.named("time millisecond")) not in (None, column):
         _finer(timed, sheet.numbers(counter))
     return timed
 
 
-_DECIMAL_COMMA = re.compile(r"-?\d{1,4},\d{1,9}")
+def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> tuple[str, FloatArray, list[str]]:
+    texts = sheet.texts(column)
+    day = None if mapped else sheet.find("date")
+    if day is not None and day != column:
+        pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
+        texts = [f"{date} {time}".strip() for date, time in pairs]
+    name, unit = dictionary.plain(sheet.names[column]), sheet.unit(column)
+    count = next((short for short, form in _COUNTS.items() if form.search(unit) or form.search(name)), None)
+    # the sign for micro is no letter of a plain name: 'Time [\u00b5s]' is 'time s' there
+    if unit in ("\u00b5s", "\u03bcs") or (unit and count is None):
+        count = "us" if unit in ("\u00b5s", "\u03bcs") else "s"
+    zone = _stamps.header_zone(sheet.names[column], dictionary.in_brackets(sheet.names[column])[1])
+    if day is not None and not zone:
+        zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
+    if "/" in zone:
+        options, zone = replace(options, timezone=zone), ""
+    gps = re.search(r"\bgps", name) is not None
+    return _stamps.read(texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps)
 
 
-def _has_decimal_commas(sheet: Sheet) -> bool:
-    """Check whether the first row has numbers with a decimal comma."""
-    return bool(sheet.cells) and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in sheet.cells[0])
+_COUNTS = {"us": re.compile(r"\b(us|usec|micros\w*)\b"), "ms": re.compile(r"\bms\b|^m?sec$|millisecond"),
+           "s": re.compile(r" s$|^s$|\bsec(ond)?s\b")}  # fmt: skip
+
+
+def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:
+    """UTC of a column of GPS weeks and one of the seconds or milliseconds of the week; None where there are none."""
+    week, second = sheet.find("gps_week"), sheet.find("gps_seconds")
+    if week is None or second is None or (time is not None and time != second and not _counts(sheet, time)):
+        return None
+    weeks, seconds = sheet.numbers(week), sheet.numbers(second)
+    if not (np.nanmedian(weeks) > 1024 if np.isfinite(weeks).any() else False):
+        return None
+    scale = 1e-3 if np.nanmax(seconds) > 604_800 else 1.0
+    return np.asarray(weeks * 604_800.0 + seconds * scale + _stamps.GPS_S - _stamps.LEAP_S)
+
+
+def _counts(sheet: Sheet, column: int) -> bool:
+    """Check whether a column of times counts from an unknown origin."""
+    values = sheet.numbers(column)
+    return bool(np.isfinite(values).any() and np.nanmedian(np.abs(values)) < 0.9e9)
+
+
+def refuse_shifted(columns: Iterable[tuple[str, dictionary.Quantity, FloatArray]]) -> None:
+    """Refuse a table whose rows are shifted against its header, by what the dictionary knows of its columns.
+
+    Raises
+    ------
+    InputError
+        If some rows have several values that their columns cannot have, or the identities of cells are fractions.
+    """
+    wrong = [(name, values, dictionary.impossible(quantity, values)) for name, quantity, values in columns]
+    if not wrong or not len(wrong[0][1]):
+        return
+    count = np.sum([mask for *_, mask in wrong], axis=0)
+    fractions = [
+        (name, values, mask) for name, values, mask in wrong
+        if 2 * (mask & (values != np.round(values))).sum() > np.isfinite(values).sum() and "pci" in name.lower()
+    ]  # fmt: skip
+    if not fractions and (count > 1).sum() < max(3, len(count) // 20):
+        return
+    row = int(np.argmax(fractions[0][2] if fractions else count > 1))
+    shown = "; ".join(f"{name!r} is {values[row]:g}" for name, values, mask in wrong if mask[row])
+    raise InputError(
+        f"the rows do not fit the header: {shown}",
+        expected="values that their columns can have",
+        cause="a column is missing in the header or in the rows, and all values stand beside their names",
+    )
 
 
 _MOST_APART_NS = 1_500_000_000
@@ -383,6 +558,47 @@ def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:
         rows.warnings.append("the column of milliseconds does not go with the times: it is left out")
         return
     rows.time = np.where(known, zero.max() + counted, time).astype("datetime64[ns]")
+
+
+# More values of a key than these are no devices or networks: they count something.
+_MOST_PARTS = 64
+
+
+def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows.Rows, Sheet]]:
+    """A table by an identity (``device``, ``network``): the name of each part, its rows and its cells.
+
+    Parameters
+    ----------
+    rows : Rows
+    sheet : Sheet
+    key : str
+        Quantity of the dictionary; of several columns of it, the combination counts.
+
+    Yields
+    ------
+    tuple of str, Rows and Sheet
+        The name is empty where the table has one part.
+    """
+    columns = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name == key]
+    several = [i for i in columns if 1 < len({text for text in sheet.texts(i) if _says(text)}) <= _MOST_PARTS]
+    if not several:
+        yield "", rows, sheet
+        return
+    texts = [np.array(sheet.texts(i), dtype=object) for i in several]
+    for values in product(*[dict.fromkeys(column.tolist()) for column in texts]):
+        where = np.all([column == value for column, value in zip(texts, values, strict=True)], axis=0)
+        if where.any():
+            words = [_label(sheet.plain[i], text) for i, text in zip(several, values, strict=True) if _says(text)]
+            yield "_".join(words), rows.part(where), sheet.part(where)
+
+
+def _says(text: str) -> bool:
+    return text.lower() not in NO_VALUE and text not in ("0", "2147483647", "65535")
+
+
+def _label(name: str, value: str) -> str:
+    word = re.sub(r"\W+", "_", value).strip("_")
+    return word if word[:1].isalpha() else name.split()[0] + word
 
 
 def nothing(data: bytes, reader: str, reason: str) -> ReadResult:

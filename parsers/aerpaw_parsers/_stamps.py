@@ -1,33 +1,57 @@
-"""Dates and times in the forms that programs other than AERPAW's write, brought to one: ``YYYY-mm-dd HH:MM:SS.f``.
+"""Dates and times in the forms that programs write, brought to one: ``YYYY-mm-dd HH:MM:SS.f`` with the zone if any.
 
-Which of two readings of ``03/04/2025`` holds is decided by the whole column; where it says nothing the month comes
-first and a warning says so.
+One parser for all readers and for ``--map``. The zone in the cell wins, then that in the name of the column, then the
+user's. Which of two readings of ``03/04/2025`` holds is decided by the whole column; what it does not say is assumed,
+and a warning says so.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from datetime import datetime
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.readers import ReadOptions
 
-_CLOCK = r"[T _,]{0,2}(\d{1,2})[:.](\d\d)(?:[:.](\d\d(?:[.,:]\d{1,9})?))? ?([AaPp][Mm])?"
-_ZONE = r" ?(Z|UTC|GMT|[+-]\d\d:?\d\d)?"
-_YEAR_FIRST = re.compile(r"(\d{4})[-/._](\d{1,2})[-/._](\d{1,2})" + _CLOCK + _ZONE)
-_YEAR_LAST = re.compile(r"(\d{1,2})([-/.])(\d{1,2})\2(\d{4})" + _CLOCK + _ZONE)
-_WORD_MONTH = re.compile(r"(\d{1,2})[- ]?([A-Z][a-z]{2})[a-z]{0,6}[- ]?(\d{4}|\d\d)" + _CLOCK + _ZONE)
-_DIGITS = re.compile(r"(20\d\d)(\d\d)(\d\d)[T_ -]?(\d\d)(\d\d)(\d\d(?:\.\d{1,9})?)()" + _ZONE)
-_OF_DAY = re.compile(r"T?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?) ?([AaPp][Mm])?" + _ZONE)
+_NAMED_ZONE = r"Z|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
+_ZONE = rf"(?: ?[(\[]?(?P<zone>(?:UTC|GMT) ?[+-]\d{{1,2}}(?::?\d\d)?|(?![AaPp][Mm]\b)(?:{_NAMED_ZONE}))[)\]]?)?"
+_CLOCK = (
+    r"(?P<hour>\d{1,2})[:.h-](?P<minute>\d\d)(?:[:.m-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,9}))?)?"
+    r" ?(?P<half>[AaPp]\.?[Mm]\.?)?"
+)
+_GAP = r"[T _,:;]{1,3}(?:at )?"
+_DAY = r"(?:(?:[Mm]on|[Tt]ue|[Ww]ed|[Tt]hu|[Ff]ri|[Ss]at|[Ss]un)[a-z]{0,6}[., ]{1,2})?"
+_WORD = r"(?P<word>[A-Za-z]{3,9})\.?"
+# The date in front of the clock; date(1) puts the year, and the zone, behind it.
+_DATES = (
+    r"(?P<year>\d{4})[-/._ ](?P<month>\d{1,2})[-/._ ](?P<day>\d{1,2})",
+    rf"(?P<year>\d{{4}})[-/._ ]?{_WORD}[-/._ ]?(?P<day>\d{{1,2}})",
+    r"(?P<a>\d{1,2})(?P<mark>[-/.])(?P<b>\d{1,2})(?P=mark)(?P<c>\d{4}|\d\d)",
+    rf"(?P<day>\d{{1,2}})[-/._ ]?{_WORD}[-/._, ]{{0,2}}(?P<year>\d{{4}}|\d\d)",
+    rf"{_WORD} (?P<day>\d{{1,2}})(?:st|nd|rd|th)?,? (?P<year>\d{{4}})",
+)
+_FORMS = (
+    *(re.compile(_DAY + date + rf"(?:{_GAP}{_CLOCK})?{_ZONE}") for date in _DATES),
+    re.compile(_DAY + rf"{_WORD} {{1,2}}(?P<day>\d{{1,2}}) {_CLOCK}{_ZONE} (?P<year>\d{{4}})"),
+    re.compile(r"(?P<year>20\d\d)(?P<month>\d\d)(?P<day>\d\d)[T_ -]?(?P<hour>\d\d)(?P<minute>\d\d)(?P<second>\d\d)"
+               r"(?:\.?(?P<fraction>\d{1,9}))?" + _ZONE),
+    *(re.compile(rf"{_CLOCK}{_ZONE}[ ,]{{1,2}}" + date) for date in _DATES),
+)  # fmt: skip
+_TWICE = _FORMS[2], _FORMS[len(_DATES) + 4]
+_DIGITS = _FORMS[len(_DATES) + 1]
+_OF_DAY = re.compile(r"T?" + _CLOCK.replace("[:.h-]", ":", 1).replace("[:.m-](?P<second>", ":(?P<second>") + _ZONE)
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,12})?(?:[eE][-+]?\d{1,3})?")
 # An epoch that a spreadsheet shortened, ``1.74093E+12``: fewer than nine digits behind the first leave out seconds.
 _ROUNDED = re.compile(r"\d(?:[.,]\d{0,8})?[eE]\+?0?(?:9|1\d)")
-_NO_SECONDS = re.compile(r".*[T _,]\d{1,2}[:.]\d\d(?: ?[AaPp][Mm])?" + _ZONE)
+# What a spreadsheet shows of a time: minutes, seconds, tenths; the hour is lost.
+_MINUTES = re.compile(r"\d{1,2}:\d\d[.,]\d")
 _COMMON = re.compile((_time.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 # Dates with hyphens or none, and Nemo's year, month, day: its summary of ``24Feb09`` says ``2024 Feb 09``.
@@ -35,6 +59,25 @@ _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
 )
+# Hours east of UTC of the abbreviations that say it, and the zone whose clock they are a part of.
+_HOURS = {
+    "Z": 0.0, "UT": 0.0, "UTC": 0.0, "GMT": 0.0, "EDT": -4.0, "CDT": -5.0, "MDT": -6.0, "PDT": -7.0, "MST": -7.0,
+    "HST": -10.0, "CEST": 2.0, "EEST": 3.0, "BST": 1.0, "JST": 9.0, "KST": 9.0, "AKDT": -8.0, "AEDT": 11.0,
+    "WEST": 1.0, "MSK": 3.0, "SGT": 8.0, "HKT": 8.0, "NZDT": 13.0,
+}  # fmt: skip
+# Those of winter that people also write in summer, and those of several countries.
+_STANDARD = {
+    "EST": ((-5.0, "America/New_York"),), "CST": ((-6.0, "America/Chicago"),), "PST": ((-8.0, "America/Los_Angeles"),),
+    "AKST": ((-9.0, "America/Anchorage"),), "CET": ((1.0, "Europe/Berlin"),), "EET": ((2.0, "Europe/Athens"),),
+    "WET": ((0.0, "Europe/Lisbon"),), "AEST": ((10.0, "Australia/Sydney"),), "NZST": ((12.0, "Pacific/Auckland"),),
+    "IST": ((5.5, "Asia/Kolkata"), (1.0, "Europe/Dublin"), (2.0, "Asia/Jerusalem")),
+}  # fmt: skip
+# Names of a zone with its summer time.
+_WITH_SUMMER = {
+    "ET": "America/New_York", "EASTERN": "America/New_York", "CT": "America/Chicago", "CENTRAL": "America/Chicago",
+    "MT": "America/Denver", "PT": "America/Los_Angeles", "PACIFIC": "America/Los_Angeles",
+}  # fmt: skip
+_OFFSET = re.compile(r"(?:UTC|GMT)? ?([+-])(\d{1,2}):?(\d\d)?")
 
 
 def _date_in_name(name: str) -> str | None:
@@ -59,61 +102,200 @@ def _month(word: str) -> int:
     return _MONTHS.index(word[:3].lower()) + 1 if word[:3].lower() in _MONTHS else 0
 
 
-def _written(year: str, month: int, day: str, clock: Sequence[str | None], zone: str | None) -> bytes:
-    """One time in the common form; ``-`` where it is no time of the day."""
-    hour, minute, second, half = (clock[0] or "0", clock[1] or "0", clock[2] or "0", clock[3])
-    number = int(hour)
-    if half:
-        number = number % 12 + (12 if half.lower() == "pm" else 0)
-    integer, _, fraction = re.sub("[,:]", ".", second).partition(".")
-    text = f"{year}-{month:02d}-{int(day):02d} {number:02d}:{int(minute):02d}:{int(integer):02d}"
-    end = "Z" if zone in ("UTC", "GMT") else zone or ""
-    return (text + (f".{fraction}" if fraction else "") + end).encode()
+class _Order:
+    """Which of three numbers of a date is what, decided for the whole column, and what was assumed for it."""
+
+    def __init__(self, texts: Iterable[str], name: str, *, european: bool) -> None:
+        dates = [match for text in texts if (match := _match(text)) and "a" in match.re.groupindex]
+        self.day_first, self.year_first = True, False
+        self.warnings: list[str] = []
+        if not dates:
+            return
+        self._year(dates)
+        keys = ("b", "c") if self.year_first else ("a", "b")
+        firsts = [(int(match[keys[0]]), int(match[keys[1]])) for match in dates]
+        if all(match["mark"] == "." for match in dates) and not self.year_first:
+            return  # 02.03.2025: where points stand, the day comes first
+        if any(first > 12 for first, _ in firsts):
+            return
+        self.day_first = False
+        if any(second > 12 for _, second in firsts) or self.year_first:
+            return
+        date = _date_in_name(name)
+        fits = [first for first in (True, False) if date and self._dated(dates[0], first) == date]
+        self.day_first = fits[0] if len(fits) == 1 else european
+        reason = "as where decimal commas are written" if european else "a guess"
+        reason = "as the date in the file name" if len(fits) == 1 else reason
+        word = "day" if self.day_first else "month"
+        self.warnings.append(f"the dates can be read with the day or the month first: the {word} was taken, {reason}")
+
+    def _year(self, dates: list[re.Match[str]]) -> None:
+        if len(dates[0]["c"]) == 4:
+            return
+        last, first = ([int(match[key]) for match in dates] for key in ("c", "a"))
+        self.year_first = any(number > 31 for number in first) or (
+            not all(_FIRST_YEAR <= number <= _LAST_YEAR for number in last)
+            and all(_FIRST_YEAR <= number <= _LAST_YEAR for number in first)
+        )
+        word = "first" if self.year_first else "last"
+        self.warnings.append(f"the years of the dates have two digits: the {word} number was taken, a guess")
+
+    def _dated(self, match: re.Match[str], day_first: bool) -> str:
+        year, month, day = self.parts(match, day_first=day_first)
+        return f"{year}-{month:02d}-{day:02d}"
+
+    def parts(self, match: re.Match[str], *, day_first: bool | None = None) -> tuple[str, int, int]:
+        """Year, month and day."""
+        groups = match.groupdict()
+        if groups.get("a") is None:
+            month = int(groups["month"]) if groups.get("month") else _month(groups["word"])
+            return _year(groups["year"]), month, int(groups["day"])
+        a, b, c = groups["a"], groups["b"], groups["c"]
+        if self.year_first:
+            return _year(a), int(b), int(c)
+        first = self.day_first if day_first is None else day_first
+        return _year(c), int(b if first else a), int(a if first else b)
 
 
-def _dated(text: str, day_first: bool) -> bytes | None:
-    if match := _YEAR_FIRST.fullmatch(text) or _DIGITS.fullmatch(text):
-        return _written(match[1], int(match[2]), match[3], match.groups()[3:7], match[8])
-    if match := _YEAR_LAST.fullmatch(text):
-        day, month = (match[1], match[3]) if day_first else (match[3], match[1])
-        return _written(match[4], int(month), day, match.groups()[4:8], match[9])
-    if match := _WORD_MONTH.fullmatch(text):
-        year = match[3] if len(match[3]) == 4 else f"20{match[3]}"
-        return _written(year, _month(match[2]), match[1], match.groups()[3:7], match[8])
-    return None
+# Two digits of years in which logs of this kind are written.
+_FIRST_YEAR, _LAST_YEAR = 15, 40
 
 
-def _day_first(texts: Iterable[str]) -> bool | None:
-    """Check whether the day stands before the month; None where every date can be read both ways."""
-    dates = [match for text in texts if (match := _YEAR_LAST.fullmatch(text))]
-    if dates and all(match[2] == "." for match in dates):
-        return True  # 02.03.2025: where points stand, the day comes first
-    if any(int(match[1]) > 12 for match in dates):
-        return True
-    if any(int(match[3]) > 12 for match in dates) or not dates:
-        return False
-    return None
+def _year(digits: str) -> str:
+    return digits if len(digits) == 4 else f"20{digits}"
 
 
-def _first_by_name(texts: Sequence[str], name: str) -> bool | None:
-    """Check whether the day stands first if the first date is to be that of the file name; None where it is no help."""
-    date = _date_in_name(name)
-    fits = [first for first in (True, False) if date and (_dated(texts[0], first) or b"").startswith(date.encode())]
-    return fits[0] if len(fits) == 1 else None
+def _match(text: str) -> re.Match[str] | None:
+    return next((match for form in _FORMS if (match := form.fullmatch(text))), None)
+
+
+def _written(text: str, order: _Order, zones: _Zones) -> bytes:
+    """One time in the common form; ``-`` where it is none."""
+    match = _match(text)
+    if match is None:
+        return b"-"
+    year, month, day = order.parts(match)
+    groups = match.groupdict()
+    hour = _hour(groups)
+    date = f"{year}-{month:02d}-{day:02d} {hour:02d}:{groups.get('minute') or '00'}:{groups.get('second') or '00'}"
+    fraction = f".{groups['fraction']}" if groups.get("fraction") else ""
+    return (date + fraction + zones.offset(groups.get("zone"), date)).encode()
+
+
+def _hour(groups: dict[str, str | None]) -> int:
+    hour, half = int(groups.get("hour") or 0), groups.get("half")
+    return hour % 12 + (12 if half[0].lower() == "p" else 0) if half else hour
+
+
+class _Zones:
+    """Offsets of the zones that a column's cells or its name write."""
+
+    def __init__(self, options: ReadOptions, header: str) -> None:
+        self._own, self._header = options.timezone, header
+        self._known: dict[tuple[str, str], str] = {}
+
+    def offset(self, written: str | None, date: str) -> str:
+        """``+hh:mm`` of a zone at a date, ``Z``, or an empty text where nothing says it."""
+        word = (written or self._header).strip().upper()
+        if not word:
+            return ""
+        key = word, date[:10]
+        if key not in self._known:
+            self._known[key] = self._find(word, date)
+        return self._known[key]
+
+    def _find(self, word: str, date: str) -> str:
+        if (exact := _OFFSET.fullmatch(word)) is not None:
+            return f"{exact[1]}{int(exact[2]):02d}:{exact[3] or '00'}"
+        if word in _HOURS:
+            return _shown(_HOURS[word])
+        try:
+            moment = datetime.fromisoformat(date)
+        except ValueError:
+            return ""  # no date of the calendar: who reads it says so
+        if self._own and (here := _at(self._own, moment)) is not None and here[1] == word:
+            return _shown(here[0])
+        if word in _WITH_SUMMER:
+            here = _at(_WITH_SUMMER[word], moment)
+            return "" if here is None else _shown(here[0])
+        if word not in _STANDARD:
+            raise UsageError(
+                f"the times are of a zone that is not known: {word}",
+                expected="UTC, an offset such as -04:00, or an abbreviation such as EDT",
+                cause="mend the name in the file, or its offset",
+            )
+        candidates = _STANDARD[word]
+        hours, zone = candidates[0]
+        here = _at(zone, moment)
+        if len(candidates) == 1 and (here is None or here[0] == hours):
+            return _shown(hours)
+        raise UsageError(_in_doubt(word, date, here), expected=_candidates(word, candidates, here))
+
+
+def _in_doubt(word: str, date: str, here: tuple[float, str] | None) -> str:
+    if here is None or len(_STANDARD[word]) > 1:
+        return f"the times say {word}, which is the zone of several countries"
+    return f"the times say {word}, but on {date[:10]} the clocks of that zone show {here[1]}"
+
+
+def _candidates(word: str, known: tuple[tuple[float, str], ...], here: tuple[float, str] | None) -> str:
+    """The offsets that may be meant, and how each is chosen."""
+    ways = [f"{_shown(hours)} ({zone})" for hours, zone in known]
+    if len(known) == 1:
+        ways = [f"{_shown(known[0][0])} as written"] + ([f"{_shown(here[0])} ({here[1]})"] if here else [])
+    return f"{' or '.join(ways)}: put the offset in place of {word} in the file"
+
+
+def _shown(hours: float) -> str:
+    minutes = round(abs(hours) * 60)
+    return f"{'-' if hours < 0 else '+'}{minutes // 60:02d}:{minutes % 60:02d}"
+
+
+def _at(zone: str, moment: datetime) -> tuple[float, str] | None:
+    """Hours east of UTC and the abbreviation of a zone at a wall time; None where there is no such zone."""
+    try:
+        local = moment.replace(tzinfo=ZoneInfo(zone))
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        return None
+    offset = local.utcoffset()
+    return (offset.total_seconds() / 3600, local.tzname() or "") if offset is not None else None
+
+
+def header_zone(name: str, brackets: str) -> str:
+    """The zone that the name of a column of times writes, in brackets or as its last word; empty where it does not.
+
+    Examples
+    --------
+    >>> header_zone("Time (EDT)", "EDT"), header_zone("utc_time", ""), header_zone("Time [local]", "local")
+    ('EDT', 'UTC', '')
+    """
+    inside = brackets.strip()
+    if inside and ("/" in inside or re.fullmatch(_NAMED_ZONE, inside.upper()) or inside.upper() in _WITH_SUMMER):
+        return "" if inside.lower() in ("ms", "us", "s", "local", "iso", "date", "time", "unix", "epoch") else inside
+    words = re.split(r"[^A-Za-z0-9+]+", name)
+    if {word.lower() for word in words} & {"utc", "gps", "gmt", "zulu"}:
+        return "UTC"
+    return next((word for word in words if word in _HOURS or word in _STANDARD), "")
 
 
 def read(
-    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, european: bool = False
-) -> tuple[str, AnyArray, list[str]]:
+    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, european: bool = False, zone: str = "",
+    gps: bool = False,
+) -> tuple[str, AnyArray, list[str]]:  # fmt: skip
     """A column of times in any of the known forms.
 
     Parameters
     ----------
     texts : sequence of str
+    options : ReadOptions
     unit : {"s", "ms", "us"}, optional
         Of numbers, where the head of the column says so and they count from no known origin.
     european : bool
         Has the table decimal commas? Where they stand, the day comes before the month.
+    zone : str
+        Of times without one: what the name of the column says.
+    gps : bool
+        Does the name of the column say that numbers are GPS time?
 
     Returns
     -------
@@ -125,53 +307,64 @@ def read(
     """
     shown = [text.strip().strip('"').strip() for text in texts]
     filled = [text for text in shown if text]
-    refuse_rounded(filled)
+    refuse_spreadsheets(filled)
     counts = sum(_NUMBER.fullmatch(text) is not None for text in filled)
     if counts * 2 > len(filled) and not any(_DIGITS.fullmatch(text) for text in filled[:3]):
-        return _numbers(shown, unit, options)
+        return _numbers(shown, unit, options, gps=gps)
     if sum(_OF_DAY.fullmatch(text) is not None for text in filled) * 2 > len(filled):
-        return _of_day(shown, options)
-    first = _day_first(filled)
-    warnings = []
-    if first is None:
-        first = _first_by_name(filled, options.file_name)
-        reason = "as the date in the file name"
-        if first is None:
-            first, reason = european, "as where decimal commas are written" if european else "a guess"
-        word = "day" if first else "month"
-        warnings = [f"the dates can be read with the day or the month first: the {word} was taken, {reason}"]
-    if len(set(filled)) < len(filled) and 2 * sum(_NO_SECONDS.fullmatch(text) is not None for text in filled) > len(
-        filled
-    ):
+        return _of_day(shown, options, zone)
+    plain = [text for text in filled if not _COMMON.fullmatch(text)]
+    order = _Order(plain, options.file_name, european=european)
+    warnings = order.warnings
+    bare = [match for text in plain if (match := _match(text)) and match.groupdict().get("second") is None]
+    if len(set(filled)) < len(filled) and 2 * len(bare) > len(filled):
         warnings.append("the times have no seconds (a table saved by a spreadsheet?): rows of a minute share one time")
-    cells = [text.encode() if _COMMON.fullmatch(text) else _dated(text, bool(first)) or b"-" for text in shown]
+    zones = _Zones(options, zone)
+    cells = [
+        text.encode() if _COMMON.fullmatch(text) and (not zone or text[-6] in "+-" or text[-1] == "Z")
+        else _written(text, order, zones) for text in shown
+    ]  # fmt: skip
     return "wall", _lines.cells(cells), warnings
 
 
-def refuse_rounded(texts: Sequence[str]) -> None:
-    """Refuse a column of epochs that lost their last digits: all rows of minutes or days would share a time.
+def refuse_spreadsheets(texts: Sequence[str]) -> None:
+    """Refuse a column of times of which a spreadsheet took something away.
 
     Raises
     ------
     InputError
-        If most of the texts are such.
+        If most of the texts are epochs without their last digits (all rows of minutes or days would share a time), or
+        minutes and seconds without the hour.
     """
     rounded = [text for text in texts if _ROUNDED.fullmatch(text)]
+    minutes = [text for text in texts if _MINUTES.fullmatch(text)]
     if 2 * len(rounded) > len(texts):
         raise InputError(
             f"the times are rounded, such as {rounded[0]}",
             expected="all digits of the epoch",
             cause="the table was saved by a spreadsheet, which shortens long numbers",
         )
+    if 2 * len(minutes) > len(texts):
+        raise InputError(
+            f"the times are minutes and seconds without the hour and the date, such as {minutes[0]}",
+            expected="whole times",
+            cause="the table was saved by a spreadsheet, which shows times so: save the column as text",
+        )
 
 
-def _numbers(texts: Sequence[str], unit: str | None, options: ReadOptions) -> tuple[str, AnyArray, list[str]]:
+def _numbers(
+    texts: Sequence[str], unit: str | None, options: ReadOptions, *, gps: bool
+) -> tuple[str, AnyArray, list[str]]:
     """Numbers: epochs by their size, else relative times."""
     value = np.array([float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else np.nan for text in texts])
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
         if middle >= 0.9 * scale and scale >= _LEAST_EPOCH.get(unit or "", 0.0):
-            return (form, value, []) if form else ("epoch_us", value / 1e3, [])
+            if gps and middle < 1.58 * scale:  # as an epoch of 1970 before 2020, as one of 1980 before 2030
+                value, warnings = value + (GPS_S - LEAP_S) * scale / 1e9, [_GPS_COUNT]
+            else:
+                warnings = ["the times are called GPS time and count from 1970: read as UTC"] if gps else []
+            return (form, value, warnings) if form else ("epoch_us", value / 1e3, warnings)
     if unit is None and 86_400 < middle < 86_400_000 and not (value % 1 > 0).any():
         if np.nanmin(value) < 3_600_000:
             return "relative_ms", value, [_MILLISECONDS]
@@ -183,6 +376,9 @@ def _numbers(texts: Sequence[str], unit: str | None, options: ReadOptions) -> tu
     return f"relative_{unit or 's'}", value, []
 
 
+# GPS time counts from 6 January 1980; since 2017 it is 18 s ahead of UTC (IERS Bulletin C 52).
+GPS_S, LEAP_S = 315_964_800, 18
+_GPS_COUNT = "the times count from 1980 (GPS time): 18 leap seconds were taken off"
 # An epoch in a unit that the head of the column says; 1e9 microseconds are a quarter of an hour of PX4's own clock.
 _LEAST_EPOCH = {"s": 1e9, "ms": 1e12, "us": 1e15}
 # Date of number zero, and the numbers of the years 2000 to 2099.
@@ -203,41 +399,52 @@ def _are_days(value: FloatArray, low: float, high: float) -> bool:
 _MILLISECONDS = "the times are whole numbers beyond a day of seconds: read as milliseconds"
 
 
-def _of_day(texts: Sequence[str], options: ReadOptions) -> tuple[str, AnyArray, list[str]]:
+def _of_day(texts: Sequence[str], options: ReadOptions, zone: str) -> tuple[str, AnyArray, list[str]]:
     """Times of the day: their date is that of ``time_origin``, of the file name, or nobody's."""
     matches = [_OF_DAY.fullmatch(text) for text in texts]
-    seconds = np.array([_seconds(item.groups()) if item else np.nan for item in matches], dtype=np.float64)
+    seconds = np.array([_seconds(item.groupdict()) if item else np.nan for item in matches], dtype=np.float64)
     seconds += 86_400.0 * np.cumsum(np.nan_to_num(np.diff(seconds, prepend=np.nan)) < -43_200)
-    marked = any(item[5] for item in matches if item)
-    hours = _hours_off(seconds, options.file_name)
-    seconds -= 3600.0 * hours
-    warnings = ["the times are marked as UTC but read as local, as the program's own names say"] if marked else []
+    written = next((item["zone"] for item in matches if item and item["zone"]), None) or zone
+    first = seconds[np.isfinite(seconds)][:1]
+    named, start_s = _NEMO_NAME.search(options.file_name), _session_start_s(options)
+    own_form = written == "Z" and any(text.startswith("T") for text in texts[:3])  # Nemo Handy's
+    if not own_form or not len(first):
+        return _on_a_date(seconds, options, [], written)
+    # Nemo Handy marks its local times as UTC, and some of its exports are whole hours off: its summary says the start
+    hours = 0 if start_s is None else round((float(first[0]) - start_s) / 3600)
+    name_s = int(named[1]) * 3600 + int(named[2]) * 60 + int(named[3]) if named else float(first[0])
+    if start_s is None and abs(float(first[0]) - name_s) > _NEAR_S:
+        text = "the times are marked as UTC and not those of the program's own file name, which is local: read as UTC"
+        return _on_a_date(seconds, options, [text], written)
+    warnings = ["the times are marked as UTC but read as local, as the program's own names say"]
     if hours:
-        warnings.append(f"the times are {hours:+d} h from the time in the file name: read as those of the name, local")
-    return _on_a_date(seconds, options, warnings)
+        warnings.append(f"the times are {hours:+d} h from the start that the summary beside says: read as those, local")
+    return _on_a_date(seconds - 3600.0 * hours, options, warnings)
 
 
 _NEMO_NAME = re.compile(r"(?<!\d)\d\d[A-Z][a-z]{2}\d\d_(\d\d)(\d\d)(\d\d)(?!\d)")
+_SESSION_START = re.compile(rb"^Measurement start;\d{4} \w{3} \d\d (\d\d):(\d\d)", re.MULTILINE)
 _NEAR_S = 300.0
 
 
-def _hours_off(seconds: FloatArray, name: str) -> int:
-    """Whole hours between the first time of the day [s] and the one in Nemo's file name; 0 where there is none."""
-    written, first = _NEMO_NAME.search(name), seconds[np.isfinite(seconds)][:1]
-    if written is None or not len(first):
-        return 0
-    apart = float(first[0]) - (int(written[1]) * 3600 + int(written[2]) * 60 + int(written[3]))
-    hours = round(apart / 3600)
-    return hours if abs(apart - 3600 * hours) < _NEAR_S else 0
+def _session_start_s(options: ReadOptions) -> float | None:
+    """Second of the day at which Nemo's summary of the session, a CSV beside the log, says that it began."""
+    beside = options.neighbour(options.file_name.rpartition(".")[0] + ".csv") if options.neighbour else None
+    start = _SESSION_START.search(beside[:4096]) if beside else None
+    return None if start is None else int(start[1]) * 3600.0 + int(start[2]) * 60.0
 
 
-def _on_a_date(seconds: FloatArray, options: ReadOptions, warnings: list[str]) -> tuple[str, AnyArray, list[str]]:
+def _on_a_date(
+    seconds: FloatArray, options: ReadOptions, warnings: list[str], zone: str = ""
+) -> tuple[str, AnyArray, list[str]]:
     """Seconds of the first day; relative where nothing says which day that is."""
     date = options.time_origin[:10] if options.time_origin else _date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
         return "relative_s", seconds, [*warnings, "the times have no date and the file name has none either"]
+    offset = _Zones(options, zone).offset(None, f"{date} 12:00:00").encode()
     cells = _wall_cells(np.datetime64(date, "us"), seconds)
     source = "time_origin" if options.time_origin else "the file name"
+    cells = np.where(cells == b"-", cells, np.char.add(cells, offset)) if offset else cells
     return "wall", cells, [f"the times have no date: it is that of {source}, {date}", *warnings]
 
 
@@ -247,8 +454,6 @@ def _wall_cells(day: np.datetime64, seconds: FloatArray) -> AnyArray:
     return np.where(np.isnan(seconds), b"-", np.datetime_as_string(stamps, unit="us").astype(np.bytes_))
 
 
-def _seconds(parts: Sequence[str | None]) -> float:
-    hour = int(parts[0] or 0)
-    if parts[3]:
-        hour = hour % 12 + (12 if parts[3].lower() == "pm" else 0)
-    return hour * 3600.0 + int(parts[1] or 0) * 60.0 + float((parts[2] or "0").replace(",", "."))
+def _seconds(groups: dict[str, str | None]) -> float:
+    fraction = f"{groups.get('second') or '0'}.{groups.get('fraction') or '0'}"
+    return _hour(groups) * 3600.0 + int(groups["minute"] or 0) * 60.0 + float(fraction)

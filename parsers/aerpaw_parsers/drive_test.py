@@ -10,41 +10,27 @@ quantities become streams of kind ``kpi``, RI a rank stream (from one). Position
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.readers import dictionary
 
-from . import _cells, _nemo, _pose, _quantities, _sheet, aadm_snr, own_csv, pose_csv, quectel_ri
+from . import _cells, _nemo, _pose, _sheet, aadm_snr, own_csv, pose_csv, quectel_ri
 
-_PCI = re.compile(r"\b(\w{0,5}pci|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci)\b")
-_ARFCN = re.compile(r"\b(nr ?|e ?|u ?)?arfcn\b|\bchannel number\b|\bfreq(uency)? channel\b")
-_NEIGHBOUR = re.compile(
-    r"\b(detected|neigh(bou?rs?)?|nbr|nb|ncell|n ?\d{1,2}|nrx|nlte\w*|adjacent|top \d{1,2})\b|^n\d?(rsrp|rxrsrp)\b|^nrx"
-)
-_NR = re.compile(r"\b(nr|5g|spcell|ss ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss")
-_LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
-# A secondary carrier: it serves beside the primary one.
-_SECONDARY = re.compile(r"\bsc(?:ell|c) ?(\d{0,2})\b")
-_NUMBER = re.compile(r"(?:^| )n?(\d{1,2})(?: |$)")
 _QUALITIES = {"RSRQ": "rsrq_db", "RSSI": "rssi_dbm", "SINR": "sinr_db", "path loss": "pathloss_db"}
 _TOWER_SNR = re.compile(r"snr (lw\d)")
-
-
-# Columns of tables with a cell a row: whether the cell serves.
-_REGISTERED = (r"(is )?(registered|serving|connected)( cell)?",)
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
+_NO, _YES = ("false", "0", "no"), ("true", "1", "yes")
 
 
 def is_header(names: list[str]) -> bool:
     """Check whether names hold a time and a level, ratio or rank."""
-    names = _quantities.in_common_words(names)
-    times = any(_sheet.matches(name, (*_sheet.TIME_NAMES, "date")) for name in names)
-    return times and any(pose_csv.has_radio(name) for name in names) and len(names) > 2
+    return len(names) > 2 and pose_csv.has_time(names) and pose_csv.has_radio(names)
 
 
 def sniff(head: bytes) -> bool:
@@ -69,35 +55,27 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
     """Cells of the table, columns of other quantities, columns of rank."""
     cells: dict[tuple[str, str], _Cell] = {}
     others, ranks = [], []
-    for i, name in enumerate(sheet.plain):
-        meaning = _quantities.quantity(name)
-        is_pci, is_arfcn = _PCI.search(name) is not None, _ARFCN.search(name) is not None
-        if meaning is None and not is_pci and not is_arfcn:
+    for i, meaning in enumerate(sheet.meanings):
+        if meaning is None or meaning.quantity.role not in ("rss", "rank", "kpi", "cell"):
             continue
-        if meaning is not None and meaning.kind == "rank":
-            ranks.append(i)
-            continue
-        if meaning is not None and meaning.name not in ("RSRP", *_QUALITIES):
+        name = meaning.quantity.name
+        if meaning.uplink or (meaning.quantity.role in ("rss", "kpi") and name not in ("RSRP", *_QUALITIES)):
             others.append(i)
-            continue
-        rat = "nr" if _NR.search(name) else "lte" if _LTE.search(name) else ""
-        neighbour = _NEIGHBOUR.search(name) is not None
-        number, second = _NUMBER.search(re.sub(r"\b[45] ?g\b", "", name)), _SECONDARY.search(name)
-        role = f"n{number[1] if number else 0}" if neighbour else f"scell{second[1]}" if second else "serving"
-        cell = cells.setdefault((rat, role), _Cell(rat, not neighbour))
-        _put(cell, i, meaning, is_pci=is_pci, is_arfcn=is_arfcn, others=others)
+        elif meaning.quantity.role == "rank":
+            ranks.append(i)
+        elif meaning.quantity.role != "cell" or name in ("PCI", "ARFCN"):
+            place = (meaning.rat, meaning.place)
+            _put(cells.setdefault(place, _Cell(meaning.rat, not meaning.neighbour)), i, name, others)
     return _completed(cells, others), others, ranks
 
 
-def _put(
-    cell: _Cell, i: int, meaning: _quantities.Quantity | None, *, is_pci: bool, is_arfcn: bool, others: list[int]
-) -> None:
+def _put(cell: _Cell, i: int, quantity: str, others: list[int]) -> None:
     """Column ``i`` to its place; a second column of one quantity is kept as a KPI."""
-    name = "" if meaning is None else _QUALITIES.get(meaning.name, "")
-    if meaning is None and (is_pci or is_arfcn):
-        part = "pci" if is_pci else "arfcn"
+    name = _QUALITIES.get(quantity, "")
+    if quantity in ("PCI", "ARFCN"):
+        part = quantity.lower()
         setattr(cell, part, i if getattr(cell, part) is None else getattr(cell, part))
-    elif meaning is not None and meaning.name == "RSRP" and cell.rsrp is None:
+    elif quantity == "RSRP" and cell.rsrp is None:
         cell.rsrp = i
     elif name and name not in cell.qualities:
         cell.qualities[name] = i
@@ -138,11 +116,9 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
 
 def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
     tables = []
-    tech, registered = sheet.find(*_quantities.OF_GNETTRACK), sheet.find(*_REGISTERED)
-    of_row = None if tech is None else np.array([_rat(text) for text in sheet.texts(tech)], dtype=np.int8)
-    idle = None
-    if registered is not None:
-        idle = np.array([text.lower() in ("false", "0", "no") for text in sheet.texts(registered)], dtype=bool)
+    technology = sheet.find("technology")
+    of_row = None if technology is None else np.array([_rat(text) for text in sheet.texts(technology)], dtype=np.int8)
+    idle = _idle(sheet)
     for cell in cells:
         assert cell.rsrp is not None
         level = sheet.numbers(cell.rsrp)
@@ -153,9 +129,7 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
         rat = np.full(len(row), _cells.RATS.index(cell.rat), dtype=np.int8)
         if of_row is not None and not cell.rat:
             rat = of_row[row]
-        serving = np.full(len(row), cell.serving)
-        if idle is not None:
-            serving &= ~idle[row]
+        serving = np.full(len(row), cell.serving) & ~idle[row]
         tables.append(
             _cells.Table(
                 row=row, rat=rat, pci=pci, arfcn=arfcn, rsrp_dbm=level[row], serving=serving, qualities=qualities
@@ -164,14 +138,26 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
     return _cells.joined(tables)
 
 
+def _idle(sheet: _sheet.Sheet) -> BoolArray:
+    """Rows of tables with a cell a row whose cell does not serve."""
+    idle = np.zeros(len(sheet), dtype=bool)
+    for name, words in (("serving", _NO), ("neighbouring", _YES)):
+        if (column := sheet.find(name)) is not None:
+            idle |= np.array([text.lower() in words for text in sheet.texts(column)], dtype=bool)
+    return idle
+
+
 def _rat(technology: str) -> int:
-    """Index into ``RATS`` of what G-NetTrack calls a technology."""
+    """Index into ``RATS`` of what a program calls a technology."""
     word = technology.strip().lower()
-    return _cells.RATS.index("lte" if word in ("4g", "lte") else "nr" if word in ("5g", "nr") else "")
+    return _cells.RATS.index("nr" if re.search(r"5g|nr", word) else "lte" if re.search(r"4g|lte", word) else "")
 
 
 def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:
-    return np.full(count, np.nan) if column is None else sheet.numbers(column)
+    if column is None:
+        return np.full(count, np.nan)
+    values, meaning = sheet.numbers(column), sheet.meanings[column]
+    return values if meaning is None else np.where(dictionary.is_none(meaning.quantity, values), np.nan, values)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -184,15 +170,33 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
-    """Streams of a table whose columns have the names of a drive-test program."""
+    """Streams of a table whose columns have the names of a drive-test program: of each device, of each network."""
     _settle_names(sheet)
+    streams: list[Stream | None] = []
+    for device, of_device, table in _sheet.parts(rows, sheet, "device"):
+        name = f"phone_{device}" if device else "phone"
+        streams.append(_pose.from_sheet(of_device, table, name=name, source="table of a phone"))
+        for network, part, cells in _sheet.parts(of_device, table, "network"):
+            suffix = "_".join(word for word in (network, device) if word)
+            streams += [_renamed(stream, suffix) for stream in _radio(part, cells)]
+    rows.warnings += sheet.unread()
+    return rows.result(_distinct(streams))
+
+
+def _radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     cells, others, ranks = _places(sheet)
-    track = _pose.from_sheet(rows, sheet, name="phone", source="table of a phone")
     levels = _cells.streams(rows, _readings(sheet, cells), source="drive test")
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
-    streams = [(_rank if column in ranks else _other)(rows, sheet, column) for column in columns]
-    rows.warnings += sheet.unread()
-    return rows.result(_distinct([track, *levels, *streams]))
+    return [*levels, *((_rank if column in ranks else _other)(rows, sheet, column) for column in columns)]
+
+
+def _renamed(stream: Stream | None, suffix: str) -> Stream | None:
+    if stream is None or not suffix:
+        return stream
+    about = {**stream.attributes, "part": suffix}
+    if "channel" in about:
+        about["channel"] = f"{about['channel']}_{suffix}"
+    return replace(stream, name=f"{stream.name}_{suffix}", attributes=about)
 
 
 def _event_columns(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
@@ -206,22 +210,25 @@ def _event_columns(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
 
 
 def _settle_names(sheet: _sheet.Sheet) -> None:
-    """Names in common words; G-NetTrack's ``Level`` is an RSRP on 4G and 5G only, its bit rates are in kbit/s.
+    """G-NetTrack's ``Level`` is an RSRP on 4G and 5G, an RSCP on 3G and an RxLev on 2G: columns of their own.
 
-    Its ``LTERSSI`` is in dBm, from older phones in steps from 0 that are no level.
+    Its ``LTERSSI`` is in dBm, from older phones in steps from 0.
     """
-    words = _quantities.in_common_words(sheet.plain)
-    if not set(words).isdisjoint(_quantities.OF_GNETTRACK):
-        sheet.units |= {i: "kbit/s" for i, name in enumerate(words) if name in ("dl bitrate", "ul bitrate")}
-    if words != sheet.plain and "level" in sheet.plain:
-        places, tech = [sheet.plain.index(name) for name in ("level", "qual")], sheet.find(*_quantities.OF_GNETTRACK)
-        if tech is not None:
-            texts = sheet.texts(tech)
-            older = {text for text in set(texts) if not _TECH.search(text)}
-            sheet.silence(np.array([text in older for text in texts], dtype=bool), places)
-        if (rssi := sheet.find("lterssi")) is not None:
-            sheet.silence(sheet.numbers(rssi) >= 0, [rssi])
-    sheet.plain = words
+    if sheet.program is None or "level" not in sheet.program.words:
+        return
+    texts = sheet.texts(column) if (column := sheet.find("technology")) is not None else []
+    if (rssi := sheet.named("lterssi")) is not None:
+        sheet.silence(sheet.numbers(rssi) >= 0, [rssi])
+    level, quality = sheet.named("level"), sheet.named("qual")
+    assert level is not None
+    assert quality is not None
+    for name, older in (("RSCP", r"(?i)3g|umts|hspa|wcdma"), ("RxLev", r"(?i)2g|gsm|gprs|edge")):
+        mine = [re.search(older, text) is not None and not _TECH.search(text) for text in texts]
+        if any(mine):
+            sheet.add(name, [cells[level] if its else "" for cells, its in zip(sheet.cells, mine, strict=True)])
+    unlike = np.array([not _TECH.search(text) for text in texts], dtype=bool)
+    if unlike.any():
+        sheet.silence(unlike, [level, quality])
 
 
 def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
@@ -234,17 +241,10 @@ def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
 
 
 def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
-    values = sheet.numbers(column)
-    name = sheet.plain[column]
+    values, name = sheet.numbers(column), sheet.plain[column]
     if tower := _TOWER_SNR.fullmatch(name):
         return _rows.snr(rows, tower[1].upper(), values)
-    finite = np.isfinite(values)
-    meaning = _quantities.quantity(name)
-    if meaning is not None and meaning.kind == "rss" and _NEIGHBOUR.search(name):  # of a cell that nobody names
-        return rows.stream(
-            "kpi", re.sub(r"\W+", "_", name), {"value": values}, where=finite, unit=meaning.unit, quantity=meaning.name
-        )
-    return _quantities.stream(rows, name, values, unit=sheet.unit_read(column), where=finite)
+    return _cells.named(rows, name, values, unit=sheet.unit_read(column), where=np.isfinite(values))
 
 
 def _distinct(streams: list[Stream | None]) -> list[Stream | None]:

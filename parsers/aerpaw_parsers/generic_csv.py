@@ -8,20 +8,19 @@ since 1970 in UTC (``clock: local_as_utc`` for wall time stored so).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from difflib import get_close_matches
 
 import numpy as np
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, Stream
+from aerpaw_cmp.readers import dictionary
 
-from . import _sheet, _stamps
+from . import _pose, _sheet
 
 _EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
 # What may stand beside a rank, or beside a level: the positions of a table merged by hand are its track.
@@ -29,9 +28,11 @@ _COMPANIONS: dict[str, tuple[str, ...]] = {"rank": _EXTRA, "rss": (*COLUMNS["tel
 # Columns that a record of a kind is about.
 _VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": ("rss_db",), "rank": ("ri_raw",)}
 
-_TEXT = re.compile(_time.TIME + _time.ZONE)
-_PLAIN = re.compile(_lines.NUMBER)
 _INK = re.compile(rb"\S")
+# Units of record columns, by the ends of their names.
+_UNITS = {"_deg": "deg", "_m": "m", "_mps": "m/s", "_dbm": "dBm", "_db": "dB"}
+# Keys that divide a mapped table, besides devices: each part is a series.
+_KEYS = ("network", "PCI", "ARFCN")
 
 
 def sniff(head: bytes) -> bool:  # noqa: ARG001 - the contract of sniffers
@@ -90,50 +91,36 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
     return options.kind, {column: header.index(name) for column, name in options.columns.items()}
 
 
-# What stands for no value; -inf dB is no signal. Any other word, and +inf, is flagged.
-_NONE = (b"", b"nan", b"na", b"n/a", b"none", b"null", b"-", b"--", b"-inf", b"-infinity")
+def _values(sheet: _sheet.Sheet, column: int, name: str, options: ReadOptions) -> FloatArray:
+    """A mapped column in the unit of its record column.
+
+    Raises
+    ------
+    UsageError
+        If the unit in the file is of another quantity than the mapping.
+    """
+    values, unit = sheet.numbers(column), sheet.unit_read(column)
+    wanted = next(unit for end, unit in (*_UNITS.items(), ("", "")) if name.endswith(end))
+    right = unit in ("dBm", "dB") if name == "rss_db" else unit == wanted
+    if unit and wanted and not right and unit in {known for known, _ in dictionary.UNITS.values()}:
+        raise UsageError(
+            f"column {sheet.names[column]!r} is in {unit} and mapped to {name}", expected=f"a column in {wanted}"
+        )
+    if name == "rss_db" and unit == "dBm" and options.unit not in (None, "dBm"):
+        raise UsageError(f"column {sheet.names[column]!r} says dBm and --unit says {options.unit}", expected="one unit")
+    return values
 
 
-def _numbers(cells: list[str], comma: bool = False) -> FloatArray:
-    """Numbers of a column; what is none becomes NaN, and +inf where it is a word: the limits flag it."""
-    stripped = [cell.strip().strip('"').encode("ascii", "replace") for cell in cells]
-    if comma:  # a decimal comma, where the separator leaves room for one
-        stripped = [cell.replace(b",", b".") for cell in stripped]
-    return np.array([_number(cell) for cell in stripped], dtype=np.float64)
-
-
-def _number(cell: bytes) -> float:
-    if _PLAIN.fullmatch(cell):
-        return float(cell)
-    return np.nan if cell.lower() in _NONE else np.inf
-
-
-def _times(cells: list[str], options: ReadOptions, *, comma: bool) -> tuple[str, AnyArray, list[str]]:
-    """Kind of clock and times, as :func:`aerpaw_cmp.logs.rows.times` takes them, and warnings."""
-    texts = [_bare(cell) for cell in cells]
-    if not _counts(texts):
-        return _stamps.read([text.decode() for text in texts], options, european=comma)
-    _stamps.refuse_rounded([text.decode() for text in texts if text])
-    seconds = np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in texts], dtype=np.float64)
-    return "epoch_s" if options.time_origin is None else "relative_s", seconds, []
-
-
-def _bare(cell: str) -> bytes:
-    return cell.strip().strip('"').encode("ascii", "replace")
-
-
-def _counts(texts: Iterable[bytes]) -> bool:
-    """Check whether times are numbers: the first that is a time in either form decides."""
-    for text in texts:
-        if _PLAIN.fullmatch(text):
-            return True
-        if _TEXT.fullmatch(text):
-            return False
-    return False
+def _odd(sheet: _sheet.Sheet, column: int) -> BoolArray:
+    """Cells that are words or infinities; -inf dB is no signal."""
+    values = sheet.numbers(column)
+    texts = [text.strip('"').lower() for text in sheet.texts(column)]
+    none = np.array([text in _sheet.NO_VALUE and text != "inf" for text in texts], dtype=bool)
+    return np.asarray(np.isnan(values) & ~none)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """One stream of the kind that the options name.
+    """Streams of the kind that the options name: one, or one for each device, network and cell that the table names.
 
     Raises
     ------
@@ -146,38 +133,53 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         return ReadResult("generic_csv", (), count, 0, count)
     first, separator, header = top
     kind, where = _checked(options, header)
-    lines = _lines.split(data)
-    sheet = _sheet.cut(lines, first, separator, header)
-    column = {name: [fields[i] for fields in sheet.cells] for name, i in where.items()}
-    comma = separator != ","  # a decimal comma, where the separator leaves room for one
-    clock, time, warnings = _times(column.pop("time"), options, comma=comma)
-    numbers = {name: _numbers(texts, comma=comma) for name, texts in column.items()}
-    rows = _rows.built(
-        lines, sheet.row, {"time": time, **numbers}, options, reader="generic_csv", reason=lambda _line: None,
-        clock=clock, extra=sheet.rejected, markup=sheet.blank_rows,
-    )  # fmt: skip
-    rows.warnings += warnings
-    if kind == "rss" and options.unit is None:
+    sheet = _sheet.cut(_lines.split(data), first, separator, header)
+    rows = _sheet.rows(sheet, options, reader="generic_csv", column=where.pop("time"))
+    assert rows is not None
+    unit = sheet.unit_read(where["rss_db"]) if kind == "rss" else ""
+    if kind == "rss" and options.unit is None and not unit:
         rows.warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
-    return rows.result([_stream(rows, kind, list(numbers)), _track(rows, kind)])
+    streams: list[Stream | None] = []
+    for device, of_device, table in _sheet.parts(rows, sheet, "device"):
+        for label, part, cells in _divided(of_device, table, kind):
+            values = {name: _values(cells, column, name, options) for name, column in where.items()}
+            odd = np.any([_odd(cells, where[name]) for name in _VALUE[kind]], axis=0)
+            words = "_".join(word for word in (options.channel or kind, label, device) if word)
+            streams.append(_stream(part, kind, words, values, odd, options.unit or unit))
+        if kind == "rss":
+            streams.append(_track(of_device, table, where, device))
+    rows.warnings += sheet.unread()
+    return rows.result(streams)
 
 
-def _stream(rows: _rows.Rows, kind: Kind, names: list[str]) -> Stream | None:
+def _divided(rows: _rows.Rows, sheet: _sheet.Sheet, kind: Kind) -> list[tuple[str, _rows.Rows, _sheet.Sheet]]:
+    parts = [("", rows, sheet)]
+    for key in _KEYS if kind != "telemetry" else ():
+        parts = [
+            ("_".join(word for word in (label, more) if word), inner, cells)
+            for label, part, table in parts
+            for more, inner, cells in _sheet.parts(part, table, key)
+        ]
+    return parts
+
+
+def _stream(
+    rows: _rows.Rows, kind: Kind, name: str, values: dict[str, AnyArray], odd: BoolArray, unit: str
+) -> Stream | None:
     """Columns by the rules of the kind, and the attributes that go with them; words in place of numbers are flagged."""
     options, flag = rows.options, rows.flag.copy()
-    odd = np.any([np.isposinf(rows.columns[name]) for name in _VALUE[kind]], axis=0)
     _lines.add_flag(flag, odd, "no_number")
     if odd.any():
         lines = "1 row is" if odd.sum() == 1 else f"{odd.sum()} rows are"
         first = int(rows.row[odd][0]) + 1
         rows.warnings.append(f"{lines} flagged no_number; the first: line {first}, a word or an infinity; not scored")
-    values: dict[str, AnyArray] = {name: _finite(rows, name) for name in names}
-    attributes: dict[str, str | None] = {}
+    attributes: dict[str, str | float | None] = {}
     if kind == "rss":
-        silent = ~(values["rss_db"] > options.floor_db)
+        level = values["rss_db"]
+        silent = ~(level > options.floor_db) | ((unit == "dBm") & (level == 0))
         _lines.add_flag(flag, silent & ~odd, "out_of_coverage")
-        values["rss_db"] = np.where(silent, np.nan, values["rss_db"])
-        attributes = {"unit": options.unit or "dB re full scale"}
+        values["rss_db"] = np.where(silent, np.nan, level)
+        attributes = {"unit": unit or "dB re full scale"}
     elif kind == "rank":
         base, ri = int(options.ri_base == "one"), values["ri_raw"]
         good = (ri >= base) & (ri <= 7 + base) & (ri == np.round(ri))
@@ -188,28 +190,30 @@ def _stream(rows: _rows.Rows, kind: Kind, names: list[str]) -> Stream | None:
         attributes = {"ri_base": options.ri_base}
     else:
         place = ("latitude_deg", "longitude_deg", "altitude_m")
-        latitude, longitude, altitude = (values[name] for name in place)
+        latitude, longitude, altitude = (values[key] for key in place)
         lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (altitude > -998.5))
         _lines.add_flag(flag, lost, "no_fix")
-        values |= {name: np.where(lost, np.nan, values[name]) for name in place}
-        for name in {"fix", "satellites"} & set(values):
-            values[name] = np.where(np.isnan(values[name]), -1, values[name]).clip(-1, 255).astype(np.int64)
-    return rows.stream(kind, options.channel or kind, values, flag=flag, about=attributes)
+        values |= {key: np.where(lost, np.nan, values[key]) for key in place}
+        for key in {"fix", "satellites"} & set(values):
+            values[key] = np.where(np.isnan(values[key]), -1, values[key]).clip(-1, 255).astype(np.int64)
+    return rows.stream(kind, name, values, flag=flag, about=attributes)
 
 
-def _finite(rows: _rows.Rows, name: str) -> FloatArray:
-    """A column, words as NaN."""
-    values: FloatArray = rows.columns[name]
-    return np.where(np.isposinf(values), np.nan, values)
-
-
-def _track(rows: _rows.Rows, kind: Kind) -> Stream | None:
+def _track(rows: _rows.Rows, sheet: _sheet.Sheet, where: dict[str, int], device: str) -> Stream | None:
     """Positions that stand beside levels, as the track of the flight: a table merged by hand holds both."""
-    names = [name for name in COLUMNS["telemetry"][:-2] if name in rows.columns]
-    if kind != "rss" or not {"latitude_deg", "longitude_deg"} <= set(names):
+    names = [name for name in COLUMNS["telemetry"][:-2] if name in where]
+    if not {"latitude_deg", "longitude_deg"} <= set(names):
         return None
-    values = {name: _finite(rows, name) for name in names}
-    return rows.stream("telemetry", "vehicle", values, flag=_lines.flags(len(rows)), source="mapped columns")
+    values: dict[str, AnyArray] = {name: sheet.numbers(where[name]) for name in names}
+    about: _pose.Height = {}
+    height = sheet.meanings[where["altitude_m"]] if "altitude_m" in where else None
+    if height is not None and height.quantity.datum in ("sea level", "ellipsoid"):
+        rows.height_from = "written"
+        lost = np.isnan(values["latitude_deg"])
+        values["altitude_m"], about = _pose.above_takeoff(rows, values, height.quantity.datum, lost)
+    flag = _lines.flags(len(rows))
+    name = f"vehicle_{device}" if device else "vehicle"
+    return rows.stream("telemetry", name, values, flag=flag, source="mapped columns", about=about)
 
 
 READER = Reader(

@@ -47,8 +47,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     lines = _lines.split(data)
     points = [(at, values) for at, values in _points(data) if {b"lat", b"lon", b"time"} <= set(values)]
     row = lines.number_at(at for at, _ in points)
-    row, first = np.unique(row, return_index=True)
-    placed = [points[i][1] for i in first.tolist()]
+    placed = [values for _, values in points]
     clock, time, warnings = _stamps.read([values[b"time"].decode("ascii", "replace") for values in placed], options)
     column = {
         name.decode(): _lines.cells([values.get(name, b"") for values in placed])
@@ -56,15 +55,14 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     }
     rows = _rows.built(
         lines, row, {"time": time, **column}, options, reader="gpx", reason=lambda _line: None, clock=clock,
-        extra=_torn(lines, data, row),
+        extra=_torn(lines, data, row), closed=True,
     )  # fmt: skip
     rows.warnings += warnings
-    if len(points) > len(row):
-        rows.warnings.append(f"{len(points) - len(row)} further points on lines that hold several were not read")
     values = {"latitude_deg": rows.decimal("lat"), "longitude_deg": rows.decimal("lon")}
     lost = _pose.clean(rows, values)
-    values["altitude_m"] = _pose.above_takeoff(rows, rows.decimal("ele"), lost)
-    return rows.result([rows.stream("telemetry", "track", values, where=~lost, source="GPX")])
+    values["altitude_m"], rows.height_from = rows.decimal("ele"), "program"
+    values["altitude_m"], about = _pose.above_takeoff(rows, values, "sea level", lost)
+    return rows.result([rows.stream("telemetry", "track", values, where=~lost, source="GPX", about=about)])
 
 
 def _torn(lines: _lines.Lines, data: bytes, row: object) -> list[RejectedLine]:

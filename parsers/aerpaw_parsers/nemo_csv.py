@@ -16,7 +16,7 @@ from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
 
-from . import _nemo, _quantities
+from . import _cells, _nemo
 
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
 _LEVELS = (("rsrp_dbm", "nr_rsrp"), ("sinr_db", "nr_sinr"), ("cqi", "wb_cqi"))
@@ -34,7 +34,7 @@ _ROW = re.compile(
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     values = {name: rows.number(name) for name in _COLUMNS}
     levels = [
-        _quantities.stream(rows, name, values[column], where=np.isfinite(values[column]), about={"rat": "nr"})
+        _cells.named(rows, name, values[column], where=np.isfinite(values[column]), about={"rat": "nr"})
         for column, name in _LEVELS
     ]  # before rows without a rank are flagged so
     yield _nemo.pdsch_rank(rows, dict(values))

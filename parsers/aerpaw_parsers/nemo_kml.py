@@ -15,8 +15,9 @@ from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.readers import dictionary
 
-from . import _quantities
+from . import _cells
 from ._nemo import pdsch_rank
 
 _N = rb"(" + _lines.NUMBER + rb"|nan)"
@@ -64,17 +65,22 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         rows.warnings.append(f"{len(reports) - len(row)} further reports on lines that hold several were not read")
     position = {name: rows.number(name) for name in _POSITION}
     what = np.array(rows.text("what"), dtype=object)
-    if _quantities.is_rank(what[0]) if len(what) else False:
+    if _is_rank(what[0]) if len(what) else False:
         return rows.result([pdsch_rank(rows, {"ri_raw": rows.number("value"), **position})])
     streams = [rows.stream("telemetry", "phone", position, source="Nemo placemarks")]
     streams += [_measured(rows, name, what == name) for name in dict.fromkeys(what.tolist())]
     return rows.result(streams)
 
 
+def _is_rank(name: str) -> bool:
+    meaning = dictionary.meaning(name)
+    return meaning is not None and meaning.quantity.role == "rank"
+
+
 def _measured(rows: _rows.Rows, name: str, where: BoolArray) -> Stream | None:
     """Level or KPI stream of one quantity."""
     unit = next((text for text in rows.text("unit") if text), "")
-    return _quantities.stream(rows, name, rows.number("value"), unit=unit, where=where)
+    return _cells.named(rows, name, rows.number("value"), unit=unit, where=where)
 
 
 def _markup(lines: _lines.Lines, row: IntArray) -> IntArray:

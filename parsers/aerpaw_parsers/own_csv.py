@@ -13,6 +13,7 @@ from aerpaw_cmp.common.units import BoolArray
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.readers import dictionary
 
 from . import _sheet
 
@@ -22,8 +23,9 @@ _TAP = ("time utc", "query", "status", "rank", "ri raw")
 
 
 def is_header(names: list[str]) -> bool:
-    """Check whether plain names are those of one of the three tables."""
-    return any(set(form) <= set(names) for form in (_RSS, _RANK, _TAP))
+    """Check whether names are those of one of the three tables."""
+    plain = {dictionary.plain(name) for name in names}
+    return any(set(form) <= plain for form in (_RSS, _RANK, _TAP))
 
 
 def sniff(head: bytes) -> bool:
@@ -36,12 +38,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     sheet = _sheet.read(data, is_header)
     if sheet is None:
         return _sheet.nothing(data, "own_csv", "no header of an export")
-    column = sheet.find("time utc")
-    empty = column is not None and not any(sheet.texts(column))
-    also = ("time s",) if empty and sheet.find("time s") is not None else ("time utc",)
-    rows = _sheet.rows(sheet, options, reader="own_csv", also=also)
-    if rows is None:
-        return _sheet.nothing(data, "own_csv", "no header of an export")
+    column = sheet.named("time utc")
+    if column is not None and not any(sheet.texts(column)):
+        column = sheet.named("time s", "time utc")
+    rows = _sheet.rows(sheet, options, reader="own_csv", column=column)
+    assert rows is not None
     names = set(sheet.plain)
     if set(_RSS) <= names:
         return rows.result(_levels(rows, sheet))
@@ -49,14 +50,14 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _text(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-arg]
-    place = sheet.find(name)
+    place = sheet.named(name)
     texts = [] if place is None else sheet.texts(place)
     # NumPy compares an array of objects with a text whose last NULs it has taken off
     return np.array([text.replace("\0", "\ufffd") for text in texts], dtype=object)
 
 
 def _number(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-arg]
-    place = sheet.find(name)
+    place = sheet.named(name)
     return np.full(len(sheet), np.nan) if place is None else sheet.numbers(place)
 
 

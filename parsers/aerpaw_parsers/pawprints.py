@@ -128,8 +128,9 @@ def _track(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
     if not np.isfinite(values["latitude_deg"]).any():
         return None
     lost = _pose.clean(rows, values)
-    values["altitude_m"] = _pose.above_takeoff(rows, _json.column(places, "altitude", "alt"), lost)
-    return rows.stream("telemetry", "phone", values, where=~lost, source="PawPrints location")
+    values["altitude_m"], rows.height_from = _json.column(places, "altitude", "alt"), "program"
+    values["altitude_m"], about = _pose.above_takeoff(rows, values, "ellipsoid", lost)
+    return rows.stream("telemetry", "phone", values, where=~lost, source="PawPrints location", about=about)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

@@ -10,8 +10,9 @@ import re
 
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.readers import dictionary
 
-from . import _nemo, _pose, _quantities, _sheet, quectel_ri, vehicle_out
+from . import _nemo, _pose, _sheet, ardupilot_bin, quectel_ri, vehicle_out
 
 _LIKE_A_LEVEL = re.compile(
     r"^(?!.*(batt|volt|throttle|gps)).*(\b(rx|received?) ?power|signal|\bdbm\b|\brss\b|strength)"
@@ -20,26 +21,28 @@ _LIKE_A_LEVEL = re.compile(
 
 def is_header(names: list[str]) -> bool:
     """Check whether names hold a position and a time, and no quantity of a radio."""
-    return (
-        _pose.has_position(names)
-        and _has_time(names)
-        and not any(has_radio(name) for name in _quantities.in_common_words(names))
+    return _pose.has_position(names) and has_time(names) and not has_radio(names)
+
+
+def has_radio(names: list[str]) -> bool:
+    """Check whether names hold a level, a ratio or a rank of the channel."""
+    plain = [dictionary.plain(name) for name in names]
+    words = zip(names, dictionary.in_common_words(plain), plain, strict=True)
+    known = [dictionary.meaning(name, None if word == own else word) for name, word, own in words]
+    return any(
+        m is not None and (m.quantity.role in ("rss", "rank") or m.quantity.name in ("SINR", "RSRQ")) for m in known
     )
 
 
-def has_radio(name: str) -> bool:
-    """Check whether a plain name is that of a level or rank."""
-    meaning = _quantities.quantity(name)
-    return meaning is not None and (meaning.kind in ("rss", "rank") or meaning.name in ("SINR", "RSRQ"))
-
-
-def _has_time(names: list[str]) -> bool:
-    return any(_sheet.matches(name, _sheet.TIME_NAMES) for name in names)
+def has_time(names: list[str]) -> bool:
+    """Check whether a name is that of a time, a date, or GPS weeks."""
+    known = {meaning.quantity.name for name in names if (meaning := dictionary.meaning(name)) is not None}
+    return not known.isdisjoint(("time", "date")) or {"gps_week", "gps_seconds"} <= known
 
 
 def sniff(head: bytes) -> bool:
     """Check whether a header with position and time stands in front, and it is not AERPAW's own layout."""
-    narrower = (vehicle_out.READER.sniff, _nemo.sniff, quectel_ri.READER.sniff)
+    narrower = (vehicle_out.READER.sniff, ardupilot_bin.sniff, _nemo.sniff, quectel_ri.READER.sniff)
     return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 
 
@@ -49,12 +52,15 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows = None if sheet is None else _sheet.rows(sheet, options, reader="pose_csv")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "pose_csv", "no header with a time, a latitude and a longitude")
-    unread = [name for name, text in zip(sheet.names, sheet.plain, strict=True) if _LIKE_A_LEVEL.search(text)]
+    unread = [name for name in sheet.names if _LIKE_A_LEVEL.search(dictionary.plain(name))]
     if unread:
         rows.warnings.append(f"columns that are not read: {', '.join(unread[:5])}; '--map' reads a level")
-    track = _pose.from_sheet(rows, sheet, name="vehicle", source="table of positions")
+    tracks = [
+        _pose.from_sheet(part, cells, name=f"vehicle_{label}" if label else "vehicle", source="table of positions")
+        for label, part, cells in _sheet.parts(rows, sheet, "device")
+    ]
     rows.warnings += sheet.unread()
-    return rows.result([track])
+    return rows.result(tracks)
 
 
 READER = Reader(

@@ -160,7 +160,8 @@ def test_a_last_record_without_line_end_is_flagged(reader: str, sample: str) -> 
         return
     flagged = [flag for stream in cut.streams for flag in stream.frame.loc[stream.frame["line"] == last, "flag"]]
     assert flagged
-    assert all("unterminated_line" in flag for flag in flagged)
+    closed = reader in ("gpx", "gnettrack_kml")  # a record ends with its own tag
+    assert all(("unterminated_line" in flag) is not closed for flag in flagged)
 
 
 @pytest.mark.parametrize("reader", SAMPLES)

@@ -78,7 +78,7 @@ def test_cells_of_rows_that_do_not_count_are_empty() -> None:
     sheet.silence(np.array([False, True, True]), [1])
     np.testing.assert_array_equal(sheet.numbers(1), [2, np.nan, np.nan])
     assert sheet.texts(1) == ["2", "", ""]
-    sheet.keep(np.array([True, False, True]))
+    sheet = sheet.part(np.array([True, False, True]))
     np.testing.assert_array_equal(sheet.numbers(1), [2, np.nan])
     np.testing.assert_array_equal(sheet.numbers(2), [3, 7])
 
@@ -93,9 +93,14 @@ def test_a_midnight_is_a_day_more() -> None:
     assert (np.diff(time) == np.timedelta64(1, "h")).all()
 
 
-@pytest.mark.parametrize(("yaws", "known"), [((1.0, 3.0), np.degrees([1, 3])), ((1.0, 200.0), [1, 200])])
-def test_the_largest_yaw_of_the_table_tells_radians(yaws: tuple[float, float], known: list[float]) -> None:
-    result = read("pose_csv", POSES + b"".join(pose(i, yaw=yaw) for i, yaw in enumerate(yaws)))
+@pytest.mark.parametrize(
+    ("yaws", "pitch", "known"),
+    [((1.0, 3.0), "0.2", np.degrees([1, 3])), ((1.0, 200.0), "0.2", [1, 200]), ((1.0, 3.0), "-2", [1, 3]), ((1.0, 3.0), "", [1, 3])],
+)  # fmt: skip
+def test_all_three_angles_must_look_like_radians(yaws: tuple[float, float], pitch: str, known: list[float]) -> None:
+    rows = [pose(i, yaw=yaw).strip() + f",0.1,{pitch}\n".encode() for i, yaw in enumerate(yaws)]
+    result = read("pose_csv", POSES.strip() + b",Roll,Pitch\n" + b"".join(rows))
+    assert any("a guess" in text for text in result.warnings) == (known[0] != 1)
     np.testing.assert_allclose(result.streams[0].frame["yaw_deg"], known, rtol=1e-14)
 
 
@@ -181,10 +186,12 @@ def column_of(result: ReadResult, kind: str, name: str) -> list[float]:
 GOOD = "2025-03-02 10:00:0{i},35.72{i},-78.69,3{i},-8{i}"
 
 
-def test_cells_with_a_unit_behind_the_number_are_said() -> None:
-    result = drive_test(six_rows(GOOD.replace("-8{i}", "-8{i} dBm")))
+def test_units_of_cells_are_read_and_words_are_said() -> None:
+    result = drive_test(six_rows(GOOD.replace("-8{i}", "-11{i} dBW")))
+    assert column_of(result, "rss", "rss_db") == [-80.0 - i for i in range(6)]
+    result = drive_test(six_rows(GOOD.replace("-8{i}", "-8{i} bars")))
     assert not any(stream.kind == "rss" for stream in result.streams)
-    assert any("'RSRP (dBm)': 6 cells are no number (the first: '-80 dBm')" in text for text in result.warnings)
+    assert any("'RSRP (dBm)': 6 cells are no number (the first: '-80 bars')" in text for text in result.warnings)
     assert not any("no number" in text for text in drive_test(six_rows(GOOD)).warnings)
 
 

@@ -125,10 +125,10 @@ CASES |= {
         {"vehicle": {"altitude_m": HEIGHTS}},
         "pose_csv",
     ),
-    "a table of nobody that begins at rest counts from the ground": Case(
+    "a table of nobody that never leaves its height is not on the ground": Case(
         "x.csv",
         table("time,lat,lon,alt\n", "2025-03-02 10:00:{s:02d},35.73,-78.7,{rest}\n"),
-        {"vehicle": {"altitude_m": [0.0] * 8}},
+        {"vehicle": {"altitude_m": [134.5] * 8}},
         "pose_csv",
     ),
     "altitudes that the header calls above sea level": Case(
@@ -137,11 +137,11 @@ CASES |= {
         {"vehicle": {"altitude_m": [float(i) for i in range(8)]}},
         "pose_csv",
     ),
-    "Nemo's name is year, month, day; its clock 4 h off": Case(
+    "Nemo's name is year, month, day; times that are not its name's are UTC, as they say": Case(
         "25Mar02_100000.1.gpx",
         '<gpx><trkpt lat="35.73" lon="-78.7"><ele>90.5</ele><time>T14:00:01.250Z</time></trkpt>\n'
         '<trkpt lat="35.73" lon="-78.7"><ele>91.5</ele><time>T14:00:02.250Z</time></trkpt></gpx>\n',
-        {"track": {"time": [1.25, 2.25], "altitude_m": [0.0, 1.0]}},
+        {"track": {"time": [-3598.75, -3597.75], "altitude_m": [0.0, 1.0]}},
         "gpx",
     ),
     "gnb.log of srsRAN Project is UTC": Case(
@@ -398,16 +398,16 @@ CASES |= {
         "2025-03-02T10:00:00.250-05:00,35.73,-78.7,LTE,8,1300,-90,false\n"
         "2025-03-02T10:00:01.250-05:00,35.73,-78.7,LTE,7,2850,-81,true\n",
         {
-            "pci7_arfcn1300": {"time": [0.25], "serving": [1]},
-            "pci8": {"time": [0.25], "serving": [0]},
-            "pci7_arfcn2850": {"time": [1.25], "serving": [1]},
+            "lte_pci7_arfcn1300": {"time": [0.25], "serving": [1]},
+            "lte_pci8": {"time": [0.25], "serving": [0]},
+            "lte_pci7_arfcn2850": {"time": [1.25], "serving": [1]},
         },
         "drive_test",
     ),
     "CellMapper: signal of a PCI": Case(
         "cm.csv",
         "Latitude,Longitude,MCC,MNC,CID,Signal,Type,ARFCN,PSC or PCI,Timestamp\n35.73,-78.7,310,260,2,-85,LTE,2850,325,1740927600250\n",
-        {"pci325": {"time": [0.25], "rss_db": [-85]}},
+        {"lte_pci325": {"time": [0.25], "rss_db": [-85]}},
         "drive_test",
     ),
     "one RNTI in two cells of an srsRAN gNB": Case(

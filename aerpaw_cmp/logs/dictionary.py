@@ -1,0 +1,464 @@
+"""The dictionary of columns: what a name means in any log, whatever the program, and which values of it can be.
+
+A reader says which names a file has; :func:`meaning` says what each holds: quantity, unit, words for none, possible
+range, role (serving cell, n-th neighbour, uplink) and, of a height, its datum. ``PROGRAMS`` says what the names alone
+do not: units and datums that a program is known to write. A new name is a row here; docs/formats.md shows the table.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from functools import cache
+from types import MappingProxyType
+
+import numpy as np
+
+from ..common.units import BoolArray, FloatArray
+from .records import Kind
+
+# What Android, modems and autopilots write for "not available".
+UNAVAILABLE = (2147483647.0, -2147483648.0, 9223372036854775807.0, 268435455.0, 65535.0, -32768.0, -999.0, -9999.0)
+_ANY = (-np.inf, np.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A row of the dictionary.
+
+    Parameters
+    ----------
+    name : str
+        The field's word, or the column of the record model.
+    role : str
+        ``time``, ``position``, ``height``, ``angle``, ``velocity``, ``count``, ``identity``, ``cell`` or a kind of
+        stream: ``rss``, ``rank``, ``kpi``.
+    names : tuple of str
+        Patterns that stand in a plain name (:func:`plain`), the preferred first.
+    unit : str
+        In which it is read, and what numbers without a unit count in.
+    none : tuple of float
+        Numbers that stand for no value, besides those of :data:`UNAVAILABLE`.
+    can_be : (low, high)
+        Possible values, in its unit: what lies beyond belongs to another column.
+    datum : str
+        Of a height: ``take-off``, ``ground``, ``sea level``, ``ellipsoid`` or ``unknown``.
+    """
+
+    name: str
+    role: str
+    names: tuple[str, ...]
+    unit: str = ""
+    none: tuple[float, ...] = ()
+    can_be: tuple[float, float] = _ANY
+    datum: str = ""
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of the stream that a level, rank or KPI gives."""
+        return "rss" if self.role == "rss" else "rank" if self.role == "rank" else "kpi"
+
+
+_UP = r"\b(alt|altitude|height|hgt|elevation|ele|hoehe)"
+_ANGLE = (-360.0, 360.0)
+_SPEED = (-400.0, 400.0)
+_DBM, _DB = (-200.0, 30.0), (-60.0, 100.0)
+
+QUANTITIES: tuple[Quantity, ...] = (
+    # when; the surest first
+    Quantity("time", "time", (
+        r"^time utc usec$", r"^(measured|recorded|logged|sampled|seen) at$",
+        r"^(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| us| iso| unix)?$",
+        r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s| us)?$",
+        r"^(custom )?(update ?)?(local |utc )?time( utc| ms| s| us| usec| local| epoch)?$", r"^time ?millisecond$",
+        r"^(rel|relative|elapsed) ?time( ms| s)?$", r"^time boot ms$", r"^(epoch|unix)( ms| s)?$", r"^utc$", r"^t$",
+    )),
+    Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$",)),
+    Quantity("gps_week", "time", (r"^gps ?(week|wk)( number| no)?$", r"^gwk$", r"^(week|wn)( number| no)?$")),
+    Quantity("gps_seconds", "time", (
+        r"^(gps ?)?(tow|i ?tow|seconds? of week|week seconds?|sow|gps seconds?)( s| ms)?$", r"^gms$",
+    ), "s"),
+    # where
+    Quantity("latitude_deg", "position", (
+        r"^(osd |gps )?(lat|latitude)( deg| degrees| int)?( ?1?e ?7)?$", r" (lat|latitude)( deg)?$",
+    ), "deg", can_be=(-90.0, 90.0)),
+    Quantity("longitude_deg", "position", (
+        r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int)?( ?1?e ?7)?$", r" (lon|lng|longitude)( deg)?$",
+    ), "deg", can_be=(-180.0, 180.0)),
+    # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's
+    Quantity("home", "other", (
+        r"\b(home|take ?off|launch|terrain|ground|geoid|undulation|delta|target|max|min)\b.*" + _UP + r"(?!.*\babove)",
+        _UP + r" (of )?(home|terrain|geoid|target)$", r"^geoid", r"accuracy|variance|\bvdop\b|precision",
+    )),
+    Quantity("altitude_m", "height", (
+        _UP + r" ?(above |over )?(the )?(take ?off|home|launch)", r"\b(rel|relative)[ ]?(home ?)?(alt|altitude|height)",
+        _UP + r" ?(rel|relative|ato)\b", r"^rel ?home ?alt$", r"^osd height", r"^ascent",
+    ), "m", can_be=(-1000.0, 20_000.0), datum="take-off"),
+    Quantity("altitude_m", "height", (
+        r"\bagl\b|altitude ?agl|^agl ?alt", _UP + r" ?(above |over )(the )?(ground|terrain)", r"\babove ground\b",
+    ), "m", can_be=(-1000.0, 20_000.0), datum="ground"),
+    Quantity("altitude_m", "height", (
+        r"(\b|altitude|alt|height)(amsl|msl|asl)\b", r"sea ?level", r"\borthometric\b", r"^osd alt", r"^gps " + _UP[2:],
+        r"^(ele|elevation)( m| ft| feet| meters)?$",
+    ), "m", can_be=(-1000.0, 20_000.0), datum="sea level"),
+    Quantity("altitude_m", "height", (
+        r"^(alt|altitude)( m| meters| metres| ft| feet)?$", r"^(height|hgt)( m| meters| metres| ft| feet)?$",
+    ), "m", can_be=(-1000.0, 20_000.0), datum="unknown"),
+    Quantity("altitude_m", "height", (
+        r"ellips", r"\b(hae|wgs ?84)\b",
+    ), "m", can_be=(-1000.0, 20_000.0), datum="ellipsoid"),
+    # how it lies; a gimbal's or camera's angles are not the aircraft's
+    Quantity("gimbal", "other", (r"\b(gimbal|camera|mount|payload|des|desired|target|setpoint|sp)\b",)),
+    Quantity("roll_deg", "angle", (r"^(osd )?roll( deg| degrees| rad)?$",), "deg", can_be=_ANGLE),
+    Quantity("pitch_deg", "angle", (r"^(osd )?pitch( deg| degrees| rad)?$",), "deg", can_be=_ANGLE),
+    Quantity("yaw_deg", "angle", (
+        r"^(osd )?yaw( deg| degrees| rad)?$", r"^compass heading( degrees)?$", r"^(heading|hdg)( deg| degrees)?$",
+        r"^bearing( deg)?$",
+    ), "deg", none=(1000.0,), can_be=_ANGLE),
+    Quantity("velocity_north_mps", "velocity", (
+        r"^velocity ?(north|x)( mps)?$", r"^vn$", r"^vel n m s$", r"^(osd )?x ?speed", r"^speed ?x$", r"^vx$",
+    ), "m/s", can_be=_SPEED),
+    Quantity("velocity_east_mps", "velocity", (
+        r"^velocity ?(east|y)( mps)?$", r"^ve$", r"^vel e m s$", r"^(osd )?y ?speed", r"^speed ?y$", r"^vy$",
+    ), "m/s", can_be=_SPEED),
+    Quantity("velocity_down_mps", "velocity", (
+        r"^velocity ?(down|z)( mps)?$", r"^vd$", r"^vz$", r"^vel d m s$", r"^(osd )?z ?speed", r"^speed ?z$",
+    ), "m/s", can_be=_SPEED),
+    Quantity("fix", "count", (r"^(gps )?fix( type)?$", r"^gpsfix$", r"^gps lock$")),
+    Quantity("satellites", "count", (
+        r"^(number of satellites?|satellites( used)?|num ?sat|osd gpsnum|nsats|numberofsatellites|gps count)$",
+    )),
+    # who
+    Quantity("device", "identity", (
+        r"^(device|phone|modem|ue|vehicle|drone|uav|logger|serial)( ?(id|name|no|number|serial|index))?$",
+        r"^(imei|imsi|sys ?id|system ?id)$", r"^(receiver|rx)( ?(id|name|channel|port|antenna|serial number))?$",
+        r"^(transmitter|tx)( ?(id|name|channel|port|antenna))?$",
+    )),
+    Quantity("network", "identity", (
+        r"^(operator|carrier|network operator|operator ?name|network name|provider|plmn|sim)( ?(id|code|slot|no))?$",
+        r"^mcc$", r"^mnc$", r"^mcc ?mnc$",
+    )),
+    Quantity("technology", "cell", (
+        r"^(network ?(tech|mode|type)|net ?type|rat|technology|access technology|radio( type| access)?|act|cell type)$",
+    )),
+    Quantity("serving", "cell", (r"^(is ?)?(registered|serving|connected)( cell)?$",)),
+    Quantity("neighbouring", "cell", (r"^(is ?)?neighbou?r(ing)?( cell)?$",)),
+    # how strong; 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
+    Quantity("rank", "rank", (
+        r"\b(pdsch rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b",
+    ), none=(0.0,), can_be=(0.0, 16.0)),
+    Quantity("RSRP", "rss", (
+        r"\brs ?rp\b|\bss ?rsrp\b|\b(nrx)?rsrp\d{0,2}\b|\b(n|nb|nbr)\d{0,2}rsrp\b",
+    ), "dBm", none=(0.0,), can_be=_DBM),
+    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0,), can_be=_DB),
+    Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", can_be=_DB),
+    Quantity("RSSI", "rss", (r"\brssi\d{0,2}\b",), "dBm", none=(0.0,), can_be=_DBM),
+    Quantity("RSCP", "rss", (r"\brscp\b",), "dBm", none=(0.0,), can_be=_DBM),
+    Quantity("RxLev", "rss", (r"\brx ?lev\b",), "dBm", none=(0.0,), can_be=_DBM),
+    Quantity("Ec/N0", "kpi", (r"\bec ?(n0|no|io)\b",), "dB", can_be=_DB),
+    Quantity("PCI", "cell", (
+        r"\b(\w{0,5}pci\d{0,2}|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci|phy ?id)\b",
+        r"\bpsc or pci\b",
+    ), can_be=(0.0, 1007.0)),
+    Quantity("ARFCN", "cell", (
+        r"\b(nr ?|e ?|u ?)?arfcn\d{0,2}\b|\bchannel number\b|\bfreq(uency)? channel\b",
+    ), can_be=(0.0, 3_279_165.0)),
+    Quantity("CQI", "kpi", (r"\bcqi\b",), can_be=(0.0, 100.0)),
+    Quantity("path loss", "kpi", (r"\bpath ?loss\b",), "dB"),
+    Quantity("throughput", "kpi", (r"\b(throughput|tput|bit ?rate|thr?put)\b",), "bit/s"),
+    Quantity("MCS", "kpi", (r"\bmcs\b",), can_be=(0.0, 100.0)),
+    Quantity("BLER", "kpi", (r"\bbler\b",), "%"),
+)  # fmt: skip
+# Patterns as one expression per row: most names are none of them.
+_COMPILED = tuple((re.compile("|".join(f"(?:{pattern})" for pattern in row.names)), row) for row in QUANTITIES)
+
+_NEIGHBOUR = re.compile(
+    r"\b(detected|neigh(bou?rs?)?\d{0,2}|nbr?\d{0,2}|ncell ?\d{0,2}|n ?\d{1,2}|nrx|nlte\w*|adj(acent)?\d{0,2})\b"
+    r"|\btop \d{1,2}\b"
+    r"|\bn\d?(rsrp|rxrsrp|rsrq|pci)\d{0,2}\b|^nrx|\bnbr?\d{0,2}(rsrp|rsrq|pci)\b"
+)
+_NR = re.compile(r"\b(nr|5g|spcell|ss ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss|\bnrpci\b|\bnr ?arfcn\b|\bnci\b")
+_LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
+# A secondary carrier: it serves beside the primary one.
+_SECONDARY = re.compile(r"\bsc(?:ell|c) ?(\d{0,2})\b")
+_NUMBER = re.compile(
+    r"(?:^| )(?:n|nb|nbr|neigh|neighbou?r|ncell|adj|top|rsrp|rsrq|pci|e?arfcn)? ?(\d{1,2})(?: |$)"
+    r"|\bn(?:br?)?(\d{1,2})[a-z]"
+)
+# What the base station hears is no level of the downlink.
+_UPLINK = re.compile(r"\b(ul|uplink|pusch|pucch|srs)\b")
+
+
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """What a column holds.
+
+    Parameters
+    ----------
+    quantity : Quantity
+    unit : str
+        As its name writes it, in lower case; empty where it does not.
+    rat : str
+        ``lte``, ``nr`` or empty.
+    place : str
+        ``serving``, ``scell1``, ``n2`` (the second neighbour; ``n0`` where it has no number).
+    uplink : bool
+    """
+
+    quantity: Quantity
+    unit: str = ""
+    rat: str = ""
+    place: str = "serving"
+    uplink: bool = False
+
+    @property
+    def neighbour(self) -> bool:
+        """Whether it is of a cell that does not serve."""
+        return self.place.startswith("n")
+
+
+def plain(name: str) -> str:
+    """A name in lower case with its marks as single spaces.
+
+    Examples
+    --------
+    >>> plain("RSRP (LTE detected) - 1")
+    'rsrp lte detected 1'
+    """
+    return re.sub(r"[^a-z0-9]+", " ", name.lower().replace("\u200b", "")).strip()
+
+
+_BRACKET = re.compile(r"[\[(]([^\[\]()]{1,16})[\])]\s*$")
+_A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5\u03bc%\u00b0]{1,7}(/[a-z]{1,3})?")
+
+
+@cache
+def meaning(name: str, words: str | None = None) -> Meaning | None:
+    """What a name means; None if nothing that is known.
+
+    Parameters
+    ----------
+    name : str
+        As written, with its unit.
+    words : str, optional
+        Its plain form in common words, where a program has words of its own.
+
+    Examples
+    --------
+    >>> found = meaning("NB1_RSRP [dBm]")
+    >>> found.quantity.name, found.unit, found.place
+    ('RSRP', 'dbm', 'n1')
+    """
+    unit, _zone, rest = in_brackets(name)
+    text = plain(name) if words is None else words
+    bare = plain(rest) if words is None else text
+    if not unit and (end := re.fullmatch(r"(.+) (\S+)", text)) and end[2] in _SUFFIXES:
+        unit = end[2]
+    row = next(
+        (row for form, row in _COMPILED if form.search(text) or (bare != text and form.search(bare))), None
+    )  # fmt: skip
+    if row is None or row.role == "other":
+        return None
+    rat = "nr" if _NR.search(text) else "lte" if _LTE.search(text) else ""
+    digits = _NUMBER.search(re.sub(r"\b[45] ?g\b", "", text))
+    number = next((group for group in digits.groups() if group), "0") if digits else "0"
+    second = _SECONDARY.search(text)
+    place = f"n{number}" if _NEIGHBOUR.search(text) else f"scell{second[1]}" if second else "serving"
+    return Meaning(row, unit, rat, place, uplink=_UPLINK.search(text) is not None)
+
+
+def in_brackets(name: str) -> tuple[str, str, str]:
+    """Unit and time zone in brackets at the end of a name, and the name without them."""
+    written = _BRACKET.search(name)
+    if written is None:
+        return "", "", name
+    inside, rest = written[1].strip(), name[: written.start()]
+    if is_unit(inside) or _A_UNIT.fullmatch(inside.lower()):
+        return inside.lower(), "", rest
+    return "", inside, rest
+
+
+def rank_of(quantity: Quantity, words: str) -> tuple[int, int]:
+    """How sure a plain name means a quantity: rows and patterns come in the order of preference."""
+    fits = [i for i, pattern in enumerate(quantity.names) if re.search(pattern, words)]
+    return QUANTITIES.index(quantity), fits[0] if fits else len(quantity.names)
+
+
+def is_none(quantity: Quantity, values: FloatArray) -> BoolArray:
+    """Where numbers stand for no value."""
+    return np.isin(values, (*UNAVAILABLE, *quantity.none))
+
+
+def impossible(quantity: Quantity, values: FloatArray) -> BoolArray:
+    """Where a column has a value that its quantity cannot have, words for none aside; of identities, fractions, too."""
+    beyond = (values < quantity.can_be[0]) | (values > quantity.can_be[1])
+    if quantity.role == "cell":
+        beyond |= np.isfinite(values) & (values != np.round(values))
+    return beyond & ~is_none(quantity, values)
+
+
+def angle_form(values: FloatArray, quantity: Quantity) -> str:
+    """The unit of positions that cannot be degrees: MAVLink's integers, or NMEA's degrees and minutes; else empty."""
+    known = np.abs(values[np.isfinite(values) & ~is_none(quantity, values) & (values != 0)])
+    most = quantity.can_be[1]
+    if not len(known) or np.median(known) <= most:
+        return ""
+    if (known == np.round(known)).all() and np.median(known) > 1e5 and known.max() <= most * 1e7:
+        return "1e-7 deg"
+    if known.max() <= 100 * most and (known % 100 < 60).all():
+        return "ddmm.mmmm"
+    return ""
+
+
+# --- units ------------------------------------------------------------------------------------------------------------
+
+
+def _times(factor: float) -> Callable[[FloatArray], FloatArray]:
+    return lambda values: values * factor
+
+
+def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
+    def convert(values: FloatArray) -> FloatArray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(values >= 0, 10 * np.log10(np.where(values > 0, values, np.nan) * per_unit), np.nan)
+
+    return convert
+
+
+# Each unit that a name or a cell may have: the unit in which it is read, and how it becomes that.
+UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
+    **{word: ("m", _times(factor)) for word, factor in (
+        ("ft", 0.3048), ("feet", 0.3048), ("foot", 0.3048), ("m", 1.0), ("meter", 1.0), ("meters", 1.0),
+        ("metres", 1.0), ("cm", 0.01), ("mm", 1e-3), ("km", 1e3), ("yd", 0.9144))},
+    **{word: ("m/s", _times(factor)) for word, factor in (
+        ("mph", 0.44704), ("m/s", 1.0), ("mps", 1.0), ("km/h", 1 / 3.6), ("kmh", 1 / 3.6), ("kph", 1 / 3.6),
+        ("kts", 0.514444), ("kt", 0.514444), ("knots", 0.514444), ("cm/s", 0.01), ("ft/s", 0.3048))},
+    **{word: ("deg", _times(factor)) for word, factor in (
+        ("deg", 1.0), ("degree", 1.0), ("degrees", 1.0), ("\u00b0", 1.0), ("rad", 180 / np.pi),
+        ("radians", 180 / np.pi), ("1e-7 deg", 1e-7), ("1e-7deg", 1e-7), ("dege7", 1e-7), ("deg e7", 1e-7),
+        ("degrees e7", 1e-7), ("e7", 1e-7),
+        ("deg*1e7", 1e-7), ("1e7", 1e-7), ("cdeg", 0.01), ("centidegrees", 0.01), ("mrad", 0.18 / np.pi))},
+    **{word: ("bit/s", _times(factor)) for word, factor in (
+        ("bps", 1.0), ("bit/s", 1.0), ("kbps", 1e3), ("kbit/s", 1e3), ("mbps", 1e6), ("mbit/s", 1e6), ("gbps", 1e9),
+        ("gbit/s", 1e9))},
+    "db": ("dB", _times(1.0)),
+    "dbm": ("dBm", _times(1.0)),
+    "dbw": ("dBm", lambda values: values + 30.0),
+    "mw": ("dBm", _milliwatts(1.0)), "w": ("dBm", _milliwatts(1e3)), "uw": ("dBm", _milliwatts(1e-3)),
+    "\u00b5w": ("dBm", _milliwatts(1e-3)), "nw": ("dBm", _milliwatts(1e-6)), "pw": ("dBm", _milliwatts(1e-9)),
+}  # fmt: skip
+_DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
+# Units that may end a name without brackets: 'alt_ft', 'rsrp_dbm'.
+_SUFFIXES = {"ft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps", "dbm",
+             "dbw", "mw", "uw", "nw", "e7", "cdeg", "kbps", "mbps", "db"}  # fmt: skip
+
+
+def is_unit(text: str) -> bool:
+    """Check whether a text is a unit that values are converted from."""
+    return text.lower() in UNITS or text.lower() in _DDMM
+
+
+def unit_of(written: str) -> str:
+    """Unit in which values of a written unit are read; the written one where none is known, empty for other words."""
+    known = UNITS.get(written)
+    return known[0] if known else "deg" if written in _DDMM else written if _A_UNIT.fullmatch(written) else ""
+
+
+def converted(values: FloatArray, written: str) -> FloatArray:
+    """Values of a written unit in the unit in which they are read."""
+    if written in _DDMM:
+        return from_minutes(values)
+    return UNITS[written][1](values) if written in UNITS else values
+
+
+def from_minutes(values: FloatArray) -> FloatArray:
+    """Angles as NMEA writes them, ddmm.mmmm, in degrees."""
+    degrees = np.trunc(values / 100)
+    return np.asarray(degrees + (values - 100 * degrees) / 60)
+
+
+# --- programs ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """What a program is known to write, by columns that it alone has.
+
+    Parameters
+    ----------
+    name : str
+    signs : collection of str
+        Plain names: all of one of the sets.
+    words : mapping of str to str
+        Patterns of its own words, whole plain names, and the common words for them.
+    units : mapping of str to str
+        Units of plain names that have none in brackets; ``time`` for that of the clock.
+    datum : str
+        Of heights whose name does not tell it.
+    angles : str
+        Unit of angles.
+    """
+
+    name: str
+    signs: tuple[frozenset[str], ...]
+    words: MappingProxyType[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    units: MappingProxyType[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    datum: str = ""
+    angles: str = ""
+
+
+def _program(
+    name: str, *signs: str, words: dict[str, str] | None = None, units: dict[str, str] | None = None, datum: str = "",
+    angles: str = "",
+) -> Program:  # fmt: skip
+    sets = tuple(frozenset(part.split(",")) for part in signs)
+    return Program(name, sets, MappingProxyType(words or {}), MappingProxyType(units or {}), datum, angles)
+
+
+PROGRAMS: tuple[Program, ...] = (
+    _program("PX4, vehicle_gps_position", "time utc usec,timestamp", datum="sea level",
+             units={"timestamp": "us", "alt": "mm"}),
+    _program("PX4", "timestamp,timestamp sample", "timestamp,delta alt", datum="sea level", units={"timestamp": "us"},
+             angles="rad"),
+    _program("MAVLink", "time boot ms", "rollspeed", datum="sea level", angles="rad", units={
+        "relative alt": "mm", "alt": "mm", "vx": "cm/s", "vy": "cm/s", "vz": "cm/s", "hdg": "cdeg", "lat": "e7",
+        "lon": "e7"}),
+    _program("ArduPilot", "timeus", "gcrs,spd", "lat,lng,q1,q2", "desroll,roll", datum="sea level", angles="deg"),
+    _program("aerpawlib", "gpsfix,numberofsatellites", "gpsfix,batteryvolts", "numberofsatellites,batteryvolts",
+             "volt,number of satellite", "voltage,number of satellites", "volt,number of satellites", datum="take-off"),
+    _program("G-NetTrack Pro", "level,qual,networktech", "level,qual,networkmode", datum="sea level", words={
+        r"level": "rsrp", r"qual": "rsrq", r"psc": "pci", r"nrxlev(\d)": r"rsrp neighbour \1",
+        r"nqual(\d)": r"rsrq neighbour \1", r"ncell(\d)": r"pci neighbour \1", r"narfcn(\d)": r"arfcn neighbour \1",
+        r"lterssi": "rssi"}, units={"dl bitrate": "kbps", "ul bitrate": "kbps"}),
+    _program("G-NetTrack KML", "technology,mode,pc", "technology,pc,layer", datum="sea level", words={r"pc": "pci"}),
+    _program("G-NetTrack", "networktech", "networkmode", datum="sea level",
+             units={"dl bitrate": "kbps", "ul bitrate": "kbps"}),
+    _program("srsUE", "time,cc,earfcn,rsrp,cfo", words={r"pl": "path loss"}, units={"time": "ms"}),
+    _program("Tower Collector", "psc,short cell id,net type", datum="sea level", words={r"psc": "pci"}),
+    _program("CellMapper", "signal,psc or pci", datum="sea level", words={
+        r"signal": "rsrp", r"psc or pci": "pci", r"type": "network type"}),
+    _program("phone", "cellname", datum="sea level"),
+)  # fmt: skip
+
+
+def program(names: Collection[str]) -> Program | None:
+    """The program that wrote a table of such plain names, None where no sign stands in it."""
+    present = set(names)
+    return next((item for item in PROGRAMS if any(sign <= present for sign in item.signs)), None)
+
+
+def in_common_words(names: list[str]) -> list[str]:
+    """Plain names, those that only one program uses in the words of all."""
+    known = program(names)
+    words = dict(known.words) if known else {}
+    if "rank" in names and not words and any(_is_level(name) for name in names):
+        words = {"rank": "rank indicator"}  # by itself the word may be that of any list
+    for pattern, word in words.items():
+        names = [re.sub(f"^{pattern}$", word, name) for name in names]
+    return names
+
+
+def _is_level(name: str) -> bool:
+    known = meaning(name)
+    return known is not None and known.quantity.role == "rss"

@@ -192,7 +192,7 @@ _UPLINK = re.compile(r"\b(ul|uplink|pusch|pucch|srs)\b")
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """What a column holds.
+    """Content of a column.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ class Meaning:
 
     @property
     def neighbour(self) -> bool:
-        """Whether it is of a cell that does not serve."""
+        """True of a cell that does not serve."""
         return self.place.startswith("n")
 
 
@@ -235,7 +235,7 @@ _A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5\u
 
 @cache
 def meaning(name: str, words: str | None = None) -> Meaning | None:
-    """What a name means; None if nothing that is known.
+    """Meaning of a name; None if nothing that is known.
 
     Parameters
     ----------
@@ -246,8 +246,8 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
 
     Examples
     --------
-    >>> found = meaning("NB1_RSRP [dBm]")
-    >>> found.quantity.name, found.unit, found.place
+    >>> level = meaning("NB1_RSRP [dBm]")
+    >>> level.quantity.name, level.unit, level.place
     ('RSRP', 'dbm', 'n1')
     """
     unit, _zone, rest = in_brackets(name)
@@ -280,18 +280,18 @@ def in_brackets(name: str) -> tuple[str, str, str]:
 
 
 def rank_of(quantity: Quantity, words: str) -> tuple[int, int]:
-    """How sure a plain name means a quantity: rows and patterns come in the order of preference."""
+    """Rank of a plain name among those of a quantity, the surest first: rows and patterns come in the order of preference."""
     fits = [i for i, pattern in enumerate(quantity.names) if re.search(pattern, words)]
     return QUANTITIES.index(quantity), fits[0] if fits else len(quantity.names)
 
 
 def is_none(quantity: Quantity, values: FloatArray) -> BoolArray:
-    """Where numbers stand for no value."""
+    """Mask of numbers that stand for no value."""
     return np.isin(values, (*UNAVAILABLE, *quantity.none))
 
 
 def impossible(quantity: Quantity, values: FloatArray) -> BoolArray:
-    """Where a column has a value that its quantity cannot have, words for none aside; of identities, fractions, too."""
+    """Mask of values that a quantity cannot have, numbers for none aside; of identities, fractions, too."""
     beyond = (values < quantity.can_be[0]) | (values > quantity.can_be[1])
     if quantity.role == "cell":
         beyond |= np.isfinite(values) & (values != np.round(values))
@@ -383,7 +383,7 @@ def from_minutes(values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """What a program is known to write, by columns that it alone has.
+    """A program and what it is known to write, by columns that it alone has.
 
     Parameters
     ----------
@@ -413,7 +413,8 @@ def _program(
     angles: str = "",
 ) -> Program:  # fmt: skip
     sets = tuple(frozenset(part.split(",")) for part in signs)
-    return Program(name, sets, MappingProxyType(words or {}), MappingProxyType(units or {}), datum, angles)
+    words_of, units_of = MappingProxyType(words or {}), MappingProxyType(units or {})
+    return Program(name=name, signs=sets, words=words_of, units=units_of, datum=datum, angles=angles)
 
 
 PROGRAMS: tuple[Program, ...] = (

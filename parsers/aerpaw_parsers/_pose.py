@@ -182,8 +182,8 @@ def _attitude(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
     """Angles in degrees: by the unit of the name, by the program, and only then by the values of all three."""
     columns = {key: column for key in _ANGLES if (column := sheet.find(key)) is not None}
     values = {key: sheet.numbers(column) for key, column in columns.items()}
-    told = any(sheet.unit(column) for column in columns.values())
-    if not told and _are_radians(values):
+    named = any(sheet.unit(column) for column in columns.values())
+    if not named and _are_radians(values):
         rows.warnings.append("nothing names the unit of the angles: by their values they were read as radians, a guess")
         values = {key: np.degrees(value) for key, value in values.items()}
     yaw = values.get("yaw_deg")

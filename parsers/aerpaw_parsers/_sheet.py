@@ -141,7 +141,7 @@ class Sheet:
 
     @cached_property
     def meanings(self) -> list[dictionary.Meaning | None]:
-        """What each column holds."""
+        """Meaning of each column."""
         return [
             dictionary.meaning(name) if written == words else dictionary.meaning(name, words)
             for name, written, words in zip(self.names, self._own, self.plain, strict=True)
@@ -463,8 +463,8 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     )  # fmt: skip
     timed.warnings += warnings
     if len(timed.row) < len(sheet.row):
-        kept = sheet.part(np.isin(sheet.row, timed.row))
-        sheet.row, sheet.cells, sheet._silent, sheet._numbers = kept.row, kept.cells, kept._silent, {}
+        timed_part = sheet.part(np.isin(sheet.row, timed.row))
+        sheet.row, sheet.cells, sheet._silent, sheet._numbers = timed_part.row, timed_part.cells, timed_part._silent, {}
     if (counter := sheet.named("time millisecond")) not in (None, column):
         _finer(timed, sheet.numbers(counter))
     return timed

@@ -103,7 +103,7 @@ def _month(word: str) -> int:
 
 
 class _Order:
-    """Which of three numbers of a date is what, decided for the whole column, and what was assumed for it."""
+    """Order of the three numbers of a date, decided for the whole column, and what was assumed for it."""
 
     def __init__(self, texts: Iterable[str], name: str, *, european: bool) -> None:
         dates = [match for text in texts if (match := _match(text)) and "a" in match.re.groupindex]
@@ -429,8 +429,8 @@ _NEAR_S = 300.0
 
 def _session_start_s(options: ReadOptions) -> float | None:
     """Second of the day at which Nemo's summary of the session, a CSV beside the log, says that it began."""
-    beside = options.neighbour(options.file_name.rpartition(".")[0] + ".csv") if options.neighbour else None
-    start = _SESSION_START.search(beside[:4096]) if beside else None
+    summary = options.neighbour(options.file_name.rpartition(".")[0] + ".csv") if options.neighbour else None
+    start = _SESSION_START.search(summary[:4096]) if summary else None
     return None if start is None else int(start[1]) * 3600.0 + int(start[2]) * 60.0
 
 

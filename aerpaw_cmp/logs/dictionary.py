@@ -280,7 +280,7 @@ def in_brackets(name: str) -> tuple[str, str, str]:
 
 
 def rank_of(quantity: Quantity, words: str) -> tuple[int, int]:
-    """Rank of a plain name among those of a quantity, the surest first: rows and patterns come in the order of preference."""
+    """Place of a plain name in the order of preference: rows come so, and the patterns of a row."""
     fits = [i for i, pattern in enumerate(quantity.names) if re.search(pattern, words)]
     return QUANTITIES.index(quantity), fits[0] if fits else len(quantity.names)
 

@@ -98,7 +98,9 @@ def _quick_answer(arguments: list[str]) -> int | None:
         print(f"aerpaw-cmp {__version__}")
         return 0
     if not first.startswith("-") and first not in COMMANDS:
-        print(_unknown_command(first), file=sys.stderr)
+        from .common.errors import printable
+
+        print(printable(_unknown_command(first)), file=sys.stderr)
         return 2
     return None
 
@@ -206,7 +208,9 @@ def _interrupted(interrupt: KeyboardInterrupt) -> int:
     """Tell what is kept; 128 and the number of the signal."""
     by = interrupts.last()
     word = "interrupted" if by == signal.SIGINT else f"ended by {by.name}"
-    print("; ".join([f"aerpaw-cmp: {word}", *_notes(interrupt)]), file=sys.stderr)
+    from .common.errors import one_line
+
+    print(one_line("; ".join([f"aerpaw-cmp: {word}", *_notes(interrupt)])), file=sys.stderr)
     return SIGNALLED + by
 
 
@@ -217,8 +221,10 @@ def _failed(error: Exception, debug: bool, arguments: list[str]) -> int:
         import traceback
 
         traceback.print_exc()
+    from .common.errors import printable
+
     text, code = _message(error, arguments)
-    print(text, file=sys.stderr)
+    print(printable(text), file=sys.stderr)
     return code
 
 

@@ -46,7 +46,7 @@ if web := values.pop("web", None):  # a page at this port; no limit on new conne
     from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
     from aerpaw_cmp.report.live_page import live_page
     feed = Feed(["modem"])
-    WebServer(feed, Page(*live_page(None, "benchmark")), Address("127.0.0.1", web),
+    WebServer(feed, Page(*live_page(None, "benchmark")), Address("127.0.0.1", web), token="benchmark",
               limits=Limits(per_second=1e6, burst=1e6)).__enter__()
     watch = lambda item: feed.put(0, item)
 try:
@@ -78,7 +78,8 @@ while not ended:
     try:
         with socket.create_connection(("127.0.0.1", port), 2) as link:
             link.settimeout(1.5)
-            link.sendall(f"GET /events?from={cursor} HTTP/1.1\\r\\nHost: 127.0.0.1\\r\\n\\r\\n".encode())
+            target = f"/events?token=benchmark&from={cursor}"
+            link.sendall(f"GET {target} HTTP/1.1\\r\\nHost: 127.0.0.1\\r\\n\\r\\n".encode())
             connections += 1
             for line in link.makefile("r"):
                 if line.startswith("id: "):
@@ -109,7 +110,9 @@ def start_browser(port: int) -> subprocess.Popen[str]:
 
 def damaged(chance: random.Random) -> bytes:
     """A request that is damaged in one of many ways."""
-    request = bytearray(b"GET /events?from=00000000-1-2-3 HTTP/1.1\r\nHost: 127.0.0.1\r\nLast-Event-ID: 1\r\n\r\n")
+    request = bytearray(
+        b"GET /events?token=benchmark&from=00000000-1-2-3 HTTP/1.1\r\nHost: 127.0.0.1\r\nLast-Event-ID: 1\r\n\r\n"
+    )
     kind = chance.randrange(5)
     if kind == 0:
         return bytes(chance.randrange(256) for _ in range(chance.randrange(600))) + b"\r\n\r\n"
@@ -120,7 +123,11 @@ def damaged(chance: random.Random) -> bytes:
         return chance.choice([b"GET /" + b"a" * 70_000, many]) + b"\r\n\r\n"
     if kind == 3:
         parts = [b"/", b"..", b"%2e%2e", b"%00", b"etc", b"passwd", b"?token=", b"&", b"[", b"\\", b"events", b"\xff"]
-        return b"GET " + b"".join(chance.choice(parts) for _ in range(10)) + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+        return (
+            b"GET "
+            + b"".join(chance.choice(parts) for _ in range(10))
+            + b"?token=benchmark HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+        )
     for _ in range(chance.randrange(1, 12)):
         request[chance.randrange(len(request))] = chance.randrange(256)
     return bytes(request) + b"\r\n\r\n"

@@ -212,3 +212,21 @@ def test_an_interrupt_says_what_is_kept(tmp_path: Path) -> None:
     assert err.splitlines()[-1] == f"aerpaw-cmp: interrupted; {before.parent} is as it was before"
     assert before.read_text() == "an earlier report"
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
+
+
+def test_words_of_strangers_are_shown_and_not_obeyed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A table, paragraphs, lines and warnings with the title of a window in a channel's name."""
+    from aerpaw_cmp.cli.shown import print_files, show, table, warn_all
+
+    name = "\x1b]0;PWN\a\x9b2J\rUSRP1\u202e"
+    for width in (None, 30):
+        table(["channel", f"{name} dB"], [[name, "1.0"], ["USRP1 " * 9, "2.0"]], name, width=width)
+    show(f"two lines\n{name}")
+    print_files([Path(name)])
+    warn_all([name])
+    out, err = capsys.readouterr()
+    for text in (out, err):
+        assert "x1b]0;PWN" in text
+        assert all(character.isprintable() or character == "\n" for character in text)

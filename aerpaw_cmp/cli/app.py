@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -23,6 +24,7 @@ from typer import Option
 from typer.core import TyperCommand
 
 from ..common.commands import COMMANDS
+from ..common.errors import UsageError
 from .shown import say
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -126,6 +128,10 @@ def _with_quiet(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def run(*, quiet: bool = False, **arguments: Any) -> Any:
         say.quiet = quiet
+        for option, value in arguments.items():
+            for number in value if isinstance(value, (list, tuple)) else (value,):
+                if isinstance(number, float) and not math.isfinite(number):
+                    raise UsageError(f"--{option.replace('_', '-')} {number}", expected="a finite number")
         try:
             return function(**arguments)
         except KeyboardInterrupt as error:

@@ -10,7 +10,7 @@ from typer import Argument, Option
 from ..common.stages import duration
 from ..jobs.options import RunOptions
 from .app import Export, Force, Json, LogsRoot, Scheduler, Workers, command, output
-from .shown import number, print_json, records, say, table
+from .shown import number, print_json, records, say, show, table
 
 
 @command(
@@ -68,7 +68,7 @@ def _print_status(status: Any) -> None:
     time = "no time was measured yet" if status.estimate_s is None else f"about {duration(status.estimate_s)}"
     if not status.to_do:
         time = "nothing to compute"
-    print(
+    show(
         f"{status.name}: {len(status.states)} tasks, {status.kept} kept in {status.keep}, {status.failed} failed the "
         f"last time, {status.to_do} to do, {time} with {status.workers} worker{'s' if status.workers > 1 else ''}"
     )
@@ -77,7 +77,7 @@ def _print_status(status: Any) -> None:
         title = "To do" if len(rows) <= _SHOWN else f"To do: the first {_SHOWN} of {len(rows)}"
         table(["flight", "setting", "last failure"], rows[:_SHOWN], title)
     for failure in status.failures:
-        print(f"{failure.flight}: {failure.message}")
+        show(f"{failure.flight}: {failure.message}")
 
 
 def _print_campaign_summary(outcome: Any) -> None:
@@ -89,4 +89,4 @@ def _print_campaign_summary(outcome: Any) -> None:
     heads = {"setting": "setting", "flight": "flight", "tower": "tower", "K": "k:g"}
     numbers = {"total variation": "total_variation:.3f", "agreement": "agreement:.2f", "kappa": "kappa:.2f"}
     records(m["rank"], heads | numbers, "Rank")
-    print(f"report: {outcome.folder / 'campaign.html'}")
+    show(f"report: {outcome.folder / 'campaign.html'}")

@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from ..common.errors import one_line
 from .app import Force, Json, command, output
-from .shown import print_json, records, say
+from .shown import print_json, records, say, show
 
 
 @command(
@@ -41,7 +41,7 @@ def diff(
     else:
         _print_diff(comparison)
         if out is not None:
-            print(f"page: {out / 'diff.html'}")
+            show(f"page: {out / 'diff.html'}")
     return 1 if strict and comparison.differences else 0
 
 
@@ -52,20 +52,20 @@ _SHOWN = 20
 def _print_diff(comparison: Any) -> None:
     from ..report.diff.html import verdict
 
-    print(verdict(comparison))
+    show(verdict(comparison))
     for text in comparison.remarks:
         say.warn(f"warning: {one_line(text)}")
     for title, items in (("setting", comparison.settings), ("version", comparison.versions)):
         for item in items[:_SHOWN]:
-            print(one_line(f"{title} {item.key}: {_value(item.first)} -> {_value(item.second)}"))
+            show(one_line(f"{title} {item.key}: {_value(item.first)} -> {_value(item.second)}"))
         if len(items) > _SHOWN:
-            print(f"and {len(items) - _SHOWN} more {title}s")
+            show(f"and {len(items) - _SHOWN} more {title}s")
     for item in comparison.inputs:
-        print(one_line(f"input {item.path} ({item.role}): {item.what}"))
+        show(one_line(f"input {item.path} ({item.role}): {item.what}"))
     _print_numbers(comparison)
     for name, texts in (("second", comparison.new_warnings), ("first", comparison.gone_warnings)):
         for text in texts:
-            print(one_line(f"warning only in the {name}: {text}"))
+            show(one_line(f"warning only in the {name}: {text}"))
 
 
 def _value(value: Any) -> str:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from typer import Argument, Option
 
 from .app import Json, LogsRoot, command
-from .shown import number, print_json, records, say, table
+from .shown import number, print_json, records, say, show, table
 
 
 @command(
@@ -45,11 +45,11 @@ def explain(
 
 def _print(explanation: Any) -> None:
     east, north, up = explanation.position_m
-    print(
+    show(
         f"{explanation.flight}: {explanation.tower} {explanation.channel} at {explanation.time_utc} "
         f"({explanation.time_s:.1f} s)"
     )
-    print(f"UAV at {east:.2f} m east, {north:.2f} m north, {up:.2f} m up; {explanation.carrier_hz / 1e9:g} GHz")
+    show(f"UAV at {east:.2f} m east, {north:.2f} m north, {up:.2f} m up; {explanation.carrier_hz / 1e9:g} GHz")
     rows = [
         [p.words, f"{p.length_m:.2f}", f"{p.delay_ns:.1f}",
          f"{p.departure_azimuth_deg:.1f} / {p.departure_elevation_deg:.1f}",
@@ -71,10 +71,10 @@ def _print(explanation: Any) -> None:
     angle = {"path": "path", "face": "face", "material": "material", "incidence deg": "incidence_deg:.1f"}
     records(bounces, angle | {"|TE| dB": "te_db:.2f", "|TM| dB": "tm_db:.2f"}, "Reflections")
     levels = [number(level, "{:.2f}") for level in (explanation.level_dbm, explanation.power_sum_dbm)]
-    print(f"coherent sum {levels[0]} dBm, sum of powers {levels[1]} dBm")
+    show(f"coherent sum {levels[0]} dBm, sum of powers {levels[1]} dBm")
     if explanation.measured_db is not None:
-        print(f"measured {number(explanation.measured_db, '{:.2f}')} {explanation.unit}, before any offset")
+        show(f"measured {number(explanation.measured_db, '{:.2f}')} {explanation.unit}, before any offset")
     for path, reason in explanation.absent:
-        print(f"not there: {path}: {reason}")
+        show(f"not there: {path}: {reason}")
     for note in explanation.notes:
-        print(f"note: {note}")
+        show(f"note: {note}")

@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from ..jobs.options import RunOptions
 from .app import DryRun, Export, Force, Json, LogsRoot, command, output
-from .shown import number, print_files, print_json, print_plan, records, say, table, warn_all
+from .shown import number, print_files, print_json, print_plan, records, say, show, table, warn_all
 
 
 @command(
@@ -156,11 +156,11 @@ def _print_report_summary(outcome: Any) -> None:
     records(thresholds, {**columns, "n": "n"}, "Rank, measured against replayed")
     _print_forecasts(outcome.metrics["rank"])
     if "against" in outcome.metrics:
-        print(outcome.metrics["against"]["sentence"])
+        show(outcome.metrics["against"]["sentence"])
     warn_all(outcome.metrics["warnings"])
-    print(f"report: {outcome.folder / 'report.html'}")
+    show(f"report: {outcome.folder / 'report.html'}")
     if audited := (outcome.metrics.get("rt") or {}).get("audit"):
-        print(audited["summary"])
+        show(audited["summary"])
 
 
 @command(
@@ -219,10 +219,10 @@ def calibrate(
     }  # fmt: skip
     records(forecasts, columns, "Rank on what was left out")
     for text in [*m["words"], *m["warnings"]]:
-        print(text)
-    print(outcome.files[0])
+        show(text)
+    show(outcome.files[0])
     page = outcome.folder / "calibration.html"
-    print(page if page.exists() else outcome.folder)
+    show(page if page.exists() else outcome.folder)
 
 
 @command(
@@ -264,5 +264,5 @@ def sample(
     if as_json:
         print_json({"flight": str(flight)})
         return
-    print(f"flight: {flight}")
-    print(f"next: aerpaw-cmp report {flight}")
+    show(f"flight: {flight}")
+    show(f"next: aerpaw-cmp report {flight}")

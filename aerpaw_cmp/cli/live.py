@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from typer import Argument, Option
 from typer.core import TyperCommand
 
-from ..common.errors import UsageError
+from ..common.errors import UsageError, one_line
 from .app import Force, Json, command, output
-from .shown import print_files, print_json, say
+from .shown import print_files, print_json, say, show
 
 WEB = "127.0.0.1:8765"
 
@@ -82,7 +82,7 @@ def tap(
         if as_json:
             print_json(json_safe(exported))
         else:
-            print(exported)
+            show(exported)
         return 0
     _needs_posix("tap")
     from ..jobs.live.live_tap import Shown, play_logs, tap_modems
@@ -135,8 +135,8 @@ class StatusLine:
 
         head = f"{name}: " if name else ""
         if now.message:
-            print(("\r\033[K" if self._terminal else "") + head + now.message, file=sys.stderr, flush=True)
-        self._lines[name] = head + format_status(now)
+            print(("\r\033[K" if self._terminal else "") + one_line(head + now.message), file=sys.stderr, flush=True)
+        self._lines[name] = one_line(head + format_status(now))
         if self._enabled and self._terminal:
             print("\r\033[K" + " | ".join(self._lines.values()), end="", file=sys.stderr, flush=True)
         elif self._enabled:
@@ -205,7 +205,7 @@ def modem_sim(
         if as_json:
             print_json({"port": str(port)})
         else:
-            print(port, flush=True)
+            show(port)
 
     return run_modem_sim(settings, on_ready=ready, meanwhile=flown)
 

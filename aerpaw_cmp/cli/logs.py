@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from typer import Argument, Option
 
 from .app import Force, Json, command, output
-from .shown import print_json, records, say, table
+from .shown import print_json, records, say, show, table
 
 
 @command(
@@ -61,12 +61,12 @@ def ingest(
     if out is not None:
         flights = summary["flights"]
         several = f": {len(flights)} flights, {', '.join(flights)}" if len(flights) > 1 else ""
-        print(f"wrote {out}{several}")
+        show(f"wrote {out}{several}")
     if draft is not None:
         for remark in summary["draft"]:
             say(remark)
         for place in summary["drafts"]:
-            print(f"wrote {place}")
+            show(f"wrote {place}")
 
 
 @command(

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from .app import Json, command
-from .shown import print_json, records, say
+from .shown import print_json, records, say, show
 
 
 @command(
@@ -44,7 +44,7 @@ def bench(
     }  # fmt: skip
     records(rows, columns, f"Speed against error ({_conditions(result['conditions'])})")
     for name, ratio in result["ratios"].items():
-        print(f"{name}: {ratio:.3g} times")
+        show(f"{name}: {ratio:.3g} times")
 
 
 def _conditions(at: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from ..jobs.options import RunOptions
 from .app import Flights, Force, Json, LogsRoot, command, output
-from .shown import print_json, records, say, warn_all
+from .shown import print_json, records, say, show, warn_all
 
 _FENCE = Option(metavar="KML", help="Area that may be flown  [default: the area of the site]")
 _AVOID = Option(metavar="KML", help="No-fly areas; repeatable.")
@@ -79,9 +79,9 @@ def _in_km(route: dict[str, Any]) -> dict[str, Any]:
 
 def _print_summary(outcome: Any) -> None:
     m = outcome.metrics
-    print(m["sentence"])
+    show(m["sentence"])
     length = {"SD dB": "sd_db:.2f", "km": "km:.1f", "min": "minutes:.1f"}
     records([_in_km(c) for c in m["candidates"]], {"route": "name", **length, "may be flown": "flown"}, "Candidates")
     records([_in_km(p) for p in m["length"]], length, "What a longer flight buys")
     warn_all(m["warnings"])
-    print(f"page: {outcome.folder / 'plan.html'}")
+    show(f"page: {outcome.folder / 'plan.html'}")

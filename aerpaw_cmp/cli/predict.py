@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from ..jobs.options import RunOptions
 from .app import Flights, Force, Json, LogsRoot, command, output
-from .shown import print_json, records, say, warn_all
+from .shown import print_json, records, say, show, warn_all
 
 
 @command(
@@ -65,7 +65,7 @@ def predict(
 
 def _print_summary(outcome: Any) -> None:
     m = outcome.metrics
-    print(m["sentence"])
+    show(m["sentence"])
     series = [{"name": name, "mean_p_above": None, **numbers} for name, numbers in m["series"].items()]
     columns = {
         "series": "name", "unit": "unit", "mean level": "mean_level_db:.1f", "mean SD dB": "mean_sd_db:.1f",
@@ -73,4 +73,4 @@ def _print_summary(outcome: Any) -> None:
     }  # fmt: skip
     records(series, columns, "Prediction")
     warn_all(m["warnings"])
-    print(f"page: {outcome.folder / 'prediction.html'}")
+    show(f"page: {outcome.folder / 'prediction.html'}")

@@ -10,9 +10,14 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from ..common.errors import one_line
+from ..common.errors import one_line, printable
 
 _EVERY_S = 30.0
+
+
+def show(text: object, *, to_stderr: bool = False) -> None:
+    """Print lines, on standard output or error: the words of strangers' files in them are shown, never obeyed."""
+    print(printable(str(text)), file=sys.stderr if to_stderr else sys.stdout, flush=True)
 
 
 class ProgressLines:
@@ -43,12 +48,12 @@ class ProgressLines:
             late = tail and time.monotonic() - self._last >= _EVERY_S
             if late or int(4 * fraction) > self._quarters.get(name, 0):
                 self._quarters[name], self._last = int(4 * fraction), time.monotonic()
-                print(f"{name} {100 * fraction:.0f} %{tail and ': ' + tail}", file=sys.stderr, flush=True)
+                show(f"{name} {100 * fraction:.0f} %{tail and ': ' + tail}", to_stderr=True)
 
     def warn(self, text: str) -> None:
         """Show a line, also where all else is quiet."""
         self.end()
-        print(text, file=sys.stderr, flush=True)
+        show(text, to_stderr=True)
 
     def _draw(self, text: str, fraction: float) -> None:
         name, _, tail = text.partition("\t")
@@ -56,9 +61,9 @@ class ProgressLines:
         if self._bar is None or self._name != name:
             self.end()
             self._bar, self._name = _bar(), name
-            self._bar.add_task(shown, total=1.0)
+            self._bar.add_task(one_line(shown), total=1.0)
             self._bar.start()
-        self._bar.update(self._bar.tasks[0].id, completed=fraction, description=shown)
+        self._bar.update(self._bar.tasks[0].id, completed=fraction, description=one_line(shown))
         if fraction >= 1.0:
             self.end()
 
@@ -115,8 +120,8 @@ def print_plan(plan: Any, as_json: bool = False) -> None:
     rows = [[stage.name, stage.work, number(stage.seconds, "{:.1f}")] for stage in plan.stages]
     rows.append(["all", "", f"{plan.seconds:.0f} and what has a dash"])
     table(["stage", "work", "s"], rows, f"{plan.job}, not run")
-    print(plan.as_dict()["measured"])
-    print(f"reads {len(plan.inputs)} files; would write {plan.output}")
+    show(plan.as_dict()["measured"])
+    show(f"reads {len(plan.inputs)} files; would write {plan.output}")
 
 
 def print_files(paths: Sequence[Path], as_json: bool = False) -> None:
@@ -125,7 +130,7 @@ def print_files(paths: Sequence[Path], as_json: bool = False) -> None:
         print_json({"files": [str(path) for path in paths]})
         return
     for path in paths:
-        print(path)
+        show(path)
 
 
 # Columns up to this width (numbers, times) are never broken.
@@ -138,6 +143,8 @@ def table(columns: list[str], rows: list[list[str]], title: str | None = None, w
     from rich.console import Console
     from rich.table import Table
 
+    rows = [[one_line(cell) for cell in row] for row in rows]
+    columns, title = [one_line(name) for name in columns], title and one_line(title)
     console = Console(width=width if width or sys.stdout.isatty() else 160)
     needs = [max(map(cell_len, [*name.split(), *(row[i] for row in rows)])) for i, name in enumerate(columns)]
     roomy = sum(max(need, cell_len(name)) + 3 for need, name in zip(needs, columns, strict=True)) < console.width
@@ -157,7 +164,7 @@ def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, wi
     import textwrap
 
     if title:
-        print(title)
+        show(title)
     for row in rows:
         lines = [""]
         for name, cell in zip(columns[1:], row[1:], strict=True):
@@ -165,9 +172,9 @@ def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, wi
             if lines[-1] and len(lines[-1]) + len(item) + 7 > width:  # 7: indent and separator
                 lines.append("")
             lines[-1] += f" | {item}" if lines[-1] else item
-        print(row[0])
+        show(row[0])
         for line in lines:
-            print(textwrap.fill(line, width, initial_indent="    ", subsequent_indent="      ", break_on_hyphens=False))
+            show(textwrap.fill(line, width, initial_indent="    ", subsequent_indent="      ", break_on_hyphens=False))
 
 
 def number(value: float | None, form: str) -> str:

@@ -10,7 +10,7 @@ from typer import Argument, Option
 from ..common.errors import UsageError
 from ..jobs.options import RunOptions
 from .app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, command, output, site_app
-from .shown import print_files, print_json, print_plan, say, table
+from .shown import print_files, print_json, print_plan, say, show, table
 
 
 @command(
@@ -84,7 +84,7 @@ def site_import(
         return
     for line in actions:
         say(line)
-    print(out)
+    show(out)
 
 
 @command(
@@ -228,6 +228,6 @@ def map_(
         table(["where", "what", "paper", "here"], rows, "What the paper states, and what this run gives")
     for path in outcome.files:
         if path.parent == outcome.folder:
-            print(path)
+            show(path)
     if outcome.metrics["tiles"]:
-        print(outcome.metrics["tiles"]["store"])
+        show(outcome.metrics["tiles"]["store"])

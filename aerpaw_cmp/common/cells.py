@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")
+# also behind a semicolon: where that parts cells, what follows begins a cell
+_BEGINNING = re.compile(r"(^|;)(?=[=+\-@\t\r'])")
+_GUARDED = re.compile(r"(^|;)'")
 
 
 def guarded(table: Any) -> Any:
@@ -15,11 +18,22 @@ def guarded(table: Any) -> Any:
     guarded_columns = {}
     for name in table.columns:
         if table[name].dtype.kind == "O" or str(table[name].dtype).startswith("str"):
-            words = [word for word in table[name].unique() if isinstance(word, str) and word.startswith(_FORMULA)]
+            words = [word for word in table[name].unique() if isinstance(word, str) and _BEGINNING.search(word)]
             if words:
                 texts = table[name].astype(object)
-                guarded_columns[name] = texts.replace({word: f"'{word}" for word in words})
+                guarded_columns[name] = texts.replace({word: guarded_text(word) for word in words})
     return table.assign(**guarded_columns) if guarded_columns else table
+
+
+def guarded_text(word: str) -> str:
+    """A cell that no spreadsheet takes for a formula.
+
+    Examples
+    --------
+    >>> guarded_text("=1+1"), guarded_text("LW1;=1+1"), guarded_text("LW1")
+    ("'=1+1", "LW1;'=1+1", 'LW1')
+    """
+    return _BEGINNING.sub(r"\1'", word)
 
 
 def unguarded(word: str) -> str:
@@ -30,4 +44,4 @@ def unguarded(word: str) -> str:
     >>> unguarded("'=1+1"), unguarded("LW1")
     ('=1+1', 'LW1')
     """
-    return word[1:] if word.startswith("'") else word
+    return _GUARDED.sub(r"\1", word)

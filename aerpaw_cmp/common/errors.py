@@ -31,12 +31,14 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
     r"""Text that may have lines and holds nothing that a terminal takes for a command: a file's words may be in it.
+
+    All that is printed passes through here or through :func:`one_line`.
 
     Examples
     --------
-    >>> print(_printable("red: \x1b[31m"))
+    >>> print(printable("red: \x1b[31m"))
     red: \x1b[31m
     """
     return "\n".join(one_line(line) for line in text.split("\n"))
@@ -113,7 +115,7 @@ class AerpawCmpError(Exception):
             text += f"; expected {self.expected}"
         if self.cause:
             text += f". Likely cause: {self.cause}"
-        return _printable(text)
+        return printable(text)
 
 
 @contextmanager

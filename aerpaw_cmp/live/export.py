@@ -11,6 +11,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from ..common.cells import guarded_text
 from ..common.errors import InputError
 from ..common.outputs import OutputFile
 from ..logs.checksums import Record
@@ -134,7 +135,7 @@ def export_csv(source: Path, out: Path, *, force: bool = False) -> ExportSummary
         writer = csv.DictWriter(table, COLUMNS, extrasaction="ignore")
         writer.writeheader()
         for row in _rows(source, bad):
-            writer.writerow(row)
+            writer.writerow({name: guarded_text(cell) if isinstance(cell, str) else cell for name, cell in row.items()})
             rows += 1
         output.write(table.getvalue().encode("ascii"))
     return ExportSummary(out, rows, tuple(bad))

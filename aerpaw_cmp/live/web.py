@@ -1,9 +1,10 @@
 """The tap's page for browsers: one page and one stream of events, by the standard library.
 
 It answers GET of ``/`` and ``/events`` and nothing else, reads no file, and refuses what other sites ask for (Host,
-Origin, Sec-Fetch-Site), so that a page on the Internet cannot read it by DNS rebinding. Beyond the loopback it wants
-a token. Each browser has a thread that only reads the :class:`~aerpaw_cmp.live.feed.Feed`: one that takes nothing for
-some seconds is dropped and refills when it comes back; the tap never waits for it.
+Origin, Sec-Fetch-Site), so that a page on the Internet cannot read it by DNS rebinding. Every request needs the token
+of the printed address, or the cookie that the first visit with it gave: the loopback belongs to all users of a machine.
+Each browser has a thread that only reads the :class:`~aerpaw_cmp.live.feed.Feed`: one that takes nothing for some
+seconds is dropped and refills when it comes back; the tap never waits for it.
 """
 
 from __future__ import annotations
@@ -57,9 +58,9 @@ class Limits:
     Parameters
     ----------
     connections : int
-        Open at once.
+        Open at once, of browsers with the token and of others each. The oldest of the others gives way to a new one.
     per_second, burst : float
-        New connections, on average and at once; more are closed unanswered.
+        New connections, on average and at once; more wait their turn, so that none keeps others out.
     request_s : float
         Longest time between a connection and the end of its request [s].
     send_s : float
@@ -69,7 +70,7 @@ class Limits:
     """
 
     connections: int = 24
-    per_second: float = 10.0
+    per_second: float = 50.0
     burst: float = 40.0
     request_s: float = 5.0
     send_s: float = 5.0
@@ -120,7 +121,7 @@ class WebServer:
     page : Page
     address : Address
     token : str, optional
-        Asked for in the URL; None: none on the loopback, a random one elsewhere.
+        Asked for in the URL; None or empty: a random one. Only that is printed: one that was set is a secret of others.
     limits : Limits
 
     Raises
@@ -134,7 +135,10 @@ class WebServer:
     ) -> None:
         self.feed, self.page, self.address = feed, page, address
         self.limits = limits or Limits()
-        self.token = token or ("" if address.loopback else secrets.token_urlsafe(12))
+        self._printed = not token
+        self.token = token or secrets.token_urlsafe(12)
+        # not the token itself: other servers of this machine see the cookies of its name, whatever the port
+        self.pass_word = hmac.new(self.token.encode(), b"cookie", "sha256").hexdigest()
         self.closing = False
         try:
             self._server = _Server(self)
@@ -157,7 +161,7 @@ class WebServer:
     @property
     def urls(self) -> list[str]:
         """Addresses for a browser; of a server on all interfaces, this computer's as other computers see it first."""
-        query = f"/?token={quote(self.token)}" if self.token else "/"
+        query = f"/?token={quote(self.token) if self._printed else '...'}"
         hosts = [self.address.host]
         if self.address.host in ("0.0.0.0", "::"):
             hosts = [*_outward(), "127.0.0.1"]
@@ -204,15 +208,19 @@ class _Server(ThreadingHTTPServer):
         self.server_address = self.socket.getsockname()
 
     def verify_request(self, request: Any, client_address: Any) -> bool:  # noqa: ARG002
-        """Check whether the connection is within the limits; one beyond them is closed unanswered."""
-        now, limits = time.monotonic(), self.web.limits
-        self._allowance = min(limits.burst, self._allowance + (now - self._counted) * limits.per_second)
+        """Let a connection wait its turn, then make room for it: the oldest that showed no token gives way."""
+        limits = self.web.limits
+        now = time.monotonic()
+        self._allowance = min(limits.burst, self._allowance + (now - self._counted) * limits.per_second) - 1.0
         self._counted = now
+        time.sleep(max(0.0, -self._allowance / limits.per_second))
         with self._lock:
-            if self._allowance < 1.0 or len(self._open) >= limits.connections:
-                return False
-            self._allowance -= 1.0
-            self._open[request] = now
+            unknown = [other for other, since in self._open.items() if since < float("inf")]
+            gives_way = unknown[: len(unknown) + 1 - limits.connections]
+            for other in gives_way:
+                del self._open[other]
+            self._open[request] = time.monotonic()
+        self._end(gives_way)
         return True
 
     def shutdown_request(self, request: Any) -> None:
@@ -232,10 +240,14 @@ class _Server(ThreadingHTTPServer):
             with self._lock:
                 self.streams -= 1
 
-    def request_is_in(self, request: Any) -> None:
-        """The request was read to its end: its time limit no longer counts."""
+    def let_in(self, request: Any) -> bool:
+        """Lift the time limit of a connection that showed the token; False where too many of these are open."""
         with self._lock:
+            known = sum(since == float("inf") for since in self._open.values())
+            if known >= self.web.limits.connections:
+                return False
             self._open[request] = float("inf")
+            return True
 
     def end_late_requests(self) -> None:
         """End connections whose request does not come to an end, a byte at a time or not at all."""
@@ -269,7 +281,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with the page or the events."""
-        self.server.request_is_in(self.request)
         try:
             parts = urlsplit(self.path)
             query = {name: values[0] for name, values in parse_qs(parts.query, max_num_fields=8).items()}
@@ -279,9 +290,11 @@ class _Handler(BaseHTTPRequestHandler):
         refusal = self._refusal(parts.path, query)
         if refusal is not None:
             self._text(*refusal)
+        elif not self.server.let_in(self.request):
+            self._text(HTTPStatus.SERVICE_UNAVAILABLE, "too many browsers have this page open")
         elif parts.path == "/":
             body = self.server.web.page.body
-            self._head("text/html; charset=utf-8", len(body))
+            self._head("text/html; charset=utf-8", len(body), cookie=True)
             self._pieces(body)
         else:
             self._head("text/event-stream", None)
@@ -299,12 +312,22 @@ class _Handler(BaseHTTPRequestHandler):
         opened = path == "/" and headers.get("Sec-Fetch-Dest", "document") == "document"
         if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin") and not opened:
             return HTTPStatus.FORBIDDEN, "the request comes from another site"
-        given = query.get("token", "")
-        if web.token and not hmac.compare_digest(given.encode(), web.token.encode()):
+        if not self._has_token(query):
             return HTTPStatus.FORBIDDEN, "the token is missing or wrong: use the address that the tap printed"
         if path not in ("/", "/events"):
             return HTTPStatus.NOT_FOUND, "there is one page here: /"
         return None
+
+    @property
+    def _cookie(self) -> str:
+        return f"aerpaw_tap_{self.server.web.address.port}"
+
+    def _has_token(self, query: dict[str, str]) -> bool:
+        """Check whether a request has the token in its address, or the cookie of an earlier visit."""
+        pairs = (item.strip().partition("=") for item in self.headers.get("Cookie", "").split(";"))
+        cookie = next((value for name, _, value in pairs if name == self._cookie), "")
+        given = (query.get("token", ""), self.server.web.token), (cookie, self.server.web.pass_word)
+        return any(hmac.compare_digest(text.encode(), secret.encode()) for text, secret in given)
 
     def _events(self, cursor: str) -> None:
         """Send what is new until the browser goes, takes nothing, or the session ends."""
@@ -321,9 +344,12 @@ class _Handler(BaseHTTPRequestHandler):
             self._pieces(text.encode("ascii"))
             time.sleep(0.0 if web.closing else web.limits.tick_s)
 
-    def _head(self, kind: str, length: int | None) -> None:
+    def _head(self, kind: str, length: int | None, *, cookie: bool = False) -> None:
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", kind)
+        if cookie:
+            secret = self.server.web.pass_word
+            self.send_header("Set-Cookie", f"{self._cookie}={secret}; Path=/; HttpOnly; SameSite=Strict")
         if length is not None:
             self.send_header("Content-Length", str(length))
         self.end_headers()

@@ -19,6 +19,13 @@ def test_a_text_that_a_spreadsheet_would_run_gets_an_apostrophe_and_comes_back(n
     assert [unguarded(row[0]) for row in rows[1:]] == ["USRP1", name, name]
 
 
+@pytest.mark.parametrize("name", ["LW1;=1+1", "a;b;@SUM(A1);-1", "a;'b", ";=;'=", "'';'"])
+def test_no_cell_that_a_semicolon_begins_is_a_formula(name: str) -> None:
+    text = guarded(pd.DataFrame({"channel": [name]})).channel[0]
+    assert not [cell for cell in text.split(";") if cell.startswith(("=", "+", "-", "@"))]
+    assert unguarded(text) == name
+
+
 def test_a_table_without_such_names_is_the_same_object() -> None:
     table = pd.DataFrame({"channel": ["USRP1"], "rss_db": [-1.5]})
     assert guarded(table) is table

@@ -36,6 +36,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     kml(folder / "fence.kml", [(-300, -250), (250, -250), (250, 250), (-300, 250)])
     kml(folder / "small.kml", [(-20, -20), (20, -20), (20, 20), (-20, 20)])
     kml(folder / "far.kml", [(9000, 0), (9500, 0), (9500, 500), (9000, 500)])
+    turn = 2.0 * np.pi * 1201 / 3000 * np.arange(3000)  # a star whose sides all cross
+    kml(folder / "tangled.kml", [*zip(200 * np.cos(turn), 200 * np.sin(turn), strict=True)])
+    turn = 2.0 * np.pi * np.arange(10_001) / 10_001
+    kml(folder / "round.kml", [*zip(200 * np.cos(turn), 200 * np.sin(turn), strict=True)])
     (folder / "points.csv").write_text("east_m,north_m,height_m\n0,100,40\n,,\n50,120,40\n")
     (folder / "far.csv").write_text("east_m,north_m,height_m\n,,\n9000,0,40\n")
     (folder / "nowhere.csv").write_text("east_m,north_m,height_m\n,,\n")
@@ -80,7 +84,15 @@ def test_plan_writes_the_best_route_and_prefers_headings(place: Path) -> None:
         (["points.csv", "--route", "torn.plan"], 3, "damaged QGroundControl plan"),
         (["points.csv", "--route", "gone.kml"], 3, "gone.kml"),
         (["sphere", "--geofence", "points.csv"], 3, "without an area"),
+        (
+            ["sphere", "--geofence", "tangled.kml"],
+            3,
+            "3000 corners that cannot be used; expected at most 10000 corners",
+        ),
+        (["sphere", "--avoid", "round.kml"], 3, "an area of 10001 corners that cannot be used"),
         (["sphere", "--tower", "LW9"], 2, "no tower 'LW9'"),
+        (["sphere", "--height=-inf"], 2, "--height -inf; expected a finite number"),
+        (["sphere", "--target-height", "nan"], 2, "--target-height nan; expected a finite number"),
     ],
 )
 def test_bad_input_is_one_message(

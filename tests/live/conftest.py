@@ -22,16 +22,22 @@ PAGE = Page(b"<!doctype html><title>t</title>", "default-src 'none'")
 class Browser:
     """Reads the events of a page, or takes nothing; comes back when it is dropped."""
 
-    def __init__(self, port, *, reads=True):
+    @classmethod
+    def of(cls, web, *, reads=True):
+        return cls(web.address.port, web.token, reads=reads)
+
+    def __init__(self, port, token, *, reads=True):
         self.messages, self.connections, self._cursor = [], 0, ""
-        self._port, self._reads, self._stop = port, reads, threading.Event()
+        self._port, self._token, self._reads, self._stop = port, token, reads, threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self):
         while not self._stop.wait(0.05):
             with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self._port), 5) as link:
-                link.sendall(f"GET /events?from={self._cursor} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+                link.sendall(
+                    f"GET /events?token={self._token}&from={self._cursor} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode()
+                )
                 self.connections += 1
                 self._read(link)
 
@@ -65,7 +71,7 @@ def page_open(wanted):
         return
     feed = Feed(["modem"])
     with WebServer(feed, PAGE, Address("127.0.0.1", 0), limits=Limits(send_s=0.5)) as server:
-        browsers = [Browser(server.address.port), Browser(server.address.port, reads=False)]
+        browsers = [Browser.of(server), Browser.of(server, reads=False)]
         yield feed
         feed.digest()
         until = time.monotonic() + 5
@@ -201,7 +207,7 @@ def child(tmp_path, request):
         values = {"folder": tmp_path / "log", "ri_hz": 20.0, "other_hz": 2.0, "pause_s": 0.0} | settings
         if watched:
             values["web"] = free_port()
-            browsers.append(Browser(values["web"]))
+            browsers.append(Browser(values["web"], "benchmark"))
         processes.append(start_tap(port, **values))
         return processes[-1]
 

@@ -40,11 +40,11 @@ def made_map():
 class Flight:
     """A page fed by hand: a flight that goes east, a row at a time."""
 
-    def __init__(self, names=("modem",), background=None, port=0):
+    def __init__(self, names=("modem",), background=None, port=0, token=None):
         self.now_ns, self.count = 1_800_000_000 * SECOND, 0
         self.feed = Feed(list(names), lambda: self.now_ns)
         self.names = names
-        self.server = WebServer(self.feed, Page(*live_page(background, "<b>made up</b>")), Address("127.0.0.1", port),
+        self.server = WebServer(self.feed, Page(*live_page(background, "<b>made up</b>")), Address("127.0.0.1", port), token=token,
                                 limits=Limits(burst=1000.0, tick_s=0.02))  # fmt: skip
         self.start_ns = self.now_ns
         for modem in range(len(names)):
@@ -300,7 +300,7 @@ def test_a_tap_that_is_started_anew_goes_on_in_the_same_page(driver, fly):
     driver.execute_script("window.same = true")
     flight.server.close(wait_s=0.1)
     until(driver, "document.getElementById('state').textContent === 'no connection to the tap'")
-    again = Flight(background=made_map(), port=port)
+    again = Flight(background=made_map(), port=port, token=flight.server.token)
     again.now_ns = again.start_ns = again.feed.start_ns = flight.now_ns + 20 * SECOND
     with again.server:
         again.fly(4)
@@ -354,7 +354,7 @@ def test_nothing_is_asked_of_another_place(driver, fly):
     asked = {
         m["params"]["request"]["url"].partition("?")[0] for m in messages if m["method"] == "Network.requestWillBeSent"
     }
-    own = flight.server.urls[0]
+    own = flight.server.urls[0].partition("?")[0]
     assert {url for url in asked if not url.startswith(("data:", "about:", "chrome:"))} == {own, own + "events"}
 
 

@@ -146,7 +146,8 @@ def _serve(stack: contextlib.ExitStack, feed: Feed, twin: Any, shown: Shown, tit
     background = None if twin is None else twin.map()
     page = Page(*live_page(background, title if background is None else background.title))
     server = stack.enter_context(WebServer(feed, page, address, token=os.environ.get(TOKEN)))
-    shown.say("the page: " + "  ".join(server.urls))
+    known = f"  (... is the value of {TOKEN})" if os.environ.get(TOKEN) else ""
+    shown.say("the page: " + "  ".join(server.urls) + known)
 
 
 def _together(sessions: Sequence[Callable[[], TapSummary]], stop: Stop) -> list[TapSummary]:

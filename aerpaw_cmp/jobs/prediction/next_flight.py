@@ -25,6 +25,7 @@ from ...flight.training import counted_once
 from ...logs.route import read_areas
 from ...report.names import safe_name
 from ...report.plan_html import PlanPage, plan_metrics, write_plan
+from ...site.outlines import MAX_CROSSINGS, is_tangled
 from ...site.site import Site
 from ..learning.calibrate import learned_antennas, observe
 from ..options import DEFAULT, JobOutcome, RunOptions
@@ -42,6 +43,8 @@ _MOST_TARGETS = 600
 # At points of a target whose heading is open.
 HEADINGS = 4
 
+# Of one area: geofences are drawn by hand.
+_MOST_CORNERS = 10_000
 # A target that lies farther outside the geofence throughout, or a geofence outside the site, is refused.
 _FARTHEST_M = 1000.0
 
@@ -244,7 +247,15 @@ def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
     for corners in read_areas(path):
         latitude, longitude = np.array(corners).T
         east, north = site.frame.to_local(latitude, longitude)
-        out.append(shapely.Polygon(np.column_stack([east, north])).buffer(0))
+        ring = shapely.Polygon(np.column_stack([east, north]))
+        if len(corners) > _MOST_CORNERS or is_tangled(ring):  # what follows is not bounded and hears no Ctrl-C
+            raise InputError(
+                f"an area of {len(corners)} corners that cannot be used",
+                expected=f"at most {_MOST_CORNERS} corners and {MAX_CROSSINGS} crossings of the outline with itself",
+                cause="a track or a drawing by hand: simplify it in the map program",
+                path=path,
+            )
+        out.append(ring.buffer(0))
     if not any(item.area > 0 for item in out):
         raise InputError("areas without an extent", expected="outlines of three corners or more", path=path)
     return out

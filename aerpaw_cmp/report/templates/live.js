@@ -58,12 +58,11 @@
 
   // --- the connection -----------------------------------------------------------------------------------------------
 
+  history.replaceState(null, "", "/"); // the token does its work once: the cookie is there, and nobody reads it in the bar
   let source = null, opening = 0;
   function connect() {
     if (source) source.close();
-    const query = new URLSearchParams(location.search);
-    if (state.cursor) query.set("from", state.cursor);
-    source = new EventSource(`/events?${query}`);
+    source = new EventSource(state.cursor ? `/events?from=${encodeURIComponent(state.cursor)}` : "/events");
     opening = Date.now();
     source.onmessage = event => receive(event.data, event.lastEventId);
     source.onerror = () => later(draw);
